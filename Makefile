@@ -45,10 +45,10 @@ docs: $(TOOLS)
 
 # Measurements that take long; each is a script of its own and writes to bench/results.
 bench: $(TOOLS)
-	$(BIN)/python -m bench.demo_accuracy
-	$(BIN)/python -m bench.accuracy
-	$(BIN)/python -m bench.marker_speed
-	$(BIN)/python -m bench.register_scale
+	$(BIN)/python -m bench.whole_runs.demo_accuracy
+	$(BIN)/python -m bench.registration.accuracy
+	$(BIN)/python -m bench.markers.marker_speed
+	$(BIN)/python -m bench.registration.register_scale
 
 # Bad input for every parser: so many seconds for each (an hour: make torture-fuzz FUZZ_S=3600). What is found is kept in
 # build/fuzz. With `$(BIN)/python -m pip install ".[fuzz]"` a second engine follows the lines that an input reaches.

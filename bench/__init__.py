@@ -1,4 +1,7 @@
-"""Benchmarks: each file is a script that anyone can run; linear algebra uses one thread, as in the program."""
+"""Benchmarks, in a folder for each subject: scripts that anyone can run.
+
+Linear algebra uses one thread, as in the program.
+"""
 
 from __future__ import annotations
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 REPOSITORY = Path(__file__).parents[1]
+RESULTS = REPOSITORY / "bench" / "results"
 
 
 def machine() -> dict[str, Any]:

@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from simulators.arm import ARM_MODEL
+from bench.machine import REPOSITORY
 from simulators.geometry import apply, inverse, look_at
-from simulators.render import Renderer
-from simulators.scan_formats import encode
-from simulators.scan_station import scan_scene
+from simulators.rendering.render import Renderer
+from simulators.scan_station.formats import encode
+from simulators.scan_station.station import scan_scene
+from simulators.scene.arm import ARM_MODEL
+from simulators.scene.world import STATIONS, Scene, nominal_hand_eye
 from simulators.ur_controller.kinematics import inverse as joints_for
-from simulators.world import STATIONS, Scene, nominal_hand_eye
 
 Array = NDArray[np.float64]
-CACHE = Path(__file__).parents[1] / "build" / "bench" / "scenes"
+CACHE = REPOSITORY / "build" / "bench" / "scenes"
 SETTINGS = {"exposure_s": 1 / 15, "iso": 100, "aperture_f": 22}
 POSE_COLUMNS = ["image", "x", "y", "z", "qx", "qy", "qz", "qw"]
 _NEAR = np.array([1.57, -1.5, 1.9, -2.0, -1.57, 0.0])

@@ -9,9 +9,9 @@ from pathlib import Path
 from pydantic import Field
 
 from drivers.errors import DeviceUnavailableError, IncompleteExportError
-from drivers.export_watch import ExportWatch
 from drivers.interfaces import DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
-from drivers.mesh_file import MeshUnit, read_mesh_file
+from drivers.meshes.export_watch import ExportWatch
+from drivers.meshes.mesh_file import MeshUnit, read_mesh_file
 from drivers.plugin import DriverConfig, DriverSpec
 
 
@@ -65,7 +65,7 @@ class ScanFolder:
     def read(self, export: ScanExport) -> ScannedMesh:
         """Read one export, in metres.
 
-        Raises IncompleteExportError if a file of it has gone, and otherwise as drivers.mesh_file.read_mesh_file does.
+        Raises IncompleteExportError if a file of it has gone, and otherwise as read_mesh_file does.
         """
         for path in export.files:
             if not path.is_file():

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from drivers.errors import IncompleteExportError, UnreadableFileError
-from drivers.mesh_file import MESH_SUFFIXES, export_of
-from drivers.photo_file import ExifRecord
-from drivers.photo_folder import (
+from drivers.meshes.mesh_file import MESH_SUFFIXES, export_of
+from drivers.photos.photo_file import ExifRecord
+from drivers.photos.photo_folder import (
     RAW_MEDIA_TYPES,
     LeftOut,
     ListedFile,

@@ -11,9 +11,9 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from pydantic import ValidationError
 
-from drivers.device_lock import DeviceLock
 from drivers.errors import DeviceUnavailableError
-from drivers.host import hosted
+from drivers.host.device_lock import DeviceLock
+from drivers.host.hosted_device import hosted
 from drivers.interfaces import (
     Camera,
     CtSource,

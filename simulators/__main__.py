@@ -32,10 +32,10 @@ class SimulatorModule(Protocol):
 SIMULATORS = {
     "ur": ("simulators.ur_controller", "a Universal Robots controller: RTDE, dashboard, script port"),
     "camera": ("simulators.sony_camera", "a Sony ILCE-7RM5 over PTP/IP"),
-    "scanner": ("simulators.scan_station", "an Artec export folder"),
-    "ct": ("simulators.ct_suite", "a CT scanner that writes a DICOM series"),
+    "scanner": ("simulators.scan_station.station", "an Artec export folder"),
+    "ct": ("simulators.ct_suite.suite", "a CT scanner that writes a DICOM series"),
     "lightbox": ("simulators.lightbox", "the light and environment box on a pseudo-terminal"),
-    "rig": ("simulators.rig", "all of them around one scene"),
+    "rig": ("simulators.rig.processes", "all of them around one scene"),
 }
 
 

@@ -23,7 +23,7 @@ from drivers.errors import (
 from drivers.gphoto import settings as words
 from drivers.gphoto.link import AddedFile, Link, gp, library_version
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
-from drivers.photo_file import check_jpeg_complete, read_exif, sha256_of
+from drivers.photos.photo_file import check_jpeg_complete, read_exif, sha256_of
 from drivers.plugin import DriverConfig
 
 _LOG = logging.getLogger(__name__)

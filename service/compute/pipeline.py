@@ -14,8 +14,8 @@ from service.compute.evaluation.accuracy import Evaluation, evaluate
 from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.image_files import detect_all, locate_outlines
 from service.compute.registration.cost import Cost
-from service.compute.registration.identity import Assignment, identify
-from service.compute.registration.pairing import CONTROL_GATE, paired
+from service.compute.registration.identification.identity import Assignment, identify
+from service.compute.registration.identification.pairing import CONTROL_GATE, paired
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import OutlineResidual, RegistrationResult, register
 from service.core.errors import DataError

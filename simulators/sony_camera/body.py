@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 
 from simulators.faults import Fault, FaultPlan
-from simulators.picture_faults import Lens
+from simulators.rendering.picture_faults import Lens
 from simulators.serve import SimulatorError
 from simulators.sony_camera.exif import Shot, encode_jpeg, encode_raw
 from simulators.sony_camera.properties import (

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.hand_effects import hand_in_picture
+from simulators.hand.effects import hand_in_picture
 from simulators.serve import SimulatorError
 from simulators.sony_camera.properties import ExposureSettings
 
@@ -184,7 +184,8 @@ class WorldSource:
     def _renderer(self) -> _Renderer:
         if self._built is None:
             # Imported on demand: ray casting is slow to import, and picture files do not need it.
-            self._built = cast(_Renderer, importlib.import_module("simulators.render").Renderer(self._width))
+            render = importlib.import_module("simulators.rendering.render")
+            self._built = cast(_Renderer, render.Renderer(self._width))
         return self._built
 
     def _view(self) -> dict[str, Any]:

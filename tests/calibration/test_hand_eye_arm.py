@@ -31,9 +31,9 @@ from service.compute.calibration.hand_eye.record import hand_eye_record, read_ar
 from service.compute.poses.files.pose_files import write_poses_csv
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, inverse
+from simulators.scene.world import Scene
 from simulators.ur_controller.kinematics import MODELS
 from simulators.ur_controller.kinematics import forward as simulated_forward
-from simulators.world import Scene
 from tests.support.scenes.board_images import checkerboard, photograph
 from tests.support.scenes.board_sessions import (
     BOARD,

@@ -112,7 +112,7 @@ def test_boards_that_cannot_be_are_refused() -> None:
 
 def test_a_small_board_in_a_dark_room_is_found_as_it_is() -> None:
     # Stretching the histogram turns the noise of a dark room into texture: of 14 boards photographed so (a public set
-    # of bench/real_data.py) OpenCV finds all without stretching, and 4 with it.
+    # of bench/real_data/__main__.py) OpenCV finds all without stretching, and 4 with it.
     rng = np.random.default_rng(1)
     paper = np.full((400, 520), 95.0)
     for row in range(7):

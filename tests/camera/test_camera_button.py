@@ -13,9 +13,9 @@ import pytest
 
 from drivers.errors import DeviceBusyError, DeviceUnavailableError
 from drivers.interfaces import Camera, CameraSettings
-from simulators.hand import Press
-from simulators.rig_world import World, WorldServer
-from simulators.world import Scene
+from simulators.hand.technician import Press
+from simulators.rig.world_server import World, WorldServer
+from simulators.scene.world import Scene
 from tests.camera.test_gphoto_driver import PAPER, driver
 from tests.support.rig.camera_simulator import camera_simulator
 

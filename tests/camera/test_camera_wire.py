@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from simulators.geometry import look_at
-from simulators.world import Scene
+from simulators.scene.world import Scene
 from tests.support.rig.camera_simulator import RunningCamera, camera_simulator
-from tests.support.rig.camera_vendor_session import vendor_session
+from tests.support.vendor.camera_vendor_session import vendor_session
 
 
 @pytest.fixture(scope="module")

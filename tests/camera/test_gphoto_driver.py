@@ -26,7 +26,7 @@ from drivers.errors import (
 from drivers.gphoto import DRIVER, GphotoConfig
 from drivers.gphoto.link import check_library_version
 from drivers.gphoto.settings import choose_number, choose_word, number_of, quality_of
-from drivers.host import hosted
+from drivers.host.hosted_device import hosted
 from drivers.interfaces import Camera, CameraSettings
 from tests.support.rig.camera_simulator import RunningCamera, camera_simulator
 

@@ -15,10 +15,10 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import cone_of_sphere
 from service.compute.markers.detect import detect_spheres
 from simulators.geometry import apply, inverse, look_at
-from simulators.intrinsics import Intrinsics
-from simulators.overlays import Frame, draw_sphere, half_plane_coverage
-from simulators.render import PREVIEW_WIDTH, REFERENCE, Renderer
-from simulators.world import BOARD_SQUARE_M, BOARD_SQUARES, NOMINAL_LUX, RADIUS_M, SCENE_CENTRE_M, Scene
+from simulators.rendering.overlays import Frame, draw_sphere, half_plane_coverage
+from simulators.rendering.render import PREVIEW_WIDTH, REFERENCE, Renderer
+from simulators.scene.intrinsics import Intrinsics
+from simulators.scene.world import BOARD_SQUARE_M, BOARD_SQUARES, NOMINAL_LUX, RADIUS_M, SCENE_CENTRE_M, Scene
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]

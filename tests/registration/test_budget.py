@@ -20,7 +20,7 @@ from service.compute.evaluation.error_budget import (
     loop_observations,
 )
 from service.compute.pipeline import register_images
-from service.compute.registration.identity import Assignment
+from service.compute.registration.identification.identity import Assignment
 from service.core.errors import ComputeError
 from service.core.geometry import apply, inverse, transform
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, exact_outlines, scene

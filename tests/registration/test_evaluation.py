@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import evaluate, leave_one_out, radial_errors_m, true_error_m
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.identity import Assignment
+from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import ComputeError

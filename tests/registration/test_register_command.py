@@ -24,10 +24,10 @@ from service.compute.poses.files.pose_files import (
     write_transforms_json,
 )
 from service.core.geometry import apply, inverse, look_at
-from simulators.render import REFERENCE, Renderer
-from simulators.scan_formats import encode
-from simulators.scan_station import scan_scene
-from simulators.world import NOMINAL_LUX, RADIUS_M, SCENE_CENTRE_M, Scene
+from simulators.rendering.render import REFERENCE, Renderer
+from simulators.scan_station.formats import encode
+from simulators.scan_station.station import scan_scene
+from simulators.scene.world import NOMINAL_LUX, RADIUS_M, SCENE_CENTRE_M, Scene
 
 pytestmark = pytest.mark.slow  # photographs are rendered and registered
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.identification.identity import Assignment, identify
 from service.compute.registration.settings import CommonErrors, RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import DataError

@@ -16,9 +16,9 @@ import numpy as np
 import psutil
 import pytest
 
-from drivers import heartbeat
 from drivers.errors import DeviceFaultError, DeviceTimeoutError, DeviceUnavailableError, SafetyStopError
-from drivers.host import HostedDevice, hosted
+from drivers.host import heartbeat
+from drivers.host.hosted_device import HostedDevice, hosted
 from service.core.errors import ConfigurationError
 from tests.support.processes.waiting import until
 from tests.support.rig.host_fake_driver import Fake, FakeConfig
@@ -117,7 +117,7 @@ def test_the_child_is_told_that_its_parent_lives_during_long_calls_too(fake: Fak
 def test_no_beat_while_the_parent_stands_still() -> None:
     program = (
         "import sys\n"
-        "from drivers.host import hosted\n"
+        "from drivers.host.hosted_device import hosted\n"
         "from tests.support.rig.host_fake_driver import Fake, FakeConfig\n"
         f"d = hosted(Fake, {SPEC!r}, FakeConfig(), call_timeout_s=20, name='watched')\n"
         "d.open()\n"
@@ -205,7 +205,7 @@ def test_child_exits_when_its_parent_is_killed(tmp_path: Path, busy: bool) -> No
     program = (
         "import sys, threading, time\n"
         "from pathlib import Path\n"
-        "from drivers.host import hosted\n"
+        "from drivers.host.hosted_device import hosted\n"
         "from tests.support.rig.host_fake_driver import Fake, FakeConfig\n"
         f"d = hosted(Fake, {SPEC!r}, FakeConfig(trace=Path({str(trace)!r})), call_timeout_s=1, name='orphan')\n"
         "print(d.open().serial, flush=True)\n"

@@ -18,8 +18,8 @@ import pytest
 from simulators.ur_controller import rtde_codec as codec
 from simulators.ur_controller.kinematics import MODELS, forward, from_pose, inverse, to_pose
 from simulators.ur_controller.motion import MoveJ, MoveL, Stop
-from tests.support.rig.ur_rtde_protocol import RtdeClient
 from tests.support.rig.ur_simulator import address, simulated_ur
+from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 DATA = Path(__file__).parents[1] / "data"
 VERSIONS = {"3.15": "UR10", "5.12": "UR10e", "5.25": "UR5e"}
@@ -242,7 +242,7 @@ def test_dashboard_lines(controller: tuple[str, str]) -> None:
 
 def test_unmodified_ur_rtde(controller: tuple[str, str]) -> None:
     host, version = controller
-    command = [sys.executable, "-m", "tests.support.rig.ur_vendor_session", host, version]
+    command = [sys.executable, "-m", "tests.support.vendor.ur_vendor_session", host, version]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout.splitlines()[-1])
@@ -281,7 +281,7 @@ def rare_calls() -> dict[str, Any]:
     """The client's answers to rare calls, in one session."""
     host = address(48)
     with simulated_ur(host, "--version", "5.12", "--model", "UR10e", "--speed-up", "5"):
-        command = [sys.executable, "-m", "tests.support.rig.ur_vendor_calls", host]
+        command = [sys.executable, "-m", "tests.support.vendor.ur_vendor_calls", host]
         done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])

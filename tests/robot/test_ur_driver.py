@@ -21,15 +21,15 @@ from drivers.errors import (
     SafetyStopError,
     UnreachablePoseError,
 )
-from drivers.host import hosted
+from drivers.host.hosted_device import hosted
 from drivers.interfaces import Array, Payload, RobotArm, RobotSample, SafetyState, SettleCriteria
 from drivers.ur import UrConfig
 from drivers.ur.stream import judge, ringing_s, safety_state
 from service.core.geometry import inverse, rotation_angle_rad, transform
 from tests.support.processes.waiting import until
 from tests.support.rig.arm_watch import watched_arm
-from tests.support.rig.ur_rtde_protocol import RtdeClient
 from tests.support.rig.ur_simulator import address, simulated_ur
+from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 SPEED_UP = "3"
 SPEED, ACCELERATION = 1.05, 1.4

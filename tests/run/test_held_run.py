@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.torture.faults.disk import FaultyDisk
+from bench.torture.faults.place.disk import FaultyDisk
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import StepNote
 from service.runner.held_run import held_run

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drivers.mesh_file import mesh_findings
+from drivers.meshes.mesh_file import mesh_findings
 from service.compute.surfaces.isosurface import surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, transform

@@ -15,14 +15,14 @@ from scipy.spatial import cKDTree
 from drivers.dicom_folder import DicomFolder, DicomFolderConfig
 from drivers.errors import IncompleteExportError
 from drivers.interfaces import Array, CtVolume, ScannedMesh
-from drivers.mesh_file import read_mesh_file
+from drivers.meshes.mesh_file import read_mesh_file
 from drivers.scan_folder import ScanFolder, ScanFolderConfig
 from service.compute.surfaces.isosurface import surface
 from service.core.geometry import apply, inverse
-from simulators.ct_suite import true_frames, write_series
-from simulators.ct_volume import Grid
+from simulators.ct_suite.suite import true_frames, write_series
+from simulators.ct_suite.volume import Grid
 from simulators.faults import FaultPlan
-from simulators.world import Scene
+from simulators.scene.world import Scene
 from tests.support.rig.simulator_process import simulator
 
 SEED = 7

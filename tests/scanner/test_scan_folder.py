@@ -14,7 +14,7 @@ from trimesh.exchange.ply import export_ply
 
 from drivers.errors import DeviceError, DeviceUnavailableError, IncompleteExportError, UnreadableFileError
 from drivers.interfaces import ScannedMesh
-from drivers.mesh_file import merge_equal, read_mesh_file
+from drivers.meshes.mesh_file import merge_equal, read_mesh_file
 from drivers.scan_folder import DRIVER, ScanFolder, ScanFolderConfig
 from tests.support.record.counting import calls_of
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from bench.layout_gate import judge
+from bench.registration.layout_gate import judge
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
 from service.compute.layout.ambiguity import REQUIRED_MARGIN_M, check_layout
@@ -24,8 +24,8 @@ from service.compute.layout.words import show_move
 from service.compute.markers.cones import Cone, cone_of_sphere, fit_cone
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, inverse, transform
-from simulators.rig_world import HELD_CAMERAS
-from simulators.world import Scene
+from simulators.rig.world_server import HELD_CAMERAS
+from simulators.scene.world import Scene
 
 
 def _decagon(height_m: float = 0.0) -> Array:

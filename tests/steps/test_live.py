@@ -39,7 +39,7 @@ from service.compute.planning.information import (
     view_information,
 )
 from service.compute.planning.next_best_view import Candidate, CurrentInformation, next_best_views
-from service.compute.registration.pairing import paired
+from service.compute.registration.identification.pairing import paired
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import GatesEvaluated, StepNote

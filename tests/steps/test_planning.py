@@ -35,9 +35,9 @@ from service.core.protocol.models import Motion, load_protocol
 from service.rig import CollisionSection, load_rig
 from service.station import layout_of
 from service.steps import params_models
-from service.steps.capture.planning import situation_of, usual_posture
-from service.steps.capture.preview import preview_board_poses, preview_plans
-from service.steps.capture.viewpoints import denser_viewpoints, plan_viewpoints
+from service.steps.capture.plan.planning import situation_of, usual_posture
+from service.steps.capture.plan.preview import preview_board_poses, preview_plans
+from service.steps.capture.plan.viewpoints import denser_viewpoints, plan_viewpoints
 from service.steps.context import StationLayout
 from service.steps.kinds import viewpoint_capture
 

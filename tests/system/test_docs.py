@@ -224,16 +224,16 @@ RUN_ELSEWHERE = {
     "orthocapture demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     "make demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     'python -m pip install ".[fuzz]"': (
-        "tests/system/test_torture_fuzz.py::test_every_parser_refuses_bad_input_as_people_can_understand"
+        "tests/torture/test_torture_fuzz.py::test_every_parser_refuses_bad_input_as_people_can_understand"
     ),
     "make torture-crash": (
-        "tests/store/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
+        "tests/torture/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
     ),
     "python -m bench.torture.crash --sample 100 --random-runs 1": (
-        "tests/store/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
+        "tests/torture/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
     ),
     "python -m bench.soak --only large --viewpoints 2000 --gigabytes 5": (
-        "tests/store/test_soak.py::test_each_part_runs_small_and_its_figures_stand_beside_the_others"
+        "tests/torture/test_soak.py::test_each_part_runs_small_and_its_figures_stand_beside_the_others"
     ),
     **dict.fromkeys(
         (
@@ -256,7 +256,7 @@ RUN_ELSEWHERE = {
         "tests/poses/test_import.py::test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere"
     ),
     "orthocapture simulate rig --scene 7 --dir rig --hand usual": (
-        "tests/steps/test_handheld.py::test_the_evidence_verifies"
+        "tests/handheld/test_handheld.py::test_the_evidence_verifies"
     ),
     **dict.fromkeys(
         (
@@ -264,7 +264,7 @@ RUN_ELSEWHERE = {
             "python -m bench.torture.faults --sample 40 --seed 7 --minutes 10",
             "python -m bench.torture.faults --record",
         ),
-        "tests/system/test_torture_faults.py::test_a_few_cases_of_each_device_go_as_the_table_says",
+        "tests/torture/test_torture_faults.py::test_a_few_cases_of_each_device_go_as_the_table_says",
     ),
     **dict.fromkeys(
         (
@@ -278,10 +278,10 @@ RUN_ELSEWHERE = {
         "tests/store/test_backup.py::test_the_signing_key_leaves_only_when_asked_and_a_restored_run_can_be_signed"
     ),
     "orthocapture doctor --rig rig.yaml --protocol protocols/exvivo_spine.yaml --data runs": (
-        "tests/run/test_space.py::test_doctor_and_pages_say_it_before_a_run"
+        "tests/rig/test_space.py::test_doctor_and_pages_say_it_before_a_run"
     ),
     "orthocapture audit verify --signatures FILE": (
-        "tests/audit/test_signature_log.py::test_a_run_keeps_the_copy_that_its_rig_file_names"
+        "tests/verify/test_signature_log.py::test_a_run_keeps_the_copy_that_its_rig_file_names"
     ),
     "orthocapture serve --rig rig/rig.yaml --data runs": (
         "tests/browser/test_browser_run.py::test_a_technician_is_led_through_a_run_and_a_second_person_releases_it"
@@ -302,7 +302,7 @@ RUN_ELSEWHERE = {
     ),
     "orthocapture act release": "tests/web/test_web_held.py::test_the_buttons_ask_the_step",
     "orthocapture simulate rig --scene 7 --dir rig": (
-        "tests/run/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
+        "tests/recovery/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
     ),
 }
 
@@ -428,7 +428,7 @@ def test_links_of_the_documents_lead_somewhere() -> None:
 
 
 def test_what_the_readme_says_of_a_corrected_arm_is_what_was_measured() -> None:
-    """For errors of the simulated arm's own model, and for an arm with other errors (bench/hand_eye)."""
+    """For errors of the simulated arm's own model, and for an arm with other errors (bench/calibration/hand_eye)."""
     measured = json.loads((ROOT / "bench" / "results" / "hand_eye-2026-11-21.json").read_text())
     text = " ".join((ROOT / "README.md").read_text().split())
     for kind, words in (("systematic", "poses good to {} … {} mm once"), ("odd", "{} … {} mm are left")):

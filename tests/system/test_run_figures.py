@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from bench.run_figures import run_figures
+from bench.whole_runs.run_figures import run_figures
 from service.core.protocol.models import load_protocol
 from service.dataset.summary import summarise
 from service.run_start import recorded_run

@@ -24,11 +24,10 @@ from typing import Any
 
 import cv2
 
-from bench.machine import commit, machine
+from bench.machine import RESULTS, commit, machine
 from bench.torture.crash.random_kills import Kill, random_kills
 from bench.torture.crash.sweep import Case, How, Sweep, Verdict
 
-RESULTS = Path(__file__).parents[2] / "results"
 _WAYS: tuple[How, ...] = ("kill", "power")
 _TWICE = 10  # one case in this many dies again after resuming
 

@@ -2,7 +2,7 @@
 
 `python -m bench.torture.faults` (or `make torture-faults`) tries every case on a small rig: the real drivers over
 their real wires, the real runner, and a simulated person who takes the first way on that the screen lists. All cases
-are judged by the same rules (bench/torture/faults/rules.py), and the outcomes are compared with the table in
+are judged by the same rules (judgement/rules.py), and the outcomes are compared with the table in
 docs/reference/faults.md; `--record` writes that table, and the results to bench/results.
 Exit status: 0 if every rule held and the table is right, 1 otherwise.
 """
@@ -29,10 +29,10 @@ import cv2
 
 from bench.machine import REPOSITORY, commit, machine
 from bench.torture.faults.case import Case
+from bench.torture.faults.judgement.table import differences, read_table, report, table
+from bench.torture.faults.judgement.verdict import Verdict
 from bench.torture.faults.matrix import cases
-from bench.torture.faults.table import differences, read_table, report, table
 from bench.torture.faults.trial import prepare_seed, run_in_child
-from bench.torture.faults.verdict import Verdict
 
 DOCUMENT = REPOSITORY / "docs" / "reference" / "faults.md"
 RESULTS = REPOSITORY / "bench" / "results"

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import trimesh
 
-from bench.torture.faults.disk import FaultyDisk, JumpingClock
-from bench.torture.faults.material import SCAN, ct_folder, mirrored_ct, other_ct, scan_folder, spoilt_ct
+from bench.torture.faults.place.disk import FaultyDisk, JumpingClock
+from bench.torture.faults.place.material import SCAN, ct_folder, mirrored_ct, other_ct, scan_folder, spoilt_ct
 from service.store.database.engine import database_path
-from tests.support.rig.ur_rtde_protocol import RtdeClient
+from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 if TYPE_CHECKING:
     from bench.torture.faults.trial import Trial

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from bench.torture.faults.proxy import AWAY_S, Spoil
+from bench.torture.faults.wire.proxy import AWAY_S, Spoil
 
 Scene = Literal["arm", "camera", "lightbox", "scan", "ct", "store"]
 BOUND_S = 240.0  # limit for a case, in addition to the time that its device is away

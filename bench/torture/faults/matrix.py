@@ -6,7 +6,7 @@ import errno
 from collections.abc import Iterator
 
 from bench.torture.faults.case import Case, Scene
-from bench.torture.faults.proxy import Column, Spoil
+from bench.torture.faults.wire.proxy import Column, Spoil
 
 COLUMNS: dict[Column, str] = {
     "drop": "is lost",

@@ -14,15 +14,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.torture.faults import rules
 from bench.torture.faults.acts import ACTS, MENDS, SEAMS
 from bench.torture.faults.case import Case
-from bench.torture.faults.disk import FaultyDisk, JumpingClock
-from bench.torture.faults.laboratory import CT, PROTOCOL, SCAN, VIEWS, Laboratory, Simulators, exposed, write_rig
-from bench.torture.faults.material import FIVE, ct_folder, make_material, scan_folder
-from bench.torture.faults.person import ArmEye, LeftError, Motions, Person
-from bench.torture.faults.proxy import RunningProxy, Wire, start_proxy
-from bench.torture.faults.verdict import Verdict, errors_of, first_words, listed, masked, policy_of
+from bench.torture.faults.judgement import rules
+from bench.torture.faults.judgement.verdict import Verdict, errors_of, first_words, listed, masked, policy_of
+from bench.torture.faults.place.disk import FaultyDisk, JumpingClock
+from bench.torture.faults.place.laboratory import (
+    CT,
+    PROTOCOL,
+    SCAN,
+    VIEWS,
+    Laboratory,
+    Simulators,
+    exposed,
+    write_rig,
+)
+from bench.torture.faults.place.material import FIVE, ct_folder, make_material, scan_folder
+from bench.torture.faults.place.person import ArmEye, LeftError, Motions, Person
+from bench.torture.faults.wire.proxy import RunningProxy, Wire, start_proxy
 from service.core.errors import OrthocaptureError
 from service.core.protocol.models import parse_protocol
 from service.core.run.decide import AskOperator, initial_state

@@ -21,8 +21,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.machine import REPOSITORY, commit, machine
-from bench.torture.fuzz.table import table
-from bench.torture.fuzz.target import Target
+from bench.torture.fuzz.targets.table import table
+from bench.torture.fuzz.targets.target import Target
 from bench.torture.fuzz.watch import Engine, Finding, Outcome, Sweep, all_findings
 
 RESULTS = REPOSITORY / "bench" / "results"

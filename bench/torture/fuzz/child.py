@@ -26,13 +26,13 @@ from typing import Any
 
 import hypothesis
 
+from bench.machine import REPOSITORY
 from bench.torture.fuzz.minimise import minimised
 from bench.torture.fuzz.mutations import mutated
 from bench.torture.fuzz.slot import Slot
-from bench.torture.fuzz.table import targets_of
-from bench.torture.fuzz.target import Target, fault_of
+from bench.torture.fuzz.targets.table import targets_of
+from bench.torture.fuzz.targets.target import Target, fault_of
 
-REPOSITORY = Path(__file__).resolve().parents[3]
 INSTRUMENTED = ["service", "drivers", "simulators", "yaml", "trimesh", "pydicom"]
 _CHUNK = 100  # examples per round of hypothesis
 _MINIMISE_S = 4.0

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from drivers.errors import DeviceUnavailableError, IncompleteExportError, UnreadableFileError
 from drivers.interfaces import DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
-from drivers.mesh_file import MESH_SUFFIXES, MeshUnit, export_of, read_mesh_file
+from drivers.meshes.mesh_file import MESH_SUFFIXES, MeshUnit, export_of, read_mesh_file
 from drivers.plugin import DriverConfig, DriverSpec
 
 

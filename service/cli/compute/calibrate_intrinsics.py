@@ -12,7 +12,7 @@ import typer
 from rich.markup import escape
 
 from drivers.errors import UnreadableFileError
-from drivers.photo_file import read_exif
+from drivers.photos.photo_file import read_exif
 from service.cli.common import (
     JsonOption,
     StrictOption,

@@ -9,7 +9,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from drivers.mesh_file import MeshUnit
+from drivers.meshes.mesh_file import MeshUnit
 from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors
 from service.cli.compute.spheres import spheres_of
 from service.compute.images.files import read_image

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 import typer
 
-from drivers.mesh_file import MeshUnit
+from drivers.meshes.mesh_file import MeshUnit
 from service.cli.common import (
     JsonOption,
     StrictOption,

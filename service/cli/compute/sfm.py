@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from drivers.mesh_file import MeshUnit, read_mesh_file
+from drivers.meshes.mesh_file import MeshUnit, read_mesh_file
 from service.cli.common import (
     JsonOption,
     StrictOption,
@@ -42,7 +42,7 @@ from service.compute.poses.files.robot_files import read_hand_eye, read_stations
 from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.poses.sfm.estimate import SfmModel, reconstruct
 from service.compute.poses.sfm.options import Effort, Refine, SfmOptions, options_for
-from service.compute.surfaces.mesh_spheres import locate_spheres
+from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, align_points, apply
 from service.core.units import deg, metres, mm

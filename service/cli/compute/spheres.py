@@ -12,12 +12,12 @@ import typer
 from numpy.typing import NDArray
 from rich.table import Table
 
-from drivers.mesh_file import MeshUnit, read_mesh_file
-from drivers.point_cloud import is_point_cloud, read_point_cloud
+from drivers.meshes.mesh_file import MeshUnit, read_mesh_file
+from drivers.meshes.point_cloud import is_point_cloud, read_point_cloud
 from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors, require_writable
-from service.compute.surfaces.mesh_spheres import MeshSphere, SphereLimits, locate_spheres
-from service.compute.surfaces.other_radii import SeenRadius, seen_radius
-from service.compute.surfaces.sphere_records import spheres_document
+from service.compute.surfaces.spheres.mesh_spheres import MeshSphere, SphereLimits, locate_spheres
+from service.compute.surfaces.spheres.other_radii import SeenRadius, seen_radius
+from service.compute.surfaces.spheres.records import spheres_document
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 from service.core.text.counts import counted

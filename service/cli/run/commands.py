@@ -61,7 +61,7 @@ from service.runner.loop import Runner
 from service.station import Station, layout_of
 from service.steps import params_models
 from service.steps.capture.live_numbers import describe_view
-from service.steps.capture.preview import preview_board_poses, preview_plans
+from service.steps.capture.plan.preview import preview_board_poses, preview_plans
 from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.timestamps import stamp_end
 from service.store.store import Store

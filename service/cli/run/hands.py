@@ -30,7 +30,7 @@ class SimulatedHands:
         self.act(step.id, attempt, [action.model_dump(exclude_none=True) for action in step.simulated_hands])
 
     def act(self, step: str, attempt: int, actions: Sequence[Mapping[str, Any]]) -> None:
-        """Do these actions (the vocabulary of simulators/rig_world.py) one after the other; once for each attempt.
+        """Do these actions (those of simulators/rig/world_server.py) one after the other; once for each attempt.
 
         Raises OrthocaptureError if the simulated world does not answer or cannot do one of them.
         """
@@ -42,7 +42,7 @@ class SimulatedHands:
                 raise OrthocaptureError(
                     f"the simulated technician could not {action.get('action')}: {answer.get('error')}",
                     where=f"step {step}",
-                    remedy="Give the step an action that simulators/rig_world.py lists",
+                    remedy="Give the step an action that simulators/rig/world_server.py lists",
                 )
         self._done.add((step, attempt))
 

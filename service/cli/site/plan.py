@@ -27,7 +27,7 @@ from service.rig import load_rig
 from service.run_start import recorded_run
 from service.station import layout_of
 from service.steps import params_models
-from service.steps.capture.preview import BoardPreview, preview_board_poses, preview_plans
+from service.steps.capture.plan.preview import BoardPreview, preview_board_poses, preview_plans
 from service.steps.kinds import calibration
 from service.store.store import Store
 

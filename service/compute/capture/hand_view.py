@@ -15,8 +15,8 @@ from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import DetectionOptions, SphereOutline
 from service.compute.markers.search.predicted import fit_pose
 from service.compute.planning.information import ViewInformation, view_information
-from service.compute.registration.identity import identify
-from service.compute.registration.pairing import paired
+from service.compute.registration.identification.identity import identify
+from service.compute.registration.identification.pairing import paired
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse

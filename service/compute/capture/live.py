@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.markers.outlines.edges import profiles, sample
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.identity import Assignment, identify
-from service.compute.registration.pairing import paired
+from service.compute.registration.identification.identity import Assignment, identify
+from service.compute.registration.identification.pairing import paired
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse

@@ -10,7 +10,7 @@ import numpy as np
 from service.compute.descent import gauss_newton
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import cone_residuals
-from service.compute.registration.identity import Assignment
+from service.compute.registration.identification.identity import Assignment
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, align_points, apply, increment, place_jacobian
 

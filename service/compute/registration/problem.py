@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import Cost, PointCost, cone_residuals, residuals_and_derivative
-from service.compute.registration.identity import Assignment
+from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.settings import RegistrationSettings
 from service.core.errors import ComputeError
 from service.core.geometry import Array, skew

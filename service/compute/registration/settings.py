@@ -29,9 +29,9 @@ class CommonErrors:
 # bias around the outline is growth, the difference between the sides is light; both are similar in size. Truth on ten
 # rendered scenes with outlines of 60 px radius: growth -0.020…-0.031 px, light 0.016 px rms per coordinate, shift
 # 0.003 px in x and 0.008 px in y rms; on three with 150 px radius: growth -0.008 px, light 0.017 px
-# (bench/accuracy.py, bench/registration_sigma.py). Other lights, colours and another renderer (bench/outlines.py)
-# gave growth of -0.04 px and displacements of single images of 0.05 px rms, so light is set above what the first
-# renderer requires.
+# (accuracy.py and registration_sigma.py in bench/registration). Other lights, colours and another renderer
+# (bench/markers/outlines.py) gave growth of -0.04 px and displacements of single images of 0.05 px rms, so light is
+# set above what the first renderer requires.
 EXPECTED_COMMON_ERRORS = CommonErrors(shift_px=0.015, growth_px=0.03, light_px=0.02)
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import Cost
-from service.compute.registration.identity import Assignment
+from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.normal_equations import (
     Blocks,
     compress,

@@ -28,9 +28,9 @@ from service.steps.board.plan import (
     nominal_camera,
     prediction_record,
 )
-from service.steps.capture.planning import known_arm, plan_step, situation_of, usual_posture
+from service.steps.capture.plan.planning import known_arm, plan_step, situation_of, usual_posture
+from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.capture.retakes import to_take_again
-from service.steps.capture.viewpoints import Viewpoint
 from service.steps.capture.views import capture_viewpoints
 from service.steps.context import StepContext
 

@@ -18,7 +18,7 @@ from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, Transform
 from service.core.records.events import ArtefactRef, Matrix4, ViewpointCaptured
 from service.steps.capture.motion import settle_criteria
-from service.steps.capture.viewpoints import Viewpoint
+from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import StepContext
 from service.store.records import NewArtefact
 

@@ -30,7 +30,7 @@ from service.steps.capture.exposure import (
     wanted_settings,
 )
 from service.steps.capture.motion import MotionLimits, move_and_settle, settle_criteria
-from service.steps.capture.viewpoints import Viewpoint, flange_target
+from service.steps.capture.plan.viewpoints import Viewpoint, flange_target
 from service.steps.context import StepContext
 
 #: Errors after which the same viewpoint may be tried again on a reopened device.

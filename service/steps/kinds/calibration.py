@@ -21,7 +21,7 @@ from service.steps.board.looks import board_arguments
 from service.steps.board.mend import mend_calibration
 from service.steps.board.plan import BoardPoses
 from service.steps.capture.optics import departing_images, optics_departures
-from service.steps.capture.viewpoints import ViewpointSet, plan_viewpoints
+from service.steps.capture.plan.viewpoints import ViewpointSet, plan_viewpoints
 from service.steps.context import ROBOT_MOVES, Announcement, JobRequest, JobResult, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, result_of, taken
 from service.steps.measures import CaptureMeasures, Count, FineMm, Measure, Mm, Px, Share

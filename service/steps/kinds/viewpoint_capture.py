@@ -11,9 +11,9 @@ from service.core.protocol.models import MovingParams
 from service.core.records.events import Record
 from service.steps.capture.live_numbers import Live, LiveAnalysis
 from service.steps.capture.optics import departing_images, optics_departures
-from service.steps.capture.planning import feasible_extra, plan_step
+from service.steps.capture.plan.planning import feasible_extra, plan_step
+from service.steps.capture.plan.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.capture.retakes import advise_retakes, to_take_again
-from service.steps.capture.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.capture.views import CaptureTotals, capture_viewpoints
 from service.steps.context import ROBOT_MOVES, Announcement, StepContext, StepKind, StepOutcome
 from service.steps.measures import CaptureMeasures, Count, ErrorMm, PredictedMeasures

@@ -25,7 +25,7 @@ from service.core.run.state import JobState, RunState
 from service.jobs.calibration import calibrate
 from service.jobs.poses import features, match
 from service.jobs.records import ImageFile
-from service.steps.capture.viewpoints import Viewpoint
+from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import Taken, taken
 from service.store.records import NewJob

@@ -22,7 +22,7 @@ from service.core.geometry import Transform, inverse
 from service.core.protocol.models import Board as BoardSection
 from service.core.records.events import ViewpointCaptured
 from service.core.units import deg, metres, mm
-from service.steps.capture.planning import known_arm
+from service.steps.capture.plan.planning import known_arm
 from service.web.record.pictures import cached
 
 POSES = 6

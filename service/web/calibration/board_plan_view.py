@@ -11,7 +11,7 @@ from service.core.text.counts import counted
 from service.rig import Rig
 from service.run_record import RunRecord
 from service.steps.board.plan import NOTE, describe_prediction
-from service.steps.capture.preview import preview_board_poses
+from service.steps.capture.plan.preview import preview_board_poses
 from service.steps.context import StationLayout
 from service.steps.kinds.calibration import Params
 from service.web.calibration.board_plan_drawing import board_plan_svg

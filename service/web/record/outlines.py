@@ -14,7 +14,7 @@ import numpy as np
 from service.compute.camera_model import CameraModel
 from service.compute.markers.archive import outline_from_record
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.pairing import CONTROL_GATE, paired
+from service.compute.registration.identification.pairing import CONTROL_GATE, paired
 from service.core.geometry import Transform, inverse
 from service.core.jobs.references import jobs_of, resolve
 from service.core.units import metres

@@ -17,7 +17,7 @@ from service.core.protocol.models import Step
 from service.core.records.events import RunStarted
 from service.rig import RigSection, parse_recorded_rig
 from service.run_record import RunRecord
-from service.steps.capture.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
+from service.steps.capture.plan.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.context import StationLayout
 
 Vector = tuple[float, float, float]

@@ -28,8 +28,8 @@ from service.compute.markers.archive import outline_from_record
 from service.compute.markers.records import SphereOutline
 from service.compute.overlay import draw_overlay
 from service.compute.pipeline import Detection
-from service.compute.registration.identity import Assignment
-from service.compute.registration.pairing import CONTROL_GATE, paired
+from service.compute.registration.identification.identity import Assignment
+from service.compute.registration.identification.pairing import CONTROL_GATE, paired
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse

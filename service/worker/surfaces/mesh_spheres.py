@@ -12,8 +12,8 @@ from service.compute.layout.ambiguity import check_layout, layout_measures, layo
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.isosurface import surface
 from service.compute.surfaces.loop_closure import LoopClosure, close_loop
-from service.compute.surfaces.mesh_spheres import locate_spheres as find_spheres
-from service.compute.surfaces.sphere_records import sphere_record
+from service.compute.surfaces.spheres.mesh_spheres import locate_spheres as find_spheres
+from service.compute.surfaces.spheres.records import sphere_record
 from service.core.geometry import Array
 from service.core.units import mm
 from service.jobs.records import SpheresFound

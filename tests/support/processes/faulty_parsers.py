@@ -6,7 +6,7 @@ import ctypes
 from pathlib import Path
 
 from bench.torture.fuzz.mutations import flip
-from bench.torture.fuzz.target import Target
+from bench.torture.fuzz.targets.target import Target
 from service.core.errors import DataError
 
 _KEPT: list[bytes] = []

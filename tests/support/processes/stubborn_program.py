@@ -12,7 +12,7 @@ import time
 from typing import Any
 
 from drivers.errors import DeviceError, DeviceUnavailableError
-from drivers.host import HostedDevice, hosted
+from drivers.host.hosted_device import HostedDevice, hosted
 from drivers.interfaces import RobotArm
 from drivers.ur import UrConfig
 

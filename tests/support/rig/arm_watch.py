@@ -8,7 +8,7 @@ from collections.abc import Generator
 from dataclasses import dataclass
 
 from tests.support.processes.waiting import until
-from tests.support.rig.ur_rtde_protocol import RtdeClient
+from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 LONGEST_STEP_S = 0.05  # longest gap that counts; in a longer one the simulator was not scheduled
 

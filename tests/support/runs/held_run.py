@@ -18,7 +18,7 @@ from service.compute.planning.information import ViewInformation
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.worker.loop import work
-from simulators.hand import Grip, follow
+from simulators.hand.technician import Grip, follow
 from tests.steps.test_live import MEASURED, SPHERES_M, BenchCt, MeasuringRig, camera
 from tests.support.rig.bench_rig import BenchRig, ScriptedOperator
 from tests.support.runs.bench_run import PROTOCOL, Bench

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from simulators.ct_suite import write_series
-from simulators.ct_volume import grid_around
+from simulators.ct_suite.suite import write_series
+from simulators.ct_suite.volume import grid_around
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, from_euler, look_at
-from simulators.render import REFERENCE, Renderer
-from simulators.scan_formats import encode
-from simulators.scan_station import scan_scene
+from simulators.rendering.render import REFERENCE, Renderer
+from simulators.scan_station.formats import encode
+from simulators.scan_station.station import scan_scene
+from simulators.scene.world import NOMINAL_LUX, SCENE_CENTRE_M, Scene
 from simulators.sony_camera.exif import Shot, encode_jpeg
 from simulators.sony_camera.properties import ExposureSettings
-from simulators.world import NOMINAL_LUX, SCENE_CENTRE_M, Scene
 
 SEED = 7
 SETTINGS = ExposureSettings(

@@ -19,11 +19,11 @@ from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, align_points, apply, inverse, look_at, transform
 from service.rig import LensSection
 from service.steps.board.plan import BoardPoses, Planner, nominal_board, nominal_camera, preview_board
-from service.steps.capture.viewpoints import ViewpointSet, flange_target, plan_viewpoints
+from service.steps.capture.plan.viewpoints import ViewpointSet, flange_target, plan_viewpoints
 from service.steps.context import StationLayout
-from simulators.arm import ARM_MODEL
+from simulators.scene.arm import ARM_MODEL
+from simulators.scene.world import SCENE_CENTRE_M, Scene, nominal_hand_eye
 from simulators.ur_controller.kinematics import inverse as joints_for
-from simulators.world import SCENE_CENTRE_M, Scene, nominal_hand_eye
 
 PROTOCOLS = Path(__file__).parents[3] / "protocols"
 BOARD = Board(23, 16, 0.015)

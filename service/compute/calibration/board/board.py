@@ -220,7 +220,7 @@ def refine_corners(image: Grey, found: Array, half: int) -> tuple[Array, NDArray
     A corner is the point whose directions to all pixels of the window are normal to the gradients there. Four squares
     meet with point symmetry, so neither gamma nor blur moves this point. Smoothing first halves the error:
     differences of neighbouring pixels amplify noise, and a sharp lens is undersampled.
-    Source: Förstner and Gülch 1987, as in OpenCV's cornerSubPix; the smoothing from bench/corner_accuracy.py.
+    Source: Förstner and Gülch 1987, as in OpenCV's cornerSubPix; the smoothing: bench/calibration/corner_accuracy.py.
     """
     sigma = float(np.clip(_SMOOTHING * half, 0.5, _MAX_SMOOTHING_PX))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)

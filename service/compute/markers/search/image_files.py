@@ -33,8 +33,8 @@ from service.compute.markers.search.predicted import (
     fit_pose,
     tone_of,
 )
-from service.compute.registration.identity import Assignment, identify
-from service.compute.registration.pairing import paired
+from service.compute.registration.identification.identity import Assignment, identify
+from service.compute.registration.identification.pairing import paired
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import register
 from service.core.errors import ComputeError, DataError

@@ -21,7 +21,7 @@ from service.compute.poses.hybrid.adjustment import Solution, solve
 from service.compute.poses.hybrid.bundle import Data, Sigmas, SphereSightings, State, whitening_of
 from service.compute.poses.hybrid.camera_error import camera_share
 from service.compute.poses.sfm.tracks import Tracks
-from service.compute.registration.identity import identify
+from service.compute.registration.identification.identity import identify
 from service.compute.registration.settings import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import ComputeError, DataError

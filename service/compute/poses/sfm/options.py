@@ -58,7 +58,7 @@ def options_for(effort: Effort, camera: CameraModel, *, refine: Refine = "nothin
     """Settings for images of this camera.
 
     Camera positions were off by 0.017–0.028 mm (normal) and 0.013 mm (quality) on 20 rendered images 1920 px wide of
-    a scene 0.65 m away (bench/sfm.py); the errors are noise, so more features reduce them.
+    a scene 0.65 m away (bench/poses/sfm.py); the errors are noise, so more features reduce them.
     """
     longer = max(camera.width, camera.height)
     if effort == "quick":

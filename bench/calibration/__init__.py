@@ -1,0 +1,1 @@
+"""Calibration of camera and hand-eye against ground truth."""

@@ -1,0 +1,1 @@
+"""Pages of the web: their response times and their screenshots."""

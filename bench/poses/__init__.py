@@ -1,0 +1,1 @@
+"""Camera poses from images, against ground truth and against COLMAP."""

@@ -1,0 +1,1 @@
+"""The stand-alone commands on public data sets."""

@@ -1,0 +1,147 @@
+"""The table in docs/reference/faults.md and the results: what went wrong, what was done about it, how it ended."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from bench.torture.faults.case import Case
+from bench.torture.faults.judgement.verdict import Verdict
+
+_HEAD = """\
+# What happens when something goes wrong
+
+Made by `make torture-faults`, which tries each case with the real drivers and the real runner, and checks this
+table ([torture.md](../howto/torture.md)). Each row is one case: what goes wrong, what the program does about it, how
+the run ends for a person who takes the first way on that the screen lists, and the words that the person reads first
+(N stands for a figure).
+
+What is done: *again*, the same view at once, on a device that is opened again where it had gone; *reopen*, the
+device is opened again; *retry*, the step is tried again after a wait; *skip*, a view is given up; *ask*, the run
+waits for a person; *told*, the person reads it, and the run goes on; *stop*, the program ends with these words and
+the run is resumed later. Where nothing is done, the case does no harm: what comes out is right all the same.
+
+"""
+_COLUMNS = "| case | what goes wrong | what is done | how it ends | errors | words on the screen |"
+_LONGEST = 140  # length of a command in the results; the JSON has all of it
+_RULE = "|---|---|---|---|---|---|"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One row of the table, with its cells as written there."""
+
+    case: str
+    what: str
+    done: str
+    end: str
+    errors: str
+    words: str
+
+    @classmethod
+    def of(cls, case: Case, verdict: Verdict) -> Row:
+        """The row for the result of a case."""
+        done = ", ".join(verdict.policy) or "nothing"
+        return cls(case.name, case.what, done, verdict.end, ", ".join(verdict.errors), _cell(verdict.words))
+
+    def line(self) -> str:
+        """Format the row as Markdown."""
+        return f"| {self.case} | {self.what} | {self.done} | {self.end} | {self.errors} | {self.words} |"
+
+
+def _cell(text: str) -> str:
+    """Escape text for a table cell."""
+    plain = " ".join(text.split()).replace("|", "/").replace("`", "'").replace("<", "&lt;")
+    return plain if len(plain) <= 400 else f"{plain[:400]} …"
+
+
+def read_table(document: Path) -> dict[str, Row]:
+    """Read the rows of the table by case; empty if the document does not exist."""
+    if not document.exists():
+        return {}
+    rows: dict[str, Row] = {}
+    for line in document.read_text(encoding="utf-8").splitlines():
+        cells = [cell.strip() for cell in line.strip().strip("|").split(" | ")]
+        if line.startswith("| ") and line != _COLUMNS and len(cells) == 6:
+            rows[cells[0]] = Row(*cells)
+    return rows
+
+
+def differences(verdicts: Sequence[Verdict], rows: Mapping[str, Row]) -> list[str]:
+    """The rows whose policy, end or error differs from the table."""
+    found: list[str] = []
+    for verdict in verdicts:
+        row = rows.get(verdict.name)
+        now = (", ".join(verdict.policy) or "nothing", verdict.end, ", ".join(verdict.errors))
+        if row is None:
+            found.append(f"{verdict.name}: not in the table")
+        elif (row.done, row.end, row.errors) != now:
+            was = (row.done, row.end, row.errors)
+            found.append(f"{verdict.name}: {' / '.join(now)}; the table says {' / '.join(was)}")
+    return found
+
+
+def table(cases: Sequence[Case], verdicts: Sequence[Verdict], before: Mapping[str, Row]) -> str:
+    """Format the document: tried rows are replaced, the others stay."""
+    new = {verdict.name: verdict for verdict in verdicts if not verdict.broken}
+    parts: dict[str, list[str]] = defaultdict(list)
+    for case in cases:
+        row = Row.of(case, new[case.name]) if case.name in new else before.get(case.name)
+        if row is not None:
+            parts["/".join(case.name.split("/")[:2])].append(row.line())
+    sections = [f"## {name}\n\n{_COLUMNS}\n{_RULE}\n" + "\n".join(lines) + "\n" for name, lines in parts.items()]
+    return _HEAD + "\n".join(sections)
+
+
+def report(about: Mapping[str, Any], known: Container[str], new: Sequence[Verdict], stem: Path) -> None:
+    """Write the results as JSON and Markdown; results of the same day that were not tried again stay."""
+    path = stem.with_suffix(".json")
+    before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"sweeps": [], "verdicts": []}
+    rows = {row["name"]: row for row in before["verdicts"] if row["name"] in known}
+    rows |= {verdict.name: {**verdict.told(), "commit": about["commit"]} for verdict in new}
+    now: dict[str, Any] = {key: about[key] for key in ("options", "commit", "seconds")}
+    sweeps: list[dict[str, Any]] = [*before["sweeps"], now | {"tried": len(new)}]
+    whole = {key: about[key] for key in ("date", "machine", "cases")}
+    whole |= {"sweeps": sweeps, "verdicts": list(rows.values())}
+    path.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+    told = {field.name for field in fields(Verdict)}
+    verdicts = [Verdict(**{key: row[key] for key in row if key in told}) for row in rows.values()]
+    groups: dict[str, list[Verdict]] = defaultdict(list)
+    for verdict in verdicts:
+        groups["/".join(verdict.name.split("/")[:2])].append(verdict)
+    broken = [verdict for verdict in verdicts if verdict.broken]
+    commands = [" ".join(["python -m bench.torture.faults", *sweep["options"]]) for sweep in sweeps]
+    commands = [words if len(words) < _LONGEST else f"{words[:_LONGEST]} …" for words in commands]
+    lines = [
+        "# Fault matrix",
+        "",
+        f"{about['date']}; {about['machine']['processor']}, {about['machine']['cores']} cores shared with others.",
+        "",
+        *(
+            f"- `{c}`, {s['commit']}: {s['tried']} cases, {s['seconds']} s"
+            for c, s in zip(commands, sweeps, strict=True)
+        ),
+        "",
+        f"{len(verdicts)} of {about['cases']} cases were tried, "
+        f"{sum(v.reached for v in verdicts)} in which the planned fault occurred, **{len(broken)} with a fault**.",
+        "",
+        "| wire or state | cases | nothing | again, reopen or retry | asked | stopped | completed "
+        "| left open | longest s |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for name, some in sorted(groups.items()):
+        done = [set(verdict.policy) for verdict in some]
+        lines.append(
+            f"| {name} | {len(some)} | {sum(not one for one in done)} | "
+            f"{sum(bool(one) and not one & {'ask', 'stop'} for one in done)} | {sum('ask' in one for one in done)} | "
+            f"{sum('stop' in one for one in done)} | {sum(v.end == 'completed' for v in some)} | "
+            f"{sum(v.end.startswith('waits') for v in some)} | {max(v.seconds for v in some):.0f} |"
+        )
+    if broken:
+        lines += ["", "Faults:", ""]
+        lines += [f"- {verdict.name}: {fault}" for verdict in broken for fault in verdict.broken]
+    stem.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")

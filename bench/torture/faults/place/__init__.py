@@ -1,0 +1,1 @@
+"""Where a case happens: its small rig, its files, its disk, and the person beside it."""

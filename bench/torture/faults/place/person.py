@@ -1,0 +1,103 @@
+"""The person in a case, who takes the first way on that the screen lists, and the observer of all motions."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from service.core.records.events import OperatorAction
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
+from service.monitor.snapshot import Doing
+from service.runner.operator import AnswerBy
+from tests.support.rig.bench_rig import ScriptedOperator, agree, answer
+from tests.support.vendor.ur_rtde_protocol import RtdeClient
+
+_MAY_MOVE = 0b11  # safety_status_bits: normal, reduced
+
+
+class LeftError(Exception):
+    """The person has left the question open and gone."""
+
+
+@dataclass
+class Person(ScriptedOperator):
+    """Does what the screen lists, a few times.
+
+    Attributes:
+        fix: repair made at the device before an answer.
+        patience: answers to the same question before it is left open.
+        look: called several times a second.
+    """
+
+    fix: Callable[[], None] = lambda: None
+    patience: int = 3
+    look: Callable[[RunState], None] = lambda _state: None
+    open: AskOperator | None = None
+    stopped: list[AskOperator] = field(default_factory=list[AskOperator])
+
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
+        """Return the person's answer to a question, or None while there is none yet. Raises LeftError."""
+        if question.for_ != "recovery":
+            return agree(question, state)
+        self.stopped.append(question)
+        ways = [way for way in question.ways if way.available and way.verb != "abort"]
+        if len(self.stopped) > self.patience or not ways:
+            self.open = question
+            raise LeftError
+        self.fix()
+        way = ways[0]
+        if way.verb == "confirm":
+            return answer(question, "confirm")
+        return OperatorAction(action=way.verb, step=way.step, reason="as the screen says")
+
+    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
+        """Observe what the runner is doing."""
+        del doing, pedal_armed, asked
+        self.look(state)
+
+
+class Motions:
+    """Times at which an arm began to move, and at which it was in a safety stop: host time.monotonic()."""
+
+    def __init__(self) -> None:
+        self.begun_s: list[float] = []
+        self.stopped_s: list[float] = []
+
+    def began(self, _number: int = 0) -> None:
+        """Note the start of a motion, reported by an in-memory arm."""
+        self.begun_s.append(time.monotonic())
+
+
+class ArmEye(Motions):
+    """Observes a simulated controller over a connection of its own, past the proxy."""
+
+    def __init__(self, host: str) -> None:
+        super().__init__()
+        self._client = RtdeClient(host)
+        self._client.output_setup(["target_qd", "safety_status_bits"], 125.0)
+        self._client.start()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop observing."""
+        with contextlib.suppress(OSError):
+            self._client.shutdown()
+        self._thread.join(5.0)
+        self._client.close()
+
+    def _run(self) -> None:
+        moving = False
+        with contextlib.suppress(OSError):
+            while True:
+                data, now_s = self._client.data(), time.monotonic()
+                moves = any(data["target_qd"])
+                if moves and not moving:
+                    self.begun_s.append(now_s)
+                moving = moves
+                if not int(data["safety_status_bits"][0]) & _MAY_MOVE:
+                    self.stopped_s.append(now_s)

@@ -1,0 +1,1 @@
+"""Whole runs on simulated rigs, measured as a user would see them."""

@@ -1,0 +1,243 @@
+"""Driver for a CT suite, through the folder of DICOM series and segmented meshes that it delivers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from pydicom.dataset import FileDataset
+
+from drivers.dicom_folder.slices import (
+    PARSE_ERRORS,
+    SliceHeader,
+    arrange,
+    dicom_files,
+    problems_of,
+    read_dicom,
+    read_header,
+)
+from drivers.errors import UnreadableFileError
+from drivers.interfaces import CtSeries, CtVolume, DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
+from drivers.meshes.export_watch import ExportWatch
+from drivers.meshes.mesh_file import MeshUnit, read_mesh_file
+from drivers.plugin import DriverConfig, DriverSpec
+from drivers.scan_folder import free_bytes, require_folder
+
+_ARRIVING = "still arriving"
+# What pydicom, its plug-ins and Pillow raise for pixels that are truncated, damaged or of a missing codec.
+_DECODE_ERRORS = (*PARSE_ERRORS, RuntimeError, OSError)
+
+
+class DicomFolderConfig(DriverConfig):
+    """The CT suite's section in rig.yaml."""
+
+    folder: Path = Field(description="where the CT suite delivers its series, in sub-folders or not")
+    mesh_unit: MeshUnit = Field(
+        default="auto", description="unit of segmented meshes: mm, m, or auto (from the size)"
+    )
+    stable_s: float = Field(
+        default=10.0, ge=0, description="how long a series or a segmented mesh must stay unchanged; 10 s on a share"
+    )
+
+
+_FileKey = tuple[Path, int, int]  # path, size, mtime in ns
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrival:
+    """The files of a series, and since when this host has seen them unchanged."""
+
+    files: frozenset[_FileKey]
+    since_s: float
+
+
+class DicomFolder:
+    """drivers.interfaces.CtSource on a folder, which it reads but never changes."""
+
+    def __init__(self, config: DicomFolderConfig, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._config = config
+        self._monotonic = monotonic
+        self._watch = ExportWatch(config.folder, config.stable_s, monotonic)
+        self._headers: dict[_FileKey, SliceHeader | str] = {}
+        self._arrivals: dict[str, _Arrival] = {}
+
+    def open(self) -> DeviceIdentity:
+        """Check that the folder exists and start watching it; raises DeviceUnavailableError if it does not."""
+        require_folder(self._config.folder)
+        self._watch.poll()
+        self.series()
+        return self._identity()
+
+    def close(self) -> None:
+        """Do nothing: nothing is kept open."""
+
+    def report(self) -> DeviceReport:
+        """Return the number of series, their problems, and the files that are not DICOM."""
+        series = self.series()
+        arriving = [one for one in series if any(text.startswith(_ARRIVING) for text in one.problems)]
+        # A series in transfer is no fault, and its other problems may only be due to missing files.
+        problems = [
+            f"series {one.uid} ({one.description}): {text}"
+            for one in series
+            if one not in arriving
+            for text in one.problems
+        ]
+        problems += [text for text in self._headers.values() if isinstance(text, str)]
+        return DeviceReport(
+            identity=self._identity(),
+            free_bytes=free_bytes(self._config.folder),
+            details={
+                "series": str(len(series)),
+                "usable": str(sum(not one.problems for one in series)),
+                "arriving": str(len(arriving)),
+                "stable_s": f"{self._config.stable_s:g}",
+            },
+            problems=tuple(problems) + self._watch.poll()[1],
+        )
+
+    def series(self) -> tuple[CtSeries, ...]:
+        """Return all series with images, including those with problems, sorted by UID.
+
+        A series that this driver saw change less than `stable_s` ago has the problem "still arriving", because a
+        series in transfer looks like a complete, shorter one. The age of the files is not used, since copying may
+        preserve it and the clock of a share may differ.
+        """
+        require_folder(self._config.folder)
+        groups: dict[str, list[SliceHeader]] = {}
+        keys: dict[str, set[_FileKey]] = {}
+        unread: set[_FileKey] = set()  # each may be the beginning of another slice, of any series
+        for key, header in self._scan().items():
+            if isinstance(header, SliceHeader):
+                groups.setdefault(header.series_uid, []).append(header)
+                keys.setdefault(header.series_uid, set()).add(key)
+            else:
+                unread.add(key)
+        now = self._monotonic()
+        arrivals: dict[str, _Arrival] = {}
+        for uid, own in keys.items():
+            files, old = frozenset(own | unread), self._arrivals.get(uid)
+            arrivals[uid] = old if old is not None and old.files == files else _Arrival(files, now)
+        self._arrivals = arrivals
+        return tuple(self._series(uid, headers, self._arriving(uid, now)) for uid, headers in sorted(groups.items()))
+
+    def read(self, series: CtSeries) -> CtVolume:
+        """Read one series into Hounsfield units.
+
+        Voxel axes: i along a row of the image, j down its columns, k along their cross product, so that T_ct_voxel is
+        right-handed whatever the order of the files. The ct frame is DICOM's patient frame (x left, y back, z head),
+        in metres.
+
+        Raises:
+            UnreadableFileError: the series has problems, or a slice cannot be decoded; names the slice and the file.
+        """
+        headers = [self._header(path) for path in series.files]
+        sound = [header for header in headers if isinstance(header, SliceHeader)]
+        problems = [header for header in headers if isinstance(header, str)] + list(problems_of(sound))
+        if problems:
+            raise UnreadableFileError(
+                f"the series cannot be used: {'; '.join(problems)}",
+                where=f"{series.uid} in {self._config.folder}",
+                remedy="Export the complete series again from the CT suite; gaps are never interpolated",
+            )
+        ordered, T_ct_voxel, spacing = arrange(sound)
+        first = ordered[0]
+        volume = np.empty((len(ordered), first.rows, first.columns), dtype=np.int16)
+        for k, header in enumerate(ordered):
+            volume[k] = _hounsfield(header)
+        return CtVolume(volume, T_ct_voxel, spacing, self._series(series.uid, ordered, ()))
+
+    def segmented_meshes(self) -> tuple[ScanExport, ...]:
+        """Return the complete segmented meshes in the folder (STL, PLY, OBJ), oldest first."""
+        require_folder(self._config.folder)
+        return self._watch.poll()[0]
+
+    def read_mesh(self, export: ScanExport) -> ScannedMesh:
+        """Read one segmented mesh, in metres; raises as drivers.meshes.mesh_file.read_mesh_file does."""
+        return read_mesh_file(export.files[0], self._config.mesh_unit, export=export)
+
+    def _scan(self) -> dict[_FileKey, SliceHeader | str]:
+        fresh: dict[_FileKey, SliceHeader | str] = {}
+        for path in dicom_files(self._config.folder):
+            try:
+                key = _key(path)
+            except FileNotFoundError:  # renamed since the folder was listed, as at the end of a transfer
+                continue
+            fresh[key] = self._header(path)
+        self._headers = fresh
+        return fresh
+
+    def _arriving(self, uid: str, now: float) -> tuple[str, ...]:
+        waited_s = now - self._arrivals[uid].since_s
+        if waited_s >= self._config.stable_s:
+            return ()
+        return (f"{_ARRIVING}: unchanged for {waited_s:.1f} s, waiting for {self._config.stable_s:g} s",)
+
+    def _header(self, path: Path) -> SliceHeader | str:
+        """The header, or why it cannot be read; a file that does not change is read only once."""
+        try:
+            known = self._headers.get(_key(path))
+        except OSError as error:
+            return f"{path.name}: cannot be opened ({error.strerror})"
+        return read_header(path) if known is None else known
+
+    def _series(self, uid: str, headers: list[SliceHeader], arriving: tuple[str, ...]) -> CtSeries:
+        return CtSeries(
+            uid=uid,
+            description=headers[0].description,
+            modality=headers[0].modality,
+            slices=len(headers),
+            files=tuple(header.path for header in headers),
+            problems=arriving + problems_of(headers),
+        )
+
+    def _identity(self) -> DeviceIdentity:
+        return DeviceIdentity(
+            kind="ct",
+            model="DICOM folder",
+            serial="",
+            firmware="",
+            driver="dicom_folder",
+            driver_version=f"pydicom {version('pydicom')}",
+            address=str(self._config.folder),
+        )
+
+
+def _key(path: Path) -> _FileKey:
+    stat = path.stat()
+    return path, stat.st_size, stat.st_mtime_ns
+
+
+def _hounsfield(header: SliceHeader) -> NDArray[np.int16]:
+    """The pixels of one slice in Hounsfield units, (J, I). Raises UnreadableFileError."""
+    try:
+        dataset = read_dicom(header.path)
+        stored = np.asarray(dataset.pixel_array)
+    except _DECODE_ERRORS as error:
+        raise UnreadableFileError(
+            f"the image of slice {header.instance_uid} cannot be decoded ({error})",
+            where=str(header.path),
+            remedy=f"Export it again, uncompressed (it has transfer syntax {header.transfer_syntax})",
+        ) from error
+    if stored.shape != (header.rows, header.columns):
+        raise UnreadableFileError(
+            f"slice {header.instance_uid} holds an image of shape {stored.shape} instead of "
+            f"{(header.rows, header.columns)}",
+            where=str(header.path),
+            remedy="Export the series again as single monochrome slices",
+        )
+    slope, intercept = _rescale(dataset)
+    return np.clip(np.rint(stored * slope + intercept), -32768, 32767).astype(np.int16)
+
+
+def _rescale(dataset: FileDataset) -> tuple[float, float]:
+    values: Mapping[str, object] = {name: dataset.get(name) for name in ("RescaleSlope", "RescaleIntercept")}
+    return float(str(values["RescaleSlope"])), float(str(values["RescaleIntercept"]))
+
+
+DRIVER = DriverSpec(kind="ct", config=DicomFolderConfig, build=DicomFolder, hosted=False, call_timeout_s=300.0)

@@ -1,0 +1,275 @@
+"""The parent's side of a hosted driver: a supervised child process (call timeout, heartbeat, restart).
+
+It contains native crashes of vendor libraries.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar, cast
+
+from pydantic import BaseModel
+
+from drivers.errors import DeviceError, DeviceTimeoutError, DeviceUnavailableError
+from drivers.host.heartbeat import CLOSE_TIMEOUT_S, START_TIMEOUT_S, Line
+from drivers.interfaces import DeviceIdentity
+from service.core.errors import OrthocaptureError
+
+T = TypeVar("T")
+
+PING_TIMEOUT_S = 15.0
+
+_LOG = logging.getLogger("drivers.host")
+_LEVELS = logging.getLevelNamesMapping()
+
+
+def hosted(interface: type[T], spec_path: str, config: BaseModel, *, call_timeout_s: float, name: str) -> T:
+    """Return a proxy with exactly the public methods of `interface`; each call runs in the driver's own process.
+
+    Args:
+        interface: RobotArm, Camera, … (a Protocol derived from Device).
+        spec_path: entry point of the driver, "module:ATTRIBUTE" naming a DriverSpec.
+        config: the validated configuration; the child validates its JSON again.
+        call_timeout_s: longest time that one call may take before the child is killed.
+        name: the device's name in rig.yaml, for messages and logs.
+
+    `open()` starts the child, and restarts it after it died. Methods raise only OrthocaptureError.
+    """
+    device = HostedDevice(spec_path, config, call_timeout_s=call_timeout_s, name=name)
+    methods: dict[str, Any] = {"__init__": _keep_device, "__doc__": f"{interface.__name__} in a process of its own."}
+    for base in reversed(interface.__mro__):
+        for method, function in vars(base).items():
+            if not method.startswith("_") and callable(function):
+                methods[method] = _forwarder(method, function)
+    return cast("T", type(f"Hosted{interface.__name__}", (), methods)(device))
+
+
+def _keep_device(proxy: Any, device: HostedDevice) -> None:
+    proxy.hosted_device = device
+
+
+def _forwarder(method: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def forward(proxy: Any, *args: Any, **kwargs: Any) -> Any:
+        device: HostedDevice = proxy.hosted_device
+        if method == "open":
+            return device.open()
+        if method == "close":
+            return device.close()
+        return device.call(method, *args, **kwargs)
+
+    forward.__name__ = method
+    forward.__doc__ = function.__doc__
+    return forward
+
+
+@dataclass(frozen=True, slots=True)
+class _Child:
+    """A running child process, with the parent's end of its connection and of its log."""
+
+    process: subprocess.Popen[str]
+    line: Line
+    log_reader: threading.Thread
+
+
+class HostedDevice:
+    """The parent's side: starts the child, calls it, kills it when it does not answer, and reports how it ended."""
+
+    def __init__(
+        self,
+        spec_path: str,
+        config: BaseModel,
+        *,
+        call_timeout_s: float,
+        name: str,
+        heartbeat_s: float = 5.0,
+    ) -> None:
+        self._spec_path = spec_path
+        self._config_json = config.model_dump_json()
+        self._call_timeout_s = call_timeout_s
+        self._name = name
+        self._heartbeat_s = heartbeat_s
+        self._lock = threading.RLock()
+        self._child: _Child | None = None
+        self._sequence = 0
+        self._obituary = "not opened yet"
+        self._suspect = False  # the driver reported a lost link
+        self._watch_stop = threading.Event()
+        self._watcher: threading.Thread | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the child; None if none is running."""
+        child = self._child
+        return child.process.pid if child else None
+
+    def open(self) -> DeviceIdentity:
+        """Start the child unless one is alive, open the device in it and return its identity.
+
+        Raises DeviceError as `call` does, and ConfigurationError if the driver cannot be loaded.
+        """
+        with self._lock:
+            if self._child is not None and (self._suspect or self._child.process.poll() is not None):
+                self._bury()  # do not reconnect within a native library that has lost its link
+            fresh = self._child is None
+            if fresh:
+                self._start()
+            try:
+                return cast("DeviceIdentity", self.call("open"))
+            except DeviceError as error:
+                if fresh or self._child is not None:
+                    raise
+                # The rest of the old connection crashed the child; a new child starts clean.
+                _LOG.warning("%s: %s; trying once more", self._name, error)
+                self._start()
+                return cast("DeviceIdentity", self.call("open"))
+
+    def close(self) -> None:
+        """Close the device and end the child; does not raise if either is already gone."""
+        with self._lock:
+            if self._child is None:
+                return
+            try:
+                self._exchange("close", (), {}, CLOSE_TIMEOUT_S)
+            except DeviceError as error:
+                _LOG.warning("%s: closing: %s", self._name, error)
+            self._bury()
+            self._obituary = "closed"
+        self._watch_stop.set()
+
+    def call(self, method: str, *args: Any, **kwargs: Any) -> Any:
+        """Run one method of the driver in the child and return its result.
+
+        Raises:
+            OrthocaptureError: as raised by the driver.
+            DeviceFaultError: the driver raised any other exception.
+            DeviceTimeoutError: no answer within the call timeout; the child was killed.
+            DeviceUnavailableError: the child is not running.
+        """
+        with self._lock:
+            return self._exchange(method, args, kwargs, self._call_timeout_s)
+
+    # --- conversation --------------------------------------------------------------------------------
+
+    def _exchange(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], timeout_s: float) -> Any:
+        child = self._child
+        if child is None:
+            raise self._unavailable()
+        self._sequence += 1
+        try:
+            child.line.send((self._sequence, method, args, kwargs))
+            ok, value = self._receive(child, timeout_s)
+        except TimeoutError:
+            child.process.kill()
+            self._bury()
+            self._obituary = f"killed after {method or 'ping'} did not return within {timeout_s:g} s"
+            raise DeviceTimeoutError(
+                f"driver call {method or 'ping'} did not return within {timeout_s:g} s; its process was ended",
+                where=self._name,
+                remedy="Check the device and its cable, then open it again",
+            ) from None
+        except (EOFError, OSError) as error:
+            self._bury()
+            raise self._unavailable() from error
+        if not ok:
+            self._suspect = self._suspect or isinstance(value, DeviceUnavailableError)
+            raise value
+        return value
+
+    def _receive(self, child: _Child, timeout_s: float) -> tuple[bool, Any]:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            if not child.line.poll(max(0.0, deadline - time.monotonic())):
+                raise TimeoutError
+            sequence, ok, value = cast("tuple[int, bool, Any]", child.line.receive())
+            if sequence == self._sequence:  # older answers belong to calls that Ctrl-C interrupted
+                return ok, value
+
+    def _unavailable(self) -> DeviceUnavailableError:
+        return DeviceUnavailableError(
+            f"driver process is not running: {self._obituary}", where=self._name, remedy="Open the device again"
+        )
+
+    # --- birth and death -----------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        ours, theirs = socket.socketpair()
+        path = os.pathsep.join(p for p in sys.path if p)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "drivers.host", str(theirs.fileno())],
+            stdin=subprocess.DEVNULL,  # libgphoto2 closes descriptor 0
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            pass_fds=[theirs.fileno()],
+            env={**os.environ, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"},
+            start_new_session=True,  # Ctrl-C must reach only the parent, which then closes the device properly
+            text=True,
+            errors="replace",
+        )
+        theirs.close()
+        reader = threading.Thread(target=_log_output, args=(process, self._name), daemon=True)
+        reader.start()
+        self._child = _Child(process, Line(Connection(ours.detach())), reader)
+        self._suspect = False
+        start = (self._spec_path, self._config_json, self._call_timeout_s)
+        try:
+            if self._exchange("start", start, {}, START_TIMEOUT_S):
+                self._child.line.begin()
+        except OrthocaptureError:
+            self._bury()
+            raise
+        self._watch_stop = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, args=(self._watch_stop,), daemon=True)
+        self._watcher.start()
+
+    def _bury(self) -> None:
+        child, self._child = self._child, None
+        if child is None:
+            return
+        child.line.close()  # the child exits when its connection closes
+        try:
+            status = child.process.wait(CLOSE_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            child.process.kill()
+            status = child.process.wait()
+        child.log_reader.join(CLOSE_TIMEOUT_S)
+        if child.process.stdout is not None:
+            child.process.stdout.close()
+        self._obituary = f"died of {signal.Signals(-status).name}" if status < 0 else f"exited with status {status}"
+        if status != 0:
+            _LOG.error("%s: driver process %d %s", self._name, child.process.pid, self._obituary)
+        self._watch_stop.set()
+
+    def _watch(self, stop: threading.Event) -> None:
+        """Ping the child between calls, so that the log shows when it died or hung."""
+        while not stop.wait(self._heartbeat_s):
+            if not self._lock.acquire(blocking=False):
+                continue  # a call is in progress and has its own timeout
+            try:
+                if not stop.is_set():
+                    self._exchange("", (), {}, PING_TIMEOUT_S)
+            except DeviceError as error:
+                _LOG.error("%s: heartbeat: %s", self._name, error)
+                return
+            finally:
+                self._lock.release()
+
+
+def _log_output(process: subprocess.Popen[str], name: str) -> None:
+    log = logging.getLogger(f"{_LOG.name}.{name}")
+    assert process.stdout is not None
+    for line in process.stdout:
+        level, separator, message = line.rstrip().partition("|")
+        if separator and level in _LEVELS:
+            log.log(_LEVELS[level], "%s", message)
+        elif line.strip():
+            log.info("%s", line.rstrip())

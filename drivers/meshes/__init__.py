@@ -1,0 +1,1 @@
+"""Mesh and point cloud files, which scanners and CT suites export."""

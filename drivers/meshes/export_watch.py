@@ -1,0 +1,114 @@
+"""Watches a folder for finished mesh exports, by polling, since the folder is often an SMB share."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.errors import DeviceUnavailableError, IncompleteExportError, UnreadableFileError
+from drivers.interfaces import ScanExport
+from drivers.meshes.mesh_file import MESH_SUFFIXES, export_of
+from drivers.meshes.mesh_format import check_complete
+
+
+@dataclass
+class _Seen:
+    signature: tuple[tuple[str, int, int], ...]  # name, size, mtime of the mesh and its companions
+    since_s: float
+    export: ScanExport | None = None
+    trouble: str = ""
+
+
+class ExportWatch:
+    """Finds the complete exports in a folder.
+
+    An export counts as complete when this host has seen its sizes and modification times unchanged for `stable_s`.
+    The age of a file is not used, because the clocks of the share and of this host may differ.
+    """
+
+    def __init__(self, folder: Path, stable_s: float, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._folder = folder
+        self._stable_s = stable_s
+        self._monotonic = monotonic
+        self._seen: dict[Path, _Seen] = {}
+
+    def poll(self) -> tuple[tuple[ScanExport, ...], tuple[str, ...]]:
+        """Return the complete exports, oldest first, and one sentence for each incomplete one.
+
+        Raises DeviceUnavailableError if the folder cannot be read.
+        """
+        now = self._monotonic()
+        present = mesh_files(self._folder)
+        self._seen = {path: seen for path, seen in self._seen.items() if path in present}
+        exports: list[tuple[int, ScanExport]] = []
+        pending: list[str] = []
+        for path in present:
+            try:
+                seen = self._observe(path, now)
+            except OSError as error:
+                self._seen.pop(path, None)
+                pending.append(f"{path.name}: cannot be read ({error.strerror})")
+                continue
+            waited_s = now - seen.since_s
+            if seen.export is not None and waited_s >= self._stable_s:
+                exports.append((seen.signature[0][2], seen.export))
+            elif seen.export is not None:
+                pending.append(f"{path.name}: unchanged for {waited_s:.1f} s, waiting for {self._stable_s:g} s")
+            else:
+                pending.append(f"{path.name}: {seen.trouble}")
+        exports.sort(key=lambda item: (item[0], item[1].name))
+        return tuple(export for _, export in exports), tuple(pending)
+
+    def _observe(self, path: Path, now: float) -> _Seen:
+        old = self._seen.get(path)
+        trouble = ""
+        export = None
+        files: tuple[Path, ...] = (path,)
+        own = _signature((path,))
+        if old is not None and old.export is not None and _signature(old.export.files) == old.signature:
+            return old
+        try:
+            if old is None or old.signature[:1] != own or old.trouble:
+                check_complete(path)
+            export = export_of(path)
+            files = export.files
+        except IncompleteExportError as error:
+            trouble = str(error)
+        except UnreadableFileError as error:
+            trouble = f"cannot be used: {error}"
+        signature = _signature(files)
+        since_s = old.since_s if old is not None and old.signature == signature and old.export is not None else now
+        seen = _Seen(signature, since_s, export, trouble)
+        self._seen[path] = seen
+        return seen
+
+
+def mesh_files(folder: Path) -> list[Path]:
+    """The mesh files in a folder and its subfolders, sorted, without hidden files and links that lead out of it.
+
+    Raises DeviceUnavailableError if the folder cannot be read.
+    """
+    try:
+        root = folder.resolve(strict=True)
+        found = [
+            path
+            for path in sorted(folder.rglob("*"))
+            if path.suffix.lower() in MESH_SUFFIXES
+            and not any(part.startswith((".", "~")) for part in path.relative_to(folder).parts)
+            and path.is_file()
+            and path.resolve().is_relative_to(root)
+        ]
+    except OSError as error:
+        raise DeviceUnavailableError(
+            f"the folder cannot be read ({error.strerror})",
+            where=str(folder),
+            remedy="Check that the share is mounted and that the path in rig.yaml is right",
+        ) from error
+    return found
+
+
+def _signature(files: tuple[Path, ...]) -> tuple[tuple[str, int, int], ...]:
+    stats = [(path.name, path.stat()) for path in files]
+    return tuple((name, stat.st_size, stat.st_mtime_ns) for name, stat in stats)

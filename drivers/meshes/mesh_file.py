@@ -1,0 +1,261 @@
+"""Reads OBJ, PLY and STL meshes into metres and reports completeness, unit, normals and defects; repairs nothing."""
+
+from __future__ import annotations
+
+import struct
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from drivers.errors import IncompleteExportError, UnreadableFileError
+from drivers.interfaces import Array, Mesh, ScanExport, ScannedMesh
+from drivers.meshes.mesh_format import check_complete, companions, file_has_normals
+
+MeshUnit = Literal["auto", "mm", "m"]
+METRES_PER_UNIT = {"mm": 1e-3, "m": 1.0}
+# Plausible diagonals of the bounding box. A unit is inferred only for the size of a scene with its spheres, so that
+# centimetres or inches are not mistaken for millimetres. A configured unit must be plausible for anything between a
+# bone and a room; this range spans a factor of 1000, so that millimetres and metres are never both plausible.
+SCENE_DIAGONAL_M = (0.1, 3.0)
+OBJECT_DIAGONAL_M = (0.02, 20.0)
+MESH_SUFFIXES = (".obj", ".ply", ".stl")
+
+IntArray = NDArray[np.int64]
+
+# What trimesh and NumPy raise for a damaged file or one of another format; some are bugs of trimesh (NameError).
+PARSE_ERRORS = (
+    *(ValueError, TypeError, LookupError, AttributeError, NameError, EOFError, AssertionError, ArithmeticError),
+    *(RuntimeError, struct.error),
+)
+
+
+def export_of(path: Path) -> ScanExport:
+    """Return the export formed by this mesh file and its companions. Raises as `mesh_format.companions` does."""
+    stat = path.stat()
+    modified = datetime.fromtimestamp(stat.st_mtime, UTC).isoformat().replace("+00:00", "Z")
+    return ScanExport(name=path.name, files=(path, *companions(path)), modified_utc=modified)
+
+
+def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | None = None) -> ScannedMesh:
+    """Read a triangle mesh, in metres.
+
+    Args:
+        path: an OBJ, PLY or STL (ASCII or binary) file.
+        unit: of the file; `auto` infers it from the size of the bounding box, and `unit_evidence` says how. A unit
+            that contradicts the size is an error, never silently corrected.
+        export: the export that the file belongs to; found beside the file if not given.
+
+    Returns:
+        The mesh with bitwise equal vertices merged (STL facets, UV seams), vertex normals (V, 3) from the file or
+        area-weighted from its faces, and `findings`, the numbers of: vertices, faces, holes, boundary_edges,
+        non_manifold_edges, components, degenerate_faces, unreferenced_vertices; normals_computed is 0 or 1.
+
+    Raises:
+        IncompleteExportError: truncated, still growing, locked, or a companion is missing.
+        UnreadableFileError: not a mesh, no faces, coordinates not finite, indices out of range, implausible unit.
+    """
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise UnreadableFileError(
+            f"this kind of file ({path.suffix or 'no extension'}) is not supported",
+            where=str(path),
+            remedy="Export the scan as OBJ, PLY or STL",
+        )
+    try:
+        before = path.stat()
+        check_complete(path)
+        export = export or export_of(path)
+        vertices, faces, normals = _parse(path)
+        after = path.stat()
+    except FileNotFoundError as error:
+        raise UnreadableFileError(
+            "there is no such file", where=str(path), remedy="Check the path, or export the scan again"
+        ) from error
+    except OSError as error:
+        raise IncompleteExportError(
+            f"the file cannot be opened ({error.strerror})",
+            where=str(path),
+            remedy="Wait until the exporting program has let go of it, and check the permissions of the folder",
+        ) from error
+    if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
+        raise IncompleteExportError(
+            "the file changed while it was read", where=str(path), remedy="Wait until the export has finished"
+        )
+    _validate(path, vertices, faces)
+    found, evidence = credible_unit(path, vertices[np.unique(faces)], unit)
+    vertices = vertices * METRES_PER_UNIT[found]
+    first, index = merge_equal(vertices)
+    merged, faces = vertices[first], index[faces]
+    computed = normals is None
+    kept = vertex_normals(merged, faces) if normals is None else _unit_length(_summed(index, normals, len(merged)))
+    findings = {**mesh_findings(merged, faces), "normals_computed": float(computed)}
+    return ScannedMesh(Mesh(merged, faces.astype(np.int32), kept), found, evidence, findings, export)
+
+
+def merge_equal(vertices: Array) -> tuple[IntArray, IntArray]:
+    """Group bitwise equal vertices (V, 3).
+
+    Returns the index of each group's first vertex (G,), in the order of the file, and the group of each vertex (V,).
+    """
+    # Sorting one 64-bit hash per row is several times faster than sorting rows; the comparison detects collisions.
+    words = np.ascontiguousarray(vertices + 0.0).view(np.uint64).reshape(-1, 3)  # + 0.0: no negative zero
+    mix = words[:, 0] * np.uint64(0x9E3779B97F4A7C15)
+    mix = (mix ^ (mix >> np.uint64(29)) ^ words[:, 1]) * np.uint64(0xBF58476D1CE4E5B9)
+    mix = (mix ^ (mix >> np.uint64(31)) ^ words[:, 2]) * np.uint64(0x94D049BB133111EB)
+    mix ^= mix >> np.uint64(30)
+    _, first, index = np.unique(mix, return_index=True, return_inverse=True)
+    if not np.array_equal(vertices[first[index]], vertices):
+        _, first, index = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    # Keep the order of the file.
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return first[order].astype(np.int64), rank[index.reshape(-1)].astype(np.int64)
+
+
+def vertex_normals(vertices: Array, faces: IntArray) -> Array:
+    """Area-weighted unit normals (V, 3) of vertices (V, 3); zero for a vertex without a face of non-zero area."""
+    p = vertices[faces]
+    n = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    corner = faces.ravel()
+    return _unit_length(_summed(corner, np.repeat(n, 3, axis=0), len(vertices)))
+
+
+def mesh_findings(vertices: Array, faces: IntArray) -> dict[str, float]:
+    """Count the defects of an indexed mesh without duplicate vertices; the keys are those of `read_mesh_file`."""
+    p = vertices[faces]
+    cross = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    longest = np.max(np.sum((p - np.roll(p, 1, axis=1)) ** 2, axis=2), axis=1)
+    degenerate = np.linalg.norm(cross, axis=1) <= 1e-9 * longest
+    sound = faces[~degenerate]
+    n = len(vertices)
+    ends = np.sort(np.concatenate([sound[:, [0, 1]], sound[:, [1, 2]], sound[:, [2, 0]]]), axis=1)
+    keys, counts = np.unique(ends[:, 0] * n + ends[:, 1], return_counts=True)
+    a, b = keys // n, keys % n
+    used = np.zeros(n, dtype=np.bool_)
+    used[sound] = True
+    return {
+        "vertices": float(n),
+        "faces": float(len(faces)),
+        "holes": float(_components(a[counts == 1], b[counts == 1], n)),
+        "boundary_edges": float(np.count_nonzero(counts == 1)),
+        "non_manifold_edges": float(np.count_nonzero(counts > 2)),
+        "components": float(_components(a, b, n)),
+        "degenerate_faces": float(np.count_nonzero(degenerate)),
+        "unreferenced_vertices": float(n - np.count_nonzero(used)),
+    }
+
+
+def _components(a: IntArray, b: IntArray, n: int) -> int:
+    """Number of connected components of these edges, given by their end vertices `a` and `b` out of `n`."""
+    if len(a) == 0:
+        return 0
+    graph = coo_matrix((np.ones(len(a), dtype=np.int8), (a, b)), shape=(n, n))
+    _, labels = connected_components(graph, directed=False)
+    return len(np.unique(labels[a]))
+
+
+def _summed(index: IntArray, rows: Array, n: int) -> Array:
+    """Sum the rows (N, 3) that share an index (N,) in 0…n-1; returns (n, 3)."""
+    return np.stack([np.bincount(index, rows[:, k], n).astype(np.float64) for k in range(3)], axis=1)
+
+
+def _unit_length(normals: Array) -> Array:
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+
+
+def _parse(path: Path) -> tuple[Array, IntArray, Array | None]:
+    """Vertices (V, 3) in the file's unit, faces (F, 3) and the file's vertex normals, None if missing or invalid."""
+    suffix = path.suffix.lower()[1:]
+    # The geometry does not need the materials, which travel with the export as companions.
+    options: dict[str, Any] = {"skip_materials": True} if suffix == "obj" else {}
+    try:
+        with path.open("rb") as stream:
+            loaded = trimesh.load(stream, file_type=suffix, process=False, **options)
+            mesh = loaded.to_geometry() if isinstance(loaded, trimesh.Scene) else loaded
+            if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+                raise UnreadableFileError(
+                    "the file has no faces, only points",
+                    where=str(path),
+                    remedy="Export a triangle mesh; triangle strips and point clouds are not supported",
+                )
+            vertices = np.array(mesh.vertices, dtype=np.float64)
+            faces = np.array(mesh.faces, dtype=np.int64)
+            normals = None
+            if suffix != "stl" and file_has_normals(path) and len(mesh.vertex_normals) == len(vertices):
+                normals = np.array(mesh.vertex_normals, dtype=np.float64)
+    except PARSE_ERRORS as error:
+        raise UnreadableFileError(
+            f"the file cannot be parsed as a {suffix.upper()} mesh ({error})",
+            where=str(path),
+            remedy="Open it in the scanner's software and export it again",
+        ) from error
+    if normals is not None:
+        length = np.linalg.norm(normals, axis=1)
+        if not np.all(np.isfinite(length)) or np.mean(np.abs(length - 1.0) > 0.05) > 0.01:
+            normals = None
+    return vertices, faces, normals
+
+
+def _validate(path: Path, vertices: Array, faces: IntArray) -> None:
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        raise UnreadableFileError(
+            f"vertices have {vertices.shape[-1]} coordinates and faces {faces.shape[-1]} corners, each must have 3",
+            where=str(path),
+            remedy="Open it in the scanner's software and export it again as triangles",
+        )
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise UnreadableFileError(
+            f"a face refers to vertex {int(faces.max())} of {len(vertices)}",
+            where=str(path),
+            remedy="The file is damaged or was cut short: export it again",
+        )
+    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if len(bad):
+        raise UnreadableFileError(
+            f"{len(bad)} of {len(vertices)} vertices have coordinates that are not numbers, first vertex {bad[0]}",
+            where=str(path),
+            remedy="Export the scan again; if the problem remains, clean the mesh in the scanner's software",
+        )
+
+
+def credible_unit(path: Path, vertices: Array, unit: MeshUnit) -> tuple[str, str]:
+    """Determine the unit of vertices (V, 3) from the size of their bounding box; returns the unit and the evidence.
+
+    Raises:
+        UnreadableFileError: no unit is plausible, or the configured one contradicts the size.
+    """
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    low, high = SCENE_DIAGONAL_M if unit == "auto" else OBJECT_DIAGONAL_M
+    span = f"{'a scene' if unit == 'auto' else 'what is scanned'} is {low:g} to {high:g} m across"
+    fitting = [name for name, scale in METRES_PER_UNIT.items() if low <= diagonal * scale <= high]
+    if unit == "auto":
+        if len(fitting) != 1:
+            raise UnreadableFileError(
+                f"the unit cannot be determined: the bounding box is {diagonal:.6g} file units across, which is "
+                f"credible neither in millimetres nor in metres ({span})",
+                where=str(path),
+                remedy="Set the unit of the export in the scanner's software to millimetres and export again; "
+                "if this is a single object, configure its unit",
+            )
+        other = "m" if fitting[0] == "mm" else "mm"
+        return fitting[0], (
+            f"inferred: the bounding box is {diagonal:.4g} {fitting[0]} across; in {other} it would be "
+            f"{diagonal * METRES_PER_UNIT[other]:.4g} m, and {span}"
+        )
+    if unit not in fitting:
+        advice = f"Set the unit to {fitting[0]}" if fitting else "Check the unit in the scanner's software"
+        raise UnreadableFileError(
+            f"the configured unit {unit} contradicts the size: the bounding box would be "
+            f"{diagonal * METRES_PER_UNIT[unit]:.4g} m across, and {span}",
+            where=str(path),
+            remedy=f"{advice}, unless the scan shows something else",
+        )
+    return unit, (
+        f"configured; the bounding box is {diagonal * METRES_PER_UNIT[unit]:.4g} m across, which is credible ({span})"
+    )

@@ -1,0 +1,1 @@
+"""Photograph files, of whatever camera: one file, and a folder of them."""

@@ -1,0 +1,323 @@
+"""Identifies markers over the whole image set: assignments of single images, verified with all camera poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from service.compute.camera_model import CameraModel
+from service.compute.markers.records import SphereOutline
+from service.compute.registration.identification.hypotheses import Hypothesis, image_hypotheses, rivals
+from service.compute.registration.identification.pairing import ROBOT_GATE, Sightings, match, sightings
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, apply, inverse, rotation_angle_rad, transform
+
+_HYPOTHESES_PER_IMAGE = 6
+_MOST_TRIED = 80
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """The assignment of one image: outline index → marker index, and the pose that it implies (None: unknown)."""
+
+    markers: dict[int, int] = field(default_factory=dict)
+    T_camera_scan: Transform | None = None
+    scale: float | None = None  # of the camera positions, if it was estimated
+
+
+@dataclass(frozen=True, slots=True)
+class _Reading:
+    """One solution for a group of images."""
+
+    T_world_scan: Transform
+    scale: float
+    markers: tuple[dict[int, int], ...]
+    total: int
+    cost: float  # mean angle in marker radii
+
+
+def identify(
+    outlines: Sequence[Sequence[SphereOutline]],
+    sphere_centres_m: Array,
+    camera: CameraModel,
+    poses: Array | None = None,
+    *,
+    radius_m: float,
+    groups: Sequence[int] | NDArray[np.int64] | None = None,
+    metric: bool = True,
+    names: Sequence[str] = (),
+) -> tuple[Assignment, ...]:
+    """Assign markers to outlines.
+
+    Args:
+        outlines: per image.
+        sphere_centres_m: (M, 3) registration spheres in the scan frame; other detections stay unassigned.
+        camera: intrinsics.
+        poses: (N, 4, 4) T_world_camera, each in the frame of its group; None: every image is identified on its own.
+        radius_m: radius of the spheres.
+        groups: (N,) station of each image.
+        metric: whether the poses' positions are in metres; otherwise the scale is estimated too.
+        names: of the images, for messages.
+
+    Raises:
+        ComputeError: too few spheres are visible, more than one assignment fits, or none fits all poses.
+    """
+    names = list(names) or [f"image {i}" for i in range(len(outlines))]
+    centres = np.asarray(sphere_centres_m, dtype=np.float64)
+    seen = [sightings(o, radius_m, camera) for o in outlines]
+    readings = [image_hypotheses(o, centres, radius_m, camera) for o in outlines]
+    _require_any(readings, outlines, names, len(centres))
+    if poses is None:
+        return _each_alone(readings, names)
+    stations = np.zeros(len(outlines), dtype=np.int64) if groups is None else np.asarray(groups)
+    out: list[Assignment] = [Assignment()] * len(outlines)
+    for g in sorted(set(stations.tolist())):
+        members = np.nonzero(stations == g)[0]
+        where = f"station {g}" if len(set(stations.tolist())) > 1 else ""
+        reading = _solve_group(
+            [readings[i] for i in members], [seen[i] for i in members], poses[members], centres, radius_m,
+            metric=metric, where=where, counts=", ".join(f"{names[i]}: {len(outlines[i])}" for i in members[:12]),
+        )  # fmt: skip
+        for k, i in enumerate(members):
+            T = np.array(poses[i], dtype=np.float64)
+            T[:3, 3] *= reading.scale
+            out[i] = Assignment(reading.markers[k], inverse(T) @ reading.T_world_scan, reading.scale)
+    return tuple(out)
+
+
+def _require_any(
+    readings: Sequence[list[Hypothesis]], outlines: Sequence[Sequence[SphereOutline]], names: Sequence[str], M: int
+) -> None:
+    if any(readings):
+        return
+    counts = ", ".join(f"{n}: {len(o)}" for n, o in list(zip(names, outlines, strict=True))[:24])
+    most = max((len(o) for o in outlines), default=0)
+    if most < 4:
+        raise ComputeError(
+            f"too few spheres are visible: one image must show four, at most {most} were found ({counts})",
+            remedy="Capture images that show more of the registration spheres, or check the detector's options",
+        )
+    raise ComputeError(
+        f"no image shows four of the {M} spheres in the arrangement of the sphere list (spheres found: {counts})",
+        remedy="Check the sphere list, its unit, the radius and the camera calibration",
+    )
+
+
+def _each_alone(readings: Sequence[list[Hypothesis]], names: Sequence[str]) -> tuple[Assignment, ...]:
+    """Assignments of images without poses; among several images, an ambiguous one stays unassigned."""
+    unclear = [k for k, r in enumerate(readings) if rivals(r)]
+    if unclear and len(unclear) == sum(bool(r) for r in readings):
+        k = unclear[0]
+        raise ComputeError(
+            f"the arrangement of spheres is ambiguous: {_named(readings[k][0].markers)} and "
+            + " and ".join(_named(r.markers) for r in rivals(readings[k])[:3])
+            + " explain the outlines alike",
+            where=names[k],
+            remedy="Show more of the spheres in one image, or place them less symmetrically",
+        )
+    return tuple(
+        Assignment(dict(r[0].markers), r[0].T_camera_scan) if r and k not in unclear else Assignment()
+        for k, r in enumerate(readings)
+    )
+
+
+def _named(markers: dict[int, int]) -> str:
+    """An assignment in words: outline = sphere, counted from 0."""
+    return "{" + ", ".join(f"{d}={m}" for d, m in sorted(markers.items())) + "}"
+
+
+def _solve_group(
+    readings: Sequence[list[Hypothesis]],
+    seen: Sequence[Sightings],
+    poses: Array,
+    centres: Array,
+    radius_m: float,
+    *,
+    metric: bool,
+    where: str,
+    counts: str,
+) -> _Reading:
+    if not any(readings):
+        raise ComputeError(
+            f"too few spheres are visible in the images of this station to tell which is which ({counts})",
+            where=where,
+            remedy="Capture at least one image with four or more registration spheres from this station",
+        )
+    if not metric and sum(bool(r) for r in readings) < 2:
+        raise _scale_unknown(where, counts)
+    starts = _metric_starts(readings, poses) if metric else _similarity_starts(readings, poses)
+    solved: list[_Reading] = []
+    tried: set[frozenset[tuple[int, int, int]]] = set()
+    for T, s in starts:
+        first = _read(T, s, seen, poses, centres, radius_m)
+        key = frozenset((k, d, m) for k, r in enumerate(first.markers) for d, m in r.items())
+        if first.total < 4 or key in tried:
+            continue
+        tried.add(key)
+        solved.append(_polish(first, seen, poses, centres, radius_m, metric=metric))
+    solved.sort(key=lambda r: (-r.total, r.cost))
+    if not solved:
+        raise ComputeError(
+            "no assignment of the spheres agrees with the camera poses",
+            where=where,
+            remedy="Check that the poses are T_world_camera in the stated unit (--estimate-scale for poses without a "
+            "metric scale) and belong to these images",
+        )
+    best = solved[0]
+    for other in solved[1:]:
+        if _differ(best, other) and other.total >= 0.9 * best.total and other.cost < 3 * best.cost + 0.02:
+            raise ComputeError(
+                f"the arrangement of spheres is ambiguous: two assignments explain {best.total} and {other.total} "
+                f"of the detections, in one image {' and '.join(map(_named, _first_difference(best, other)))}",
+                where=where,
+                remedy="Place the spheres less symmetrically, or show more of them in an image",
+            )
+    support = sum(len(m) > 0 for m in best.markers)
+    n_hypotheses = sum(bool(r) for r in readings)
+    agreeing = _agreeing(best, readings)
+    if not metric and len(poses) > 1 and support < 2:
+        raise _scale_unknown(where, counts)
+    if n_hypotheses >= 3 and agreeing < 0.34 * n_hypotheses:
+        raise ComputeError(
+            f"the poses contradict the images: {agreeing} of {n_hypotheses} images agree with one registration",
+            where=where,
+            remedy="Check that the poses belong to these images, their convention and their unit",
+        )
+    return best
+
+
+def _scale_unknown(where: str, counts: str) -> ComputeError:
+    return ComputeError(
+        "the scale of the poses cannot be determined from one image",
+        where=where,
+        remedy=f"At least two images must show four or more registration spheres (spheres found: {counts})",
+    )
+
+
+def _agreeing(best: _Reading, readings: Sequence[list[Hypothesis]]) -> int:
+    """Number of images whose own hypotheses include the assignment."""
+    return sum(
+        any(len(set(h.markers.items()) & set(m.items())) >= min(4, h.count) for h in r)
+        for m, r in zip(best.markers, readings, strict=True)
+    )
+
+
+def _differ(a: _Reading, b: _Reading) -> bool:
+    for ma, mb in zip(a.markers, b.markers, strict=True):
+        if any(d in mb and mb[d] != m for d, m in ma.items()):
+            return True
+    return False
+
+
+def _first_difference(a: _Reading, b: _Reading) -> tuple[dict[int, int], dict[int, int]]:
+    """The markers of the first image in which two solutions differ."""
+    return next(
+        (x, y) for x, y in zip(a.markers, b.markers, strict=True) if any(d in y and y[d] != m for d, m in x.items())
+    )
+
+
+def _metric_starts(readings: Sequence[list[Hypothesis]], poses: Array) -> list[tuple[Transform, float]]:
+    ranked = sorted(
+        ((h.score, -h.rms_px, k, n) for k, r in enumerate(readings) for n, h in enumerate(r[:_HYPOTHESES_PER_IMAGE])),
+        reverse=True,
+    )
+    return [(poses[k] @ readings[k][n].T_camera_scan, 1.0) for _, _, k, n in ranked[:_MOST_TRIED]]
+
+
+def _similarity_starts(readings: Sequence[list[Hypothesis]], poses: Array) -> list[tuple[Transform, float]]:
+    """Initial similarities from pairs of images: their rotations must agree, their distance gives the scale."""
+    ranked = sorted(
+        ((h.score, -h.rms_px, k, n) for k, r in enumerate(readings) for n, h in enumerate(r[:_HYPOTHESES_PER_IMAGE])),
+        reverse=True,
+    )[:60]
+    spread = float(np.max(np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0), axis=1)))
+    starts: list[tuple[float, Transform, float]] = []
+    for x, (_, _, i, a) in enumerate(ranked):
+        for _, _, j, b in ranked[x + 1 :]:
+            if i == j:
+                continue
+            Ti, Tj = readings[i][a].T_camera_scan, readings[j][b].T_camera_scan
+            Ri, Rj = poses[i][:3, :3] @ Ti[:3, :3], poses[j][:3, :3] @ Tj[:3, :3]
+            if rotation_angle_rad(transform(Ri.T @ Rj, np.zeros(3))) > 0.06:
+                continue
+            given = poses[j][:3, 3] - poses[i][:3, 3]
+            length = float(np.linalg.norm(given))
+            if length < 0.05 * spread:
+                continue
+            true = Ri @ (inverse(Tj)[:3, 3] - inverse(Ti)[:3, 3])
+            s = float(np.linalg.norm(true)) / length
+            cosine = float(true @ given) / max(float(np.linalg.norm(true)) * length, 1e-12)
+            if cosine < 0.99:
+                continue
+            T = np.array(poses[i], dtype=np.float64)
+            T[:3, 3] *= s
+            starts.append((length, T @ Ti, s))
+    starts.sort(key=lambda e: -e[0])
+    return [(T, s) for _, T, s in starts[:_MOST_TRIED]]
+
+
+def _camera_centres(T_world_scan: Transform, s: float, pose: Transform, centres: Array) -> Array:
+    return (apply(T_world_scan, centres) - s * pose[:3, 3]) @ pose[:3, :3]
+
+
+def _read(
+    T_world_scan: Transform, s: float, seen: Sequence[Sightings], poses: Array, centres: Array, radius_m: float
+) -> _Reading:
+    markers: list[dict[int, int]] = []
+    cost, total = 0.0, 0
+    for sight, pose in zip(seen, poses, strict=True):
+        c = _camera_centres(T_world_scan, s, pose, centres)
+        pairs = match(sight, c, radius_m, ROBOT_GATE)
+        markers.append({d: m for d, m, _ in pairs})
+        cost += sum(angle / sight.half_angles[d] for d, _, angle in pairs)
+        total += len(pairs)
+    return _Reading(T_world_scan, s, tuple(markers), total, cost / max(total, 1))
+
+
+def _polish(
+    reading: _Reading, seen: Sequence[Sightings], poses: Array, centres: Array, radius_m: float, *, metric: bool
+) -> _Reading:
+    """Least squares on the directions of all matched spheres, alternating with matching until nothing changes."""
+    for _ in range(4):
+        index = [(k, d, m) for k, r in enumerate(reading.markers) for d, m in r.items()]
+        image = np.array([k for k, _, _ in index])
+        axes = np.array([seen[k].axes[d] for k, d, _ in index])
+        half = np.array([seen[k].half_angles[d] for k, d, _ in index])
+        model = centres[[m for _, _, m in index]]
+        R, origin = poses[image, :3, :3], poses[image, :3, 3]
+        T0, s0 = reading.T_world_scan, reading.scale
+
+        def unpack(x: Array, T0: Transform = T0, s0: float = s0) -> tuple[Transform, float]:
+            T = transform(Rotation.from_rotvec(x[3:6]).as_matrix() @ T0[:3, :3], T0[:3, 3] + x[:3])
+            return T, s0 if metric else s0 * float(np.exp(x[6]))
+
+        def fun(
+            x: Array,
+            R: Array = R,
+            origin: Array = origin,
+            model: Array = model,
+            axes: Array = axes,
+            half: Array = half,
+        ) -> Array:
+            T, s = unpack(x)
+            c = np.einsum("nji,nj->ni", R, apply(T, model) - s * origin)
+            distance = np.linalg.norm(c, axis=1)
+            size = (np.arcsin(np.minimum(radius_m / distance, 0.9)) / half - 1)[:, None]
+            return np.hstack([(c / distance[:, None] - axes) / half[:, None], size]).ravel()
+
+        # From a tenth of a radius on, a match is doubtful.
+        fit = least_squares(fun, np.zeros(6 if metric else 7), loss="soft_l1", f_scale=0.1, x_scale="jac")
+        T, s = unpack(np.asarray(fit.x))
+        new = _read(T, s, seen, poses, centres, radius_m)
+        same = new.markers == reading.markers
+        if new.total < 4:
+            return reading
+        reading = new
+        if same:
+            break
+    return reading

@@ -1,0 +1,1 @@
+"""Spheres of known radius in meshes and point clouds."""

@@ -1,0 +1,1 @@
+"""What a capture will do, known before it begins: viewpoints, reachable order, duration."""

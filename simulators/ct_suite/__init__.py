@@ -1,0 +1,1 @@
+"""A simulated CT suite: Hounsfield volumes of the scene as DICOM series."""

@@ -1,0 +1,1 @@
+"""The simulated technician who holds the camera."""

@@ -1,0 +1,194 @@
+"""Renders what the camera sees: ray casting with exact outlines, lens distortion, exposure and photon noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from simulators.geometry import Array, Array32, Bools, Bytes, Ints, inverse
+from simulators.rendering.overlays import Frame, draw_calibration_board, draw_sphere
+from simulators.rendering.surfaces import Surfaces
+from simulators.scene.intrinsics import Intrinsics
+from simulators.scene.world import NOMINAL_LUX, RADIUS_M, Moved, Scene
+
+TILE_PIXELS = 500_000
+MOST_KEPT_RAYS = 16_000_000  # 24 bytes each
+HALO = 4  # additional rows of a tile, so that edge detection and lens blur do not see its border
+_TEXTURES = ((800, 512), (1400, 1024), (2601, 2048))  # texture size that suffices below this image width
+PREVIEW_WIDTH = 640
+FULL_WELL_E, READ_NOISE_E = 40_000.0, 4.0
+BLUR_PX = 0.42
+WHITE = 1.12  # linear colour that saturates at the reference exposure
+REFERENCE = {"exposure_s": 1 / 15, "iso": 100.0, "aperture_f": 22.0}
+_SUB = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)], dtype=np.float32) / np.float32(3.0)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What the camera sees: the parsed answer to the world's `view` request."""
+
+    T_world_camera: Array
+    intrinsics: Intrinsics
+    seed: int
+    moved: Moved
+    spray: bool
+    control_spheres: bool
+    T_world_board: Array | None
+    light_lux: float
+
+    @classmethod
+    def from_json(cls, view: Mapping[str, Any], width: int) -> View:
+        """Parse the world's answer, for images of this width."""
+        scene = view["scene"]
+        board = scene.get("board")
+        return cls(
+            T_world_camera=np.array(view["T_world_camera"], dtype=np.float64),
+            intrinsics=Intrinsics(**view["intrinsics"]).scaled(width),
+            seed=int(scene["seed"]),
+            moved=tuple((int(i), float(x), float(y), float(z)) for i, x, y, z in scene.get("moved", ())),
+            spray=bool(scene.get("spray", False)),
+            control_spheres=bool(scene.get("control_spheres", False)),
+            T_world_board=None if board is None else np.array(board, dtype=np.float64),
+            light_lux=float(view.get("light_lux", NOMINAL_LUX)),
+        )
+
+
+class Renderer:
+    """Renders views at one image width; caches the textures and the light of one scene."""
+
+    def __init__(self, image_width: int) -> None:
+        self.image_width = image_width
+        self._texture_size = next((size for width, size in _TEXTURES if image_width < width), 4096)
+        self._surfaces: Surfaces | None = None
+        self._rays: tuple[Intrinsics, Array] | None = None
+
+    def render(self, view: Mapping[str, Any], camera_settings: Mapping[str, float], seed: int) -> Bytes:
+        """Render a view as RGB (H, W, 3).
+
+        `camera_settings` are exposure_s, iso and aperture_f; `seed` is that of the noise.
+        """
+        return self._rendered(View.from_json(view, self.image_width), camera_settings, seed)
+
+    def preview(self, view: Mapping[str, Any]) -> Bytes:
+        """Render a small RGB frame at the reference exposure, for live view."""
+        return self._rendered(View.from_json(view, min(PREVIEW_WIDTH, self.image_width)), REFERENCE, 0)
+
+    def surfaces(self, seed: int, moved: Moved = ()) -> Surfaces:
+        """The surfaces of this seed's scene; built on first use, and again if a sphere was moved."""
+        now = None if self._surfaces is None else (self._surfaces.scene.seed, self._surfaces.scene.moved)
+        if self._surfaces is None or now != (seed, moved):
+            self._surfaces = Surfaces(Scene.generate(seed, moved), self._texture_size)
+        return self._surfaces
+
+    def _rendered(self, view: View, settings: Mapping[str, float], seed: int) -> Bytes:
+        surfaces = self.surfaces(view.seed, view.moved)
+        lens = view.intrinsics
+        gain = view.light_lux / NOMINAL_LUX / WHITE
+        gain *= (
+            settings["exposure_s"] / REFERENCE["exposure_s"] * (REFERENCE["aperture_f"] / settings["aperture_f"]) ** 2
+        )
+        electrons = gain * FULL_WELL_E  # per unit of linear colour, before ISO amplification
+        amplification = settings["iso"] / REFERENCE["iso"] / FULL_WELL_E
+        rng = np.random.default_rng([view.seed, seed])
+        image = np.empty((lens.height, lens.width, 3), dtype=np.uint8)
+        for first, last in _tiles(lens):
+            top, bottom = max(0, first - HALO), min(lens.height, last + HALO)
+            linear = self._linear(surfaces, view, top, bottom)
+            linear = np.asarray(cv2.GaussianBlur(linear, (0, 0), BLUR_PX, borderType=cv2.BORDER_REPLICATE))
+            signal = np.maximum(linear[first - top : last - top], 0.0) * np.float32(electrons)
+            noise = rng.standard_normal(signal.shape, dtype=np.float32)
+            signal += noise * np.sqrt(signal + np.float32(READ_NOISE_E**2))
+            image[first:last] = _srgb(signal * np.float32(amplification))
+        return image
+
+    def _linear(self, surfaces: Surfaces, view: View, top: int, bottom: int) -> Array32:
+        """Linear colour (rows, W, 3) of the image rows top…bottom."""
+        rays = self._ray_rows(view.intrinsics, top, bottom)
+        R, eye = view.T_world_camera[:3, :3], view.T_world_camera[:3, 3]
+        world = (rays @ R.T).astype(np.float32)
+        height, width = world.shape[:2]
+        pixel_rad = 1.0 / view.intrinsics.fx
+        shade = surfaces.shade(eye, world.reshape(-1, 3), pixel_rad, control=view.control_spheres, spray=view.spray)
+        colour = shade.colour.reshape(height, width, 3)
+        depth = shade.depth.reshape(height, width)
+        frame = Frame(colour, depth, rays, view.T_world_camera, view.intrinsics, top)
+        centres = surfaces.scene.sphere_centres_m(control=False)
+        if view.control_spheres:
+            centres = np.concatenate([centres, surfaces.scene.sphere_centres_m(control=True)])
+        T_camera_world = inverse(view.T_world_camera)
+        centres_camera = centres @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+        edges = _edges(depth, shade.material.reshape(height, width))
+        self._supersample(surfaces, view, frame, world, np.flatnonzero(edges))
+        for index in np.argsort(-centres_camera[:, 2]):
+            draw_sphere(frame, centres_camera[index], centres[index], RADIUS_M, surfaces.scene.lamp_m)
+        if view.T_world_board is not None:
+            draw_calibration_board(frame, view.T_world_board, surfaces.scene.lamp_m)
+        return frame.colour
+
+    def _supersample(self, surfaces: Surfaces, view: View, frame: Frame, world: Array32, at: Ints) -> None:
+        """Replace the pixels `at` (flat indices) by the mean of 3 × 3 rays."""
+        if len(at) == 0:
+            return
+        d_row, d_column = (np.gradient(world, axis=axis).reshape(-1, 3)[at] for axis in (0, 1))
+        middle = world.reshape(-1, 3)[at]
+        rays = middle[None] + _SUB[:, :1, None] * d_row[None] + _SUB[:, 1:, None] * d_column[None]
+        eye = view.T_world_camera[:3, 3]
+        total = np.zeros((len(at), 3), dtype=np.float32)
+        for row in rays:
+            shade = surfaces.shade(
+                eye,
+                np.ascontiguousarray(row, dtype=np.float32),
+                0.5 / view.intrinsics.fx,
+                control=view.control_spheres,
+                spray=view.spray,
+            )
+            total += shade.colour
+        frame.colour.reshape(-1, 3)[at] = total / np.float32(len(_SUB))
+
+    def _ray_rows(self, lens: Intrinsics, top: int, bottom: int) -> Array:
+        """Rays (rows, W, 3) of the pixel centres, in the camera frame."""
+        if lens.width * lens.height > MOST_KEPT_RAYS:
+            return _pixel_rays(lens, top, bottom)
+        if self._rays is None or self._rays[0] != lens:
+            self._rays = (lens, _pixel_rays(lens, 0, lens.height))
+        return self._rays[1][top:bottom]
+
+
+def _tiles(lens: Intrinsics) -> Iterator[tuple[int, int]]:
+    rows = max(16, TILE_PIXELS // lens.width)
+    for first in range(0, lens.height, rows):
+        yield first, min(lens.height, first + rows)
+
+
+def _pixel_rays(lens: Intrinsics, top: int, bottom: int) -> Array:
+    column, row = np.meshgrid(np.arange(lens.width, dtype=np.float64), np.arange(top, bottom, dtype=np.float64))
+    return lens.rays(np.stack([column, row], axis=-1))
+
+
+def _edges(depth: Array32, material: Bytes) -> Bools:
+    """Pixels (H, W) crossed by an outline or a crease: the depth changes abruptly, or the material changes."""
+    bend = np.abs(cv2.Laplacian(np.minimum(depth, 10.0), cv2.CV_32F)) > np.float32(0.004)
+    change = cv2.morphologyEx(material, cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8)) > 0
+    return bend | change
+
+
+_SRGB_STEPS = 4095
+
+
+def _srgb_table() -> Bytes:
+    x = np.arange(_SRGB_STEPS + 1) / _SRGB_STEPS
+    y = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-9), 1 / 2.4) - 0.055)
+    return np.round(255.0 * y).astype(np.uint8)
+
+
+_SRGB = _srgb_table()
+
+
+def _srgb(linear: Array32) -> Bytes:
+    """Convert linear colour to sRGB bytes, clipped to 0…1."""
+    index = np.clip(linear * np.float32(_SRGB_STEPS) + np.float32(0.5), 0, _SRGB_STEPS).astype(np.uint16)
+    return _SRGB[index]

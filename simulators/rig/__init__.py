@@ -1,0 +1,1 @@
+"""The simulated rig: its processes, and the world that they share."""

@@ -1,0 +1,319 @@
+"""The simulated rig: every simulator as a child process around one scene, and the rig.yaml for the service."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from simulators.faults import FaultPlan
+from simulators.geometry import Array, apply, inverse, look_at
+from simulators.hand.technician import MISHAP_EVERY, Hand
+from simulators.rig.world_server import World, WorldServer
+from simulators.scene.arm import ARM_MODEL
+from simulators.scene.world import SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
+from simulators.serve import SimulatorError, Termination, announce
+from simulators.ur_controller.kinematics import inverse as solve_joints
+
+_ELBOW_UP = np.array([1.4, -1.6, 1.9, -1.9, -1.57, 0.0])
+_TAPE_SIGMA_M = 0.003  # accuracy with which a technician measures the scene's centre with a tape
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--scene", type=int, required=True, metavar="SEED", help="seed of the scene")
+    parser.add_argument("--dir", type=Path, required=True, help="folder for rig.yaml, CT, scans, truth and logs")
+    parser.add_argument("--image-width", type=int, default=1536, metavar="W", help="image width of the photographs")
+    parser.add_argument("--speed-up", type=float, default=1.0, metavar="N", help="the arm takes 1/N of its time")
+    parser.add_argument("--ct-voxel-mm", type=float, default=0.4, help="edge of the CT's voxels")
+    parser.add_argument("--version", default="5.12", help="of Polyscope")
+    parser.add_argument(
+        "--arms", type=int, choices=(1, 2), default=1, help="one arm that is moved, or one per station"
+    )
+    parser.add_argument("--host", default="127.0.0.1", help="address of the first controller")
+    parser.add_argument(
+        "--hand",
+        choices=tuple(MISHAP_EVERY),
+        help="no arm: a technician holds the camera, and makes this many mistakes",
+    )
+    parser.add_argument(
+        "--without-cable", action="store_true", help="with --hand: the camera sends its photographs into a folder"
+    )
+    parser.add_argument(
+        "--revive-after-s",
+        type=float,
+        metavar="S",
+        help="restart a device that died after S seconds; default: end the rig",
+    )
+
+
+def serve(args: argparse.Namespace) -> None:
+    """Start everything, print the ready line and serve until SIGTERM."""
+    if args.without_cable and not args.hand:
+        raise SimulatorError("--without-cable is for a camera that a person holds: add --hand")
+    termination = Termination(with_parent=args.with_parent)
+    rig = _Rig(args, termination)
+    try:
+        rig.start()
+        termination.wait()
+    finally:
+        rig.stop()
+
+
+class _Rig:
+    def __init__(self, args: argparse.Namespace, termination: Termination) -> None:
+        self.args = args
+        self.termination = termination
+        self.folder: Path = args.dir.resolve()
+        self.faults: FaultPlan = args.faults
+        scene = Scene.generate(args.scene)
+        self.arms = () if args.hand else ("robot",) if args.arms == 1 else ("robot_1", "robot_2")
+        self.children: dict[str, subprocess.Popen[str]] = {}
+        self._words: dict[str, tuple[str, ...]] = {}  # command line with which each was started
+        self._ready: dict[str, dict[str, Any]] = {}  # ready line of each
+        self.world = World(scene, args.image_width, self.arms, _start_joints(scene), camera_held=bool(args.hand))
+        self.hand = args.hand and Hand(
+            args.hand, args.scene, self.world.hold, self.world.press_shutter, SCENE_CENTRE_M.copy()
+        )
+        self.server = WorldServer(self.world, self._act)
+        self._deliveries = threading.Lock()
+        self._truth: dict[str, Any] = {}
+
+    @property
+    def scene(self) -> Scene:
+        """The scene in its current state."""
+        return self.world.scene
+
+    # --- life ---
+
+    def start(self) -> None:
+        # Start this first: stop() waits for the server's loop, and would wait for ever if the loop had never begun.
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+        try:
+            for name in ("ct", "scans", "photographs", "logs"):
+                (self.folder / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SimulatorError(f"the folder {self.folder} cannot be used: {error.strerror}") from error
+        world = self.server.address
+        joints = ",".join(f"{q:.6f}" for q in self.world.start_joints_rad)
+        hosts = self._hosts()
+        for arm, host in zip(self.arms, hosts, strict=True):
+            self._child(
+                arm, "ur", "--host", host, "--version", self.args.version, "--speed-up", str(self.args.speed_up),
+                f"--initial-joints={joints}", "--world", world, "--arm", arm,
+            )  # fmt: skip
+        camera = self._child(
+            "camera", "camera", "--port", "0", "--world", world, "--image-width", str(self.args.image_width),
+            "--exposures-log", str(self.folder / "truth_exposures.jsonl"),
+            *(("--send-to", str(self.folder / "photographs")) if self.args.without_cable else ()),
+        )  # fmt: skip
+        self._child("lightbox", "lightbox", "--link", str(self.folder / "lightbox"), "--world", world)
+        self._write_truth()
+        rig = self.folder / "rig.yaml"
+        rig.write_text(yaml.safe_dump(self._rig_file(camera["gphoto_port"], hosts), sort_keys=False))
+        announce(
+            rig=str(rig),
+            world=world,
+            truth=str(self.folder / "truth.json"),
+            ct_folder=str(self.folder / "ct"),
+            scan_folder=str(self.folder / "scans"),
+        )
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def stop(self) -> None:
+        for process in self.children.values():
+            process.terminate()
+        for process in self.children.values():
+            try:
+                process.wait(timeout=10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+        self.server.shutdown()
+        self.server.server_close()
+
+    def _watch(self) -> None:
+        """End the rig when a device has died, since it is of no use then, and report it on stderr."""
+        while not self.termination.wait(1.0):
+            for name, process in self.children.items():
+                if process.poll() is not None and not self.termination.is_set():
+                    sys.stderr.write(f"{name} ended with status {process.returncode}: see {self.folder}/logs\n")
+                    if self.args.revive_after_s is None or self.termination.wait(self.args.revive_after_s):
+                        self.termination.set()
+                        return
+                    self._revive(name)
+                    break
+
+    def _revive(self, name: str) -> None:
+        """Restart a device at the same address: an arm with its last joints, a camera with its file counter."""
+        words = list(self._words[name])
+        if name in self.arms:
+            joints = ",".join(f"{q:.6f}" for q in self.world.joints_rad(name))
+            words = [f"--initial-joints={joints}" if w.startswith("--initial-joints") else w for w in words]
+        if name == "camera":
+            log = self.folder / "truth_exposures.jsonl"
+            taken = len(log.read_text().splitlines()) if log.exists() else 0
+            port = self._ready[name]["gphoto_port"].rpartition(":")[2]
+            words += ["--port", port, "--first-counter", str(taken + 1)]  # these override the first ones
+        with suppress(SimulatorError):  # it is retried
+            self._child(name, *words)
+
+    def _child(self, name: str, *words: str) -> dict[str, Any]:
+        """Start a simulator and wait for its ready line."""
+        command = [sys.executable, "-m", "simulators", *words, "--with-parent", "--faults", self.faults.to_json()]
+        with (self.folder / "logs" / f"{name}.log").open("w") as log:
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True
+            )
+        self.children[name] = process
+        self._words[name] = words
+        self._ready[name] = ready = _ready_line(process, name, self.folder)
+        return ready
+
+    # --- what the service reads ---
+
+    def _hosts(self) -> list[str]:
+        first = self.args.host
+        stem, _, last = first.rpartition(".")
+        return [first, f"{stem}.{int(last) + 1}"][: len(self.arms)]
+
+    def _rig_file(self, gphoto_port: str, hosts: list[str]) -> dict[str, Any]:
+        robots = {arm: {"driver": "ur", "host": host} for arm, host in zip(self.arms, hosts, strict=True)}
+        rig: dict[str, Any] = {
+            "name": f"simulated rig, scene {self.scene.seed}",
+            "simulated": True,
+            "hands": self.server.address,
+            "devices": {
+                **robots,
+                "camera": self._camera(gphoto_port),
+                "scanner": {"driver": "scan_folder", "folder": "scans", "unit": "mm", "stable_s": 1.0},
+                "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
+                "lightbox": {"driver": "lightbox", "port": "lightbox"},
+            },
+        }
+        if not robots:
+            return rig
+        return {
+            **rig,
+            "stations": {name: self._station(i, name) for i, name in enumerate(STATIONS)},
+            "T_flange_camera_nominal": nominal_hand_eye().tolist(),
+            "payload": {"mass_kg": 1.6, "centre_of_gravity_m": [0.0, 0.0, 0.08]},
+            "collision": {"arm": ARM_MODEL.name},
+            "lens": self._lens(),
+        }
+
+    def _camera(self, gphoto_port: str) -> dict[str, Any]:
+        if self.args.without_cable:
+            return {"driver": "photo_folder", "folder": "photographs", "stable_s": 1.0}
+        return {"driver": "gphoto", "port": gphoto_port, "capture_timeout_s": self._exposure_s()}
+
+    def _exposure_s(self) -> float:
+        """Longest time that one picture may take, since this camera renders it: up to some seconds per megapixel."""
+        megapixels = self.args.image_width**2 * 2 / 3 / 1e6
+        return round(40.0 + 4.0 * megapixels, 0)
+
+    def _lens(self) -> dict[str, Any]:
+        """Nominal lens data, as engraved on the lens; the true lens differs by about a percent."""
+        lens = self.scene.camera_intrinsics(self.args.image_width)
+        return {"focal_length_mm": 50.0, "sensor_width_mm": 35.7, "image_px": [lens.width, lens.height]}
+
+    def _station(self, index: int, name: str) -> dict[str, Any]:
+        T_base_world = inverse(self.scene.T_world_base[name])
+        error = np.random.default_rng([self.scene.seed, 0x7A9E, index]).normal(0.0, _TAPE_SIGMA_M, 3)
+        centre = apply(T_base_world, SCENE_CENTRE_M) + error
+        return {
+            "robot": self.arms[index % len(self.arms)],
+            "scene_centre_m": [round(float(v), 3) for v in centre],
+            "approach_azimuth_deg": round(float(np.degrees(np.arctan2(-centre[1], -centre[0]))), 1),
+        }
+
+    # --- what only tests and the demo read ---
+
+    def _write_truth(self) -> None:
+        if not self._truth:
+            self._truth = {
+                "scene": self.scene.seed,
+                "T_flange_camera": self.scene.T_flange_camera.tolist(),
+                "T_world_base": {name: T.tolist() for name, T in self.scene.T_world_base.items()},
+                "arm_dh_deltas": self.scene.arm.dh_deltas.tolist(),
+                "control_m": self.scene.control_m.tolist(),
+                "radius_m": self.scene.radius_m,
+                "intrinsics": self.scene.camera_intrinsics(self.args.image_width).to_json(),
+                "scans": [],
+                "ct": [],
+            }
+        self._truth |= {"registration_m": self.scene.registration_m.tolist(), "moved": self.scene.moved}
+        (self.folder / "truth.json").write_text(json.dumps(self._truth, indent=1))
+
+    # --- hands ---
+
+    def _act(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        match request.get("action"):
+            case "hand_scan":
+                return self._deliver("scanner", "scans", ["--spray"] if self.world.spray else [])
+            case "read":
+                if self.hand:
+                    self.hand.read(str(request.get("words", "")))
+                return {"ok": True}
+            case "ct_scan":
+                return self._deliver("ct", "ct", ["--voxel-mm", str(self.args.ct_voxel_mm)])
+            case "move_sphere":
+                answer = self.world.act(request)
+                with self._deliveries:
+                    self._write_truth()
+                return answer
+            case _:
+                return self.world.act(request)
+
+    def _deliver(self, simulator: str, folder: str, options: list[str]) -> dict[str, Any]:
+        """Let the scanner or the CT deliver one export of the scene in its current state."""
+        spheres = "--control-spheres" if self.world.control_spheres else "--no-control-spheres"
+        command = [
+            sys.executable, "-m", "simulators", simulator, "--scene", str(self.scene.seed), "--once", "--with-parent",
+            "--folder", str(self.folder / folder), spheres, "--moved", json.dumps(self.scene.moved), *options,
+            "--faults", self.faults.to_json(),
+        ]  # fmt: skip
+        with self._deliveries:
+            answer = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
+            (self.folder / "logs" / f"{simulator}.log").write_text(answer.stderr)
+            if answer.returncode != 0:
+                return {
+                    "ok": False,
+                    "error": answer.stderr.strip().splitlines()[-1] if answer.stderr else "it failed",
+                }
+            report = json.loads(answer.stdout.splitlines()[0])
+            self._truth["scans" if simulator == "scanner" else "ct"].append(report.pop("truth"))
+            self._write_truth()
+        return {"ok": True, **report}
+
+
+def _start_joints(scene: Scene) -> Array:
+    """Joints at which the camera is above the scene at station 1, looking down."""
+    eye = SCENE_CENTRE_M + np.array([0.0, -0.1, 0.62])
+    T_world_camera = look_at(eye, SCENE_CENTRE_M, np.array([0.0, 1.0, 0.0]))
+    T_base_flange = inverse(scene.T_world_base[STATIONS[0]]) @ T_world_camera @ inverse(nominal_hand_eye())
+    q = solve_joints(ARM_MODEL, T_base_flange, _ELBOW_UP)
+    if q is None:
+        raise SimulatorError("the arm does not reach the scene")
+    return q
+
+
+def _ready_line(process: subprocess.Popen[str], name: str, folder: Path) -> dict[str, Any]:
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    if not line:
+        process.wait(timeout=10)
+        log = (folder / "logs" / f"{name}.log").read_text().strip()
+        raise SimulatorError(f"{name} did not start: {log.splitlines()[-1] if log else 'no reason given'}")
+    return json.loads(line)

@@ -1,0 +1,1 @@
+"""A simulated hand scanner and the files that its software exports."""

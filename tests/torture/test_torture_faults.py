@@ -1,0 +1,121 @@
+"""A short fault matrix: cases of each device obey the rules and the table.
+
+A program that breaks a rule is detected.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bench.torture.faults.judgement import rules
+from bench.torture.faults.judgement.table import Row, differences, read_table, table
+from bench.torture.faults.judgement.verdict import Verdict, masked
+from bench.torture.faults.matrix import COLUMNS, cases
+from bench.torture.faults.place.person import Motions
+from service.store.store import Store
+from tests.support.rig.rig import REPOSITORY
+from tests.support.runs.bench_run import PROTOCOL, begin_run
+
+# One case of each device that ends the same way on any machine; for the robot also one of its own faults.
+CHOSEN = (
+    "robot/rtde/inputs/reject",
+    "robot/itself/protective_stop",
+    "camera/ptpip/file/drop",
+    "lightbox/serial/light/corrupt",
+    "scanner/export/half_written",
+    "store/disk_full/commit_02",
+)
+SILENT = """
+import sys
+import service.store.database.engine as database
+from bench.torture.faults.__main__ import main
+database._advise = lambda _error: ""  # a store that says what is wrong, and not what to do
+sys.exit(main())
+"""
+
+
+def sweep(folder: Path, *words: str, code: str = "") -> tuple[int, str, list[dict[str, Any]]]:
+    """Status, output and verdicts of the sweep, run in a process without threads because it forks."""
+    program = ["-c", code] if code else ["-m", "bench.torture.faults"]
+    done = subprocess.run(
+        [sys.executable, *program, *words, "--out", str(folder / "verdicts.json")],
+        cwd=REPOSITORY, capture_output=True, text=True, check=False,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert (folder / "verdicts.json").exists(), done.stdout + done.stderr
+    return done.returncode, done.stdout, json.loads((folder / "verdicts.json").read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_a_few_cases_of_each_device_go_as_the_table_says(tmp_path: Path) -> None:
+    status, said, verdicts = sweep(tmp_path, "--only", *CHOSEN)
+    assert [one["name"] for one in verdicts if one["broken"]] == [], said
+    assert status == 0, said
+    assert {one["name"] for one in verdicts} == set(CHOSEN)
+    assert all(one["reached"] for one in verdicts)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+def test_a_store_that_does_not_say_what_to_do_shows(tmp_path: Path) -> None:
+    status, _, (verdict,) = sweep(tmp_path, "--only", "store/disk_full/commit_02", code=SILENT)
+    assert status == 1
+    assert any(fault.startswith("no place or no remedy") for fault in verdict["broken"]), verdict
+
+
+def test_a_motion_that_nobody_confirmed_shows(tmp_path: Path) -> None:
+    early, late, stopped = Motions(), Motions(), Motions()
+    early.began()
+    with Store.open(tmp_path / "data") as store:
+        bench = begin_run(store, PROTOCOL, tmp_path)
+        bench.run()
+        events = store.events(bench.run_id)
+    late.began()
+    stopped.stopped_s.append(time.monotonic())
+    time.sleep(0.2)
+    stopped.began()
+
+    def broken(motions: Motions) -> list[str]:
+        return rules.broken(events, motions, tmp_path / "data", (), "completed", ())
+
+    assert broken(late) == []
+    assert broken(early) == ["the arm moved, and nobody had confirmed"]
+    assert broken(stopped) == ["the arm moved after a stop, and nobody had confirmed since"]
+    assert rules.broken(events, late, tmp_path / "data", ("v009",), "completed", ()) == ["v009 is not in the record"]
+
+
+def test_every_kind_of_message_is_spoilt_in_every_way_that_its_wire_has() -> None:
+    names = cases()
+    for device, kinds in (("robot", 10), ("camera", 11), ("lightbox", 5)):
+        wires = {name.rsplit("/", 1)[0] for name, case in names.items() if case.spoil and name.startswith(device)}
+        assert len(wires) == kinds
+        for wire in wires:
+            there = {name.rsplit("/", 1)[1] for name in names if name.startswith(f"{wire}/")}
+            assert COLUMNS.keys() - there <= {"reject"}, wire
+
+
+def test_the_table_is_read_as_it_is_written_and_differences_are_told(tmp_path: Path) -> None:
+    some = list(cases().values())[:2]
+    words = masked("no answer within 2.5 s [127.0.0.1:30004]. Look | at the `cable`")
+    first = Verdict(some[0].name, True, [], ["retry", "ask"], ["DeviceTimeoutError"], words, "completed")
+    second = Verdict(some[1].name, True, [], [], [], "", "completed")
+    path = tmp_path / "faults.md"
+    path.write_text(table(some, [first, second], {}))
+    rows = read_table(path)
+    assert rows == {some[0].name: Row.of(some[0], first), some[1].name: Row.of(some[1], second)}
+    assert "no answer within N s" in rows[some[0].name].words
+    assert differences([first, second], rows) == []
+    second.policy.append("ask")
+    assert differences([second], rows) == [
+        f"{second.name}: ask / completed / ; the table says nothing / completed / "
+    ]
+    assert table(some, [], rows) == path.read_text(), "rows that were not tried stay"
