@@ -70,7 +70,7 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
         before = path.stat()
         check_complete(path)
         export = export or export_of(path)
-        vertices, faces, normals = _parse(path)
+        vertices, faces, normals = parse_mesh(path)
         after = path.stat()
     except FileNotFoundError as error:
         raise UnreadableFileError(
@@ -86,7 +86,7 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
         raise IncompleteExportError(
             "the file changed while it was read", where=str(path), remedy="Wait until the export has finished"
         )
-    _validate(path, vertices, faces)
+    check_mesh(path, vertices, faces)
     found, evidence = credible_unit(path, vertices[np.unique(faces)], unit)
     vertices = vertices * METRES_PER_UNIT[found]
     first, index = merge_equal(vertices)
@@ -169,8 +169,13 @@ def _unit_length(normals: Array) -> Array:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
 
 
-def _parse(path: Path) -> tuple[Array, IntArray, Array | None]:
-    """Vertices (V, 3) in the file's unit, faces (F, 3) and the file's vertex normals, None if missing or invalid."""
+def parse_mesh(path: Path) -> tuple[Array, IntArray, Array | None]:
+    """Vertices (V, 3) in the file's unit, faces (F, 3) and the file's vertex normals, None if missing or invalid.
+
+    Raises:
+        UnreadableFileError: not a mesh of the format that the name says, or no faces.
+        OSError: the file cannot be opened.
+    """
     suffix = path.suffix.lower()[1:]
     # The geometry does not need the materials, which travel with the export as companions.
     options: dict[str, Any] = {"skip_materials": True} if suffix == "obj" else {}
@@ -202,7 +207,8 @@ def _parse(path: Path) -> tuple[Array, IntArray, Array | None]:
     return vertices, faces, normals
 
 
-def _validate(path: Path, vertices: Array, faces: IntArray) -> None:
+def check_mesh(path: Path, vertices: Array, faces: IntArray) -> None:
+    """Raise UnreadableFileError unless these are finite vertices (V, 3) and faces (F, 3) that refer to them."""
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         raise UnreadableFileError(
             f"vertices have {vertices.shape[-1]} coordinates and faces {faces.shape[-1]} corners, each must have 3",

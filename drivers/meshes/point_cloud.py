@@ -60,6 +60,13 @@ def read_point_cloud(path: Path, unit: MeshUnit = "auto") -> PointCloud:
     Raises:
         UnreadableFileError: not a point cloud, coordinates that are not finite, or an implausible unit.
     """
+    points, normals = parse_point_cloud(path)
+    found, evidence = credible_unit(path, points, unit)
+    return PointCloud(points * METRES_PER_UNIT[found], normals, found, evidence)
+
+
+def parse_point_cloud(path: Path) -> tuple[Array, Array | None]:
+    """Points (N, 3) in the file's unit, and unit normals (N, 3) or None; raises as `read_point_cloud` does."""
     try:
         points, normals = _text(path) if path.suffix.lower() in TEXT_SUFFIXES else _ply(path)
     except (OSError, *PARSE_ERRORS) as error:
@@ -72,8 +79,7 @@ def read_point_cloud(path: Path, unit: MeshUnit = "auto") -> PointCloud:
         raise UnreadableFileError(
             "the file has no points, or some that are not finite", where=str(path), remedy="Export the scan again"
         )
-    found, evidence = credible_unit(path, points, unit)
-    return PointCloud(points * METRES_PER_UNIT[found], normals, found, evidence)
+    return points, normals
 
 
 def _text(path: Path) -> tuple[Array, Array | None]:

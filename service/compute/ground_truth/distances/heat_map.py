@@ -1,0 +1,132 @@
+"""Heat maps of distances: coloured vertices, and a picture of two surfaces side by side with a scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.ground_truth.distances.chamfer import ChamferScore, Compared
+from service.compute.ground_truth.distances.sampling import normals_of
+from service.compute.ground_truth.surface import Surface
+from service.core.geometry import Array
+from service.core.units import mm
+
+Pixels = NDArray[np.uint8]
+
+BEYOND = (128, 128, 128)  # grey: farther than the outlier limit
+_PANEL_PX = 900  # longer side of each surface in the picture
+_BAR_PX, _TEXT_PX = 24, 34
+_MARGIN_PX = 20
+_BEHIND_PX = 8  # depth over which a steep surface may fall between neighbouring pixels
+_FONT = (cv2.FONT_HERSHEY_SIMPLEX, 0.6)
+_INK, _PAPER = (40, 40, 40), (255, 255, 255)
+
+
+@dataclass(frozen=True, slots=True)
+class HeatScale:
+    """Distance at the end of the colours, and the one beyond which points are grey; metres."""
+
+    full_m: float
+    outlier_m: float
+
+    @classmethod
+    def of(cls, score: ChamferScore, outlier_m: float) -> HeatScale:
+        """The scale whose end is the 95th percentile of both directions, rounded up to 1, 2 or 5."""
+        wanted = max(score.pred_to_gt.p95_m, score.gt_to_pred.p95_m, 1e-6)
+        power = 10.0 ** np.floor(np.log10(wanted))
+        return cls(float(power * next(s for s in (1, 2, 5, 10) if s * power >= wanted * (1 - 1e-9))), outlier_m)
+
+    def colours(self, distance_m: Array) -> Pixels:
+        """(N, 3) red, green, blue for distances (N,)."""
+        level = np.clip(255 * distance_m / self.full_m, 0, 255).astype(np.uint8)
+        bgr = cv2.applyColorMap(level.reshape(-1, 1), cv2.COLORMAP_VIRIDIS).reshape(-1, 3)
+        out = np.ascontiguousarray(bgr[:, ::-1]).astype(np.uint8)
+        out[distance_m > self.outlier_m] = BEYOND
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Panel:
+    surface: Surface = field(repr=False)
+    compared: Compared = field(repr=False)
+    title: str
+
+
+def heat_picture(pred: Surface, gt: Surface, score: ChamferScore, scale: HeatScale) -> Pixels:
+    """(H, W, 3) picture, blue first as OpenCV has it: both surfaces by their distances, seen along one direction."""
+    axes = _view(gt, score.gt.samples.points_m)
+    both = [score.pred.samples.points_m @ axes.T, score.gt.samples.points_m @ axes.T]
+    low = np.minimum(both[0].min(axis=0), both[1].min(axis=0))
+    size = np.maximum(both[0].max(axis=0), both[1].max(axis=0)) - low
+    pixel_m = max(float(size[:2].max()) / _PANEL_PX, 1e-9)
+    panels = (
+        _Panel(pred, score.pred, f"prediction to truth: mean {mm(score.pred_to_gt.mean_m):.3f} mm"),
+        _Panel(gt, score.gt, f"truth to prediction: mean {mm(score.gt_to_pred.mean_m):.3f} mm"),
+    )
+    height, width = (int(np.ceil(size[k] / pixel_m)) + 1 for k in (1, 0))
+    drawn = [
+        _captioned(_splat(panel, seen, low, pixel_m, (height, width), axes[2], scale), panel.title)
+        for panel, seen in zip(panels, both, strict=True)
+    ]
+    rows = np.full((drawn[0].shape[0], _MARGIN_PX, 3), _PAPER, dtype=np.uint8)
+    body = np.hstack([rows, drawn[0], rows, drawn[1], rows])
+    return np.vstack([body, _bar(body.shape[1], scale)])
+
+
+def _view(surface: Surface, points: Array) -> Array:
+    """(3, 3) rows: right, down, away from the viewer, who looks onto the widest side of the surface."""
+    few = points[:: max(1, len(points) // 20_000)]
+    right, _, flat = np.linalg.svd(few - few.mean(axis=0), full_matrices=False)[2]
+    toward = surface.area_vectors_m2.sum(axis=0) if surface.is_mesh else np.zeros(3)
+    if np.linalg.norm(toward) < 0.05 * max(surface.area_m2, 1e-300):
+        toward = np.array([0.0, 0.0, 1.0])
+    away = -flat if flat @ toward > 0 else flat
+    return np.stack([right, np.cross(away, right), away])
+
+
+def _splat(
+    panel: _Panel, seen: Array, low: Array, pixel_m: float, shape: tuple[int, int], away: Array, scale: HeatScale
+) -> Pixels:
+    """The samples of one surface as pixels, the nearest to the viewer on top."""
+    at = ((seen[:, :2] - low[:2]) / pixel_m).astype(np.int64)
+    order = np.argsort(-seen[:, 2])
+    depth = np.full(shape, np.inf, dtype=np.float32)
+    depth[at[order, 1], at[order, 0]] = seen[order, 2]
+    # What lies behind shows between the samples; it is far behind the nearest sample around it.
+    front = cv2.erode(depth, np.ones((5, 5), np.uint8))
+    order = order[seen[order, 2] <= front[at[order, 1], at[order, 0]] + _BEHIND_PX * pixel_m]
+    colours = scale.colours(panel.compared.distance_m[order]).astype(np.float64)
+    normals = normals_of(panel.surface, panel.compared.samples, order)
+    if normals is not None:
+        colours *= (0.55 + 0.45 * np.abs(normals @ away))[:, None]
+    image = np.full((*shape, 3), _PAPER, dtype=np.uint8)
+    image[at[order, 1], at[order, 0]] = colours[:, ::-1].astype(np.uint8)
+    empty = np.all(image == _PAPER, axis=2)
+    filled = cv2.erode(image, np.ones((3, 3), np.uint8))  # paper is the brightest
+    image[empty] = filled[empty]
+    return image
+
+
+def _captioned(image: Pixels, title: str) -> Pixels:
+    """The picture with its title above it."""
+    head = np.full((_TEXT_PX, image.shape[1], 3), _PAPER, dtype=np.uint8)
+    size = min(0.7, image.shape[1] / 11 / max(len(title), 1))
+    cv2.putText(head, title, (4, _TEXT_PX - 10), cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
+    return np.vstack([head, image])
+
+
+def _bar(width: int, scale: HeatScale) -> Pixels:
+    """The scale of colours under the pictures."""
+    out = np.full((2 * _MARGIN_PX + _BAR_PX + _TEXT_PX, width, 3), _PAPER, dtype=np.uint8)
+    length = width - 2 * _MARGIN_PX
+    colours = scale.colours(np.linspace(0, scale.full_m, length))[:, ::-1]
+    out[_MARGIN_PX : _MARGIN_PX + _BAR_PX, _MARGIN_PX : _MARGIN_PX + length] = colours
+    for share in (0.0, 0.5, 1.0):
+        text = f"{mm(share * scale.full_m):g} mm"
+        x = min(_MARGIN_PX + int(share * length), width - cv2.getTextSize(text, *_FONT, 1)[0][0] - 4)
+        place = (x, _MARGIN_PX + _BAR_PX + 24)
+        cv2.putText(out, text, place, *_FONT, _INK, 1, cv2.LINE_AA)
+    return out
