@@ -178,8 +178,10 @@ def test_a_dense_cloud_is_thinned_and_a_sparse_one_has_a_larger_floor() -> None:
     assert score.pred_to_gt.surface_mean_m is None
     assert score.pred_to_gt.normal_consistency is None
     sparse = Surface(dense.vertices_m[:400], dense.faces)
-    assert chamfer(sparse, dense, COARSE).pred_to_gt.n == 400
-    assert chamfer(dense, sparse, COARSE).pred_to_gt.floor_m == pytest.approx(0.5 * 0.02 / 20, rel=0.25)
+    score = chamfer(dense, sparse, ChamferSettings(spacing_m=1e-4))
+    assert score.gt_to_pred.n == pytest.approx(400, abs=8)
+    assert score.pred_to_gt.floor_m == pytest.approx(0.5 * 0.02 / 20, rel=0.2)
+    assert score.pred_to_gt.mean_m == pytest.approx(score.pred_to_gt.floor_m, rel=0.2)
 
 
 def test_too_many_samples_are_refused_before_they_are_made() -> None:
@@ -223,7 +225,7 @@ def test_the_command_writes_heat_maps_in_the_unit_of_the_surface(tmp_path: Path)
     heat = trimesh.load_mesh(tmp_path / "heat.ply", process=False)
     assert np.asarray(heat.vertices) == pytest.approx(1e3 * tilted.vertices_m, abs=1e-4)
     told = heat.metadata["_ply_raw"]["vertex"]["data"]["distance_mm"]
-    assert np.asarray(told) == pytest.approx(np.abs(1e3 * tilted.vertices_m[:, 2]), abs=0.12)
+    assert np.asarray(told) == pytest.approx(np.abs(1e3 * tilted.vertices_m[:, 2]), abs=0.25)
     colours = np.asarray(heat.visual.vertex_colors)[:, :3]
     assert len(np.unique(colours, axis=0)) > 3
     picture = cv2.imread(str(tmp_path / "heat.png"))

@@ -220,6 +220,9 @@ RUN_ELSEWHERE = {
     "orthocapture spheres --mesh scan.ply --radius-mm 15 --out spheres.json": (
         "tests/scanner/test_mesh_spheres_hard.py::test_command_reads_clouds_and_writes_spheres"
     ),
+    "orthocapture evaluate chamfer mesh.ply truth.ply --heat-map heat.ply": (
+        "tests/ground_truth/test_chamfer.py::test_the_command_writes_heat_maps_in_the_unit_of_the_surface"
+    ),
     "orthocapture layout --spheres spheres.json": "tests/steps/test_layout.py::test_command",
     "orthocapture demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     "make demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",

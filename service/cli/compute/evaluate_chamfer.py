@@ -9,8 +9,8 @@ import cv2
 import typer
 from rich.table import Table
 
-from drivers.mesh_file import METRES_PER_UNIT, MeshUnit
-from drivers.surface_file import SurfaceFile, read_surface_file
+from drivers.meshes.mesh_file import METRES_PER_UNIT, MeshUnit
+from drivers.meshes.surface_file import SurfaceFile, read_surface_file
 from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors, require_writable
 from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, Direction, chamfer
 from service.compute.ground_truth.distances.heat_map import HeatScale, heat_picture

@@ -22,7 +22,7 @@ from service.core.units import mm
 SPACING_M = 1e-4
 OUTLIER_M = 0.02
 F_THRESHOLDS_M = (5e-4, 1e-3)
-_AROUND = 6  # neighbours of a point on a surface
+_AROUND = 12  # neighbours of a point on a surface
 CHECKED = 100_000  # samples, taken at random, for the floor, the distance to the faces and the normals
 
 
@@ -184,10 +184,11 @@ def _floor(surface: Surface, samples: Samples, index: PointIndex, rng: np.random
         return float(index.nearest(random_points(surface, n, rng))[0].mean())
     if len(samples.points_m) <= _AROUND:
         return 0.0
-    # A cloud's surface is unknown: it lies in triangles of a point and two of its neighbours.
+    # A cloud's surface is unknown: the plane through a point's neighbours, as far as these reach, stands for it.
     chosen = samples.points_m[rng.choice(len(samples.points_m), n, replace=False)]
     around = samples.points_m[index.neighbours(chosen, _AROUND + 1)]
-    two = rng.integers(1, _AROUND + 1, (n, 2))
-    corners = np.stack([chosen, *(around[np.arange(n), two[:, k]] for k in range(2))], axis=1)
-    places = np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), n), corners)
-    return float(index.nearest(places)[0].mean())
+    axes = np.linalg.svd(around - around.mean(axis=1, keepdims=True), full_matrices=False)[2]
+    reach = np.linalg.norm(around[:, -1] - chosen, axis=1) * np.sqrt(rng.random(n))
+    angle = 2 * np.pi * rng.random(n)
+    flat = np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=1)
+    return float(index.nearest(chosen + np.einsum("nk,nki->ni", flat, axes[:, :2]))[0].mean())

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import Array
-from drivers.mesh_file import MESH_SUFFIXES, METRES_PER_UNIT, MeshUnit, check_mesh, parse_mesh
-from drivers.mesh_format import check_complete
-from drivers.point_cloud import TEXT_SUFFIXES, is_point_cloud, parse_point_cloud
+from drivers.meshes.mesh_file import MESH_SUFFIXES, METRES_PER_UNIT, MeshUnit, check_mesh, parse_mesh
+from drivers.meshes.mesh_format import check_complete
+from drivers.meshes.point_cloud import TEXT_SUFFIXES, is_point_cloud, parse_point_cloud
 
 OTHER_SUFFIXES = (".off", ".glb", ".gltf")
 LARGEST_IN_METRES = 3.0  # diagonal; nothing that is compared is larger, and nothing measured in mm is smaller
