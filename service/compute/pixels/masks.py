@@ -65,6 +65,29 @@ def marker_mask(
     return mask.astype(np.bool_)
 
 
+def hull_mask(camera: CameraModel, T_world_camera: Transform, points_m: Array) -> NDArray[np.bool_]:
+    """(H, W) pixels within the outline of points (N, 3) of the world, for example the spheres around a specimen.
+
+    Points behind the camera do not count.
+
+    Raises:
+        ComputeError: as `pixel_rays`.
+    """
+    mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
+    points = apply(inverse(T_world_camera), points_m)
+    _fill(mask, camera, _frustum(pixel_rays(camera), camera), _hull(points[points[:, 2] > 0]))
+    return mask.astype(np.bool_)
+
+
+def _hull(points: Array) -> Array:
+    """Rays (K, 3) of the outline of points (N, 3) before the camera."""
+    flat = (points[:, :2] / points[:, 2:]).astype(np.float32)
+    if len(flat) < 3:
+        return np.empty((0, 3))
+    hull = np.asarray(cv2.convexHull(flat), dtype=np.float64).reshape(-1, 2)
+    return np.concatenate([hull, np.ones((len(hull), 1))], axis=1)
+
+
 def _ball_outline(centre: Array, radius_m: float) -> Array:
     cone = cone_of_sphere(centre, radius_m)
     azimuth = np.linspace(0.0, 2 * np.pi, _AROUND, endpoint=False)
@@ -84,10 +107,7 @@ def _post_outline(ends: Array, radius_m: float) -> Array:
     side = np.linalg.svd(axis[None])[2][1:]
     angle = np.linspace(0.0, 2 * np.pi, _AROUND, endpoint=False)[:, None]
     circle = radius_m / np.cos(np.pi / _AROUND) * (np.cos(angle) * side[0] + np.sin(angle) * side[1])
-    points = np.concatenate([low + circle, high + circle])
-    flat = (points[:, :2] / points[:, 2:]).astype(np.float32)
-    hull = np.asarray(cv2.convexHull(flat), dtype=np.float64).reshape(-1, 2)
-    return np.concatenate([hull, np.ones((len(hull), 1))], axis=1)
+    return _hull(np.concatenate([low + circle, high + circle]))
 
 
 def _frustum(rays: PixelRays, camera: CameraModel) -> Array:

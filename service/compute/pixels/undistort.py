@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.rays import pixel_rays
+from service.core.geometry import Array
 
 _RAYS = 500_000  # pixels whose places in the photograph are in memory at a time
 
@@ -41,18 +43,36 @@ def undistorted(image: NDArray[np.uint8], camera: CameraModel) -> Undistorted:
     Cubic interpolation at places rounded to 1/32 px, in tiles of rows.
     """
     pinhole = pinhole_of(camera)
-    out, valid = np.empty_like(image), np.empty(image.shape[:2], dtype=np.bool_)
+    out = np.empty_like(image)
+    valid = np.empty(image.shape[:2], dtype=np.bool_)
+    for begin, end, at in _places(pinhole, camera):
+        valid[begin:end] = _within(at, camera)
+        places = at.astype(np.float32)
+        part = cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        part[~valid[begin:end]] = 0
+        out[begin:end] = part
+    return Undistorted(pinhole, out, valid)
+
+
+def valid_pixels(camera: CameraModel) -> NDArray[np.bool_]:
+    """(H, W) pixels of the undistorted image for which the photograph has one."""
+    valid = np.empty((camera.height, camera.width), dtype=np.bool_)
+    for begin, end, at in _places(pinhole_of(camera), camera):
+        valid[begin:end] = _within(at, camera)
+    return valid
+
+
+def _places(pinhole: CameraModel, camera: CameraModel) -> Iterator[tuple[int, int, Array]]:
+    """For tiles of rows [begin, end) of the undistorted image: (end - begin, W, 2) places in the photograph."""
     rays = pixel_rays(pinhole)
     step = max(1, _RAYS // camera.width)
     for begin in range(0, camera.height, step):
         end = min(begin + step, camera.height)
         xy = rays.xy(begin, end)
         at = camera.project(np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=2).reshape(-1, 3))
-        at = at.reshape(end - begin, camera.width, 2)
-        size = np.array([camera.width, camera.height])
-        valid[begin:end] = ((at >= -0.5) & (at <= size - 0.5)).all(axis=2)
-        places = at.astype(np.float32)
-        part = cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        part[~valid[begin:end]] = 0
-        out[begin:end] = part
-    return Undistorted(pinhole, out, valid)
+        yield begin, end, at.reshape(end - begin, camera.width, 2)
+
+
+def _within(at: Array, camera: CameraModel) -> NDArray[np.bool_]:
+    inside = (at >= -0.5) & (at <= np.array([camera.width, camera.height]) - 0.5)
+    return inside[..., 0] & inside[..., 1]

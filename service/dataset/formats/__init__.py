@@ -1,0 +1,1 @@
+"""Export formats: one module each, with a KIND; plug-ins use the entry-point group `orthocapture.exporters`."""

@@ -1,0 +1,85 @@
+"""COLMAP's model files: cameras, images and points, as text and in binary."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+
+from scipy.spatial.transform import Rotation
+
+from service.compute.camera_model import CameraModel
+from service.core.geometry import Array, Transform, inverse
+from service.dataset.posed.folder import ExportFolder
+from service.dataset.posed.records import HALF_PIXEL, DataSet, View
+
+_MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4, "FULL_OPENCV": 6}
+README = """COLMAP model. {mark}
+Frame: world (the frame of the scan), metres. Poses are world to camera, cameras as COLMAP defines them: the centre of
+the first pixel is (0.5, 0.5). {points}
+"""
+NO_POINTS = "There are no points: the model holds nothing of the ground truth."
+
+
+def write_images(dataset: DataSet, folder: ExportFolder, place: str) -> None:
+    """The picture files of all views."""
+    for view in dataset.views:
+        folder.file(f"{place}/{view.file}", lambda view=view: dataset.pixels.picture(view))
+
+
+def write_model_text(dataset: DataSet, folder: ExportFolder, place: str) -> None:
+    """cameras.txt, images.txt and an empty points3D.txt, as COLMAP's documentation describes them."""
+    head = f"# {dataset.mark}\n" * dataset.simulated
+    cameras = camera_ids(dataset.views)
+    rows = [
+        f"{number} {model} {camera.width} {camera.height} {' '.join(map(repr, parameters))}"
+        for camera, number in cameras.items()
+        for model, parameters in [model_of(camera)]
+    ]
+    folder.text(f"{place}/cameras.txt", head + "".join(f"{row}\n" for row in rows))
+    lines: list[str] = []
+    for number, view in enumerate(dataset.views, start=1):
+        q, t = world_to_camera(view.T_world_camera)
+        numbers = " ".join(repr(float(x)) for x in (*q, *t))
+        lines.append(f"{number} {numbers} {cameras[view.camera]} {view.file}\n\n")  # an empty line: no 2D points
+    folder.text(f"{place}/images.txt", head + "".join(lines))
+    folder.text(f"{place}/points3D.txt", head)
+
+
+def write_model_binary(dataset: DataSet, folder: ExportFolder, place: str, points_m: Array) -> None:
+    """cameras.bin, images.bin and points3D.bin with grey points (N, 3) without tracks; little endian."""
+    cameras = camera_ids(dataset.views)
+    blob = struct.pack("<Q", len(cameras))
+    for camera, number in cameras.items():
+        model, parameters = model_of(camera)
+        blob += struct.pack("<iiQQ", number, _MODEL_IDS[model], camera.width, camera.height)
+        blob += struct.pack(f"<{len(parameters)}d", *parameters)
+    folder.file(f"{place}/cameras.bin", lambda: blob)
+    images = struct.pack("<Q", len(dataset.views))
+    for number, view in enumerate(dataset.views, start=1):
+        q, t = world_to_camera(view.T_world_camera)
+        images += struct.pack("<I7dI", number, *q, *t, cameras[view.camera])
+        images += view.file.encode() + b"\0" + struct.pack("<Q", 0)
+    folder.file(f"{place}/images.bin", lambda: images)
+    points = [struct.pack("<Q3d3BdQ", k, *point, 128, 128, 128, 0.0, 0) for k, point in enumerate(points_m, start=1)]
+    folder.file(f"{place}/points3D.bin", lambda: struct.pack("<Q", len(points)) + b"".join(points))
+
+
+def camera_ids(views: Sequence[View]) -> dict[CameraModel, int]:
+    """A number from 1 for each different camera."""
+    return {camera: k for k, camera in enumerate(dict.fromkeys(view.camera for view in views), start=1)}
+
+
+def model_of(camera: CameraModel) -> tuple[str, list[float]]:
+    """COLMAP's name of the camera's model, and its parameters."""
+    pinhole = [camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL]
+    if not camera.distortion.any():
+        return "PINHOLE", pinhole
+    four = [*pinhole, camera.k1, camera.k2, camera.p1, camera.p2]
+    more = [camera.k3, camera.k4, camera.k5, camera.k6]
+    return ("FULL_OPENCV", four + more) if any(more) else ("OPENCV", four)
+
+
+def world_to_camera(T_world_camera: Transform) -> tuple[Array, Array]:
+    """Quaternion (4,) with the scalar first, and translation (3,)."""
+    T = inverse(T_world_camera)
+    return Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True), T[:3, 3]

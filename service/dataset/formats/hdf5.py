@@ -1,0 +1,71 @@
+"""HDF5 for training: arrays that need nothing but numpy and h5py, and a loader of forty lines beside them."""
+
+from __future__ import annotations
+
+import importlib.resources
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from service.dataset.posed.exporter import Exporter
+from service.dataset.posed.folder import ExportFolder
+from service.dataset.posed.records import DataSet, View
+
+LOADER = "loader.py"
+
+
+def write(dataset: DataSet, folder: ExportFolder) -> None:
+    """`data.h5`, which links to `views/NAME.h5`, and `loader.py` for PyTorch users.
+
+    A view has image (H, W, 3) RGB, depth_m (H, W) z in metres, normal (H, W, 3) in the camera frame, valid and
+    markers (H, W), K (3, 3) for pixel centres at integers, distortion (8,) k1 k2 p1 p2 k3 k4 k5 k6, T_world_camera
+    (4, 4) and covariance (6, 6). Each view is a file of its own, so that an interrupted export goes on.
+    """
+    for view in dataset.views:
+        folder.written_by(f"views/{view.name}.h5", lambda part, view=view: _view(part, dataset, view))
+    folder.written_by("data.h5", lambda part: _index(part, dataset))
+    source = importlib.resources.files("service.dataset.posed").joinpath("h5_loader.py")
+    folder.file(LOADER, source.read_bytes)
+
+
+def _view(path: Path, dataset: DataSet, view: View) -> None:
+    pixels, camera = dataset.pixels, view.camera
+    rows = min(64, camera.height)
+    with h5py.File(path, "w") as file:
+        _about(file, dataset)
+        images = {
+            "image": pixels.colours(view)[..., ::-1],
+            "depth_m": pixels.depth_m(view),
+            "normal": pixels.normal(view),
+            "valid": pixels.valid(view),
+            "markers": pixels.markers(view),
+        }
+        for name, image in images.items():
+            chunks = (rows, camera.width, *image.shape[2:])
+            file.create_dataset(name, data=image, chunks=chunks, compression="gzip", compression_opts=1)
+        file["K"] = camera.matrix
+        terms = (camera.k1, camera.k2, camera.p1, camera.p2, camera.k3, camera.k4, camera.k5, camera.k6)
+        file["distortion"] = np.array(terms)
+        file["T_world_camera"] = view.T_world_camera
+        file["covariance"] = view.covariance
+
+
+def _index(path: Path, dataset: DataSet) -> None:
+    with h5py.File(path, "w") as file:
+        _about(file, dataset)
+        for view in dataset.views:
+            file[f"views/{view.name}"] = h5py.ExternalLink(f"views/{view.name}.h5", "/")
+        for name, split in dataset.splits.named().items():
+            file[f"splits/{name}"] = np.array([view.encode() for view in split], dtype="S")
+        file["mesh/vertices_m"] = dataset.mesh.vertices_m
+        file["mesh/faces"] = dataset.mesh.faces
+
+
+def _about(file: h5py.File, dataset: DataSet) -> None:
+    file.attrs["simulated"] = dataset.simulated
+    file.attrs["frame"] = "world, the frame of the mesh; T_world_camera: x right, y down, z forward"
+    file.attrs["unit"] = "m"
+
+
+KIND = Exporter("hdf5", "HDF5 for training, with a loader that needs only numpy and h5py", write)

@@ -1,0 +1,1 @@
+"""Formats of radiance fields and neural surfaces."""

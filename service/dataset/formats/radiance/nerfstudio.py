@@ -1,0 +1,85 @@
+"""nerfstudio's transforms.json with depth and masks, in metres."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from service.compute.camera_model import CameraModel
+from service.compute.pixels.coding import DEPTH_UNIT_MM, coded_depth
+from service.core.errors import DataError
+from service.core.units import metres
+from service.dataset.formats.colmap.model import write_images
+from service.dataset.formats.meshes import mask_png, png
+from service.dataset.posed.exporter import Exporter
+from service.dataset.posed.folder import ExportFolder
+from service.dataset.posed.records import HALF_PIXEL, OPENGL, DataSet
+
+
+def write(dataset: DataSet, folder: ExportFolder) -> None:
+    """`transforms.json`, `images/`, `depth/` (16 bit, 0.1 mm, 0 where none is known) and `masks/` (0: leave out).
+
+    Poses are camera to world with OpenGL's axes, in metres and the frame of the mesh. Keep them with
+    `nerfstudio-data --orientation-method none --center-method none --auto-scale-poses False
+    --depth-unit-scale-factor 1e-4`.
+
+    Raises:
+        DataError: a camera has the rational distortion k4, k5, k6.
+    """
+    frames = [
+        {
+            "file_path": f"images/{view.file}",
+            "depth_file_path": f"depth/{view.name}.png",
+            "mask_path": f"masks/{view.name}.png",
+            **intrinsics(view.camera),
+            "transform_matrix": (view.T_world_camera @ OPENGL).tolist(),
+            "covariance": view.covariance.tolist(),
+        }
+        for view in dataset.views
+    ]
+    files = {view.name: f"images/{view.file}" for view in dataset.views}
+    document: dict[str, Any] = {
+        "simulated": dataset.simulated,
+        "camera_model": "OPENCV",
+        "depth_unit_scale_factor": metres(DEPTH_UNIT_MM),
+        "train_filenames": [files[name] for name in dataset.splits.train],
+        "val_filenames": [files[name] for name in dataset.splits.test],
+        "test_filenames": [files[name] for name in dataset.splits.test],
+        "frames": frames,
+    }
+    folder.json("transforms.json", document)
+    write_images(dataset, folder, "images")
+    for view in dataset.views:
+        folder.file(f"depth/{view.name}.png", lambda view=view: png(coded_depth(dataset.pixels.depth_m(view))))
+        folder.file(
+            f"masks/{view.name}.png",
+            lambda view=view: mask_png(dataset.pixels.valid(view) & ~dataset.pixels.markers(view)),
+        )
+
+
+def intrinsics(camera: CameraModel) -> dict[str, float]:
+    """Of one camera, whose first pixel has its corner at 0.
+
+    Raises:
+        DataError: the camera has the rational distortion k4, k5, k6.
+    """
+    if camera.k4 or camera.k5 or camera.k6:
+        raise DataError(
+            "transforms.json cannot hold the rational distortion k4, k5, k6",
+            remedy="Choose a format with undistorted images",
+        )
+    return {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx + HALF_PIXEL,
+        "cy": camera.cy + HALF_PIXEL,
+        "k1": camera.k1,
+        "k2": camera.k2,
+        **({"k3": camera.k3} if camera.k3 else {}),
+        "p1": camera.p1,
+        "p2": camera.p2,
+    }
+
+
+KIND = Exporter("nerfstudio", "nerfstudio's transforms.json, with depth and masks", write)

@@ -1,0 +1,75 @@
+"""The declaration of an export format, and how a data set is written in one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.core.declared_kinds import declared_kinds
+from service.core.errors import ConfigurationError
+from service.dataset.posed.folder import ExportFolder, export_folder
+from service.dataset.posed.pixels import undistorted_data_set
+from service.dataset.posed.records import DataSet
+
+GROUP = "orthocapture.exporters"
+
+
+@dataclass(frozen=True, slots=True)
+class Exporter:
+    """A format.
+
+    Attributes:
+        name: as it is named on the command line.
+        words: what it is, and who reads it.
+        write: puts the files of a data set into a folder; units and frames are stated in its docstring.
+        pinhole: the format has no distortion, so it gets undistorted images.
+    """
+
+    name: str
+    words: str
+    write: Callable[[DataSet, ExportFolder], None]
+    pinhole: bool = False
+
+
+def exporters() -> dict[str, Exporter]:
+    """Every format by its name.
+
+    Raises:
+        ConfigurationError: two have the same name, or an entry point names something else.
+    """
+    return declared_kinds("service.dataset.formats", GROUP, Exporter)
+
+
+def exporter(name: str) -> Exporter:
+    """The format of this name.
+
+    Raises:
+        ConfigurationError: there is none.
+    """
+    known = exporters()
+    if name not in known:
+        raise ConfigurationError(
+            f"there is no format {name!r}", where="--format", remedy=f"Choose one of {', '.join(sorted(known))}"
+        )
+    return known[name]
+
+
+def write_data_set(dataset: DataSet, how: Exporter, target: Path, *, personal: bool = True) -> None:
+    """Write a data set into a new folder, with `dataset.json`, `splits.json` and `SHA256SUMS` beside the format.
+
+    Args:
+        dataset: as photographed; it is undistorted here where the format needs that.
+        how: the format.
+        target: a new folder; it appears when it is whole.
+        personal: False leaves GPS, owner and serial numbers out of resampled pictures.
+
+    Raises:
+        DataError: the target exists, the data set does not fit into the format, or a picture cannot be read.
+        ConfigurationError: another process is writing the same export.
+    """
+    ready = undistorted_data_set(dataset, personal=personal) if how.pinhole else dataset
+    with export_folder(target, f"{how.name} 1 {ready.identity} {'' if personal else 'impersonal'}") as folder:
+        how.write(ready, folder)
+        folder.json("dataset.json", {"format": how.name, "simulated": dataset.simulated, **dataset.statement})
+        folder.json("splits.json", {"simulated": dataset.simulated, **ready.splits.named()})

@@ -1,0 +1,216 @@
+"""Pixel data of the views: photographs from files, computed depth and masks; undistorted and cropped views."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.images.files import read_image_of
+from service.compute.pixels.crops import FULL_HD, Crop, marker_free_crops
+from service.compute.pixels.masks import Ball, Post, marker_mask
+from service.compute.pixels.metadata import described, with_metadata_of, without_personal_data
+from service.compute.pixels.render import depth_map, seen
+from service.compute.pixels.splits import Splits
+from service.compute.pixels.surface import Surface
+from service.compute.pixels.undistort import pinhole_of, undistorted, valid_pixels
+from service.core.errors import DataError
+from service.dataset.posed.records import DataSet, View
+
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+
+
+class Photographs:
+    """Views as they were photographed, in front of a mesh with markers."""
+
+    def __init__(
+        self,
+        files: Mapping[str, Path],
+        surface: Surface,
+        balls: Sequence[Ball],
+        posts: Sequence[Post] = (),
+        *,
+        personal: bool = True,
+        mark: str = "",
+    ) -> None:
+        """Take the files by the names of their views.
+
+        Args:
+            files: JPEG or PNG, by name of the view.
+            surface: the mesh in the world frame.
+            balls: spheres in the world frame.
+            posts: that carry them.
+            personal: False removes GPS, owner and serial numbers from the pictures.
+            mark: written into the pictures' description where it is not empty.
+        """
+        self._files, self._surface, self._balls, self._posts = files, surface, balls, posts
+        self._personal, self._mark = personal, mark
+
+    def picture(self, view: View) -> bytes:
+        """The file as the camera wrote it, but for what was asked to be removed or marked."""
+        try:
+            data = self._files[view.name].read_bytes()
+        except OSError as error:
+            raise DataError(
+                f"the photograph cannot be read: {error.strerror}", where=view.name, remedy="Verify the evidence"
+            ) from error
+        if not self._personal:
+            data = without_personal_data(data, view.name)
+        return described(data, self._mark, view.name) if self._mark else data
+
+    def colours(self, view: View) -> NDArray[np.uint8]:
+        """(H, W, 3) BGR."""
+        return read_image_of(self._files[view.name], view.camera)
+
+    def depth_m(self, view: View) -> NDArray[np.float32]:
+        """(H, W) z of the mesh."""
+        return depth_map(self._surface, view.camera, view.T_world_camera)
+
+    def normal(self, view: View) -> NDArray[np.float32]:
+        """(H, W, 3) normals of the mesh."""
+        return seen(self._surface, view.camera, view.T_world_camera).normal
+
+    def valid(self, view: View) -> NDArray[np.bool_]:
+        """All pixels."""
+        return np.ones((view.camera.height, view.camera.width), dtype=np.bool_)
+
+    def markers(self, view: View) -> NDArray[np.bool_]:
+        """Spheres and posts."""
+        return marker_mask(view.camera, view.T_world_camera, self._balls, self._posts)
+
+
+class Undistorted:
+    """The views of a data set as pinhole cameras: `undistorted_data_set` makes them."""
+
+    def __init__(self, distorted: DataSet, *, personal: bool) -> None:
+        """Take the distorted data set; its views have the same names."""
+        self._sources, self._inner = {view.name: view for view in distorted.views}, distorted.pixels
+        self._personal = personal
+
+    def picture(self, view: View) -> bytes:
+        """Resampled, with the photograph's metadata."""
+        return _encoded(view, self.colours(view), self._inner.picture(self._sources[view.name]), self._personal)
+
+    def colours(self, view: View) -> NDArray[np.uint8]:
+        """(H, W, 3) BGR; black where the photograph has no pixel."""
+        source = self._sources[view.name]
+        return undistorted(self._inner.colours(source), source.camera).image
+
+    def depth_m(self, view: View) -> NDArray[np.float32]:
+        """(H, W) z of the mesh for the pinhole."""
+        return self._inner.depth_m(view)
+
+    def normal(self, view: View) -> NDArray[np.float32]:
+        """(H, W, 3) normals for the pinhole."""
+        return self._inner.normal(view)
+
+    def valid(self, view: View) -> NDArray[np.bool_]:
+        """Pixels that the photograph has."""
+        return valid_pixels(self._sources[view.name].camera)
+
+    def markers(self, view: View) -> NDArray[np.bool_]:
+        """Spheres and posts for the pinhole."""
+        return self._inner.markers(view)
+
+
+class Cropped:
+    """Parts of the views of a data set: `cropped_data_set` makes them."""
+
+    def __init__(self, whole: DataSet, crops: Mapping[str, tuple[View, Crop]], *, personal: bool) -> None:
+        """Take the whole data set, and for each new view its source and its place there."""
+        self._inner, self._crops, self._personal = whole.pixels, crops, personal
+
+    def picture(self, view: View) -> bytes:
+        """Cut out and encoded anew, with the photograph's metadata."""
+        original = self._inner.picture(self._crops[view.name][0])
+        return _encoded(view, self.colours(view), original, self._personal)
+
+    def colours(self, view: View) -> NDArray[np.uint8]:
+        """(H, W, 3) BGR."""
+        source, crop = self._crops[view.name]
+        return np.ascontiguousarray(self._inner.colours(source)[crop.slices])
+
+    def depth_m(self, view: View) -> NDArray[np.float32]:
+        """(H, W) z of the mesh."""
+        return self._inner.depth_m(view)
+
+    def normal(self, view: View) -> NDArray[np.float32]:
+        """(H, W, 3) normals of the mesh."""
+        return self._inner.normal(view)
+
+    def valid(self, view: View) -> NDArray[np.bool_]:
+        """Pixels that the source has."""
+        source, crop = self._crops[view.name]
+        return self._inner.valid(source)[crop.slices]
+
+    def markers(self, view: View) -> NDArray[np.bool_]:
+        """None: crops are chosen so."""
+        return self._inner.markers(view)
+
+
+def undistorted_data_set(dataset: DataSet, *, personal: bool = True) -> DataSet:
+    """The same views with pinhole cameras (`pinhole_of`) and resampled pictures."""
+    views = tuple(dataclasses.replace(view, camera=pinhole_of(view.camera)) for view in dataset.views)
+    pixels = Undistorted(dataset, personal=personal)
+    return dataclasses.replace(dataset, identity=f"{dataset.identity} undistorted", views=views, pixels=pixels)
+
+
+def cropped_data_set(
+    dataset: DataSet,
+    wanted: Callable[[View], NDArray[np.bool_]],
+    size: tuple[int, int] = FULL_HD,
+    *,
+    most: int = 1,
+    personal: bool = True,
+) -> DataSet:
+    """Marker-free crops, named `VIEW_crop0`, `VIEW_crop1`, …, with the splits of their views.
+
+    Args:
+        dataset: whole images, distorted or not.
+        wanted: (H, W) pixels of a view that show the specimen.
+        size: width and height of a crop.
+        most: crops of each view at most; views without a place free of markers have none.
+        personal: False leaves GPS, owner and serial numbers out of the pictures.
+
+    Raises:
+        ConfigurationError: a crop is larger than an image.
+        DataError: no view has a crop.
+    """
+    crops: dict[str, tuple[View, Crop]] = {}
+    views: list[View] = []
+    children: dict[str, list[str]] = {}
+    for view in dataset.views:
+        forbidden = dataset.pixels.markers(view) | ~dataset.pixels.valid(view)
+        for k, crop in enumerate(marker_free_crops(wanted(view), forbidden, size, most)):
+            name = f"{view.name}_crop{k}"
+            crops[name] = (view, crop)
+            children.setdefault(view.name, []).append(name)
+            views.append(dataclasses.replace(view, name=name, camera=crop.camera(view.camera)))
+    if not views:
+        raise DataError(
+            f"no image has a part of {size[0]} × {size[1]} px without a sphere or post",
+            remedy="Choose a smaller crop",
+        )
+    of_crops = {
+        key: tuple(child for name in names for child in children.get(name, ()))
+        for key, names in dataset.splits.named().items()
+    }
+    return dataclasses.replace(
+        dataset,
+        identity=f"{dataset.identity} crops {size[0]}x{size[1]} {most}",
+        views=tuple(views),
+        pixels=Cropped(dataset, crops, personal=personal),
+        splits=Splits(**of_crops),
+    )
+
+
+def _encoded(view: View, colours: NDArray[np.uint8], original: bytes, personal: bool) -> bytes:
+    """As PNG, or as JPEG of quality 97 without subsampled colours, with the original's metadata."""
+    encoded, data = cv2.imencode(view.suffix, colours, _JPEG if view.suffix == ".jpg" else ())
+    if not encoded:
+        raise DataError("the picture cannot be encoded", where=view.name, remedy="Export originals instead")
+    return with_metadata_of(original, data.tobytes(), personal=personal, where=view.name)

@@ -1,0 +1,136 @@
+"""Records of a posed data set: one frame, metres, and pixel data that are read only when they are asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+from typing import Protocol as Interface
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.camera_model import CameraModel
+from service.compute.pixels.splits import Splits
+from service.core.errors import DataError
+from service.core.geometry import Array, Transform
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # T_camera_openglcamera: x right, y up, z backward
+HALF_PIXEL = 0.5  # in formats whose first pixel has its corner, not its centre, at 0
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One image.
+
+    Attributes:
+        name: without suffix; unique, of letters, digits, `_`, `-` and `.`.
+        suffix: of its picture file, `.jpg` or `.png`.
+        camera: at the size of the picture; pixel centres at integer coordinates.
+        T_world_camera: (4, 4) m; x right, y down, z forward.
+        covariance: (6, 6) of (d, w): exp([w]x) R, t + d in the axes of the world, m and rad.
+    """
+
+    name: str
+    suffix: str
+    camera: CameraModel
+    T_world_camera: Transform
+    covariance: Array
+
+    @property
+    def file(self) -> str:
+        """Name of the picture file."""
+        return self.name + self.suffix
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """The ground truth: vertices (V, 3) in the world frame, m, and faces (F, 3)."""
+
+    vertices_m: Array
+    faces: NDArray[np.int64]
+
+
+class Pixels(Interface):
+    """What belongs to the pixels of a view; read or computed at each call, at the size of `view.camera`."""
+
+    def picture(self, view: View) -> bytes:
+        """The JPEG or PNG file. Raises DataError if it cannot be read."""
+        ...
+
+    def colours(self, view: View) -> NDArray[np.uint8]:
+        """(H, W, 3) BGR of the picture. Raises DataError if it cannot be read."""
+        ...
+
+    def depth_m(self, view: View) -> NDArray[np.float32]:
+        """(H, W) z of the mesh in the camera frame, m; 0 where none is seen."""
+        ...
+
+    def normal(self, view: View) -> NDArray[np.float32]:
+        """(H, W, 3) unit normals of the mesh in the camera frame, towards the camera; 0 where none is seen."""
+        ...
+
+    def valid(self, view: View) -> NDArray[np.bool_]:
+        """(H, W) pixels that the picture has; others are outside the photograph that was resampled."""
+        ...
+
+    def markers(self, view: View) -> NDArray[np.bool_]:
+        """(H, W) pixels that a sphere or post covers."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class DataSet:
+    """Posed images with a mesh in one frame.
+
+    Attributes:
+        identity: differs where anything exported differs; an interrupted export goes on only with the same.
+        simulated: nothing of it was measured.
+        statement: JSON data on origin, devices, gates and deviations, for `dataset.json`.
+        views: in order of their names.
+        pixels: of the views.
+        mesh: ground truth in the world frame.
+        splits: of the names of the views.
+    """
+
+    identity: str
+    simulated: bool
+    statement: Mapping[str, Any]
+    views: tuple[View, ...]
+    pixels: Pixels
+    mesh: Mesh
+    splits: Splits
+
+    @property
+    def mark(self) -> str:
+        """A sentence for every file that can say it; "" for a real capture."""
+        return "SIMULATED: made by a simulated rig, not by a camera in front of a specimen" if self.simulated else ""
+
+    def keeping(self, names: tuple[str, ...]) -> DataSet:
+        """The same data set with these views only; the splits are cut to them."""
+        chosen = set(names)
+        cut = {key: tuple(n for n in split if n in chosen) for key, split in self.splits.named().items()}
+        views = tuple(view for view in self.views if view.name in chosen)
+        return dataclasses.replace(self, views=views, splits=Splits(**cut))
+
+
+def only_camera(dataset: DataSet, of: str) -> CameraModel:
+    """The camera of all views, for a format that has one.
+
+    Raises:
+        DataError: there is no view, or the views have several cameras.
+    """
+    cameras = {view.camera for view in dataset.views}
+    if len(cameras) != 1:
+        raise DataError(
+            f"the data set has {len(cameras)} cameras, {of} has one",
+            remedy="Choose COLMAP or nerfstudio, which have a camera for each image",
+        )
+    return cameras.pop()
+
+
+def require_pinholes(dataset: DataSet, of: str) -> None:
+    """Raise DataError if a camera has distortion, which a format cannot say."""
+    if any(view.camera.distortion.any() for view in dataset.views):
+        raise DataError(f"{of} has no distortion", remedy="Export undistorted images")

@@ -1,0 +1,87 @@
+"""A small posed data set with exact geometry: photographs that are painted from the rays of a known scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from service.compute.camera_model import CameraModel
+from service.compute.pixels.masks import Ball, posts_below
+from service.compute.pixels.rays import pixel_rays
+from service.compute.pixels.splits import splits
+from service.compute.pixels.surface import Surface
+from service.core.geometry import Array, Transform, apply, inverse, look_at
+from service.dataset.posed.pixels import Photographs
+from service.dataset.posed.records import DataSet, Mesh, View
+
+CAMERA = CameraModel(160, 120, 190.0, 191.0, 78.0, 61.5, -0.12, 0.04, 8e-4, -5e-4)
+BOXES_M = np.array([[[-0.08, -0.03, 0.0], [0.08, 0.03, 0.03]], [[0.04, 0.03, 0.0], [0.08, 0.09, 0.05]]])
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """An L-shaped solid, so that no turn and no mirror maps it to itself, among four spheres."""
+
+    mesh: trimesh.Trimesh
+    balls: tuple[Ball, ...]
+
+    def tone(self, world: Array) -> Array:
+        """Brightness of surface points (..., 3): it names the place."""
+        return 128 + 60 * np.sin(40 * world[..., 0]) + 55 * np.cos(37 * world[..., 1] + 30 * world[..., 2])
+
+    def distance_m(self, points: Array) -> Array:
+        """Distances (N,) of points (N, 3) from the surface of the nearer box."""
+        found: list[Array] = []
+        for low, high in BOXES_M:
+            out = np.abs(points - (low + high) / 2) - (high - low) / 2
+            outside = np.linalg.norm(np.maximum(out, 0.0), axis=1)
+            found.append(np.abs(outside + np.minimum(out.max(axis=1), 0.0)))
+        return np.min(found, axis=0)
+
+
+def scene() -> Scene:
+    """The scene, in metres."""
+    first, second = (trimesh.creation.box(bounds=box) for box in BOXES_M)
+    vertices = np.concatenate([first.vertices, second.vertices])
+    faces = np.concatenate([first.faces, second.faces + len(first.vertices)])
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    at = [(-0.15, -0.1, 0.03), (0.15, -0.11, 0.04), (0.14, 0.15, 0.03), (-0.13, 0.12, 0.05)]
+    return Scene(mesh, tuple(Ball(np.array(centre), 0.012) for centre in at))
+
+
+def poses(count: int) -> dict[str, Transform]:
+    """T_world_camera by name, around the scene."""
+    angles = np.linspace(0.2, 2 * np.pi, count, endpoint=False)
+    eyes = [np.array([0.25 * np.cos(a), 0.25 * np.sin(a), 0.4 + 0.02 * k]) for k, a in enumerate(angles)]
+    return {f"v1_{k:03d}": look_at(eye, np.array([0.01, 0.02, 0.02]), UP) for k, eye in enumerate(eyes)}
+
+
+def posed_data_set(folder: Path, count: int = 4, *, camera: CameraModel = CAMERA, simulated: bool = True) -> DataSet:
+    """Paint the photographs into a folder, and give the data set of them."""
+    shown = scene()
+    vertices, faces = np.asarray(shown.mesh.vertices), np.asarray(shown.mesh.faces, dtype=np.int64)
+    surface = Surface(vertices, faces)
+    covariance = np.diag([1e-10, 1e-10, 2e-10, 1e-9, 1e-9, 3e-9])
+    views = tuple(View(name, ".png", camera, T, covariance) for name, T in poses(count).items())
+    files = {view.name: folder / view.file for view in views}
+    blank = Photographs(files, surface, shown.balls)
+    for view in views:
+        depth = blank.depth_m(view).astype(np.float64)[..., None]
+        xy = pixel_rays(camera).xy(0, camera.height)
+        world = apply(view.T_world_camera, np.concatenate([xy * depth, depth], axis=2))
+        tone = np.where(depth[..., 0] > 0, shown.tone(world), 20.0).astype(np.uint8)
+        cv2.imwrite(str(files[view.name]), np.dstack([tone, tone // 2, tone // 3]))
+    points = trimesh.sample.sample_surface(shown.mesh, 300, seed=1)[0]
+    sees: dict[str, NDArray[np.bool_]] = {}
+    for view in views:
+        pixels_px = camera.project(apply(inverse(view.T_world_camera), points))
+        sees[view.name] = np.asarray((pixels_px > 0).all(axis=1), dtype=np.bool_)
+    mark = "simulated" if simulated else ""
+    pixels = Photographs(files, surface, shown.balls, posts_below(shown.balls, UP, 0.05, 0.004), mark=mark)
+    return DataSet(f"run-1 {count}", simulated, {"run": "run-1"}, views, pixels, Mesh(vertices, faces), splits(sees))
