@@ -49,6 +49,7 @@ bench: $(TOOLS)
 	$(BIN)/python -m bench.registration.accuracy
 	$(BIN)/python -m bench.markers.marker_speed
 	$(BIN)/python -m bench.registration.register_scale
+	$(BIN)/python -m bench.pixels.pixel_depth
 
 # Bad input for every parser: so many seconds for each (an hour: make torture-fuzz FUZZ_S=3600). What is found is kept in
 # build/fuzz. With `$(BIN)/python -m pip install ".[fuzz]"` a second engine follows the lines that an input reaches.

@@ -27,7 +27,7 @@ from service.compute.pixels.render import seen, seen_rows
 from service.compute.pixels.surface import Surface
 from service.core.geometry import Array, Transform, look_at
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parents[1] / "results"
 SIZE = (9504, 6336)
 LEAST_SHARE, MOST_GIB = 0.80, 2.0
 PINHOLE = CameraModel(*SIZE, 13000.0, 13000.0, 4751.5, 3167.5)

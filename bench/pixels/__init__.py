@@ -1,0 +1,1 @@
+"""Measurements of what belongs to the pixels of an image."""
