@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import Protocol, cast
 
 from simulators.faults import FaultPlan
-from simulators.serve import SimulatorError
+from simulators.serve import SimulatorError, end_with
 
 
 class SimulatorModule(Protocol):
@@ -86,7 +86,9 @@ def _described(name: str) -> dict[str, object]:
 
 def _common(command: argparse.ArgumentParser) -> None:
     command.add_argument("--faults", metavar="FILE|JSON", default="[]", help="fault plan: a JSON list or a file")
-    command.add_argument("--with-parent", action="store_true", help="end when the parent process ends")
+    command.add_argument(
+        "--parent", type=int, default=0, metavar="PID", help="end when this process is no longer the parent"
+    )
     command.add_argument("--log-level", default="WARNING", help="level of the log on stderr")
 
 
@@ -111,6 +113,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if isinstance(args.faults, str):
             args.faults = FaultPlan.parse(args.faults)
+        if args.parent:
+            end_with(args.parent)
         _load(args.simulator).serve(args)
     except SimulatorError as error:
         sys.stderr.write(f"simulators {args.simulator}: {error}\n")

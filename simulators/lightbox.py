@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def serve(args: argparse.Namespace) -> None:
     """Serve until SIGTERM; each SIGUSR1 is one press of the pedal."""
-    termination = Termination(with_parent=args.with_parent)
+    termination = Termination()
     box = Lightbox(args.faults, World(args.world) if args.world else None, args.link, tower=not args.without_tower)
 
     def press(number: int, frame: FrameType | None) -> None:

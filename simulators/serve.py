@@ -7,7 +7,10 @@ import os
 import signal
 import sys
 import threading
+import time
 from types import FrameType
+
+_PARENT_POLL_S = _SLICE_S = 0.5
 
 Json = None | bool | int | float | str | list["Json"] | dict[str, "Json"]
 
@@ -23,11 +26,10 @@ def announce(**fields: object) -> None:
 
 
 class Termination:
-    """Set by SIGTERM or SIGINT and, on request, by the death of the parent process. Create it in the main thread."""
+    """Set by SIGTERM or SIGINT. Create it in the main thread."""
 
-    def __init__(self, *, with_parent: bool = False) -> None:
+    def __init__(self) -> None:
         self._event = threading.Event()
-        self._parent = os.getppid() if with_parent else None
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._handle)
 
@@ -41,17 +43,30 @@ class Termination:
 
     def is_set(self) -> bool:
         """Whether the process should end."""
-        if self._parent is not None and os.getppid() != self._parent:
-            self._event.set()
         return self._event.is_set()
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Block until the process should end (returns True) or the timeout expires (returns False)."""
+        # In slices: a signal that another thread received runs its handler only when the main thread wakes up.
         remaining_s = float("inf") if timeout_s is None else timeout_s
         while not self.is_set():
             if remaining_s <= 0:
                 return False
-            slice_s = min(0.5, remaining_s)
+            slice_s = min(_SLICE_S, remaining_s)
             self._event.wait(slice_s)
             remaining_s -= slice_s
         return True
+
+
+def end_with(parent: int) -> None:
+    """Send this process SIGTERM as soon as `parent` (a process id) is no longer its parent.
+
+    The parent states its own id: a process that asks for it may ask after the parent has died.
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_PARENT_POLL_S)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()

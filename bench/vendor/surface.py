@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
 import queue
 import subprocess
 import sys
@@ -43,7 +44,7 @@ class Row:
 @contextlib.contextmanager
 def simulator(*words: str) -> Generator[dict[str, Any]]:
     """Run a simulator as a process; yields its ready line."""
-    command = [sys.executable, "-m", "simulators", *words, "--with-parent"]
+    command = [sys.executable, "-m", "simulators", *words, "--parent", str(os.getpid())]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
         assert process.stdout is not None
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -73,7 +74,8 @@ def run_by_hand(seed: int, image_width: int, hand: str) -> dict[str, Any]:
         with (folder / "rig.log").open("w") as log:
             rig = subprocess.Popen(
                 [sys.executable, "-m", "simulators", "rig", "--scene", str(seed), "--dir", str(folder / "rig"),
-                 "--image-width", str(image_width), "--ct-voxel-mm", "1.0", "--hand", hand, "--with-parent"],
+                 "--image-width", str(image_width), "--ct-voxel-mm", "1.0", "--hand", hand,
+                 "--parent", str(os.getpid())],
                 cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
             )  # fmt: skip
         try:

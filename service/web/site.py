@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
 from typing import Annotated, cast
+from weakref import WeakValueDictionary
 
 from fastapi import Depends, Request
 
@@ -16,6 +18,31 @@ from service.run_start import recorded_run
 from service.store.store import Store
 from service.web.launch import Launcher
 from service.web.server.open_streams import OpenStreams
+
+
+@dataclass
+class FollowedRuns:
+    """The runs whose pages were asked for. The first read of a run takes long; only its own pages wait for it.
+
+    `first_read` reads a run from its beginning; its errors go to whoever asked, and the next one tries again.
+    """
+
+    first_read: Callable[[str], RunFollower]
+    _runs: dict[str, RunFollower] = field(init=False, default_factory=dict[str, RunFollower])
+    # A lock exists only while somebody uses it, so that invented names of runs leave nothing behind.
+    _locks: WeakValueDictionary[str, Lock] = field(init=False, default_factory=WeakValueDictionary[str, Lock])
+    _lock: Lock = field(init=False, default_factory=Lock)  # of the two above; held for moments
+
+    def now(self, run_id: str) -> RunRecord:
+        """A run's record as of now. Raises what `first_read` raises, and IntegrityError."""
+        with self._lock:
+            run = self._runs.get(run_id)
+            lock = self._locks.setdefault(run_id, Lock())
+        if run is None:
+            with lock:
+                run = self._runs.get(run_id) or self.first_read(run_id)
+                self._runs[run_id] = run
+        return run.now()
 
 
 @dataclass
@@ -33,21 +60,22 @@ class Site:
     hosts: tuple[str, ...] = ("127.0.0.1", "localhost")  # names by which browsers may ask
     sealed_seq: int = 0  # last event of the site's chain that is known to be signed
     streams: OpenStreams = field(default_factory=OpenStreams)
-    _runs: dict[str, RunFollower] = field(default_factory=dict[str, RunFollower])
-    _lock: Lock = field(default_factory=Lock)
+    runs: FollowedRuns = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.runs = FollowedRuns(self._first_read)
 
     def run(self, run_id: str) -> RunRecord:
         """A run's record as of now. Raises UnknownRunError, IntegrityError."""
-        with self._lock:
-            if run_id not in self._runs:
-                protocol, _ = recorded_run(self.store, run_id)
-                self._runs[run_id] = RunFollower(self.store, run_id, protocol)
-            run = self._runs[run_id]
-        return run.now()
+        return self.runs.now(run_id)
 
     def protocol_files(self) -> list[Path]:
         """Protocols that can be started."""
         return sorted(self.protocols.glob("*.yaml"))
+
+    def _first_read(self, run_id: str) -> RunFollower:
+        protocol, _ = recorded_run(self.store, run_id)
+        return RunFollower(self.store, run_id, protocol)
 
 
 def _site(request: Request) -> Site:

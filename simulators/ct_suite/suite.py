@@ -46,9 +46,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def serve(args: argparse.Namespace) -> None:
     """Write a series and print the ready line.
 
-    Without --once serve until SIGTERM, with another series at each SIGUSR1.
+    Without --once serve until SIGTERM, with another series at each SIGUSR1. With --once SIGTERM ends it at once.
     """
-    termination = Termination(with_parent=args.with_parent)
+    if args.voxel_mm <= 0:
+        raise SimulatorError("--voxel-mm must be positive")
+    args.folder.mkdir(parents=True, exist_ok=True)
+    scene = Scene.generate(args.scene, args.moved)
+    if args.once:
+        announce(**_scan(scene, args))
+        return
+    termination = Termination()
     asked = False
 
     def ask(number: int, frame: FrameType | None) -> None:
@@ -57,12 +64,8 @@ def serve(args: argparse.Namespace) -> None:
         asked = True
 
     signal.signal(signal.SIGUSR1, ask)
-    if args.voxel_mm <= 0:
-        raise SimulatorError("--voxel-mm must be positive")
-    args.folder.mkdir(parents=True, exist_ok=True)
-    scene = Scene.generate(args.scene, args.moved)
     announce(**_scan(scene, args))
-    while not args.once and not termination.wait(0.2):
+    while not termination.wait(0.2):
         if asked:
             asked = False
             _scan(scene, args)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -60,7 +61,7 @@ def serve(args: argparse.Namespace) -> None:
     """Start everything, print the ready line and serve until SIGTERM."""
     if args.without_cable and not args.hand:
         raise SimulatorError("--without-cable is for a camera that a person holds: add --hand")
-    termination = Termination(with_parent=args.with_parent)
+    termination = Termination()
     rig = _Rig(args, termination)
     try:
         rig.start()
@@ -86,6 +87,7 @@ class _Rig:
         )
         self.server = WorldServer(self.world, self._act)
         self._deliveries = threading.Lock()
+        self._delivery: subprocess.Popen[str] | None = None  # the newest; it may have ended
         self._truth: dict[str, Any] = {}
 
     @property
@@ -130,14 +132,16 @@ class _Rig:
         threading.Thread(target=self._watch, daemon=True).start()
 
     def stop(self) -> None:
-        for process in self.children.values():
+        processes = [*self.children.values(), *([self._delivery] if self._delivery is not None else [])]
+        for process in processes:
             process.terminate()
-        for process in self.children.values():
+        for process in processes:
             try:
                 process.wait(timeout=10)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+        for process in self.children.values():
             if process.stdout is not None:
                 process.stdout.close()
         self.server.shutdown()
@@ -171,7 +175,10 @@ class _Rig:
 
     def _child(self, name: str, *words: str) -> dict[str, Any]:
         """Start a simulator and wait for its ready line."""
-        command = [sys.executable, "-m", "simulators", *words, "--with-parent", "--faults", self.faults.to_json()]
+        command = [
+            sys.executable, "-m", "simulators", *words, "--parent", str(os.getpid()),
+            "--faults", self.faults.to_json(),
+        ]  # fmt: skip
         with (self.folder / "logs" / f"{name}.log").open("w") as log:
             process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True
@@ -280,19 +287,20 @@ class _Rig:
         """Let the scanner or the CT deliver one export of the scene in its current state."""
         spheres = "--control-spheres" if self.world.control_spheres else "--no-control-spheres"
         command = [
-            sys.executable, "-m", "simulators", simulator, "--scene", str(self.scene.seed), "--once", "--with-parent",
-            "--folder", str(self.folder / folder), spheres, "--moved", json.dumps(self.scene.moved), *options,
+            sys.executable, "-m", "simulators", simulator, "--scene", str(self.scene.seed), "--once",
+            "--parent", str(os.getpid()), "--folder", str(self.folder / folder), spheres,
+            "--moved", json.dumps(self.scene.moved), *options,
             "--faults", self.faults.to_json(),
         ]  # fmt: skip
         with self._deliveries:
-            answer = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
-            (self.folder / "logs" / f"{simulator}.log").write_text(answer.stderr)
-            if answer.returncode != 0:
-                return {
-                    "ok": False,
-                    "error": answer.stderr.strip().splitlines()[-1] if answer.stderr else "it failed",
-                }
-            report = json.loads(answer.stdout.splitlines()[0])
+            self._delivery = process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            )
+            printed, errors = process.communicate()
+            (self.folder / "logs" / f"{simulator}.log").write_text(errors)
+            if process.returncode != 0:
+                return {"ok": False, "error": errors.strip().splitlines()[-1] if errors else "it failed"}
+            report = json.loads(printed.splitlines()[0])
             self._truth["scans" if simulator == "scanner" else "ct"].append(report.pop("truth"))
             self._write_truth()
         return {"ok": True, **report}

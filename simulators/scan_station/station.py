@@ -68,9 +68,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def serve(args: argparse.Namespace) -> None:
     """Export once and print the ready line.
 
-    Without --once serve until SIGTERM, with another export at each SIGUSR1.
+    Without --once serve until SIGTERM, with another export at each SIGUSR1. With --once SIGTERM ends it at once.
     """
-    termination = Termination(with_parent=args.with_parent)
+    folder: Path = args.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    scene = Scene.generate(args.scene, args.moved)
+    if args.once:
+        _export(scene, args, announce_it=True)
+        return
+    termination = Termination()
     asked = False
 
     def ask(number: int, frame: FrameType | None) -> None:
@@ -79,11 +85,8 @@ def serve(args: argparse.Namespace) -> None:
         asked = True
 
     signal.signal(signal.SIGUSR1, ask)
-    folder: Path = args.folder
-    folder.mkdir(parents=True, exist_ok=True)
-    scene = Scene.generate(args.scene, args.moved)
     _export(scene, args, announce_it=True)
-    while not args.once and not termination.wait(0.2):
+    while not termination.wait(0.2):
         if asked:
             asked = False
             _export(scene, args, announce_it=False)

@@ -61,7 +61,7 @@ def _attend_button(source: WorldSource, body: CameraBody, stop: threading.Event)
 
 def serve(args: argparse.Namespace) -> None:
     """Print the ready line and serve until SIGTERM."""
-    termination = Termination(with_parent=args.with_parent)
+    termination = Termination()
     options = BodyOptions(args.fast, args.first_counter, args.exposures_log, args.announce, args.send_to)
     source, stop = _source(args), threading.Event()
     body = CameraBody(source, args.faults, options)

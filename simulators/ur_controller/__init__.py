@@ -37,7 +37,7 @@ def serve(args: argparse.Namespace) -> None:
 
     Raises SimulatorError.
     """
-    termination = Termination(with_parent=args.with_parent)
+    termination = Termination()
     model = MODELS[args.model]
     controller = Controller(
         model,

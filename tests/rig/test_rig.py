@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -190,6 +191,33 @@ def test_a_killed_rig_takes_its_devices_with_it(tmp_path: Path) -> None:
         process.kill()
         process.wait(timeout=10)
         until(lambda: not any(p.is_running() for p in processes[1:]), "its devices have ended", 20)
+
+
+def test_sigterm_also_ends_a_ct_scan_that_is_under_way(tmp_path: Path) -> None:
+    with rig_process(tmp_path) as (process, ready, _), ThreadPoolExecutor(1) as pool, Hands(ready["world"]) as hands:
+        pool.submit(hands.act, "ct_scan")
+        root = psutil.Process(process.pid)
+
+        def scans() -> list[psutil.Process]:
+            return [child for child in root.children() if child.cmdline()[2:4] == ["simulators", "ct"]]
+
+        until(lambda: len(scans()) == 1, "the CT does not scan")
+        (scan,) = scans()
+        scan.suspend()  # a scan that takes for ever
+        process.terminate()
+        assert process.wait(timeout=30) == 0
+        assert not scan.is_running()
+
+
+def test_a_ct_scan_ends_with_a_rig_that_was_killed(tmp_path: Path) -> None:
+    with rig_process(tmp_path) as (process, ready, _), ThreadPoolExecutor(1) as pool, Hands(ready["world"]) as hands:
+        pool.submit(hands.send, '{"op": "act", "action": "ct_scan"}')
+        root = psutil.Process(process.pid)
+        until(lambda: any("ct" in child.cmdline() for child in root.children()), "the CT does not scan")
+        children = root.children()
+        process.kill()  # before the scan's own process has begun to look whose child it is
+        process.wait(timeout=10)
+        until(lambda: not any(child.is_running() for child in children), "its processes have not ended")
 
 
 # --- two controllers --------------------------------------------------------------------------------------

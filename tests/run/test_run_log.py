@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -85,3 +86,33 @@ def test_an_impossible_event_is_shown_by_every_page_that_is_asked(web: WebSite) 
         page = browser.get(f"/runs/{run_id}")
         assert page.status_code == 409
         assert "cannot have happened here" in page.text
+
+
+def test_the_slow_first_read_of_a_run_holds_up_no_page_of_another(web: WebSite) -> None:
+    slow, quick = (web.begin_run().run_id for _ in range(2))
+    began, go_on = threading.Event(), threading.Event()
+    read = web.site.runs.first_read
+
+    def first_read(run_id: str) -> RunFollower:
+        if run_id == slow:
+            began.set()
+            assert go_on.wait(60)
+        return read(run_id)
+
+    web.site.runs.first_read = first_read
+    browsers = [web.browser("technician") for _ in range(3)]
+    with ThreadPoolExecutor(3) as people:
+        try:
+            waiting = [people.submit(browser.get, f"/runs/{slow}") for browser in browsers[:2]]
+            assert began.wait(60)
+            assert people.submit(browsers[2].get, f"/runs/{quick}").result(60).status_code == 200
+            assert not any(page.done() for page in waiting)
+        finally:
+            go_on.set()
+        assert [page.result(60).status_code for page in waiting] == [200, 200]
+
+
+def test_a_run_whose_first_read_failed_is_read_again(web: WebSite) -> None:
+    assert web.browser("auditor").get("/runs/20260101-000000-000000").status_code == 404
+    run_id = web.begin_run().run_id
+    assert web.browser("auditor").get(f"/runs/{run_id}").status_code == 200

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import socket
 import subprocess
 import time
@@ -11,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import trimesh
 import yaml
 
 from service.cli.run.demo import free_address
 from tests.support.processes.package import installed_package
+from tests.support.processes.waiting import until
 from tests.support.rig.rig import RIG_LOCK, command, orthocapture
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -119,6 +122,35 @@ def test_truth_never_enters_the_run(demo: dict[str, Any]) -> None:
     assert b"truth" not in database
 
 
+def test_sigterm_during_the_start_of_the_rig_leaves_nothing_behind(tmp_path: Path) -> None:
+    mark = f"of {tmp_path}"
+    environment = {**os.environ, "ORTHOCAPTURE_TEST": mark}
+
+    def started() -> list[psutil.Process]:
+        return [
+            process for process in psutil.process_iter() if _environment(process).get("ORTHOCAPTURE_TEST") == mark
+        ]
+
+    with (
+        RIG_LOCK,
+        (tmp_path / "words").open("w") as words,
+        subprocess.Popen(
+            command("demo", "--out", str(tmp_path / "demo")), stdout=words, stderr=words, env=environment
+        ) as demo,
+    ):
+        until(lambda: len(started()) > 1 or demo.poll() is not None, "the demo starts no rig", 300)
+        demo.terminate()
+    assert demo.returncode != 0
+    until(lambda: not started(), "the demo left processes behind")
+
+
+def _environment(process: psutil.Process) -> dict[str, str]:
+    try:
+        return process.environ()
+    except psutil.Error:  # it has ended, or belongs to somebody else
+        return {}
+
+
 def test_a_taken_port_moves_the_demo_to_another_address(tmp_path: Path) -> None:
     with RIG_LOCK, socket.socket() as taken:
         taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -137,7 +169,10 @@ def test_a_taken_port_moves_the_demo_to_another_address(tmp_path: Path) -> None:
                     time.sleep(0.2)
                 devices = yaml.safe_load(found[0].read_text())["devices"].values()
             finally:
+                processes = psutil.Process(demo.pid).children(recursive=True)
                 demo.terminate()
+        assert processes
+        until(lambda: not any(process.is_running() for process in processes), "the demo left processes behind")
     (host,) = (device["host"] for device in devices if device["driver"] == "ur")
     assert host != first
     assert host.startswith("127.0.0.")

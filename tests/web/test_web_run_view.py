@@ -131,9 +131,9 @@ def test_every_course_of_a_run_can_be_shown(
         view = view_of(log, driven=driven, show=show)
         assert view.shown.id == (show if show in DEMO.step_ids else log.state.current)
         if view.mode in ("ask", "sign", "paused", "died"):
-            assert view.main is not None  # there is always a way on
+            assert view.question.main is not None  # there is always a way on
         if log.state.terminal:
-            assert (view.mode, view.main, view.options) == ("ended", None, ())
+            assert (view.mode, view.question.main, view.question.options) == ("ended", None, ())
     snapshot = Snapshot.model_validate({"doing": doing, "robot": robot, "messages": (Message(at_utc="", text="x"),)})
     run_view(log, snapshot, replace(ME, in_control=control), driven=driven, show=show)
     assert robot_banner(log.state, snapshot, driven=driven).title
@@ -155,9 +155,9 @@ def test_every_prefix_of_a_whole_run_can_be_shown() -> None:
 
 def test_a_step_that_moves_the_robot_is_held_and_says_what_will_happen() -> None:
     view = view_of(advance_to(PAPER, "viewpoint_capture_1"))
-    assert view.main is not None
-    assert view.main.hold
-    assert view.main.text == "Confirm: the robot takes 54 images at station 1"
+    assert view.question.main is not None
+    assert view.question.main.hold
+    assert view.question.main.text == "Confirm: the robot takes 54 images at station 1"
     assert view.progress.total == 108
     layout = view_of(advance_to(PAPER, "layout_check")).main
     assert layout is not None
@@ -206,7 +206,7 @@ def test_paused_is_shown_only_once_the_robot_stands_still() -> None:
 def test_a_dead_runner_offers_to_go_on() -> None:
     log = advance_to(DEMO, "ct_hand_over_out")
     view = view_of(log, Snapshot(), driven=False)
-    assert (view.mode, view.main and view.main.verb, view.main and view.main.hold) == ("died", "go-on", False)
+    assert (view.mode, view.question.main and view.question.main.verb, view.question.main and view.question.main.hold) == ("died", "go-on", False)
     moving = view_of(advance_to(DEMO, "viewpoint_capture_1"), Snapshot(), driven=False).main
     assert moving is not None
     assert not moving.hold
@@ -219,9 +219,9 @@ def test_after_a_restart_the_robot_waits_for_a_confirmation_that_is_held() -> No
         go(log, "on")
     log.append(SessionStarted(resumed=True, software={}, host="h", pid=1))
     view = view_of(log)
-    assert (view.mode, view.asked_anew) == ("ask", True)
-    assert view.main is not None
-    assert (view.main.verb, view.main.hold) == ("confirm", True)
+    assert (view.mode, view.question.asked_anew) == ("ask", True)
+    assert view.question.main is not None
+    assert (view.question.main.verb, view.question.main.hold) == ("confirm", True)
 
 
 def test_the_time_left_is_measured_and_never_across_a_restart() -> None:
@@ -240,14 +240,14 @@ def test_irreversible_steps_warn_and_bind_the_figures_that_release_them() -> Non
     view = view_of(advance_to(DEMO, "spraying"))
     assert view.mode == "sign"
     assert "never" in view.shown.warning
-    assert view.signature is not None
-    assert {title for title, _ in view.signature.figures} >= {"Viewpoint capture at station 1"}
-    assert len(view.signature.sha256) == 64
+    assert view.question.signature is not None
+    assert {title for title, _ in view.question.signature.figures} >= {"Viewpoint capture at station 1"}
+    assert len(view.question.signature.sha256) == 64
 
 
 def test_a_redo_says_what_it_resets() -> None:
     view = view_of(advance_to(DEMO, "station_change"))
-    redo = next(r for r in view.redos if r.step == "viewpoint_capture_1")
+    redo = next(r for r in view.question.redos if r.step == "viewpoint_capture_1")
     assert redo.resets == ("Control capture at station 1",)
     assert redo.images == 4
 

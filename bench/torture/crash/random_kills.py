@@ -245,7 +245,7 @@ def _is(what: str, process: psutil.Process, rig: str) -> bool:
     words = " ".join(process.cmdline())
     simulators = {"simulated robot": " ur ", "simulated camera": " camera ", "simulated light box": " lightbox "}
     if what in simulators:
-        return "-m simulators" in words and simulators[what] in words and "--with-parent" in words
+        return "-m simulators" in words and simulators[what] in words and "--parent" in words
     if what.startswith("driver of"):
         return "-m drivers.host" in words and what == _driver(process)
     match what:

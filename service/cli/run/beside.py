@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-import psutil
+from service.cli.run.ending import end_with_children
 
 _GRACE_S = 10.0
 _POLL_S = 0.5
@@ -57,14 +57,8 @@ class _Beside:
                 self._tell(f"no worker could be started: {error.strerror}")
 
     def end(self) -> None:
-        """End the worker and all its child processes."""
-        self._process.terminate()
-        try:
-            self._process.wait(timeout=_GRACE_S)
-        except subprocess.TimeoutExpired:  # in the middle of a long job, which the next worker begins again
-            for child in (*psutil.Process(self._process.pid).children(recursive=True), self._process):
-                child.kill()
-            self._process.wait()
+        """End the worker and all its child processes. The next worker begins a job that was killed again."""
+        end_with_children(self._process, _GRACE_S)
 
     def _start(self) -> subprocess.Popen[bytes]:
         # In its own session, so that Ctrl-C reaches only the runner, which ends its worker in an orderly way.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import getpass
-import signal
 import sys
 from contextlib import nullcontext
 from dataclasses import asdict
@@ -28,6 +27,7 @@ from service.cli.common import (
 )
 from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption
 from service.cli.run.beside import worker_beside
+from service.cli.run.ending import sigterm_like_ctrl_c
 from service.cli.run.hands import SimulatedHands
 from service.cli.run.import_operator import ImportOperator
 from service.cli.run.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
@@ -268,29 +268,24 @@ def drive(
         people = People(store)
         who = who or who_acts(people, root.operator, partial(typed_password, root.operator, from_stdin=False))
         operator = TerminalOperator(who.name, protocol, display, hands, preview=preview, people=people, who=who)
-    # SIGTERM ends the runner like Ctrl-C: the arm stops, and devices and lease are released.
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        beside = worker_beside(data, error_console.print) if worker else nullcontext()
-        with file_log(data, "runner", run=run_id), beside:
-            authority, copy = time_stamp_authority(rig), signature_copy(rig)
-            reporter.begin()
-            try:
-                state = Runner(store, run_id, protocol, station, operator, authority, copy).run()
-                reporter.outcome = f"it is {state.status}: {state.stop_reason}".removesuffix(": ")
-            finally:
-                reporter.end()
-                display.clear()
-                operator.close()
-                station.close()
-            if worker and state.status == "completed":
-                wait_for_results(store, run_id, protocol, display)
-                stamp_end(store, run_id, authority)
-                keep_elsewhere(data, copy, error_console.print)
-                state = fold(protocol, store.events(run_id))
-            return state
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    beside = worker_beside(data, error_console.print) if worker else nullcontext()
+    with sigterm_like_ctrl_c(), file_log(data, "runner", run=run_id), beside:
+        authority, copy = time_stamp_authority(rig), signature_copy(rig)
+        reporter.begin()
+        try:
+            state = Runner(store, run_id, protocol, station, operator, authority, copy).run()
+            reporter.outcome = f"it is {state.status}: {state.stop_reason}".removesuffix(": ")
+        finally:
+            reporter.end()
+            display.clear()
+            operator.close()
+            station.close()
+        if worker and state.status == "completed":
+            wait_for_results(store, run_id, protocol, display)
+            stamp_end(store, run_id, authority)
+            keep_elsewhere(data, copy, error_console.print)
+            state = fold(protocol, store.events(run_id))
+        return state
 
 
 def open_devices(station: Station) -> OpenDevices:

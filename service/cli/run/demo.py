@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
+import os
 import selectors
 import socket
 import subprocess
@@ -32,6 +33,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.run.commands import drive
+from service.cli.run.ending import end_with_children, sigterm_like_ctrl_c
 from service.cli.shipped_protocols import shipped_protocols
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.errors import ConfigurationError, OrthocaptureError
@@ -64,7 +66,7 @@ def demo_command(
 ) -> None:
     """Run the demonstration protocol on a simulated rig and show the results. Takes a few minutes."""
     started_s = time.monotonic()
-    with reporting_errors(json):
+    with reporting_errors(json), sigterm_like_ctrl_c():
         folder = out.resolve() / time.strftime("%Y%m%d-%H%M%S")
         with _simulated_rig(folder / "rig", scene, image_width, host or free_address()) as ready:
             rig = load_rig(Path(ready["rig"]))
@@ -161,8 +163,8 @@ def _simulated_rig(folder: Path, scene: int, image_width: int, host: str) -> Gen
     folder.mkdir(parents=True)
     command = [
         sys.executable, "-m", "simulators", "rig", "--scene", str(scene), "--dir", str(folder),
-        "--image-width", str(image_width), "--speed-up", "10", "--ct-voxel-mm", "1.0", "--with-parent",
-        "--host", host,
+        "--image-width", str(image_width), "--speed-up", "10", "--ct-voxel-mm", "1.0", "--host", host,
+        "--parent", str(os.getpid()),
     ]  # fmt: skip
     log = folder / "rig.log"
     with log.open("w") as errors:
@@ -172,8 +174,7 @@ def _simulated_rig(folder: Path, scene: int, image_width: int, host: str) -> Gen
     try:
         yield _ready(process, log, timeout_s=120)
     finally:
-        process.terminate()
-        process.wait(timeout=30)
+        end_with_children(process, grace_s=30.0)
         if process.stdout is not None:
             process.stdout.close()
 

@@ -1,10 +1,10 @@
-"""What people do to a run: start, tick, confirm, sign, redo, skip, pause, resume, abort; and who has control."""
+"""What people do to a run: start, tick, confirm, sign, redo, skip, pause, resume, abort."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
-from fastapi import APIRouter, Depends, Form, Path
+from fastapi import APIRouter, Depends, Form
 from fastapi.responses import RedirectResponse
 
 from service.core.errors import ConfigurationError, IllegalTransitionError
@@ -20,7 +20,6 @@ from service.core.records.events import (
     JobFailed,
     JobFinished,
     OperatorAction,
-    OperatorVerb,
     SessionStarted,
     StepNote,
     View,
@@ -29,7 +28,7 @@ from service.core.recovery.reasons import full_reason
 from service.core.run.actions import needs_leave, refuse
 from service.core.run.state import RunState
 from service.people.approvals import approve, standing_of
-from service.people.authorisation import identity_for
+from service.people.authorisation import Identity, identity_for
 from service.people.control import Control
 from service.people.errors import NotAllowedError
 from service.people.sessions import NAMES, KnownBy
@@ -37,15 +36,14 @@ from service.rig import load_rig
 from service.run_record import RunRecord
 from service.run_start import record_refusal, require_rig_free, start_run
 from service.steps import params_models
+from service.web.run.forms import ActionForm, RunId, StartForm, back_to
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["acting"])
 
-RunId = Annotated[str, Path(max_length=64)]
 Short = Annotated[str, Form(max_length=200)]
 Words = Annotated[str, Form(max_length=2000)]
-Secret = Annotated[str, Form(max_length=1000)]
 Number = Annotated[int, Form(ge=0, le=2**31)]
 # Events that change nothing of what the person was looking at when deciding.
 _HARMLESS = (
@@ -68,40 +66,35 @@ _HARMLESS = (
 def start(
     site: CurrentSite,
     person: SignedInPerson,
-    protocol: Short,
-    reason: Words = "",
-    password: Secret = "",
-    specimen: Words = "",
-    purpose: Words = "",
-    place: Annotated[str, Form(alias="site", max_length=2000)] = "",
-    operator: Words = "",
-    text: Annotated[str, Form(max_length=20_000)] = "",
+    form: Annotated[StartForm, Form()],
 ) -> RedirectResponse:
     """Begin a run of one of the protocol files; nothing moves before somebody confirms.
 
-    Whoever is the first to begin one approves its content. A content that is not the approved one of its id and
-    version needs a reason, and the password of somebody who may sign.
+    The first person who begins a run with a protocol approves its content. Content that differs from what was
+    approved under the same id and version needs a reason, and the password of somebody who may sign.
     """
-    about = about_run(specimen=specimen, purpose=purpose, site=place, operator=operator, text=text)
+    about = about_run(
+        specimen=form.specimen, purpose=form.purpose, site=form.site, operator=form.operator, text=form.text
+    )
     known = {path.name: path for path in site.protocol_files()}
-    if protocol not in known:
+    if form.protocol not in known:
         raise ConfigurationError(
-            f"there is no protocol file {protocol!r}", where=str(site.protocols), remedy="Reload the page"
+            f"there is no protocol file {form.protocol!r}", where=str(site.protocols), remedy="Reload the page"
         )
-    loaded = load_protocol(known[protocol], params_models())
+    loaded = load_protocol(known[form.protocol], params_models())
     require_rig_free(site.store, site.rig.path)
     changed = standing_of(site.store, loaded).changed
     if changed:
         if not person.may("sign"):
-            raise NotAllowedError(f"the role {person.role} may not approve a changed protocol", where=protocol)
-        if reason.strip():
-            site.people.check_password(person.account, password)
-    approve(site.store, loaded, person.account, reason=reason, identified="password" if changed else "")
+            raise NotAllowedError(f"the role {person.role} may not approve a changed protocol", where=form.protocol)
+        if form.reason.strip():
+            site.people.check_password(person.account, form.password)
+    approve(site.store, loaded, person.account, reason=form.reason, identified="password" if changed else "")
     rig = load_rig(site.rig.path)
     run_id = start_run(site.store, loaded, rig, operator=person.account, auto_confirm=False, about=about)
     Control(site.store).take(run_id, person)
     site.launcher.start(run_id)
-    return _back(run_id)
+    return back_to(run_id)
 
 
 @router.post("/runs/{run_id}/go-on", name="go_on", dependencies=[Depends(requires("operate"))])
@@ -112,7 +105,7 @@ def go_on(site: CurrentSite, person: SignedInPerson, run_id: RunId) -> RedirectR
         raise IllegalTransitionError(f"the run is {log.state.status}", where=run_id)
     Control(site.store).require(run_id, person)
     site.launcher.start(run_id)
-    return _back(run_id)
+    return back_to(run_id)
 
 
 @router.post("/runs/{run_id}/ticks", name="tick", dependencies=[Depends(requires("operate"))])
@@ -138,7 +131,7 @@ def tick(
         site.store.record(
             run_id, [ItemTicked(step=step, attempt=attempt, item=item, ticked=ticked)], actor=person.account
         )
-    return _back(run_id)
+    return back_to(run_id)
 
 
 @router.post(
@@ -148,58 +141,48 @@ def act(
     site: CurrentSite,
     person: SignedInPerson,
     run_id: RunId,
-    verb: Annotated[OperatorVerb, Form()],
-    step: Short = "",
-    attempt: Number = 0,
-    viewpoint: Short = "",
-    preset: Words = "",
-    reason: Words = "",
-    meaning: Words = "",
-    known_by: Annotated[KnownBy, Form()] = "password",
-    password: Secret = "",
-    account: Short = "",
-    signed_sha256: Short = "",
-    seen_seq: Number = 0,
-    back: Annotated[Literal["", "capture"], Form()] = "",
+    form: Annotated[ActionForm, Form()],
 ) -> RedirectResponse:
     """Append what the person does if it is allowed now; otherwise append the refusal and say why.
 
-    `password` holds what `known_by` names: the password, or the PIN or badge where the site lets them sign.
-    Pausing needs neither control of the run nor an unlocked screen: it is the safe direction.
+    Pausing needs neither control of the run nor an unlocked screen, because it can only make the run safer.
     """
     log = site.run(run_id)
-    if verb != "pause":
+    if form.verb != "pause":
         Control(site.store).require(run_id, person)
-    if verb in ("confirm", "sign", "skip", "accept"):
-        _require_current(log, step, attempt, seen_seq)
-    if verb == "sign":
+    if form.verb in ("confirm", "sign", "skip", "accept"):
+        _require_current(log, form.step, form.attempt, form.seen_seq)
+    if form.verb == "sign":
         if not person.may("sign"):
             raise NotAllowedError(f"the role {person.role} may not sign", where=run_id)
-        _require_accepted(site, known_by)
-        site.people.check_secret(person.account, known_by, password)
-    if verb == "accept":
-        _require_accepted(site, known_by)
+        _require_signing_with(site, form.known_by)
+        site.people.check_secret(person.account, form.known_by, form.password)
+    if form.verb == "accept":
+        _require_signing_with(site, form.known_by)
     # A supervisor may accept on the technician's screen, by name and password.
-    who = identity_for(
-        site.people, log.protocol, log.state, verb, account or person.account, lambda: password, known_by
-    )
-    action = OperatorAction(
-        action=verb,
-        step=step or log.state.current,
-        viewpoint=viewpoint or None,
-        reason=full_reason(preset, reason),
-        checklist=log.state.step.ticked if verb == "confirm" else (),
-        meaning=meaning.strip(),
-        signed_sha256=signed_sha256,
+    account = form.account or person.account
+    who = identity_for(site.people, log.protocol, log.state, form.verb, account, lambda: form.password, form.known_by)
+    _append(site, log, _action(form, log.state, who), who.name if who else person.account)
+    return back_to(run_id, form.back)
+
+
+def _action(form: ActionForm, state: RunState, who: Identity | None) -> OperatorAction:
+    """The event of a form; `who` is the person who identified themselves for this action, if anybody had to."""
+    return OperatorAction(
+        action=form.verb,
+        step=form.step or state.current,
+        viewpoint=form.viewpoint or None,
+        reason=full_reason(form.preset, form.reason),
+        checklist=state.step.ticked if form.verb == "confirm" else (),
+        meaning=form.meaning.strip(),
+        signed_sha256=form.signed_sha256,
         role=who.role if who else "",
-        identified=who.identified if who else known_by if verb == "sign" else "",
+        identified=who.identified if who else form.known_by if form.verb == "sign" else "",
         via="web",
     )
-    _append(site, log, action, who.name if who else person.account)
-    return _back(run_id, back)
 
 
-def _require_accepted(site: Site, known_by: KnownBy) -> None:
+def _require_signing_with(site: Site, known_by: KnownBy) -> None:
     signing = site.rig.section.signing
     if known_by != "password" and not (signing.pin if known_by == "pin" else signing.badge):
         raise NotAllowedError(
@@ -229,52 +212,3 @@ def _out_of_date(state: RunState) -> IllegalTransitionError:
         where=state.current,
         remedy="Read what it shows now and decide again; nothing was done",
     )
-
-
-# --- control ----------------------------------------------------------------------------------------------------
-
-
-@router.post("/runs/{run_id}/control/take", name="take_control", dependencies=[Depends(requires("operate"))])
-def take_control(site: CurrentSite, person: SignedInPerson, run_id: RunId, reason: Words = "") -> RedirectResponse:
-    """Take control of a run that nobody controls; a supervisor takes it from somebody with a reason."""
-    _require_open(site, run_id)
-    control = Control(site.store)
-    if reason.strip():
-        control.take_over(run_id, person, reason)
-    else:
-        control.take(run_id, person)
-    return _back(run_id)
-
-
-@router.post("/runs/{run_id}/control/ask", name="ask_for_control", dependencies=[Depends(requires("operate"))])
-def ask_for_control(site: CurrentSite, person: SignedInPerson, run_id: RunId) -> RedirectResponse:
-    """Ask whoever has control to hand it over."""
-    _require_open(site, run_id)
-    Control(site.store).ask(run_id, person)
-    return _back(run_id)
-
-
-@router.post("/runs/{run_id}/control/answer", name="answer_for_control", dependencies=[Depends(requires("operate"))])
-def answer_for_control(
-    site: CurrentSite, person: SignedInPerson, run_id: RunId, grant: Annotated[bool, Form()]
-) -> RedirectResponse:
-    """Hand control over to the screen that asked for it, or keep it."""
-    Control(site.store).answer(run_id, person, grant=grant)
-    return _back(run_id)
-
-
-@router.post("/runs/{run_id}/control/release", name="release_control", dependencies=[Depends(requires("operate"))])
-def release_control(site: CurrentSite, person: SignedInPerson, run_id: RunId) -> RedirectResponse:
-    """Give control up; the run goes on and waits at its next question."""
-    Control(site.store).release(run_id, person)
-    return _back(run_id)
-
-
-def _require_open(site: Site, run_id: str) -> None:
-    state = site.run(run_id).state
-    if state.terminal:
-        raise IllegalTransitionError(f"the run is {state.status}: there is nothing to control any more", where=run_id)
-
-
-def _back(run_id: str, page: str = "") -> RedirectResponse:
-    return RedirectResponse(f"/runs/{run_id}/{page}".rstrip("/"), status_code=303)

@@ -69,7 +69,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         space=None if log.state.terminal else forecast_of(site.store, log.protocol, log.state),
     )
     looking_back = bool(step) and view.shown.id != view.current
-    role = view.acceptance.role if view.acceptance else ""
+    role = view.question.acceptance.role if view.question.acceptance else ""
     return {
         "view": view,
         # Offered by name, so that nobody types one with gloves.

@@ -37,6 +37,7 @@ from service.web.run.view_records import (
     ChecklistItem,
     Choice,
     MainAction,
+    Question,
     RecordOfRun,
     Redo,
     RunView,
@@ -61,15 +62,20 @@ def run_view(
     """The page of a run that has begun.
 
     Args:
+        log: the run's record.
+        snapshot: the runner's latest report.
+        viewer: who looks at the page.
+        driven: whether a running process drives the run.
+        show: step to look at; the current one if it is "" or unknown.
         to_come: what is still being computed, in words.
-        driven: whether a living process drives the run.
-        show: step to look at; the current one when it is "" or unknown.
-        space: what the run will still write, where it is known.
+        space: forecast of what the run will still write; None if it is not known.
     """
     protocol, state = log.protocol, log.state
     shown = show if show in state.steps else state.current
     decision = decide(protocol, state)
     mode = _mode(state, decision, driven=driven)
+    stopped = mode == "recover"
+    unused = unused_count(state, log.events, shown)
     return RunView(
         run_id=state.run_id,
         title=protocol.title,
@@ -79,27 +85,11 @@ def run_view(
         headline=_headline(protocol, state, mode, decision),
         current=state.current,
         attempt=state.step.attempt,
-        steps=tuple(_line(protocol, state, step, shown, stopped=mode == "recover") for step in protocol.steps),
+        steps=tuple(_line(protocol, state, step, shown, stopped=stopped) for step in protocol.steps),
         passed=sum(step.phase == "passed" for step in state.steps.values()),
-        shown=_shown(
-            protocol,
-            state,
-            protocol.step(shown),
-            stopped=mode == "recover",
-            unused=unused_count(state, log.events, shown),
-        ),
-        main=_main(protocol, state, decision, mode, stopped=snapshot.robot in STOPS),
-        options=_options(decision, state),
-        can_pause=mode not in ("ended", "died", "paused") and viewer.may_operate,
-        asked_anew=needs_leave(protocol, state) and mode in ("ask", "recover"),
-        standing=snapshot.doing == "paused" and snapshot.robot != "moving",
+        shown=_shown(protocol, state, protocol.step(shown), stopped=stopped, unused=unused),
+        question=_question(log, snapshot, decision, mode, may_operate=viewer.may_operate),
         viewer=viewer,
-        trouble=_trouble(protocol, state, decision),
-        ways=tuple(map(_way, decision.ways)) if isinstance(decision, AskOperator) else (),
-        signature=_signature(protocol, state),
-        acceptance=_acceptance(protocol, state),
-        redos=() if state.terminal else tuple(_redo(protocol, state, s) for s in redoable_steps(protocol, state)),
-        skip_overrides=bool(state.step.verdicts) and not state.step.gates_passed,
         progress=capture_progress(protocol, state, log.events),
         readings=readings(snapshot, space, clock_readings(log.events)),
         working=(snapshot.what, snapshot.done, snapshot.total) if snapshot.doing == "working" else ("", 0, 0),
@@ -110,6 +100,23 @@ def run_view(
         stop_reason=state.stop_reason,
         operator=state.operator,
         released_by=state.released_by,
+    )
+
+
+def _question(log: RecordOfRun, snapshot: Snapshot, decision: object, mode: str, *, may_operate: bool) -> Question:
+    protocol, state = log.protocol, log.state
+    return Question(
+        main=_main(protocol, state, decision, mode, stopped=snapshot.robot in STOPS),
+        options=_options(decision, state),
+        can_pause=mode not in ("ended", "died", "paused") and may_operate,
+        asked_anew=needs_leave(protocol, state) and mode in ("ask", "recover"),
+        standing=snapshot.doing == "paused" and snapshot.robot != "moving",
+        trouble=_trouble(protocol, state, decision),
+        ways=tuple(map(_way, decision.ways)) if isinstance(decision, AskOperator) else (),
+        signature=_signature(protocol, state),
+        acceptance=_acceptance(protocol, state),
+        redos=() if state.terminal else tuple(_redo(protocol, state, s) for s in redoable_steps(protocol, state)),
+        skip_overrides=bool(state.step.verdicts) and not state.step.gates_passed,
     )
 
 

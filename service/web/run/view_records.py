@@ -169,6 +169,37 @@ class Choice:
 
 
 @dataclass(frozen=True, slots=True)
+class Question:
+    """What the run asks of people now, and what they can do.
+
+    Attributes:
+        main: the one large button; None if there is nothing to press.
+        options: further actions.
+        can_pause: whether this person can pause the run.
+        asked_anew: the program that drove the robot has ended, so nothing moves before somebody confirms again.
+        standing: the run is paused and the robot stands still.
+        trouble: why the run is stopped; None if it is not.
+        ways: what can be done about that, the recommended one first.
+        signature: what is to be signed; None for nothing.
+        acceptance: what could be accepted outside its limits; None for nothing.
+        redos: steps that can be done again.
+        skip_overrides: whether a skip would now override figures outside their limits.
+    """
+
+    main: MainAction | None
+    options: tuple[OperatorVerb, ...]
+    can_pause: bool
+    asked_anew: bool
+    standing: bool
+    trouble: Trouble | None
+    ways: tuple[Choice, ...]
+    signature: Signature | None
+    acceptance: Acceptance | None
+    redos: tuple[Redo, ...]
+    skip_overrides: bool
+
+
+@dataclass(frozen=True, slots=True)
 class RunView:
     """The run page."""
 
@@ -183,18 +214,8 @@ class RunView:
     steps: tuple[StepLine, ...]
     passed: int
     shown: StepView
-    main: MainAction | None
-    options: tuple[OperatorVerb, ...]  # besides the main one
-    can_pause: bool
-    asked_anew: bool  # the program that drove the robot ended: nothing moves before a fresh confirmation
-    standing: bool  # paused, and the robot stands still
+    question: Question
     viewer: Viewer
-    trouble: Trouble | None
-    ways: tuple[Choice, ...]  # where it is stopped, the recommended one first
-    signature: Signature | None
-    acceptance: Acceptance | None
-    redos: tuple[Redo, ...]
-    skip_overrides: bool  # a skip now would set aside figures outside of their limits
     progress: Progress
     readings: tuple[Reading, ...]
     working: tuple[str, int, int]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Generator, Sequence
@@ -27,7 +28,8 @@ def camera_simulator(
 ) -> Generator[RunningCamera]:
     command = [sys.executable, "-m", "simulators", "camera", "--port", str(port), "--image-width", str(width)]
     command += [
-        "--with-parent",
+        "--parent",
+        str(os.getpid()),
         "--faults",
         json.dumps([{"device": "camera", **fault} for fault in faults]),
         *options,

@@ -19,7 +19,7 @@ def address(number: int) -> str:
 @contextlib.contextmanager
 def simulated_ur(host: str, *options: str) -> Generator[dict[str, str]]:
     """Run `python -m simulators ur`; yields its ready line."""
-    command = [sys.executable, "-m", "simulators", "ur", "--host", host, "--with-parent", *options]
+    command = [sys.executable, "-m", "simulators", "ur", "--host", host, "--parent", str(os.getpid()), *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:

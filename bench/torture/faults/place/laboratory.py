@@ -155,6 +155,7 @@ class Simulators:
     def start(self, *words: str) -> dict[str, Any]:
         """Start `python -m simulators WORDS`; returns its ready line. Raises RuntimeError if it does not start."""
         reading, writing = os.pipe()
+        parent = os.getpid()
         pid = os.fork()
         if pid == 0:
             try:
@@ -163,7 +164,7 @@ class Simulators:
                 log = os.open(self._folder / f"simulated-{words[0]}.log", os.O_CREAT | os.O_APPEND | os.O_WRONLY)
                 os.dup2(log, 2)
                 sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", buffering=1)
-                status = simulate([*words, "--with-parent"])
+                status = simulate([*words, "--parent", str(parent)])
             except BaseException:  # noqa: BLE001 - the case reads that there is no ready line
                 status = 3
             os._exit(status)
