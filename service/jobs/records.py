@@ -120,6 +120,7 @@ class MeasuredSphere(JobRecord):
     centre_m: Point
     covariance_m2: Matrix
     rms_mm: float  # distance of the mesh's points from the sphere
+    radius_residual_mm: float | None = None  # fitted radius minus the known one
 
 
 class SphereDetails(JobRecord):

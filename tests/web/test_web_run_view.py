@@ -159,7 +159,7 @@ def test_a_step_that_moves_the_robot_is_held_and_says_what_will_happen() -> None
     assert view.question.main.hold
     assert view.question.main.text == "Confirm: the robot takes 54 images at station 1"
     assert view.progress.total == 108
-    layout = view_of(advance_to(PAPER, "layout_check")).main
+    layout = view_of(advance_to(PAPER, "layout_check")).question.main
     assert layout is not None
     assert not layout.hold
     assert "photograph" in layout.text
@@ -170,18 +170,18 @@ def test_nothing_is_confirmed_before_everything_is_ticked() -> None:
     first = DEMO.steps[0]
     for item in first.checklist[:-1]:
         log.append(ItemTicked(step=first.id, attempt=1, item=item, ticked=True))
-    main = view_of(log).main
+    main = view_of(log).question.main
     assert main is not None
     assert (main.enabled, main.why_not) == (False, "1 item is not ticked yet.")
     log.append(ItemTicked(step=first.id, attempt=1, item=first.checklist[-1], ticked=True))
-    main = view_of(log).main
+    main = view_of(log).question.main
     assert main is not None
     assert main.enabled
 
 
 def test_a_stopped_robot_is_not_asked_to_move() -> None:
     log = advance_to(DEMO, "viewpoint_capture_1")
-    main = view_of(log, Snapshot(doing="asking", robot="protective_stop")).main
+    main = view_of(log, Snapshot(doing="asking", robot="protective_stop")).question.main
     assert main is not None
     assert not main.enabled
     assert "at the robot" in main.why_not
@@ -193,10 +193,10 @@ def test_paused_is_shown_only_once_the_robot_stands_still() -> None:
     go(log, "on")
     log.act("pause")
     moving = Snapshot(doing="pausing", robot="moving")
-    assert not view_of(log, moving).standing
+    assert not view_of(log, moving).question.standing
     assert robot_banner(log.state, moving, driven=True).key == "pausing"
     still = Snapshot(doing="paused", robot="standing")
-    assert view_of(log, still).standing
+    assert view_of(log, still).question.standing
     assert robot_banner(log.state, still, driven=True).title.startswith("Paused")
     # A silent runner says nothing about the robot.
     silent = robot_banner(log.state, Snapshot(), driven=True)
@@ -207,7 +207,7 @@ def test_a_dead_runner_offers_to_go_on() -> None:
     log = advance_to(DEMO, "ct_hand_over_out")
     view = view_of(log, Snapshot(), driven=False)
     assert (view.mode, view.question.main and view.question.main.verb, view.question.main and view.question.main.hold) == ("died", "go-on", False)
-    moving = view_of(advance_to(DEMO, "viewpoint_capture_1"), Snapshot(), driven=False).main
+    moving = view_of(advance_to(DEMO, "viewpoint_capture_1"), Snapshot(), driven=False).question.main
     assert moving is not None
     assert not moving.hold
     assert "asked again before the robot moves" in moving.note

@@ -75,7 +75,7 @@ def _board_record(step: Step, board: BoardPreview) -> dict[str, Any]:
     return {
         "station": "" if station is None else station.station,
         "text": board.text,
-        "prediction": dict(board.prediction),
+        "prediction": board.prediction.model_dump(mode="json"),
         "poses": board.T_base_camera.round(6).tolist(),
     }
 

@@ -18,7 +18,6 @@ from service.core.geometry import Array, Transform, apply, inverse
 from service.core.text.counts import counted
 from service.steps.board.looks import BoardLooks, Look
 from service.steps.board.plan import (
-    NOTE,
     START,
     BoardPoses,
     Planner,
@@ -33,6 +32,7 @@ from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.capture.retakes import to_take_again
 from service.steps.capture.views import capture_viewpoints
 from service.steps.context import StepContext
+from service.steps.notes import BOARD_POSES
 
 _MOST_FIRST = 4  # tries for a first image that shows the board
 _MOVED_M = 0.01  # a board found further from where an earlier step had it has been moved
@@ -60,7 +60,7 @@ class BoardCapture:
 
     def __post_init__(self) -> None:
         self._mount = self.context.devices.nominal_T_flange_camera()
-        self._notes = [note.data for note in self.context.state.notes if note.note == NOTE]
+        self._notes = [note.data for note in self.context.state.notes if note.note == BOARD_POSES]
         self._replaced = sum(
             len(n["poses"]) for n in self._notes if n["why"] == "replacement" and n["attempt"] == self.context.attempt
         )
@@ -176,7 +176,7 @@ class BoardCapture:
                 {"viewpoint": v.name, "T_base_camera": [[round(float(x), 9) for x in row] for row in v.T_base_camera]}
                 for v in poses
             ],
-            "prediction": prediction,
+            "prediction": prediction.model_dump(mode="json"),
             "from_images": known.measured,
         }
         if why == "replacement":
@@ -186,7 +186,7 @@ class BoardCapture:
         if advise is not None:
             names = poses[0].name if len(poses) == 1 else f"{poses[0].name} … {poses[-1].name}"
             text = data["advice"] = advise(len(poses), names, words)
-        self.context.note(NOTE, text=text, **data)
+        self.context.note(BOARD_POSES, text=text, **data)
         self.context.tell(text)
         self._notes.append(data)
         return poses

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -27,9 +27,9 @@ from service.core.records.events import Record
 from service.core.units import metres
 from service.rig import LensSection
 from service.steps.context import StationLayout
+from service.steps.notes import BoardPrediction
 
 Why = Literal["first", "start", "rest", "replacement", "mend"]
-NOTE = "board_poses"  # name of the note that holds planned board poses
 #: The first image is taken from further away and steeply: nobody knows yet where exactly the board lies.
 FIRST = PoseWishes(tilts_deg=(8.0, 14.0, 24.0), distances_m=(0.78, 0.82, 0.86))
 START = 6  # images after which camera, mount and board are known well enough to plan the rest
@@ -167,29 +167,29 @@ def nominal_camera(lens: LensSection | None, size: tuple[int, int] | None = None
     return CameraModel(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2), share
 
 
-def prediction_record(prediction: Prediction) -> dict[str, Any]:
-    """As plain data without NaN."""
+def prediction_record(prediction: Prediction) -> BoardPrediction:
+    """The prediction as it is recorded: rounded, and without NaN."""
 
     def number(value: float, digits: int = 4) -> float | None:
         return round(value, digits) if np.isfinite(value) else None
 
-    return {
-        "coverage": number(prediction.coverage),
-        "coverage_map": prediction.coverage_map.tolist(),
-        "uncertainty_mm": number(prediction.uncertainty_mm, 5),
-        "tilt_deg": number(prediction.tilt_deg, 2),
-        "rotation_spread_deg": number(prediction.rotation_spread_deg, 2),
-        "hand_eye_sigma_mm": number(prediction.hand_eye_sigma_mm),
-        "hand_eye_sigma_deg": number(prediction.hand_eye_sigma_deg, 5),
-    }
+    return BoardPrediction(
+        coverage=round(prediction.coverage, 4),
+        coverage_map=prediction.coverage_map.tolist(),
+        uncertainty_mm=number(prediction.uncertainty_mm, 5),
+        tilt_deg=round(prediction.tilt_deg, 2),
+        rotation_spread_deg=number(prediction.rotation_spread_deg, 2),
+        hand_eye_sigma_mm=number(prediction.hand_eye_sigma_mm),
+        hand_eye_sigma_deg=number(prediction.hand_eye_sigma_deg, 5),
+    )
 
 
-def describe_prediction(record: dict[str, Any] | Any, solve: Sequence[str]) -> str:
-    """`coverage 99 %, uncertainty 0.006 mm`: what a plan is predicted to come to."""
-    parts = [f"coverage {100 * record['coverage']:.0f} %"]
-    if "intrinsics" in solve and record["uncertainty_mm"] is not None:
-        parts.append(f"uncertainty of a projected point {record['uncertainty_mm']:.3f} mm")
-    if "hand_eye" in solve and record["hand_eye_sigma_mm"] is not None:
-        parts.append(f"σ of the hand-eye {record['hand_eye_sigma_mm']:.2f} mm")
-    parts.append(f"tilts to {record['tilt_deg']:.0f}°")
+def describe_prediction(predicted: BoardPrediction, solve: Sequence[str]) -> str:
+    """`coverage 99 %, uncertainty of a projected point 0.006 mm, tilts to 40°`: what a plan is predicted to give."""
+    parts = [f"coverage {100 * predicted.coverage:.0f} %"]
+    if "intrinsics" in solve and predicted.uncertainty_mm is not None:
+        parts.append(f"uncertainty of a projected point {predicted.uncertainty_mm:.3f} mm")
+    if "hand_eye" in solve and predicted.hand_eye_sigma_mm is not None:
+        parts.append(f"σ of the hand-eye {predicted.hand_eye_sigma_mm:.2f} mm")
+    parts.append(f"tilts to {predicted.tilt_deg:.0f}°")
     return ", ".join(parts)

@@ -26,9 +26,9 @@ from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.capture.spoilt import SPOILT, LookedAt, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import artefact_of, mounting_of, robot_pose_of, taken
+from service.steps.notes import SUGGESTION, suggested_views
 
 ERROR, COVERAGE = "predicted_target_error_mm", "specimen_coverage"
-SUGGESTION = "suggested_viewpoints"  # name of the note that a retry of the step reads
 
 
 class CoverageRule(Record):
@@ -180,8 +180,7 @@ class LiveAnalysis:
 
     def suggested(self) -> set[str]:
         """Names of the viewpoints that earlier attempts of this step found wanting."""
-        notes = [note for note in self.context.state.notes if note.note == SUGGESTION]
-        return {str(view["viewpoint"]) for note in notes for view in note.data["viewpoints"]}
+        return {view.viewpoint for note in suggested_views(self.context.state) for view in note.viewpoints}
 
     def _suggest(
         self,

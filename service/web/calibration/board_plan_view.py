@@ -10,10 +10,11 @@ from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.text.counts import counted
 from service.rig import Rig
 from service.run_record import RunRecord
-from service.steps.board.plan import NOTE, describe_prediction
+from service.steps.board.plan import describe_prediction
 from service.steps.capture.plan.preview import preview_board_poses
 from service.steps.context import StationLayout
 from service.steps.kinds.calibration import Params
+from service.steps.notes import BOARD_POSES, board_plans
 from service.web.calibration.board_plan_drawing import board_plan_svg
 from service.web.record.pictures import cached
 from service.web.record.planned_poses import recorded_rig, station_of
@@ -31,7 +32,8 @@ def board_plan_of(log: RunRecord, step_id: str, data: Path) -> bytes:
     if wanted is None:
         raise ConfigurationError("no board images are planned in this step", where=f"step {step_id}")
     solve = step.params_as(Params).solve
-    notes = [note for note in log.state.steps[step_id].notes if note.note == NOTE]
+    state = log.state.steps[step_id]
+    plans = board_plans(state)
 
     def layout(name: str) -> StationLayout:
         station = station_of(log, name)
@@ -41,18 +43,17 @@ def board_plan_of(log: RunRecord, step_id: str, data: Path) -> bytes:
 
     def make() -> bytes:
         approach = np.array(layout(wanted.station).approach)
-        if notes:
-            poses = np.array([pose["T_base_camera"] for note in notes for pose in note.data["poses"]])
-            prediction = notes[-1].data["prediction"]
-            text = f"{counted(len(poses), 'board pose')} so far; predicted {describe_prediction(prediction, solve)}"
-            return board_plan_svg(text, prediction["coverage_map"], poses, approach).encode()
+        if plans:
+            poses = np.array([pose.T_base_camera for plan in plans for pose in plan.poses])
+            predicted = plans[-1].prediction
+            text = f"{counted(len(poses), 'board pose')} so far; predicted {describe_prediction(predicted, solve)}"
+            return board_plan_svg(text, predicted.coverage_map, poses, approach).encode()
         try:
             found = preview_board_poses(log.protocol, step, Rig(recorded_rig(log), Path(), b""), layout)
         except OrthocaptureError as error:
             return board_plan_svg(str(error), [[0] * 12] * 8, np.zeros((0, 4, 4)), approach).encode()
         assert found is not None  # the step plans board images
-        return board_plan_svg(found.text, found.prediction["coverage_map"], found.T_base_camera, approach).encode()
+        return board_plan_svg(found.text, found.prediction.coverage_map, found.T_base_camera, approach).encode()
 
-    return cached(
-        data, f"board plan {log.state.run_id} {step_id} {notes[-1].seq if notes else 0}", ".svg", make
-    ).read_bytes()
+    newest = max((note.seq for note in state.notes if note.note == BOARD_POSES), default=0)
+    return cached(data, f"board plan {log.state.run_id} {step_id} {newest}", ".svg", make).read_bytes()

@@ -16,7 +16,9 @@ from service.core.records.events import OperatorAction, ViewpointCaptured
 from service.core.run.actions import refuse
 from service.core.run.state import StepState
 from service.core.units import mm, mrad
+from service.jobs.capture import live_summary, live_view
 from service.run_record import RunRecord
+from service.steps.notes import motion_plan, suggested_views
 from service.web.record.board_images import board_use, board_uses
 from service.web.record.images import Capture, captures_of, last_failures
 from service.web.record.planned_poses import Vector, nominal_T_flange_camera, place, planned_viewpoints
@@ -159,17 +161,12 @@ def _state(
 
 
 def _order(state: StepState) -> list[str]:
-    plans = [note for note in state.notes if note.note == "motion_plan"]
-    stations = plans[-1].data["stations"] if plans else ()
     taken = sorted(state.captured, key=lambda name: state.captured[name])
-    return taken + [str(view["viewpoint"]) for station in stations for view in station["views"]]
+    return taken + [view.viewpoint for view in motion_plan(state).views]
 
 
 def _refused(state: StepState) -> dict[str, str]:
-    plans = [note for note in state.notes if note.note == "motion_plan"]
-    stations = plans[-1].data["stations"] if plans else ()
-    views = [view for station in stations for view in station["views"]]
-    return {str(v["viewpoint"]): str(v["reason"]) for v in views if v["outcome"] == "refused"}
+    return {view.viewpoint: view.reason for view in motion_plan(state).views if view.outcome == "refused"}
 
 
 def _place(log: RunRecord, capture: Capture) -> tuple[Vector, Vector] | tuple[None, None]:
@@ -229,7 +226,8 @@ def _found(capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
     figures = "" if spheres is None else f"{spheres:.0f} seen"
     if expected is not None:
         figures += f", {expected:.0f} expected whole in the image"
-    reason = "" if live is None else str(live.result.get("reason", "")) or live.message
+    finished = live is not None and live.status == "finished"
+    reason = live_view.KIND.read_answer(live.result).reason if finished else "" if live is None else live.message
     out.append(Verdict("Spheres", seen, words[seen], f"{figures}; {reason}".strip("; ") if reason else figures))
 
     return out
@@ -307,12 +305,11 @@ def redo_of(log: RunRecord, step: Step, view: View, account: str) -> Redo:
     return Redo("" if refusal is None else ". ".join(filter(None, (refusal.what, refusal.remedy))), moves)
 
 
-def suggestions_of(log: RunRecord, step: Step) -> tuple[str, list[dict[str, object]]]:
-    """What the step found wanting and the views that would help most; "" and none when nothing is wanting."""
+def suggestions_of(log: RunRecord, step: Step) -> tuple[str, tuple[live_summary.Suggestion, ...]]:
+    """What the step's images lack, in words, and the views that would help most; "" and none if they lack nothing."""
     state = log.state.steps[step.id]
-    notes = [note for note in state.notes if note.note == "suggested_viewpoints"]
+    notes = suggested_views(state)
     if notes:
-        return str(notes[-1].data["advice"]), [dict(view) for view in notes[-1].data["viewpoints"]]
-    jobs = [job for job in state.jobs.values() if job.kind == "live_summary" and job.status == "finished"]
-    views = jobs[-1].result.get("next_best_views", ()) if jobs else ()
-    return "", [dict(view) for view in views]
+        return notes[-1].advice, notes[-1].viewpoints
+    jobs = [job for job in state.jobs.values() if job.kind == live_summary.KIND.name and job.status == "finished"]
+    return "", live_summary.KIND.read_answer(jobs[-1].result).next_best_views if jobs else ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from service.core.gates.verdict import quantity
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import DeviceOpened, ViewHeld
 from service.core.run.state import JobState
+from service.jobs.capture import hand_board, hand_view
+from service.jobs.looks import image_of
+from service.jobs.records import Matrix
 from service.run_record import RunRecord
 from service.steps.kinds.manual_capture import failure_words
 from service.web.page.run_words import limit, measure_name
@@ -22,7 +25,7 @@ SIZE = 480.0  # of the drawing, which is square
 _REACH = 190.0  # from the middle to the lowest place of the hemisphere
 _LARGEST_ARROW = 30.0  # of the overlay, whose frame is 100 wide
 _METRES_FOR_LARGEST = 0.25
-_KINDS = ("hand_view", "hand_board")
+_KINDS = (hand_view.KIND.name, hand_board.KIND.name)  # both give the same answer
 _TOLD = ("images_used", "hemisphere_coverage", "coverage", "predicted_target_error_mm", "specimen_coverage")
 
 SpotState = Literal["done", "open", "next"]
@@ -92,7 +95,7 @@ def step_to_show(log: RunRecord, wanted: str) -> Step | None:
 def held_now(log: RunRecord, step: Step) -> HandheldView:
     """All of it, from the record alone."""
     state = log.state.steps[step.id]
-    jobs = {str(j.arguments["image"]["sha256"]): j for j in state.jobs.values() if j.kind in _KINDS}
+    jobs = {image_of(j).sha256: j for j in state.jobs.values() if j.kind in _KINDS}
     done = sorted((j for j in jobs.values() if j.status == "finished"), key=lambda j: j.enqueued_seq)
     last = done[-1] if done else None
     newest = max((j.enqueued_seq for j in jobs.values()), default=0)  # what failed before it has been told
@@ -103,18 +106,19 @@ def held_now(log: RunRecord, step: Step) -> HandheldView:
     ]
     running = log.state.current == step.id and state.phase == "running" and not log.state.paused
     captures = [c for c in captures_of(log, step.id) if c.replaced is None and isinstance(c.payload, ViewHeld)]
-    result: Mapping[str, Any] = {} if last is None else last.result
-    target = result.get("target")
-    here = result.get("T_level_camera")
+    answer = None if last is None else hand_view.KIND.read_answer(last.result)
+    target = None if answer is None else answer.target
+    here = None if answer is None else answer.T_level_camera
+    places = () if answer is None else answer.places
     return HandheldView(
         step=step,
         running=running,
-        words=str(result.get("words", "")) if running else "",
+        words=answer.words if running and answer is not None else "",
         photographs_from=_photographs_from(log),
         failures=tuple(failure_words(job) for job in failed) if running else (),
-        overlay=_overlay(here, target["T_level_camera"]) if running and here and target else None,
-        spots=_spots(result.get("places", ()), "" if target is None else str(target["name"])),
-        camera=None if not here else _spot("camera", "done", here, _lowest(result["places"])),
+        overlay=_overlay(here, target.T_level_camera) if running and here and target else None,
+        spots=_spots(places, "" if target is None else target.name),
+        camera=None if not here else _spot("camera", "done", here, _lowest(places)),
         seen=tuple(_seen(c.payload.viewpoint, c.sha256, jobs.get(c.sha256)) for c in reversed(captures)),
         figures=_figures(step, {} if last is None else last.measures),
     )
@@ -126,7 +130,7 @@ def _photographs_from(log: RunRecord) -> str:
     return str(camera.get("details", {}).get("photographs_from", ""))
 
 
-def _overlay(here: Any, there: Any) -> Overlay:
+def _overlay(here: Matrix, there: Matrix) -> Overlay:
     away = (np.linalg.inv(np.array(here)) @ np.array(there))[:3, 3]
     x, y, z = (float(v) for v in away)
     length = math.hypot(x, y)
@@ -136,26 +140,26 @@ def _overlay(here: Any, there: Any) -> Overlay:
     return Overlay((round(reach * x, 1), round(reach * y, 1)), z)
 
 
-def _lowest(places: Sequence[Mapping[str, Any]]) -> float:
+def _lowest(places: Sequence[hand_view.ShownPlace]) -> float:
     """Largest distance of a place from the vertical through the middle, metres."""
-    radii = [math.hypot(p["T_level_camera"][0][3], p["T_level_camera"][1][3]) for p in places]
+    radii = [math.hypot(p.T_level_camera[0][3], p.T_level_camera[1][3]) for p in places]
     return max([0.05, *radii])
 
 
-def _spots(places: Sequence[Mapping[str, Any]], target: str) -> tuple[PlanMarker, ...]:
+def _spots(places: Sequence[hand_view.ShownPlace], target: str) -> tuple[PlanMarker, ...]:
     lowest = _lowest(places)
     return tuple(
         _spot(
-            str(place["name"]),
-            "next" if place["name"] == target else "done" if place["done"] else "open",
-            place["T_level_camera"],
+            place.name,
+            "next" if place.name == target else "done" if place.done else "open",
+            place.T_level_camera,
             lowest,
         )
         for place in places
     )
 
 
-def _spot(name: str, state: SpotState, T_level_camera: Any, lowest: float) -> PlanMarker:
+def _spot(name: str, state: SpotState, T_level_camera: Matrix, lowest: float) -> PlanMarker:
     """From above, the side of the person at the bottom."""
     x, y = T_level_camera[0][3], T_level_camera[1][3]
     scale = _REACH / lowest
@@ -177,8 +181,8 @@ def _seen(viewpoint: str, sha256: str, job: JobState | None) -> JudgedImage:
         parts.append(f"{100 * m['clipped_fraction']:.1f} % clipped")
     if "corners" in m:
         parts.append(f"{m['corners']:.0f} corners")
-    state: Literal["used", "not_used"] = "used" if job.result["used"] else "not_used"
-    return JudgedImage(viewpoint, sha256, state, str(job.result["why"]), ", ".join(parts))
+    answer = hand_view.KIND.read_answer(job.result)
+    return JudgedImage(viewpoint, sha256, "used" if answer.used else "not_used", answer.why, ", ".join(parts))
 
 
 def _figures(step: Step, measures: Mapping[str, float]) -> tuple[tuple[str, str, str, bool | None], ...]:

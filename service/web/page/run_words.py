@@ -102,10 +102,11 @@ def stopped_words(protocol: Protocol, state: RunState, question: AskOperator) ->
 
 def way_words(state: RunState, way: WayOn) -> str:
     """A way on in few words, with a small letter: the views that mend are counted, an advice is cut at its end."""
-    views = len(state.step.mend.get("viewpoints", ()))
+    mends = mending(state.step)
+    views = len(mends.viewpoints)
     if way.verb == "confirm" and views:
         return f"take {'this view' if views == 1 else f'these {views} views'}"
-    boards = len(state.step.mend.get("poses", ()))
+    boards = len(mends.poses)
     if way.verb == "confirm" and boards:
         return f"take {boards} more {'image' if boards == 1 else 'images'} of the board"
     words = way.words.split(";")[0].split(". ")[0].rstrip(".")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from service.core.records.events import View, ViewpointFailed
 from service.core.run.state import JobState, StepState, Superseded
+from service.jobs.looks import image_of
 from service.run_record import RunRecord
 
 
@@ -90,7 +91,7 @@ def live_jobs(state: StepState) -> Mapping[str, JobState]:
     found: dict[str, JobState] = {}
     for job in sorted(state.jobs.values(), key=lambda j: j.enqueued_seq):
         if job.kind == "live_view":
-            found[str(job.arguments["image"]["sha256"])] = job
+            found[image_of(job).sha256] = job
     return found
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -14,8 +13,11 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply
 from service.dataset.registrations import best_registration as best_registration_name
 from service.dataset.registrations import registrations
+from service.jobs.records import Point, SpheresFound
 from service.jobs.registration.register import Registration
+from service.jobs.surfaces import locate_spheres
 from service.run_record import RunRecord
+from service.steps.kinds import evaluation, registration
 
 SphereKind = Literal["registration", "control", "sphere"]
 
@@ -40,63 +42,56 @@ class ShownRegistration:
     step: str
 
 
-def result_of_kind(log: RunRecord, kind: str) -> tuple[str, Mapping[str, Any]]:
-    """Name and result of the last step of a kind that has one; "" and nothing if there is none."""
-    for step in reversed(log.protocol.steps):
-        result = log.state.steps[step.id].result
-        if step.kind == kind and result:
-            return step.id, result
-    return "", {}
+def last_of_kind(log: RunRecord, kind: str) -> str:
+    """The last step of a kind that has a result; "" if there is none."""
+    steps = (step.id for step in reversed(log.protocol.steps) if step.kind == kind)
+    return next((step for step in steps if log.state.steps[step].result), "")
 
 
 def best_registration(log: RunRecord) -> ShownRegistration | None:
     """None before there is one."""
-    step, _ = result_of_kind(log, "registration")
     name = best_registration_name(log.protocol, log.state)
-    return None if name is None else ShownRegistration(name, registrations(log.protocol, log.state)[name], step)
+    if name is None:
+        return None
+    record = registrations(log.protocol, log.state)[name]
+    return ShownRegistration(name, record, last_of_kind(log, "registration"))
 
 
 def scan_spheres(log: RunRecord, by: ShownRegistration) -> tuple[Sphere, ...]:
     """Spheres of the registered scan, and the control spheres, in its frame."""
-    params = log.protocol.step(by.step).params.model_dump()
-    scan = log.state.steps[params["scan"]].result if params["scan"] in log.state.steps else {}
-    if not scan:
+    scan = _found_in(log, log.protocol.step(by.step).params_as(registration.Params).scan)
+    if not scan.spheres_m:
         return ()
-    evaluation = next((s for s in reversed(log.protocol.steps) if s.kind == "evaluation"), None)
-    before = None if evaluation is None else evaluation.params.model_dump().get("control_scan")
-    control: Mapping[str, Any] = {} if before is None else log.state.steps[before].result
-    extra = _control_centres(_key(scan["spheres_m"]), _key(control.get("spheres_m", ())))
+    judged = next((s for s in reversed(log.protocol.steps) if s.kind == evaluation.KIND.name), None)
+    before = None if judged is None else judged.params_as(evaluation.Params).control_scan
+    control = SpheresFound(spheres_m=()) if before is None else _found_in(log, before)
+    extra = _control_centres(scan.spheres_m, control.spheres_m)
     return (*_numbered(scan, "registration"), *(Sphere(f"C{i}", "control", c) for i, c in enumerate(extra)))
 
 
 def ct_spheres(log: RunRecord) -> tuple[Sphere, ...]:
     """Spheres of the CT, in its frame; all of them, for it does not say which are taken away later."""
-    return _numbered(result_of_kind(log, "ct_import")[1], "sphere")
+    return _numbered(_found_in(log, last_of_kind(log, "ct_import")), "sphere")
 
 
-def _numbered(result: Mapping[str, Any], kind: SphereKind) -> tuple[Sphere, ...]:
-    details: Mapping[str, Any] = result.get("details", {})
-    records = details.get("spheres", [{}] * len(result.get("spheres_m", ())))
+def _found_in(log: RunRecord, step: str) -> SpheresFound:
+    """What a step that imports a scan or a CT found; no spheres without such a step, or before it has a result."""
+    result = log.state.steps[step].result if step in log.state.steps else {}
+    return locate_spheres.KIND.read_answer(result) if result else SpheresFound(spheres_m=())
+
+
+def _numbered(found: SpheresFound, kind: SphereKind) -> tuple[Sphere, ...]:
+    measured = found.details.spheres or (None,) * len(found.spheres_m)
     return tuple(
-        Sphere(str(i), kind, _point(centre), record.get("rms_mm"), record.get("radius_residual_mm"))
-        for i, (centre, record) in enumerate(zip(result.get("spheres_m", ()), records, strict=False))
+        Sphere(str(i), kind, centre)
+        if sphere is None
+        else Sphere(str(i), kind, centre, sphere.rms_mm, sphere.radius_residual_mm)
+        for i, (centre, sphere) in enumerate(zip(found.spheres_m, measured, strict=False))
     )
 
 
-def _point(values: Any) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in values)
-    return x, y, z
-
-
-def _key(centres: Any) -> tuple[tuple[float, float, float], ...]:
-    return tuple(_point(c) for c in centres)
-
-
-Points = tuple[tuple[float, float, float], ...]
-
-
 @lru_cache(maxsize=16)
-def _control_centres(scan: Points, control: Points) -> Points:
+def _control_centres(scan: tuple[Point, ...], control: tuple[Point, ...]) -> tuple[Point, ...]:
     """What the control scan shows beside the spheres of the scan, in the scan's frame."""
     if not scan or not control:
         return ()
@@ -108,4 +103,4 @@ def _control_centres(scan: Points, control: Points) -> Points:
     pairs = np.array(found.pairs)
     T_a_b, _ = align_points(a[pairs[:, 0]], b[pairs[:, 1]])
     extra: Array = apply(T_a_b, b[list(found.missing_b)]) if found.missing_b else np.zeros((0, 3))
-    return _key(extra)
+    return tuple((float(x), float(y), float(z)) for x, y, z in extra)

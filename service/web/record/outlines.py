@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,11 +12,13 @@ from service.compute.markers.archive import outline_from_record
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.identification.pairing import CONTROL_GATE, paired
 from service.core.geometry import Transform, inverse
-from service.core.jobs.references import jobs_of, resolve
+from service.core.jobs.references import jobs_of
 from service.core.units import metres
+from service.jobs.capture import live_view
 from service.run_record import RunRecord
 from service.web.record.images import Capture
 from service.web.record.known_spheres import Sphere, best_registration, ct_spheres, scan_spheres
+from service.web.record.live_files import LiveOutlines, read_live_outlines, read_outlines
 from service.web.record.pictures import DrawnOutline
 
 
@@ -62,7 +60,8 @@ def outlines_of(log: RunRecord, capture: Capture) -> OutlineSource | None:
     job = capture.live
     if job is None or job.status != "finished" or not job.artefacts:
         return None
-    camera = CameraModel.from_record(resolve(job.arguments["camera"], jobs_of(log.state)))
+    arguments = live_view.KIND.read_arguments(job.arguments, jobs_of(log.state))
+    camera = CameraModel.from_record(arguments.camera.plain())
     sha256 = job.artefacts[0].sha256
     return OutlineSource(f"live-{sha256[:16]}", sha256, ct_spheres(log), camera, camera, None, True)
 
@@ -72,10 +71,13 @@ def marks_of(log: RunRecord, capture: Capture) -> tuple[DrawnOutline, ...]:
     found = outlines_of(log, capture)
     if found is None:
         return ()
-    data = _read(log.store.artefact_path(found.artefact))
-    records: Sequence[dict[str, Any]] = data["outlines"] if found.live else data.get(capture.payload.viewpoint, [])
+    path = log.store.artefact_path(found.artefact)
+    if found.live:
+        live = read_live_outlines(path)
+        records, placed = live.outlines, _provisional(live)
+    else:
+        records, placed = read_outlines(path).get(capture.payload.viewpoint, ()), found.T_camera_scan
     outlines = [outline_from_record(record, found.camera) for record in records]
-    placed = _provisional(data) if found.live else found.T_camera_scan
     named = _named(outlines, found, placed, metres(log.protocol.spheres.radius_mm))
     return tuple(
         DrawnOutline(
@@ -87,10 +89,10 @@ def marks_of(log: RunRecord, capture: Capture) -> tuple[DrawnOutline, ...]:
     )
 
 
-def _provisional(data: Mapping[str, Any]) -> Transform | None:
-    if data["T_base_scan"] is None:
+def _provisional(live: LiveOutlines) -> Transform | None:
+    if live.T_base_scan is None:
         return None
-    return inverse(np.array(data["T_base_camera"])) @ np.array(data["T_base_scan"])
+    return inverse(np.array(live.T_base_camera)) @ np.array(live.T_base_scan)
 
 
 def _named(
@@ -101,10 +103,3 @@ def _named(
     centres = np.array([sphere.centre_m for sphere in found.spheres])
     pairs = paired(outlines, T_camera_scan, centres, radius_m, found.camera, CONTROL_GATE)
     return {outline: found.spheres[m] for outline, m in pairs.items()}
-
-
-@lru_cache(maxsize=8)
-def _read(path: Path) -> dict[str, Any]:
-    """An artefact never changes under its name."""
-    data: dict[str, Any] = json.loads(path.read_bytes())
-    return data

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from threading import Lock
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +18,8 @@ from service.rig import RigSection, parse_recorded_rig
 from service.run_record import RunRecord
 from service.steps.capture.plan.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.context import StationLayout
+from service.steps.kinds import calibration
+from service.steps.notes import BOARD_POSES, SUGGESTION, board_plans, suggested_views
 
 Vector = tuple[float, float, float]
 _lock = Lock()
@@ -68,7 +69,7 @@ _known: OrderedDict[tuple[str, str, tuple[int, ...]], tuple[tuple[Viewpoint, ...
     OrderedDict()
 )
 _KNOWN = 32  # plans that are kept: pages of a run under way ask for the same one again and again
-_OF_PLANS = ("board_poses", "suggested_viewpoints")
+_OF_PLANS = (BOARD_POSES, SUGGESTION)
 
 
 def _planned(log: RunRecord, step: Step) -> tuple[tuple[Viewpoint, ...], tuple[PlannedPose, ...]]:
@@ -90,21 +91,17 @@ def _planned(log: RunRecord, step: Step) -> tuple[tuple[Viewpoint, ...], tuple[P
 
 def _computed_poses(log: RunRecord, step: Step) -> tuple[Viewpoint, ...]:
     sets: tuple[ViewpointSet, ...] = getattr(step.params, "viewpoints", ())
-    board: Any = getattr(step.params, "board_poses", None)
+    board = step.params.board_poses if isinstance(step.params, calibration.Params) else None
     out: list[Viewpoint] = []
     for viewpoint_set in sets:
         station = station_of(log, viewpoint_set.station)
         if station is not None:
             out += plan_viewpoints(viewpoint_set, station.layout)
-    for note in log.state.steps[step.id].notes:
-        if note.note == "board_poses":
-            station_name = str(board.station if board is not None else next(iter(sets)).station)
-            out += [
-                Viewpoint(str(pose["viewpoint"]), station_name, np.array(pose["T_base_camera"]))
-                for pose in note.data["poses"]
-            ]
-    notes = [note for note in log.state.steps[step.id].notes if note.note == "suggested_viewpoints"]
-    wanted = {str(view["viewpoint"]) for note in notes for view in note.data["viewpoints"]}
+    state = log.state.steps[step.id]
+    for plan in board_plans(state):
+        there = board.station if board is not None else next(iter(sets)).station
+        out += [Viewpoint(pose.viewpoint, there, np.array(pose.T_base_camera)) for pose in plan.poses]
+    wanted = {view.viewpoint for note in suggested_views(state) for view in note.viewpoints}
     for viewpoint_set in sets[-1:]:
         last = station_of(log, viewpoint_set.station)
         if wanted and last is not None:

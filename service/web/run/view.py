@@ -17,6 +17,7 @@ from service.core.run.decide import AskOperator, decide
 from service.core.run.state import RunState
 from service.dataset.registrations import evaluated
 from service.monitor.snapshot import STOPS, Snapshot
+from service.steps.notes import mending
 from service.web.page.run_words import (
     count,
     drawing_of,
@@ -236,7 +237,7 @@ def _trouble(protocol: Protocol, state: RunState, decision: object) -> Trouble |
     step, now = protocol.step(state.current), state.step
     images = sum(len(there.captured) for there in state.steps.values())
     safe = f"Yes. {count(images, 'image is', 'images are')} recorded, and every result so far."
-    advice = str(now.mend.get("advice", ""))
+    advice = mending(now).advice
     short = stopped_words(protocol, state, decision)
     if now.failure is not None:
         return Trouble(f"{step.title} did not work", short, sentence(now.failure.message), safe, advice)

@@ -3,33 +3,33 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.evaluation.closure import Alignment
 from service.core.geometry import Array, Transform, inverse
-from service.core.records.events import ArtefactRef, ViewpointCaptured
+from service.core.records.events import ArtefactRef, View, ViewpointCaptured
 from service.core.units import metres, mm
 from service.dataset.registrations import registrations
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
 from service.jobs.registration.register import Registration
 from service.run_record import RunRecord
+from service.steps.kinds import registration
 from service.web.record.images import captures_of
 from service.web.record.known_spheres import (
     ShownRegistration,
     Sphere,
     best_registration,
     ct_spheres,
-    result_of_kind,
+    last_of_kind,
     scan_spheres,
 )
+from service.web.record.live_files import LivePose, read_live_pose
 from service.web.record.pictures import cached
 from service.web.record.planned_poses import nominal_T_flange_camera, planned_poses, station_of
 
@@ -85,7 +85,7 @@ def _registered(log: RunRecord, registered: ShownRegistration) -> KnownScene:
     cameras = {name: np.array(T, dtype=np.float64) for name, T in record.T_scan_camera.items()}
     spheres = scan_spheres(log, registered)
     bases, missing = _bases(log, record)
-    scan = log.protocol.step(registered.step).params.model_dump()["scan"]
+    scan = log.protocol.step(registered.step).params_as(registration.Params).scan
     meshes = [ref for ref in log.state.steps[scan].artefacts if ref.kind == "scan_mesh"]
     left_out = record.leave_one_out
     seen = {} if left_out is None else {label: int(row[2]) for label, row in left_out.spheres.items()}
@@ -126,33 +126,33 @@ def _bases(log: RunRecord, record: Registration) -> tuple[dict[str, Transform], 
 
 def _live(log: RunRecord) -> KnownScene | None:
     """In the frame of the CT, by the newest provisional registration of each station; None while there is none."""
-    records: dict[str, dict[str, Any]] = {}
+    records: dict[str, LivePose] = {}
     for step in log.protocol.steps:
         for capture in captures_of(log, step.id):
             job = capture.live
             if capture.replaced is None and job is not None and job.status == "finished" and job.artefacts:
-                records[capture.payload.viewpoint] = _read(log.store.artefact_path(job.artefacts[0].sha256))
-    placed = {r["station"]: np.array(r["T_base_scan"]) for r in records.values() if r["T_base_scan"] is not None}
+                records[capture.payload.viewpoint] = read_live_pose(log.store.artefact_path(job.artefacts[0].sha256))
+    placed = {r.station: np.array(r.T_base_scan) for r in records.values() if r.T_base_scan is not None}
     if not placed:
         return None
     T_ct_base = {station: inverse(T) for station, T in placed.items()}
-    mine = {name: r for name, r in records.items() if r["station"] in placed}
+    mine = {name: r for name, r in records.items() if r.station in placed}
     spheres = ct_spheres(log)
     planned: dict[str, Transform] = {}
-    stations = {name: str(r["station"]) for name, r in mine.items()}
+    stations = {name: r.station for name, r in mine.items()}
     for name, station, T in _to_come(log):
         if station in T_ct_base:
             planned[name], stations[name] = T_ct_base[station] @ T, station
     away = len(records) - len(mine)
     scene = Scene(
-        cameras={n: T_ct_base[r["station"]] @ np.array(r["T_base_camera"]) for n, r in mine.items()},
+        cameras={n: T_ct_base[r.station] @ np.array(r.T_base_camera) for n, r in mine.items()},
         stations=stations,
         spheres=[SceneSphere(s.label, s.kind, s.centre_m) for s in spheres],
         radius_m=metres(log.protocol.spheres.radius_mm),
         planned=planned,
         bases=T_ct_base,
     )
-    step, _ = result_of_kind(log, "ct_import")
+    step = last_of_kind(log, "ct_import")
     meshes = [ref for ref in log.state.steps[step].artefacts if ref.kind == "ct_mesh"] if step else []
     return KnownScene(
         scene,
@@ -213,7 +213,7 @@ def _table(centre_m: tuple[float, float, float]) -> SceneMesh:
     return SceneMesh(np.array(centre_m) + offsets, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def _all_captures(log: RunRecord) -> list[Any]:
+def _all_captures(log: RunRecord) -> list[View]:
     found = [c for step in log.protocol.steps for c in captures_of(log, step.id) if c.replaced is None]
     return [c.payload for c in sorted(found, key=lambda c: c.seq)]
 
@@ -267,10 +267,3 @@ def _load(path: Path) -> tuple[Array, NDArray[np.int64], MeshFacts]:
     vertices, faces, shown = counts
     x, y, z = size
     return points, triangles, MeshFacts(vertices, faces, shown, (x, y, z))
-
-
-@lru_cache(maxsize=512)
-def _read(path: Path) -> dict[str, Any]:
-    """An artefact never changes under its name."""
-    data: dict[str, Any] = json.loads(path.read_bytes())
-    return {name: data[name] for name in ("station", "T_base_camera", "T_base_scan")}

@@ -28,8 +28,8 @@ from service.core.units import metres, metres_of_um
 from service.rig import CollisionSection, OpticsSection
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import StationLayout, StepContext
+from service.steps.notes import MOTION_PLAN
 
-PLAN = "motion_plan"  # name of the note
 _EXPOSURE_S = 3.0  # settling, exposure and download at each viewpoint, roughly
 _ELBOW_UP_RAD = np.array([0.0, -1.6, 1.9, -1.9, -1.57, 0.0])
 
@@ -83,7 +83,7 @@ def plan_step(
         {"stations": [dict(plan.record) for plan in plans if plan.record]},
     )
     if whole.record["stations"]:
-        context.note(PLAN, text=whole.text, **whole.record)
+        context.note(MOTION_PLAN, text=whole.text, **whole.record)
     if whole.text:
         context.tell(whole.text)
     return whole

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from service.steps.capture.plan.viewpoints import plan_viewpoints
 from service.steps.context import StationLayout
 from service.steps.kinds import calibration
 from service.steps.kinds.viewpoint_capture import Params
+from service.steps.notes import BoardPrediction
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class BoardPreview:
     """The board images of a calibration as they will be planned if everything lies as stated."""
 
     T_base_camera: Array  # (K, 4, 4)
-    prediction: Mapping[str, Any]  # service.steps.board.plan.prediction_record
+    prediction: BoardPrediction
     text: str
 
 

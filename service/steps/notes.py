@@ -1,0 +1,113 @@
+"""Notes of steps that other steps and pages read, as typed records: planned poses, motions, suggestions, advice."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.core.run.state import StepState
+from service.jobs.capture.live_summary import Suggestion
+from service.jobs.records import Matrix
+
+BOARD_POSES, MOTION_PLAN, SUGGESTION = "board_poses", "motion_plan", "suggested_viewpoints"
+
+
+class _NoteRecord(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class BoardPose(_NoteRecord):
+    """A planned pose of the camera above the calibration board."""
+
+    viewpoint: str
+    T_base_camera: Matrix
+
+
+class BoardPrediction(_NoteRecord):
+    """What the planned board images are predicted to give; None where there are too few images for a prediction.
+
+    Attributes:
+        coverage: share of the image's cells in which a corner is expected.
+        coverage_map: expected corners in each cell, row by row.
+        uncertainty_mm: of a projected point at the specimen's distance, 1σ.
+        tilt_deg: largest tilt of the board.
+        rotation_spread_deg: spread of the camera's rotations.
+        hand_eye_sigma_mm: of the hand-eye translation, 1σ.
+        hand_eye_sigma_deg: of the hand-eye rotation, 1σ.
+    """
+
+    coverage: float
+    coverage_map: tuple[tuple[int, ...], ...]
+    uncertainty_mm: float | None
+    tilt_deg: float
+    rotation_spread_deg: float | None
+    hand_eye_sigma_mm: float | None
+    hand_eye_sigma_deg: float | None
+
+
+class BoardPlan(_NoteRecord):
+    """Planned board images; `instead_of` has the reasons why earlier images are replaced, by viewpoint."""
+
+    poses: tuple[BoardPose, ...]
+    prediction: BoardPrediction
+    instead_of: dict[str, str] = Field(default_factory=dict[str, str])
+
+
+class PlannedView(_NoteRecord):
+    """A viewpoint in a motion plan; `outcome` is refused where the arm cannot take it."""
+
+    viewpoint: str
+    outcome: str
+    reason: str = ""
+
+
+class PlannedStation(_NoteRecord):
+    """The viewpoints of one station, in the order of capture."""
+
+    views: tuple[PlannedView, ...]
+
+
+class MotionPlan(_NoteRecord):
+    """How the arm moves in a capture."""
+
+    stations: tuple[PlannedStation, ...] = ()
+
+    @property
+    def views(self) -> tuple[PlannedView, ...]:
+        """All viewpoints in the order of capture."""
+        return tuple(view for station in self.stations for view in station.views)
+
+
+class SuggestedViews(_NoteRecord):
+    """What a capture found wanting, and the views that would help most."""
+
+    advice: str
+    viewpoints: tuple[Suggestion, ...]
+
+
+class Mending(_NoteRecord):
+    """What would bring the present attempt of a step within its limits; only the numbers of views are shown."""
+
+    advice: str = ""
+    viewpoints: tuple[object, ...] = ()
+    poses: tuple[object, ...] = ()
+
+
+def board_plans(state: StepState) -> tuple[BoardPlan, ...]:
+    """The board images planned in a step, oldest plan first."""
+    return tuple(BoardPlan.model_validate(note.data) for note in state.notes if note.note == BOARD_POSES)
+
+
+def motion_plan(state: StepState) -> MotionPlan:
+    """The newest motion plan of a step; empty without one."""
+    plans = [note.data for note in state.notes if note.note == MOTION_PLAN]
+    return MotionPlan.model_validate(plans[-1]) if plans else MotionPlan()
+
+
+def suggested_views(state: StepState) -> tuple[SuggestedViews, ...]:
+    """The suggestions of a step, oldest first."""
+    return tuple(SuggestedViews.model_validate(note.data) for note in state.notes if note.note == SUGGESTION)
+
+
+def mending(state: StepState) -> Mending:
+    """The newest advice on the present attempt; empty without any."""
+    return Mending.model_validate(dict(state.mend))
