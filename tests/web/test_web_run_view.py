@@ -206,7 +206,8 @@ def test_paused_is_shown_only_once_the_robot_stands_still() -> None:
 def test_a_dead_runner_offers_to_go_on() -> None:
     log = advance_to(DEMO, "ct_hand_over_out")
     view = view_of(log, Snapshot(), driven=False)
-    assert (view.mode, view.question.main and view.question.main.verb, view.question.main and view.question.main.hold) == ("died", "go-on", False)
+    main = view.question.main
+    assert (view.mode, main and main.verb, main and main.hold) == ("died", "go-on", False)
     moving = view_of(advance_to(DEMO, "viewpoint_capture_1"), Snapshot(), driven=False).question.main
     assert moving is not None
     assert not moving.hold

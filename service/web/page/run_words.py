@@ -10,6 +10,7 @@ from service.core.run.decide import AskOperator
 from service.core.run.state import RunState, StepState
 from service.steps import step_kinds
 from service.steps.context import ROBOT_MOVES, Announcement, BeforeStep
+from service.steps.notes import mending
 
 _ACRONYMS = {"rms": "RMS", "ct": "CT", "colmap": "COLMAP", "five": "Five", "px": "px"}
 _UNITS = frozenset({"px", "mm", "deg", "min", "m", "s", "rad"})
