@@ -1,4 +1,4 @@
-"""The web application: routers, safety headers, a sealed record, and errors that say nothing of the inside."""
+"""The web application: routers, safety headers, a sealed record, and errors that reveal no internals."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def create_app(site: Site) -> FastAPI:
         title="orthocapture",
         docs_url=None,
         redoc_url=None,
-        openapi_url=None,  # the pages are for people; a list of all addresses helps strangers only
+        openapi_url=None,  # the pages are for people; a list of all addresses would only help attackers
         dependencies=[Depends(sealed, scope="function")],
     )
     app.state.site = site
@@ -76,5 +76,5 @@ def create_app(site: Site) -> FastAPI:
     for folder in _WITH_STATIC_FILES:
         files = StaticFiles(packages=[(f"service.web.{folder}", "static")])
         app.mount(f"/static/{folder}", files, name=f"static_{folder}")
-    app.mount("/static", StaticFiles(packages=[("service.web.page", "static")]), name="static")  # of every page
+    app.mount("/static", StaticFiles(packages=[("service.web.page", "static")]), name="static")  # used by every page
     return app

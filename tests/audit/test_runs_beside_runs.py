@@ -53,7 +53,7 @@ def typed(*arguments: str) -> Result:
 def test_two_runs_stand_side_by_side_on_a_page(two: Two) -> None:
     browser = two.web.browser("auditor")
     page = words(browser.get("/compare", params={"run": [two.good, two.bad]}).text)
-    assert "Another content 2 lines differ" in page
+    assert "Different content 2 lines differ" in page
     assert re.search(r"\+ \d+: gates: \[\{measure: best_mean_radial_error_mm, max: 0.35, unit: mm, accept_by", page)
     assert "mean radial error 0.213 mm 0.900 mm +0.687 mm" in page
     assert "best mean radial error mm 0.213 mm (≤ 0.35): within 0.9 mm (≤ 0.35): outside +0.687 mm" in page
@@ -124,7 +124,7 @@ def test_figures_over_time_by_camera_lens_and_arm(tmp_path: Path) -> None:
         page = browser.get("/history").text
         for told in (
             "ILCE-7RM5, serial number 1234567",
-            "FE 50mm, serial number not told",
+            "FE 50mm, serial number not stated",
             "UR10e, serial number 20231",
         ):
             assert told in words(page)

@@ -61,7 +61,7 @@ def test_a_run_is_started_noted_on_and_found(tmp_path: Path) -> None:
         tablet.go("/?q=slipped")
         expect(page.get_by_role("link", name=f"Open run {run_id}")).to_be_visible()
         tablet.go("/?q=fractured")
-        expect(page.get_by_text("0 runs fit.")).to_be_visible()
+        expect(page.get_by_text("0 runs match.")).to_be_visible()
     with Store.open(data) as store:
         events = store.events(run_id)
     root = events[0].payload

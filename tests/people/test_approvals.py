@@ -57,7 +57,7 @@ def test_another_content_under_the_same_version_needs_a_reason_and_a_signer(web:
     (web.folder / "protocols" / "bench.yaml").write_text(LOOSE)
     browser = web.browser("technician")
     page = words(browser.get("/").text)
-    assert "Changed Another content of bench 1 was approved by emmy" in page
+    assert "Changed Different content of bench 1 was approved by emmy" in page
     assert re.search(r"− \d+: - \{measure: viewpoints_captured, min: 3\}", page)
     assert re.search(r"\+ \d+: - \{measure: viewpoints_captured, min: 1\}", page)
     for fields in (

@@ -272,10 +272,10 @@ def test_runs_are_found_by_what_people_said_of_them(web: WebSite) -> None:
     assert find(since=day, until=day) == [done, knee, spine]
     assert find(until="2020-01-01") == []
     page = browser.get("/", params={"q": "liquid", "result": "aborted"})
-    assert "1 run fits." in words(page.text)
+    assert "1 run matches." in words(page.text)
     assert spine in page.text
     assert done not in page.text
-    assert "No run that has ended fits." in browser.get("/", params={"q": "nowhere"}).text
+    assert "No finished run matches." in browser.get("/", params={"q": "nowhere"}).text
     listed = web.browser("auditor").get("/audit", params={"q": "knee teaching"}).text
     assert f"/audit/runs/{knee}" in listed
     assert f"/audit/runs/{spine}" not in listed

@@ -163,7 +163,7 @@ def test_a_form_without_the_token_of_its_sign_in_is_refused(site: WebSite, run_i
             for csrf in ("", "wrong", other, "ü" * 43):
                 answer = ask(browser, way, run_id, csrf=csrf)
                 assert answer.status_code == 403, (way, csrf, answer.text)
-                assert "does not belong to the present sign-in" in answer.text, way
+                assert "does not belong to the current sign-in" in answer.text, way
             assert events_of(site, run_id) == before, way
 
 

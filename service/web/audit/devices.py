@@ -1,4 +1,4 @@
-"""The auditor's page of a run's devices: which they were, how their clocks stood, what troubled them."""
+"""The auditor's page of a run's devices: identities and versions, clocks, and faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What leaves the system: release by a second person, bundle, report, data set."""
+"""Release of a run by a second person, and its exports: bundle, report, data set."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def exports_page(
     person: SignedInPerson,
     run_id: RunId,
 ) -> Response:
-    """Whether the run may leave the system, what has left already, and how to make more."""
+    """Whether the run may be exported, what has been exported, and the forms to export it."""
     log = site.run(run_id)
     refusal = refuse_export(log.protocol, log.state)
     released = next(
@@ -85,10 +85,10 @@ def release(
     password: Annotated[str, Form(max_length=1000)],
     signed_sha256: Annotated[str, Form(max_length=64)],
 ) -> RedirectResponse:
-    """Sign, as a second person, that a completed run may leave the system."""
+    """Sign, as a second person, that a completed run may be exported."""
     log = site.run(run_id)
     if meaning not in MEANINGS:
-        raise ConfigurationError("the meaning is none of those offered", where="meaning", remedy="Choose one of them")
+        raise ConfigurationError("the meaning is not among those offered", where="meaning", remedy="Choose one")
     refusal = refuse_release(log.state, person.account, signed_sha256)
     if refusal is not None:
         raise refusal
@@ -102,7 +102,7 @@ def release(
 def start_export(
     site: CurrentSite, exports: CurrentExports, person: SignedInPerson, run_id: RunId, what: Annotated[What, Form()]
 ) -> RedirectResponse:
-    """Begin an export. It verifies everything first, and ends without a file when anything differs."""
+    """Begin an export. It first verifies everything, and writes no file if anything differs."""
     log = site.run(run_id)
     refusal = refuse_export(log.protocol, log.state)
     if refusal is not None:

@@ -70,12 +70,12 @@ CurrentAudit = Annotated[AuditState, Depends(_audit)]
 
 @dataclass(frozen=True, slots=True)
 class AuditFrame:
-    """What stands around every page of one run."""
+    """The frame around every page of one run."""
 
     run: RunBasics
     base: str  # /audit/runs/RUN
     tabs: tuple[tuple[str, str], ...]  # address, text
-    here: str  # address of the present tab
+    here: str  # address of the current tab
     verification: Verification | None
     verified: str
     verifying: ChildState | None
@@ -83,7 +83,7 @@ class AuditFrame:
 
 
 def audit_frame(audit: AuditState, run_id: str, tab: str) -> AuditFrame:
-    """Of one run, for the page at `tab`. Raises UnknownRunError."""
+    """The frame of one run's page at `tab`. Raises UnknownRunError."""
     with audit.site.store.database.reading() as connection:
         found = queries.runs(connection, run_id)
     if not found:

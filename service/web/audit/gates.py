@@ -24,7 +24,7 @@ _ERROR, _PIXELS = "mean_radial_error_mm", "mean_reprojection_error_px"
 
 @dataclass(frozen=True, slots=True)
 class StepGates:
-    """The gates of one step as its last attempt was judged, and how many earlier judgements did not pass."""
+    """The gates of one step as its last attempt was judged, and how many earlier judgements failed."""
 
     step: str
     title: str
@@ -35,7 +35,7 @@ class StepGates:
 
 @dataclass(frozen=True, slots=True)
 class AccuracyRow:
-    """One row of the accuracy table, held against the limit that the run's own registration was judged by."""
+    """One row of the accuracy table, compared with the limit by which the run's own registration was judged."""
 
     poses: str
     error_mm: float | None

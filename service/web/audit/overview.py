@@ -27,7 +27,7 @@ from service.web.security.guards import requires
 
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncGenerator[None]:
-    """Templates are read before anybody asks: the first page of a run answers at once too."""
+    """Read the templates at the start, so that the first page of a run answers at once."""
     for name in TEMPLATES.list_templates(filter_func=lambda name: name.startswith(("audit/", "evidence/"))):
         TEMPLATES.get_template(name)
     yield
@@ -87,7 +87,7 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
 
 
 def _to_come(audit: AuditState, run_id: str, digest: Digest | None) -> list[Left]:
-    """Results that are still being computed, or will never come. Read whole only where there may be any."""
+    """Results that are still being computed, or that failed. The whole run is read only if there may be any."""
     failed = digest is not None and digest.facets.kinds.get("job_failed", 0) > 0
     if digest is None or digest.problem or not (failed or audit.site.store.open_jobs(run_id)):
         return []

@@ -1,4 +1,4 @@
-"""Whether a run's protocol is the one that its id and version stand for: approvals, other contents, what differs."""
+"""Whether a run's protocol has the approved content of its id and version: approvals, other contents, differences."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from service.store.store import Store
 
 @dataclass(frozen=True, slots=True)
 class OtherContent:
-    """Another content under the same id and version: runs made by it, who approved it, and the lines that differ."""
+    """Different content under the same id and version: its runs, who approved it, and the lines that differ."""
 
     sha256: str
     runs: tuple[str, ...]
@@ -40,7 +40,7 @@ _CONTENTS = text(
 
 
 def protocol_identity(store: Store, run_id: str, protocol: str, version: str) -> ProtocolIdentity:
-    """From the roots of all runs and the site's chain."""
+    """Read from the first events of all runs and from the site's chain."""
     known = approvals(store, protocol, version)
     with store.database.reading() as connection:
         rows = connection.execute(_CONTENTS, {"site": SITE, "protocol": protocol, "version": version})
@@ -62,7 +62,7 @@ def protocol_identity(store: Store, run_id: str, protocol: str, version: str) ->
 
 
 def _source(store: Store, approved: dict[str, Approval], sha256: str) -> str:
-    """A content's text: of its approval, else from the evidence of a run; "" where neither can be read."""
+    """The text of a content: from its approval, else from the evidence of a run; "" if neither can be read."""
     if sha256 in approved:
         return approved[sha256].payload.source
     try:

@@ -1,4 +1,4 @@
-"""What the auditor's pages are asked for: the fields of their addresses, cut to a length that a page can show."""
+"""Query fields of the auditor's pages, cut to a length that a page can show."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LONGEST = 200  # characters of a filter; more is cut
 
 
 def cut(text: str) -> str:
-    """A filter as it is used and shown."""
+    """The text of a filter, without outer blanks and cut to the longest length."""
     return text[:LONGEST].replace("\0", "")
 
 
@@ -23,7 +23,7 @@ Ticked = Annotated[bool, BeforeValidator(bool)]  # any text ticks the box
 
 
 class RunQuery(BaseModel):
-    """Of the list of runs."""
+    """Filters of the list of runs."""
 
     since: Text = ""
     until: Text = ""
@@ -37,12 +37,12 @@ class RunQuery(BaseModel):
     page: int = 1
 
     def wanted(self) -> RunFilter:
-        """Which runs."""
+        """The filter of runs that these fields describe."""
         return RunFilter(**self.model_dump(exclude={"page"}))
 
 
 class EventQuery(BaseModel):
-    """Of a list of events, which goes on after one event or ends before one."""
+    """Filters of a list of events, which begins after one event or ends before one."""
 
     step: Text = ""
     device: Text = ""
@@ -53,12 +53,12 @@ class EventQuery(BaseModel):
     before: int = 0
 
     def wanted(self) -> EventFilter:
-        """Which events."""
+        """The filter of events that these fields describe."""
         return EventFilter(self.step, self.device, self.person, self.kind, self.q)
 
 
 class ArtefactQuery(BaseModel):
-    """Of the list of files."""
+    """Filters of the list of files."""
 
     kind: Text = ""
     step: Text = ""
@@ -68,5 +68,5 @@ class ArtefactQuery(BaseModel):
     page: int = 1
 
     def wanted(self) -> ArtefactFilter:
-        """Which files."""
+        """The filter of files that these fields describe."""
         return ArtefactFilter(self.kind, self.step, self.device, self.viewpoint, self.q)

@@ -40,13 +40,13 @@ def signatures_page(request: Request, audit: CurrentAudit, run_id: str) -> Respo
     "/audit/runs/{run_id}/verification", name="audit_verification", dependencies=_READ, response_class=HTMLResponse
 )
 def verification_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
-    """What the last verification found, or how far the present one is."""
+    """What the last verification found, or how far the current one is."""
     return render(request, "audit/verification.html.j2", audit=audit_frame(audit, run_id, "/verification"))
 
 
 @router.post("/audit/runs/{run_id}/verification", name="verify", dependencies=_READ)
 def verify_now(audit: CurrentAudit, person: SignedInPerson, run_id: str) -> Response:
-    """Verify the run; it only reads, so whoever may read may ask for it."""
+    """Verify the run. It only reads, so everybody who may read may start it."""
     audit_frame(audit, run_id, "/verification")
     audit.verifications.start(run_id, person.account)
     return RedirectResponse(f"/audit/runs/{run_id}/verification", status_code=303)

@@ -1,4 +1,4 @@
-"""Which board images to add: where the image has had no corners, and poses that make the hand-eye better."""
+"""Which board images to add: parts of the image without corners, and poses that improve the hand-eye calibration."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ _ROWS, _COLUMNS = ("upper", "middle", "lower"), ("left", "centre", "right")
 
 @dataclass(frozen=True, slots=True)
 class PoseAdvice:
-    """A board pose worth taking, as the camera stands to the board.
+    """A board pose worth taking, as the pose of the camera relative to the board.
 
     Attributes:
         tilt_deg: of the optical axis from the board's normal.
         azimuth_deg: from which side, in the board's plane.
         roll_deg: of the image about the optical axis, against the one nearest to upright.
         distance_m: to the board's middle.
-        sigma_mm, sigma_deg: of the hand-eye once this and those before are taken.
-        flange_mm: where to send the flange, base frame.
+        sigma_mm, sigma_deg: of the hand-eye transform once this and the earlier poses are taken, 1σ.
+        flange_mm: position of the flange in the base frame.
     """
 
     tilt_deg: float
@@ -52,7 +52,7 @@ class PoseAdvice:
 
 
 def empty_regions(corners: Sequence[Sequence[int]]) -> list[tuple[str, int, int]]:
-    """Ninths of the image with cells that no corner has been in: name, empty cells, all its cells; worst first."""
+    """Ninths of the image that have cells without corners: name, empty cells, all its cells; worst first."""
     grid = np.array(corners)
     out: list[tuple[str, int, int]] = []
     for r, rows in enumerate(np.array_split(np.arange(grid.shape[0]), 3)):
@@ -73,7 +73,7 @@ def advised_poses(
     data: Path,
     key: str,
 ) -> tuple[PoseAdvice, ...]:
-    """Computed once for a calibration and kept in DIR/cache; none where the linearised problem has no answer.
+    """Suggested poses, computed once for a calibration and cached; none if the linearised problem has no solution.
 
     Args:
         record: of the hand-eye calibration.
@@ -146,7 +146,7 @@ def _answer(record: Mapping[str, Any]) -> HandEyeAnswer:
         sigma_mm=record["sigma"]["mm"],
         sigma_deg=record["sigma"]["deg"],
         covariance=np.array(record["sigma"]["covariance"]),
-        camera_share=np.zeros((6, 6)),  # is in the covariance; nothing here asks for it alone
+        camera_share=np.zeros((6, 6)),  # it is part of the covariance, and is not needed separately here
         formal_covariance=None,
         robot_noise_mm=record["robot_noise"]["mm"],
         robot_noise_deg=record["robot_noise"]["deg"],

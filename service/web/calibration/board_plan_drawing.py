@@ -22,7 +22,7 @@ def board_plan_svg(text: str, counts: Sequence[Sequence[int]], T_base_camera: Ar
     """An SVG document.
 
     Args:
-        text: what the plan is predicted to come to.
+        text: what the plan is predicted to give.
         counts: (8, 12) corners expected in each cell of the image.
         T_base_camera: (K, 4, 4) planned poses, those taken already included.
         approach: (3,) horizontal unit vector from the scene towards the robot, which is below in the drawing.

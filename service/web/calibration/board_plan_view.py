@@ -21,7 +21,7 @@ from service.web.record.planned_poses import recorded_rig, station_of
 
 
 def board_plan_of(log: RunRecord, step_id: str, data: Path) -> bytes:
-    """An SVG document; computed once for what is recorded of a step.
+    """The plan as an SVG document, computed once for each recorded state of a step.
 
     Raises:
         ProtocolError: no such step.

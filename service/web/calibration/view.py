@@ -18,7 +18,7 @@ from service.web.record.images import captures_of
 
 @dataclass(frozen=True, slots=True)
 class ImageRow:
-    """A board image and what remains of it in each calibration; None where it is not in it."""
+    """A board image and its residuals in each calibration; None where the calibration does not use it."""
 
     name: str
     rms_px: float | None
@@ -61,7 +61,7 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class Charts:
-    """The charts of the page; None where a part is not solved."""
+    """The charts of the intrinsics."""
 
     coverage: HeatMap
     residuals: VectorField
@@ -71,7 +71,7 @@ class Charts:
 
 
 def calibration_of(log: RunRecord) -> Calibration | None:
-    """None before a calibration step has an answer."""
+    """The calibration in force; None before a calibration step has an answer."""
     solved = [
         (step, log.state.steps[step.id])
         for step in log.protocol.steps
@@ -103,7 +103,7 @@ def calibration_of(log: RunRecord) -> Calibration | None:
 
 
 def charts_of(calibration: Calibration) -> Charts | None:
-    """None without intrinsics."""
+    """The charts of the intrinsics; None if they are not solved."""
     record = calibration.intrinsics
     if record is None:
         return None
@@ -136,14 +136,14 @@ def charts_of(calibration: Calibration) -> Charts | None:
         ),
         sigma_mm=heat_map(
             uncertainty["sigma_mm"], size,
-            title=f"The same at {uncertainty['distance_m']:.2f} m, where the specimen lies, mm",
+            title=f"Uncertainty at {uncertainty['distance_m']:.2f} m, where the specimen lies, mm",
             unit="mm", digits=4, logarithmic=True, every=4,
         ),
     )  # fmt: skip
 
 
 def hand_eye_chart(calibration: Calibration) -> Dots | None:
-    """How far each image puts the board from where the others put it; None without a hand-eye."""
+    """Distance of the board as each image places it from its place by the others; None without a hand-eye."""
     best = calibration.best
     if best is None:
         return None
@@ -158,7 +158,7 @@ def hand_eye_chart(calibration: Calibration) -> Dots | None:
 
 
 def image_rows(calibration: Calibration) -> list[ImageRow]:
-    """Every board image, with its residuals; those that are not used first."""
+    """Every board image with its residuals, unused images first."""
     record, best = calibration.intrinsics or {}, calibration.best or {}
     names: list[str] = record.get("images", [])
     validation: Mapping[str, Any] = record.get("cross_validation") or {}
@@ -187,7 +187,7 @@ def image_rows(calibration: Calibration) -> list[ImageRow]:
 
 
 def held_out_mm(calibration: Calibration) -> tuple[float, float] | None:
-    """Median and greatest error of the board's place by images that the hand-eye has not seen."""
+    """Median and maximum error of the board's position by images that the hand-eye calibration did not use, mm."""
     if calibration.best is None:
         return None
     values = list(calibration.best["residuals"]["held_out_mm"].values())
@@ -204,7 +204,7 @@ def _limit(calibration: Calibration, measure: str) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """Who signed a calibration step, when and as what."""
+    """Who signed a calibration step, when, and with which meaning."""
 
     step: str
     who: str
@@ -214,7 +214,7 @@ class Signature:
 
 @dataclass(frozen=True, slots=True)
 class LaterCheck:
-    """A later step that held its images against the calibration."""
+    """A later step that compared its images with the calibration."""
 
     step: str
     images: int
@@ -223,7 +223,7 @@ class LaterCheck:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What a certificate says beside the figures.
+    """What a certificate states in addition to the figures.
 
     Attributes:
         camera: EXIF of the first board image: settings, lens, body.
@@ -251,7 +251,7 @@ _STATED = (
 
 
 def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
-    """From the record alone."""
+    """The certificate, from the recorded events alone."""
     state, (_, there) = log.state, calibration.steps[-1]
     first = calibration.captures[0] if calibration.captures else None
     ids = {step.id for step, _ in calibration.steps}

@@ -44,7 +44,7 @@ _MEDIA_TYPE = re.compile(r"[a-z]+/[a-z0-9.+-]+")
 
 @router.get("/vendor/plotly.js", name="plotly_script", response_class=FileResponse)
 def plotly_script(request: Request, site: CurrentSite) -> Response:
-    """plotly's script out of the installed package; charts and the 3D view load it in their sandboxed frames."""
+    """plotly's script from the installed package; the 3D view loads it in its sandboxed frame."""
     path = _plotly()
     stat = path.stat()
     tag = f'"{stat.st_size:x}-{stat.st_mtime_ns:x}"'
@@ -64,7 +64,7 @@ def _plotly() -> Path:
         path = Path(folder, "package_data", "plotly.min.js")
         if path.is_file():
             return path
-    raise HTTPException(404, "plotly's script is not installed; install orthocapture anew, its dependencies included")
+    raise HTTPException(404, "plotly's script is not installed; install orthocapture again with its dependencies")
 
 
 @router.get(
@@ -140,7 +140,7 @@ def viewpoint_image(
     response_class=FileResponse,
 )
 def live_view(site: CurrentSite, run_id: RunId) -> Response:
-    """The camera's newest frame. Asking keeps the frames coming; a frame of some seconds ago is not shown as live."""
+    """The camera's newest frame. Each request keeps the frames coming; an old frame is not shown as live."""
     site.run(run_id)
     ask_for_frames(site.data, run_id)
     path = frame_path(site.data, run_id)
@@ -156,7 +156,7 @@ def live_view(site: CurrentSite, run_id: RunId) -> Response:
 
 
 def recorded_file(site: Site, run_id: str, sha256: str) -> ArtefactRef:
-    """What this run has recorded of a file. HTTP 404 when it has recorded none of this name, whatever others have."""
+    """What this run has recorded about a file. HTTP 404 if this run has not recorded it, even if another run has."""
     with site.store.database.reading() as connection:
         row = connection.execute(
             select(artefacts)
@@ -170,7 +170,7 @@ def recorded_file(site: Site, run_id: str, sha256: str) -> ArtefactRef:
 
 
 def mark_source(log: RunRecord, capture: Capture) -> str:
-    """Names what would be drawn over an image: changes when something better becomes known; "" for nothing."""
+    """The version of what would be drawn over an image; it changes when better outlines are known. "" for nothing."""
     from service.web.record.outlines import outlines_of  # noqa: PLC0415 - the matching of spheres, not needed to start
 
     found = outlines_of(log, capture)
@@ -185,7 +185,7 @@ def _reduced(
     capture: Capture | None = None,
     source: str = "",
 ) -> Path:
-    """The cached copy. HTTP 415 for what is no picture; the original is hashed again when a copy is made."""
+    """The cached copy. HTTP 415 if the file is not a picture; the original is hashed again when a copy is made."""
     if ref.media_type not in PICTURES:
         raise HTTPException(415, f"{safe_name(ref.original_name, ref.sha256)} is not a picture")
 

@@ -33,7 +33,7 @@ LISTED = 200  # viewpoints on one page of the table
 
 
 class CaptureQuery(BaseModel):
-    """Which step and which of its images to show; what is left out, the page chooses."""
+    """Which step and which of its images to show; the page chooses what is not given."""
 
     step: str = Field("", max_length=64)
     viewpoint: str = Field("", max_length=64)
@@ -60,7 +60,7 @@ def capture(
 def capture_parts(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, names: Parts, wanted: Wanted
 ) -> HTMLResponse:
-    """Parts of the page, all of one moment, for the script that keeps it up to date."""
+    """Parts of the page, all from the same moment, for the script that keeps the page up to date."""
     shown = _shown(site, person, run_id, wanted)
     return render(request, "capture/parts.html.j2", names=names.split(","), **shown)
 
@@ -147,7 +147,7 @@ def _sheet(log: RunRecord, step: Step, captures: Sequence[Capture], wanted: Capt
 
 
 def _image(log: RunRecord, step: Step, chosen: Capture | None, captures: Sequence[Capture]) -> dict[str, Any]:
-    """The one large image, with what is known of it."""
+    """The large image, with what is known about it."""
     from service.web.capture import view as capture_view  # noqa: PLC0415
     from service.web.record.known_spheres import best_registration  # noqa: PLC0415
 
@@ -161,7 +161,7 @@ def _image(log: RunRecord, step: Step, chosen: Capture | None, captures: Sequenc
 
 
 def _drawings(log: RunRecord, views: Sequence[View], name: str) -> list[PlanDrawing]:
-    """The plan of each station's viewpoints, as far as the station is known."""
+    """The plan of the viewpoints of each known station."""
     from service.web.capture import plan_drawing  # noqa: PLC0415
     from service.web.record import planned_poses  # noqa: PLC0415
 

@@ -14,9 +14,9 @@ WIDTH = 640.0  # of the drawing; its height follows from what is on it
 _MARGIN = 62.0
 _TICK = 30.0  # length of the line that tells where a camera looks
 _MOST_LABELS = 40
-_MOST_SYMBOLS = 400  # of more, those that would lie on one another are drawn as one
-_CELL = 6.0  # edge of the square in which they do
-# Which of them is drawn: what a person has to look at comes first.
+_MOST_SYMBOLS = 400  # beyond this, viewpoints that would overlap are drawn as one
+_CELL = 6.0  # edge of the square within which viewpoints overlap
+# Which of them is drawn: those that need attention come first.
 _FIRST: Sequence[ViewState] = ("failed", "again", "unused", "departs", "left_out", "skipped", "open", "done", "next")
 
 
@@ -54,7 +54,7 @@ class PlanDrawing:
 
 
 def plan_drawing(station: Station, views: Sequence[View], chosen: str = "") -> PlanDrawing | None:
-    """None without a viewpoint whose place is known. `chosen` is drawn in any case."""
+    """The drawing; None without a viewpoint whose position is known. `chosen` is always drawn."""
     placed = [(v, v.position_m, v.looks) for v in views if v.position_m is not None and v.looks is not None]
     if not placed:
         return None
@@ -96,7 +96,7 @@ def plan_drawing(station: Station, views: Sequence[View], chosen: str = "") -> P
 
 
 def _apart(symbols: Sequence[Symbol], chosen: str) -> list[Symbol]:
-    """One of those that would lie on one another; what is chosen, and what comes next, in any case."""
+    """One of the viewpoints that would overlap; the chosen and the next viewpoint are always kept."""
     wanted = [symbol for symbol in symbols if symbol.name == chosen or symbol.state == "next"]
     kept: dict[tuple[int, int], Symbol] = {}
     for symbol in sorted(symbols, key=lambda s: _FIRST.index(s.state)):

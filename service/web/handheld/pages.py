@@ -35,7 +35,7 @@ def held(request: Request, site: CurrentSite, person: SignedInPerson, run_id: Ru
 def held_parts(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, names: Parts, step: Name = ""
 ) -> HTMLResponse:
-    """Parts of the page, all of one moment, for the script that keeps it up to date."""
+    """Parts of the page, all from the same moment, for the script that keeps the page up to date."""
     return render(request, "handheld/parts.html.j2", names=names.split(","), **_shown(site, person, run_id, step))
 
 

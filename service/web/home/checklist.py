@@ -37,7 +37,7 @@ def run_checklist(request: Request, site: CurrentSite, run_id: Annotated[str, Pa
     """Of the protocol that a run began with."""
     log = site.run(run_id)
     root = log.events[0].payload
-    assert isinstance(root, RunStarted)  # site.run has read it the same way
+    assert isinstance(root, RunStarted)  # checked when the run was read
     return _page(request, log.protocol, root.protocol_sha256, run_id=run_id, frame=run_frame(site, run_id))
 
 

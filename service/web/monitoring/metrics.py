@@ -1,4 +1,4 @@
-"""The figures of a data folder in Prometheus' words, read anew at each scrape."""
+"""The figures of a data folder in the format of Prometheus, read again at each scrape."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PREFIX = "orthocapture_"
 
 
 class DataFolderMetrics(Collector):
-    """A collector over one data folder; where the record cannot be read, health alone is told."""
+    """A collector over one data folder. If the record cannot be read, it gives only the health."""
 
     def __init__(
         self,
@@ -33,7 +33,7 @@ class DataFolderMetrics(Collector):
         self._health = health
 
     def describe(self) -> Iterable[Metric]:
-        """Nothing beforehand: registering asks the database nothing."""
+        """Nothing, so that registering the collector does not read the database."""
         return ()
 
     def collect(self) -> Iterable[Metric]:
@@ -46,7 +46,7 @@ class DataFolderMetrics(Collector):
             "runners": health.runners,
         }
         yield _gauge(
-            "healthy", "1 where nothing is wrong with a part.", ("part",), {(p,): not w for p, w in parts.items()}
+            "healthy", "1 if nothing is wrong with a part.", ("part",), {(p,): not w for p, w in parts.items()}
         )
         try:
             figures, forecasts = self._figures(), self._forecasts()
@@ -59,13 +59,13 @@ class DataFolderMetrics(Collector):
         yield from _clocks(clocks)
         yield _gauge(
             "forecast_bytes",
-            "What a run that is driven will still write.",
+            "Bytes that an active run will still write.",
             ("run",),
             {(run_id,): space.needed_bytes for run_id, space in forecasts.items()},
         )
         yield _gauge(
             "forecast_views",
-            "Photographs that it will still take.",
+            "Photographs that an active run will still take.",
             ("run",),
             {(run_id,): space.views_left for run_id, space in forecasts.items()},
         )
@@ -73,7 +73,7 @@ class DataFolderMetrics(Collector):
 
 def _record(figures: Figures) -> Iterable[Metric]:
     yield _gauge("runs", "Runs by state.", ("state",), {(state,): n for state, n in figures.runs.items()})
-    yield _total("captures", "Photographs recorded, of all runs.", figures.captures)
+    yield _total("captures", "Photographs recorded in all runs.", figures.captures)
     yield _gauge("jobs", "Jobs by kind and state.", ("kind", "state"), figures.jobs)
     seconds = SummaryMetricFamily(_PREFIX + "job_seconds", "Computing time of finished jobs.", labels=("kind",))
     for kind, (count, total_s) in figures.job_seconds.items():
@@ -81,7 +81,7 @@ def _record(figures: Figures) -> Iterable[Metric]:
     yield seconds
     yield _gauge(
         "queue_length",
-        "Jobs that nobody computes yet: a step waits for them, or they are background.",
+        "Jobs that no worker has claimed yet: those that a step waits for, and those in the background.",
         ("lane",),
         {(lane,): n for lane, n in figures.queue.items()},
     )
@@ -90,23 +90,23 @@ def _record(figures: Figures) -> Iterable[Metric]:
 
 
 def _processes(figures: Figures) -> Iterable[Metric]:
-    yield _gauge("workers", "Workers that live.", (), {(): figures.workers})
-    yield _gauge("driven_runs", "Runs that a process drives now.", (), {(): len(figures.driven)})
+    yield _gauge("workers", "Workers that are running.", (), {(): figures.workers})
+    yield _gauge("driven_runs", "Runs that are driven by a process now.", (), {(): len(figures.driven)})
     yield _gauge(
         "runner_silent_seconds",
-        "Since the main loop of a runner last looked up from what it does.",
+        "Time since the main loop of a runner last reported.",
         ("run",),
         {(run.run_id,): run.silent_s for run in figures.driven if math.isfinite(run.silent_s)},
     )
     yield _gauge(
         "viewpoint_seconds",
-        "Between the last exposures of a run, median.",
+        "Median time between the last exposures of a run.",
         ("run",),
         {(run.run_id,): run.viewpoint_s for run in figures.driven if run.viewpoint_s is not None},
     )
     yield _gauge(
         "robot_state",
-        "1 for what the arm of a run does.",
+        "1 for the current state of the arm of a run.",
         ("run", "state"),
         {(r.run_id, r.robot): 1 for r in figures.driven},
     )
@@ -116,13 +116,13 @@ def _devices(figures: Figures) -> Iterable[Metric]:
     labels = ("run", "device", "kind")
     yield _gauge(
         "device_up",
-        "1 for a device that was opened, without trouble since; of the runs that are driven, or else the newest.",
+        "1 for a device that was opened and has had no fault since; of the driven runs, or else of the newest.",
         labels,
         {(d.run_id, d.device, d.kind): d.answers for d in figures.devices},
     )
     yield _gauge(
         "device_problems",
-        "What a device reported of itself when it was opened.",
+        "Problems that a device reported about itself when it was opened.",
         labels,
         {(d.run_id, d.device, d.kind): d.problems for d in figures.devices},
     )
@@ -132,7 +132,7 @@ def _clocks(clocks: Mapping[str, Sequence[ClockReading]]) -> Iterable[Metric]:
     known = {(run_id, clock.device): clock for run_id, found in clocks.items() for clock in found}
     yield _gauge(
         "clock_offset_seconds",
-        "A clock minus the one it is compared with: a device's minus the host's, the host's minus the network's.",
+        "Offset of a clock: a device's minus the host's, or the host's minus the network's.",
         ("run", "device", "against"),
         {(*of, clock.against): clock.offset_s for of, clock in known.items() if clock.offset_s is not None},
     )

@@ -25,9 +25,9 @@ _FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "
 
 
 class ReaderOrThisMachine(Guard):
-    """Lets through what this machine itself asks, with no proxy between; everybody else must be signed in to read.
+    """Lets requests from this machine pass if no proxy forwarded them; everybody else must be signed in to read.
 
-    A program that scrapes cannot sign in. Who is on this machine could read the data folder as well.
+    A scraping program cannot sign in, and whoever is on this machine could read the data folder anyway.
     """
 
     async def __call__(self, request: Request, site: CurrentSite) -> None:
@@ -46,7 +46,7 @@ def _is_this_machine(request: Request) -> bool:
 
 
 def install_metrics(app: FastAPI) -> None:
-    """A registry of this application's own. `app.state.site` is set before."""
+    """Give this application a registry of its own. `app.state.site` must be set before."""
     site = cast(Site, app.state.site)
     registry = CollectorRegistry()
     registry.register(
@@ -76,7 +76,7 @@ def _driven(site: Site) -> list[str]:
 
 @router.get("/health", name="health")
 def health(site: CurrentSite) -> JSONResponse:
-    """Whether database, data folder, worker and runners live. Status 200 when they do, 503 when one does not."""
+    """Health of database, data folder, workers and runners. Status 200 if all are well, else 503."""
     found = read_health(site.store, site.data, _driven(site))
     parts = {
         "database": found.database,
@@ -90,6 +90,6 @@ def health(site: CurrentSite) -> JSONResponse:
 
 @router.get("/metrics", name="metrics", dependencies=[Depends(ReaderOrThisMachine("read", while_locked=False))])
 def metrics(request: Request) -> Response:
-    """What Prometheus scrapes."""
+    """The figures for Prometheus."""
     content = generate_latest(cast(CollectorRegistry, request.app.state.metrics))
     return Response(content, media_type=CONTENT_TYPE_LATEST)

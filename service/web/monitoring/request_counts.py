@@ -1,4 +1,4 @@
-"""Counts what the pages are asked for: requests by route and answer, and how long each answer took to begin."""
+"""Counts requests by route and status, and measures the time until each answer begins."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _METHODS = ("GET", "HEAD", "POST")
 
 
 class RequestCounts:
-    """Outermost, in plain ASGI. Streams count when they begin: they last as long as somebody looks."""
+    """Outermost, in plain ASGI. Streams are counted when they begin, as they last while somebody watches."""
 
     def __init__(self, app: ASGIApp, registry: CollectorRegistry) -> None:
         self._app = app
@@ -37,8 +37,8 @@ class RequestCounts:
         begun_s = time.monotonic()
 
         def count(status: str) -> None:
-            # The route as it is written, never the address as it was asked for: a label for each run, or for
-            # whatever a stranger types, would grow without end.
+            # The pattern of the route, never the address of the request: a label for each run, or for
+            # whatever a stranger types, would make the metrics grow without limit.
             unrouted = "/static" if scope["path"].startswith("/static/") else "other"
             route = str(getattr(scope.get("route"), "path", unrouted))
             method = scope["method"] if scope["method"] in _METHODS else "other"

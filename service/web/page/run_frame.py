@@ -72,7 +72,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
     """The frame of a run's pages. Raises UnknownRunError."""
     log = site.run(run_id)
     root = log.events[0].payload
-    assert isinstance(root, RunStarted)  # site.run has read it the same way
+    assert isinstance(root, RunStarted)  # checked when the run was read
     here = f"/runs/{run_id}"
     driven, snapshot = site.launcher.driven(run_id), read_snapshot(site.data, run_id)
     return RunFrame(

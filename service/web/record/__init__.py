@@ -1,1 +1,1 @@
-"""What several pages read of a run: its images, spheres, planned poses and board images."""
+"""What several pages read from a run: its images, spheres, planned poses and board images."""

@@ -17,7 +17,7 @@ _SEARCH = re.compile(r" ?\(searched at widths [^)]*\)")  # what the detector onc
 
 @dataclass(frozen=True, slots=True)
 class BoardUse:
-    """What became of one board image. `used` is None while that is not known."""
+    """Whether one board image is used; `used` is None while that is not known."""
 
     used: bool | None
     word: str
@@ -25,12 +25,12 @@ class BoardUse:
 
     @property
     def tone(self) -> str:
-        """Of its word."""
+        """The tone of its word on the pages."""
         return {True: "ok", False: "attention", None: "open"}[self.used]
 
 
 def board_uses(run: RunState, events: Sequence[Event], step: str) -> Mapping[str, BoardUse]:
-    """By SHA-256, for the valid board images of a step; from the looks as they arrive, then from the calibration."""
+    """The uses of a step's valid board images by SHA-256: from their own jobs first, later from the calibration."""
     state = run.steps[step]
     images = {
         payload.artefacts[0].sha256: payload
@@ -41,7 +41,7 @@ def board_uses(run: RunState, events: Sequence[Event], step: str) -> Mapping[str
 
 
 def board_use(state: StepState, view: View) -> BoardUse:
-    """What became of one image of a step."""
+    """Whether one image of a step is used."""
     sha256, name = view.artefacts[0].sha256, view.viewpoint
     looks = [job for job in state.jobs.values() if job.kind == "board_view"]
     look = next((job for job in looks if job.arguments["image"]["sha256"] == sha256), None)
@@ -57,14 +57,14 @@ def board_use(state: StepState, view: View) -> BoardUse:
     if not reason and departs:
         reason = f"{' and '.join(departs)} not as wanted"
     if not reason and look is not None and look.status == "failed":
-        reason = f"it could not be looked at: {look.message}"
+        reason = f"it could not be examined: {look.message}"
     if reason or unseen:
         return BoardUse(False, "Not used", reason or "no board was found in it")
     if solved:
-        return BoardUse(False, "Not used", "the calibration does without it")
+        return BoardUse(False, "Not used", "the calibration does not use it")
     if look is not None and look.status == "finished":
-        return BoardUse(None, "Board found", "it is used once all images are there")
-    return BoardUse(None, "Being looked at" if look is not None else "Not looked at yet")
+        return BoardUse(None, "Board found", "it will be used once all images have been taken")
+    return BoardUse(None, "Being examined" if look is not None else "Not examined yet")
 
 
 def unused_count(run: RunState, events: Sequence[Event], step: str) -> int:
@@ -73,7 +73,7 @@ def unused_count(run: RunState, events: Sequence[Event], step: str) -> int:
 
 
 def _reasons(state: StepState, details: Mapping[str, Any]) -> dict[str, str]:
-    """By viewpoint, what the record says against it."""
+    """Reasons against using an image, by viewpoint."""
     intrinsics, hand_eye = details.get("intrinsics") or {}, state.result.get("hand_eye") or {}
     why = dict.fromkeys(map(str, details.get("views_without_board", ())), "no board was found in it")
     why |= {str(entry["image"]): str(entry["reason"]) for entry in intrinsics.get("excluded", ())}

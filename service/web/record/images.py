@@ -28,12 +28,12 @@ class Capture:
 
     @property
     def sha256(self) -> str:
-        """Of the photograph."""
+        """SHA-256 of the photograph."""
         return self.payload.artefacts[0].sha256
 
 
 def captures_of(log: RunRecord, step: str) -> list[Capture]:
-    """Every exposure of a step, in order, the replaced ones included."""
+    """Every exposure of a step in order, including replaced ones."""
     replaced = replaced_events(log)
     live = live_jobs(log.state.steps[step])
     out: list[Capture] = []
@@ -87,7 +87,7 @@ def find_capture(
 
 
 def live_jobs(state: StepState) -> Mapping[str, JobState]:
-    """By photograph: what the live numbers found in it, or that they are still looking."""
+    """The newest `live_view` job of each photograph, by SHA-256, finished or not."""
     found: dict[str, JobState] = {}
     for job in sorted(state.jobs.values(), key=lambda j: j.enqueued_seq):
         if job.kind == "live_view":
@@ -96,12 +96,12 @@ def live_jobs(state: StepState) -> Mapping[str, JobState]:
 
 
 def replaced_events(log: RunRecord) -> Mapping[int, Superseded]:
-    """By event number: what replaced an exposure."""
+    """What replaced an exposure, by the number of its event."""
     return {seq: past for past in log.state.superseded for seq in past.captured.values()}
 
 
 def last_failures(log: RunRecord, step: str) -> Mapping[str, str]:
-    """By viewpoint: the words of its last failure in the current attempt."""
+    """The message of each viewpoint's last failure in the current attempt."""
     attempt = log.state.steps[step].attempt
     return {
         event.payload.viewpoint: event.payload.message

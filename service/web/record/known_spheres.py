@@ -1,4 +1,4 @@
-"""Which spheres a run knows by now, in which frame, and which of them take no part in the registration."""
+"""The spheres known in a run so far, in which frame, and which of them are not used in the registration."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ SphereKind = Literal["registration", "control", "sphere"]
 
 @dataclass(frozen=True, slots=True)
 class Sphere:
-    """A sphere by the number that pages and pictures give it."""
+    """A sphere with the label that pages and pictures show."""
 
     label: str  # "3"; "C1" for a control sphere
-    kind: SphereKind  # "sphere": not known yet whether it will stay for the registration
+    kind: SphereKind  # "sphere": not known yet whether it is a registration or a control sphere
     centre_m: tuple[float, float, float]
     rms_mm: float | None = None  # of the surface points against the fitted sphere
     radius_residual_mm: float | None = None
@@ -49,7 +49,7 @@ def last_of_kind(log: RunRecord, kind: str) -> str:
 
 
 def best_registration(log: RunRecord) -> ShownRegistration | None:
-    """None before there is one."""
+    """The registration to show; None before there is one."""
     name = best_registration_name(log.protocol, log.state)
     if name is None:
         return None
@@ -70,7 +70,7 @@ def scan_spheres(log: RunRecord, by: ShownRegistration) -> tuple[Sphere, ...]:
 
 
 def ct_spheres(log: RunRecord) -> tuple[Sphere, ...]:
-    """Spheres of the CT, in its frame; all of them, for it does not say which are taken away later."""
+    """All spheres of the CT, in its frame; the CT does not tell which of them are removed later."""
     return _numbered(_found_in(log, last_of_kind(log, "ct_import")), "sphere")
 
 
@@ -92,7 +92,7 @@ def _numbered(found: SpheresFound, kind: SphereKind) -> tuple[Sphere, ...]:
 
 @lru_cache(maxsize=16)
 def _control_centres(scan: tuple[Point, ...], control: tuple[Point, ...]) -> tuple[Point, ...]:
-    """What the control scan shows beside the spheres of the scan, in the scan's frame."""
+    """Centres that only the control scan shows, in the frame of the scan."""
     if not scan or not control:
         return ()
     a, b = np.array(scan), np.array(control)

@@ -1,4 +1,4 @@
-"""What is drawn over an image: outlines of its spheres, told apart as well as the run can by now."""
+"""What is drawn over an image: outlines of its spheres, identified as far as that is possible so far."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from service.web.record.pictures import DrawnOutline
 
 @dataclass(frozen=True, slots=True)
 class OutlineSource:
-    """Where outlines of an image come from.
+    """The source of an image's outlines.
 
     Attributes:
-        source: changes with what would be drawn.
+        source: version of the outlines, which changes with what would be drawn.
         artefact: file with the outlines.
         T_camera_scan: of the frame of `spheres`; None while it is not known.
     """
@@ -35,7 +35,7 @@ class OutlineSource:
     source: str
     artefact: str
     spheres: tuple[Sphere, ...]
-    camera: CameraModel  # of the images that it was found in
+    camera: CameraModel  # of the images in which the outlines were found
     photograph: CameraModel  # of the photographs as captured, which may be larger
     T_camera_scan: Transform | None
     live: bool

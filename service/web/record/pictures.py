@@ -58,7 +58,7 @@ class DrawnOutline:
     outline_px: NDArray[np.float64]
 
 
-_REMEDY = "Download the recorded file and look at it; it is in evidence as it came"
+_REMEDY = "Download the recorded file and look at it; it is kept unchanged as evidence"
 
 
 def nearest_width(width: int, among: Sequence[int] = WIDTHS) -> int:
@@ -80,11 +80,11 @@ def cached(folder: Path, key: str, suffix: str, make: Callable[[], bytes]) -> Pa
 
 
 def reduced_jpeg(path: Path, width: int, marks: Sequence[DrawnOutline] = (), *, upright: bool = False) -> bytes:
-    """A JPEG of this width, or of the picture's own where that is smaller, with outlines drawn over it.
+    """A JPEG of this width, or of the picture's own width if that is smaller, with outlines drawn over it.
 
-    `upright`: turned as its orientation tag says, for people to look at; without it as stored, for measuring.
+    With `upright` it is rotated as its orientation tag says, for people; otherwise it is as stored, for measuring.
 
-    A photograph is decoded at an eighth, a quarter or half of its size, never in full when that is wider than needed.
+    A photograph is decoded at an eighth, a quarter or half of its size if that is wide enough.
 
     Raises:
         DataError: it is no picture that can be decoded.
@@ -160,6 +160,6 @@ def _segments(curve: NDArray[np.int32], dash: tuple[int, int] | None) -> list[ND
 
 
 def safe_name(name: str, sha256: str) -> str:
-    """A file name for whoever downloads: no folder, nothing that a shell or a header could take amiss."""
+    """A safe name for a download: no folder, and no characters with a meaning for a shell or a header."""
     last = _SAFE_NAME.sub("_", name.replace("\\", "/").rsplit("/", 1)[-1]).strip(" .")
     return last[-120:].lstrip(" .") or sha256[:12]

@@ -1,4 +1,4 @@
-"""Where the plan puts the camera, and the station that it stands in, without a device and without moving anything."""
+"""Planned camera poses and their stations, computed without any device."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ class PlannedPose:
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """A station as a plan of it is drawn."""
+    """A station, as needed to draw a plan of it."""
 
     layout: StationLayout
     specimen_m: tuple[float, float]  # along the approach, across it
 
 
 def station_of(log: RunRecord, name: str) -> Station | None:
-    """Of the rig as it was when the run began; None when it has no such station."""
+    """A station of the rig as it was when the run began; None if the rig has no such station."""
     section = recorded_rig(log)
     there = section.stations.get(name)
     if there is None:
@@ -56,12 +56,12 @@ def station_of(log: RunRecord, name: str) -> Station | None:
 
 
 def planned_poses(log: RunRecord, step: Step) -> tuple[Viewpoint, ...]:
-    """Those of the protocol, then those that an attempt of the step has suggested."""
+    """The viewpoints of the protocol, then those that an attempt of the step has suggested."""
     return _planned(log, step)[0]
 
 
 def planned_viewpoints(log: RunRecord, step: Step) -> tuple[PlannedPose, ...]:
-    """The same as places and directions."""
+    """Positions and viewing directions of the planned poses."""
     return _planned(log, step)[1]
 
 
@@ -73,7 +73,7 @@ _OF_PLANS = (BOARD_POSES, SUGGESTION)
 
 
 def _planned(log: RunRecord, step: Step) -> tuple[tuple[Viewpoint, ...], tuple[PlannedPose, ...]]:
-    """They follow from the root of the chain (protocol, rig) and the step's notes: computed once for each."""
+    """Computed once for each first event (protocol, rig) and set of the step's notes, which determine the poses."""
     notes = tuple(note.seq for note in log.state.steps[step.id].notes if note.note in _OF_PLANS)
     key = (log.events[0].sha256, step.id, notes)
     with _lock:
@@ -115,7 +115,7 @@ def place(T_base_camera: Transform) -> tuple[Vector, Vector]:
 
 
 def nominal_T_flange_camera(log: RunRecord) -> tuple[tuple[float, float, float, float], ...] | None:
-    """The drawing of the camera's mount."""
+    """T_flange_camera by the design of the camera's mount; None if the rig file does not state it."""
     return recorded_rig(log).T_flange_camera_nominal
 
 
@@ -127,7 +127,7 @@ def _vector(values: Transform) -> Vector:
 def recorded_rig(log: RunRecord) -> RigSection:
     """The rig file as it was when the run began."""
     root = log.events[0].payload
-    assert isinstance(root, RunStarted)  # the log was read the same way
+    assert isinstance(root, RunStarted)  # checked when the record was read
     return _rig_section(log.store.artefact_path(root.rig.sha256))
 
 

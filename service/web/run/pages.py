@@ -50,7 +50,7 @@ def run(
 def run_parts(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, names: Parts, step: Name = ""
 ) -> HTMLResponse:
-    """Parts of the page, all of one moment, for the script that keeps it up to date."""
+    """Parts of the page, all from the same moment, for the script that keeps the page up to date."""
     asked = names.split(",")
     frame = run_frame(site, run_id) if "banner" in asked else None
     shown = {} if asked == ["banner"] else _shown(site, person, run_id, step)

@@ -1,4 +1,4 @@
-"""The scene of a run as far as it is known by now: registered, or placed by the live numbers, or as planned."""
+"""The scene of a run as far as it is known: registered, provisionally placed during the capture, or planned."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ _WITH_STATIONS = ("hybrid", "robot_corrected", "robot")  # sources that tell whe
 
 @dataclass(frozen=True, slots=True)
 class KnownScene:
-    """A scene and what pages say of it.
+    """A scene and what pages say about it.
 
     Attributes:
-        frame: in words: whose frame positions are in.
+        frame: of the positions, in words.
         how: where the poses come from, in words.
         missing: what is not shown, and why.
         mesh: file of the surface; None: there is none yet.
@@ -60,7 +60,7 @@ class KnownScene:
 
 @dataclass(frozen=True, slots=True)
 class MeshFacts:
-    """What the table says of a surface."""
+    """Facts about a surface, for a table."""
 
     vertices: int
     faces: int
@@ -69,7 +69,7 @@ class MeshFacts:
 
 
 def scene_of(log: RunRecord) -> KnownScene:
-    """The best that the record has."""
+    """The best known scene: registered, else provisional, else planned."""
     registered = best_registration(log)
     if registered is not None:
         return _registered(log, registered)
@@ -118,7 +118,7 @@ def _bases(log: RunRecord, record: Registration) -> tuple[dict[str, Transform], 
         if candidate.poses in _WITH_STATIONS:
             T_scan_world = inverse(np.array(candidate.T_world_scan))
             return {name: T_scan_world @ np.array(T) for name, T in candidate.T_world_station.items()}, []
-    return {}, ["Robot bases: the poses come from the images alone, which do not tell where the robots stood."]
+    return {}, ["Robot bases: the poses come from the images alone, which do not show where the robots stood."]
 
 
 # --- while images are being taken ---------------------------------------------------------------------------------
@@ -159,7 +159,7 @@ def _live(log: RunRecord) -> KnownScene | None:
         spheres,
         "of the CT",
         "provisional: placed by the spheres seen so far",
-        (f"{away} images of a station whose place is not known yet.",) if away else (),
+        (f"{away} images of a station whose position is not known yet.",) if away else (),
         meshes[-1] if meshes else None,
     )
 
@@ -178,7 +178,7 @@ def _to_come(log: RunRecord) -> list[tuple[str, str, Transform]]:
 
 
 def _planned(log: RunRecord) -> KnownScene:
-    """One station in its base frame: where the camera was, by the drawing of its mount, and where it will be."""
+    """One station in its base frame: past camera poses by the mount's design, and planned ones."""
     captured = _all_captures(log)
     to_come = _to_come(log)
     station = to_come[0][1] if to_come else captured[-1].station if captured else ""
@@ -202,7 +202,7 @@ def _planned(log: RunRecord) -> KnownScene:
         scene,
         (),
         f"of the robot base at {station}" if station else "",
-        "by the robot and its mount's drawing",
+        "by the robot's poses and the design of the camera's mount",
         tuple(missing),
     )
 
@@ -231,13 +231,13 @@ def with_mesh(now: KnownScene, log: RunRecord, data: Path) -> Scene:
 
 
 def predicted_error_mm(registered: ShownRegistration, points_m: Array) -> Array:
-    """Standard deviation (N,) of the place of points (N, 3) of the scan in the images, 3D."""
+    """3D standard deviation (N,) of points (N, 3) of the scan, due to the registration with the images, mm."""
     placed = Alignment(np.array(registered.record.T_world_scan), np.array(registered.record.covariance)[:6, :6])
     return np.asarray(mm(np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2))), dtype=np.float64)
 
 
 def mesh_facts(now: KnownScene, log: RunRecord, data: Path) -> MeshFacts | None:
-    """None without a surface."""
+    """Facts about the surface; None without a surface."""
     return None if now.mesh is None else _surface(log, now.mesh, data)[2]
 
 

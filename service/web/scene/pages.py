@@ -1,4 +1,4 @@
-"""The scene in 3D, and the same as a table."""
+"""The scene in 3D and as tables."""
 
 from __future__ import annotations
 

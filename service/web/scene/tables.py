@@ -18,7 +18,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class CameraRow:
-    """A camera; `planned` is still to be taken."""
+    """A camera pose; a planned one has not been taken yet."""
 
     name: str
     station: str
@@ -52,7 +52,7 @@ class StationRow:
 
 @dataclass(frozen=True, slots=True)
 class SceneTables:
-    """Everything on the page beside the picture."""
+    """Everything on the page except the picture."""
 
     frame: str
     how: str
@@ -65,7 +65,7 @@ class SceneTables:
 
 
 def scene_tables(log: RunRecord, data: Path) -> SceneTables:
-    """Positions in the frame that the record uses, not in that of the picture."""
+    """The tables; positions are in the frame that the record uses, not in that of the picture."""
     now = scene_of(log)
     T_view = viewing_frame(now.scene)
     down, centre = -T_view[2, :3], -T_view[:3, :3].T @ T_view[:3, 3]

@@ -1,4 +1,4 @@
-"""Guards of every route: who is signed in, what they may do, that the request is theirs, and who has control."""
+"""Guards of routes: sign-in, permission, protection against forged requests, and control of the run."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def set_cookie(response: Response, site: Site, token: str) -> None:
 
 
 def clear_cookie(response: Response, site: Site) -> None:
-    """Take it away."""
+    """Remove the token from the browser."""
     response.delete_cookie(cookie_name(site), path="/", secure=site.secure, httponly=True, samesite="strict")
 
 
@@ -73,11 +73,11 @@ class Guard:
             raise NotAllowedError(
                 f"the role {person.role} may not do this ({self.permission})",
                 where=request.url.path,
-                remedy="Ask somebody whose role allows it",
+                remedy="Ask somebody whose role allows this",
             )
         if person.locked and not self._passes_lock(request, form):
             raise ScreenLockedError(
-                "this screen is locked", where=f"screen {person.screen}", remedy="Enter the PIN to go on"
+                "this screen is locked", where=f"screen {person.screen}", remedy="Enter the PIN to continue"
             )
 
     def _passes_lock(self, request: Request, form: FormData) -> bool:
@@ -109,7 +109,7 @@ SignedInPerson = Annotated[Person, Depends(_signed)]
 
 
 def controls(run_id: str, person: SignedInPerson, site: CurrentSite) -> None:
-    """For routes that act on a run, beside their guard: this screen has control of it. Raises ControlError."""
+    """Dependency of routes that act on a run: this screen must have control of it. Raises ControlError."""
     Control(site.store).require(run_id, person)
 
 
@@ -117,19 +117,19 @@ def _require_own_form(request: Request, form: FormData, person: Person) -> None:
     given = request.headers.get("x-csrf-token") or form.get("csrf")
     if not isinstance(given, str) or not compare_digest(given.encode(), person.csrf.encode()):
         raise NotAllowedError(
-            "this form does not belong to the present sign-in", where=request.url.path, remedy=THEFT_REMEDY
+            "this form does not belong to the current sign-in", where=request.url.path, remedy=THEFT_REMEDY
         )
 
 
 def _keep_connection(request: Request) -> None:
-    """It makes no room for strangers' any more."""
+    """From now on this connection is not dropped to make room for strangers."""
     connection = getattr(request.state, "connection", None)  # none where no `Reception` stands before the application
     if isinstance(connection, Connection):
         connection.known = True
 
 
 def _is_deliberate(request: Request) -> bool:
-    # What the page asks for by itself (news, parts, pictures) does not keep a screen from locking.
+    # Requests that the page makes by itself (news, parts, pictures) do not keep a screen from locking.
     if request.method not in SAFE_METHODS:
         return True
     headers = request.headers

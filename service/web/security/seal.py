@@ -21,7 +21,7 @@ _SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 
 
 async def sealed(request: Request, site: CurrentSite) -> AsyncGenerator[None]:
-    """For the whole application, `scope="function"`: signed before the answer leaves, refused requests included.
+    """Dependency of all routes (`scope="function"`): signs before the answer is sent, also for refused requests.
 
     Accounts, invitations, sign-ins and their refusals, wrong passwords of a signature: all of it comes with a POST.
     """
@@ -33,7 +33,7 @@ async def sealed(request: Request, site: CurrentSite) -> AsyncGenerator[None]:
 
 
 def seal(site: Site) -> None:
-    """Sign what the site's chain has that is not signed. A failure is logged: what was done stays done."""
+    """Sign the unsigned end of the site's chain. A failure is logged; what was done stays done."""
     try:
         seq = site.store.head(SITE)
         if seq != site.sealed_seq:

@@ -90,7 +90,7 @@ class Shield:
     def _refusal(self, method: str, headers: Headers, limit: int) -> tuple[int, str] | None:
         host = headers.get("host", "")
         if not self._answers_to(_host_name(host)):
-            # A name that somebody else's DNS points here would make their pages this site's own.
+            # Against DNS rebinding: a page under a foreign name that points here could act as this site's own.
             return 421, "This site does not answer to that name. Use the address that `orthocapture serve` printed."
         size = headers.get("content-length", "0")
         if not size.isdecimal() or int(size) > limit:
@@ -103,7 +103,7 @@ class Shield:
         if name in self._hosts:
             return True
         try:
-            ip_address(name)  # an address is nobody's name
+            ip_address(name)  # a plain IP address is not a DNS name
         except ValueError:
             return False
         return True
@@ -148,7 +148,7 @@ class Limiter:
         window_s: float = TRIES_WINDOW_S,
         addresses: int = 10_000,
     ) -> None:
-        """`failed_tries`: address and age in s, oldest first, of those before the service started."""
+        """`failed_tries`: address and age in s of failed tries before the service started, oldest first."""
         self._clock = clock
         self._tries = tries
         self._window_s = window_s
@@ -175,7 +175,7 @@ class Limiter:
         raise error
 
     def failed(self, address: str) -> bool:
-        """Count one; whether it was the one too many."""
+        """Count a failed try. Returns whether the address has now failed too often."""
         with self._lock:
             return self._count(address, self._clock.monotonic_s())
 
