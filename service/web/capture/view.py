@@ -226,8 +226,9 @@ def _found(capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
     figures = "" if spheres is None else f"{spheres:.0f} seen"
     if expected is not None:
         figures += f", {expected:.0f} expected whole in the image"
-    finished = live is not None and live.status == "finished"
-    reason = live_view.KIND.read_answer(live.result).reason if finished else "" if live is None else live.message
+    reason = "" if live is None else live.message
+    if live is not None and live.status == "finished":
+        reason = live_view.KIND.read_answer(live.result).reason or live.message
     out.append(Verdict("Spheres", seen, words[seen], f"{figures}; {reason}".strip("; ") if reason else figures))
 
     return out
