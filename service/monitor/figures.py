@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
+from pydantic import BaseModel
 from sqlalchemy import Connection, case, func, select
 
 from service.core.jobs.priorities import EARLY
@@ -134,6 +134,23 @@ def _queue(connection: Connection) -> dict[str, int]:
     return {"waited": 0, "background": 0} | {row.lane: row.n for row in connection.execute(found)}
 
 
+class _Identity(BaseModel):
+    kind: str = ""
+
+
+class _Report(BaseModel):
+    identity: _Identity = _Identity()
+    problems: tuple[str, ...] = ()
+
+
+class _DeviceEvent(BaseModel):
+    """The part of the events device_opened and device_trouble that the figures need; of any version."""
+
+    kind: str
+    device: str
+    report: _Report = _Report()
+
+
 def _devices(connection: Connection, run_id: str) -> list[DeviceFigures]:
     of_event = (events.c.run_id == event_index.c.run_id) & (events.c.seq == event_index.c.seq)
     found = (
@@ -144,16 +161,15 @@ def _devices(connection: Connection, run_id: str) -> list[DeviceFigures]:
     )
     devices: dict[str, DeviceFigures] = {}
     for text in connection.execute(found).scalars():
-        payload: dict[str, Any] = parse_canonical(text)
-        name = str(payload["device"])
-        known = devices.get(name)
-        if payload["kind"] == "device_opened":
-            report: dict[str, Any] = payload["report"]
-            kind = str(dict(report.get("identity") or {}).get("kind", ""))
-            problems = len(report.get("problems") or ())
-            devices[name] = DeviceFigures(run_id, name, kind, True, problems)
+        event = _DeviceEvent.model_validate(parse_canonical(text))
+        known = devices.get(event.device)
+        if event.kind == "device_opened":
+            report = event.report
+            devices[event.device] = DeviceFigures(
+                run_id, event.device, report.identity.kind, True, len(report.problems)
+            )
         elif known is not None:  # faults of anything that is not a device of the rig file name a step
-            devices[name] = DeviceFigures(run_id, name, known.kind, False, known.problems)
+            devices[event.device] = DeviceFigures(run_id, event.device, known.kind, False, known.problems)
     return list(devices.values())
 
 

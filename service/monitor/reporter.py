@@ -11,20 +11,28 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from os import getpid
 from pathlib import Path
-from typing import Any
 
-from drivers.errors import DeviceError, LeaveNeededError, SafetyStopError
-from drivers.interfaces import Camera, Lightbox, RobotArm, SafetyState, TowerLight
+from drivers.errors import DeviceError
+from drivers.interfaces import Camera, TowerLight
 from service.core.errors import OrthocaptureError
 from service.core.run.state import WAITING_FOR_HAND
 from service.monitor.alarm import Alarm
+from service.monitor.devices import (
+    CameraReading,
+    LightReading,
+    OpenDevices,
+    RobotReading,
+    read_camera,
+    read_light,
+    read_robot,
+    watch_robot,
+)
 from service.monitor.heartbeat import Heartbeat
 from service.monitor.snapshot import (
     STOPS,
     Asks,
     Doing,
     Message,
-    RobotPhase,
     Snapshot,
     Standing,
     frames_wanted,
@@ -39,16 +47,6 @@ _LIGHT_S = 3.0
 _CAMERA_S = 30.0  # reading the battery takes time that exposures need
 _MESSAGES = 12
 _QUIET_S = 1.0  # silence of the main loop, after which the heartbeat watches the robot
-_WATCHED_S = 0.3  # length of the pose stream that shows whether the arm moves
-_STOPS: Mapping[SafetyState, RobotPhase] = {
-    SafetyState.PROTECTIVE_STOP: "protective_stop",
-    SafetyState.SAFEGUARD_STOP: "safeguard_stop",
-    SafetyState.EMERGENCY_STOP: "emergency_stop",
-    SafetyState.FAULT: "fault",
-    SafetyState.UNKNOWN: "unknown",
-}
-
-
 _TOWER: Mapping[Standing, TowerLight] = {
     "works": TowerLight.WORKING,
     "waits": TowerLight.WAITING,
@@ -58,12 +56,14 @@ _TOWER: Mapping[Standing, TowerLight] = {
 
 
 @dataclass(frozen=True, slots=True)
-class OpenDevices:
-    """The devices open at this moment, by role and name in rig.yaml; none is opened just to be shown."""
+class _Moment:
+    """What the main loop reported last; a change of it is written at once."""
 
-    robots: Mapping[str, RobotArm] = field(default_factory=dict[str, RobotArm])
-    cameras: Mapping[str, Camera] = field(default_factory=dict[str, Camera])
-    lightboxes: Mapping[str, Lightbox] = field(default_factory=dict[str, Lightbox])
+    doing: Doing = "unknown"
+    step: str = ""
+    attempt: int = 0
+    pedal_armed: bool = False
+    asks: Asks = ""
 
 
 @dataclass
@@ -86,13 +86,13 @@ class Reporter:
     _progress: tuple[str, int, int] = ("", 0, 0)
     _activity: tuple[str, float] = ("", 0.0)
     _newest: Snapshot = field(default_factory=lambda: Snapshot(doing="starting"))
-    _watched: tuple[float, dict[str, Any]] = (
-        0.0,
-        {},
-    )  # time, and the robot's state then
+    _watched: tuple[float, RobotReading] = (0.0, RobotReading())  # time, and the robot's state then
     _writing: threading.Lock = field(default_factory=threading.Lock)
     _heartbeat: Heartbeat = field(init=False)
-    _known: dict[str, Any] = field(default_factory=dict[str, Any])
+    _moment: _Moment | None = None
+    _tower_light: TowerLight | None = None  # that the signal tower shows
+    _light: LightReading = field(default_factory=LightReading)
+    _camera: CameraReading = field(default_factory=CameraReading)
     _due_s: dict[str, float] = field(default_factory=dict[str, float])
 
     def __post_init__(self) -> None:
@@ -128,39 +128,51 @@ class Reporter:
             words: the question, or what goes on, for alerts.
         """
         self._activity = ("", 0.0)
-        changed = (doing, step, attempt, pedal_armed, asks) != self._known.get("at")
-        if not changed and not self._due("snapshot", _EVERY_S):
+        moment, before = _Moment(doing, step, attempt, pedal_armed, asks), self._moment
+        if moment == before and not self._due("snapshot", _EVERY_S):
             return
-        if changed and self._known.get("at", ("", ""))[1] != step:
+        if before is None or before.step != step:
             self._progress = ("", 0, 0)
-        self._known["at"] = (doing, step, attempt, pedal_armed, asks)
+        self._moment = moment
         devices = self.devices()
-        robot = self._robot(devices)
-        if doing == "paused" and robot["robot"] == "moving":
-            doing = "pausing"
-        now_s = time.time()
-        self._newest = Snapshot(
-            at_utc_s=now_s,
-            attended_utc_s=now_s,
-            robot_utc_s=now_s,
-            pid=getpid(),
-            doing=doing,
-            step=step,
-            attempt=attempt,
-            pedal_armed=pedal_armed,
-            asks=asks,
-            question=words,
-            **robot,
-            **self._light(devices),
-            **self._camera(devices),
-            disk_free_bytes=shutil.disk_usage(self.data).free,
-        )
+        self._newest = self._snapshot(moment, words, devices)
         self.beat()
         self._tower(devices, self._newest.standing)
         if self.alarm is not None:
             self.alarm.follow(self._newest.standing, self._elsewhere())
-        if doing in ("asking", "paused") or self._progress[0] == WAITING_FOR_HAND:
+        if self._newest.doing in ("asking", "paused") or self._progress[0] == WAITING_FOR_HAND:
             self._frame()
+
+    def _snapshot(self, moment: _Moment, words: str, devices: OpenDevices) -> Snapshot:
+        """The state now, with readings of the devices that are due."""
+        robot = read_robot(devices)
+        for box in devices.lightboxes.values():
+            if self._due("light", _LIGHT_S):
+                self._light = read_light(box)
+        for camera in devices.cameras.values():
+            if self._due("camera", _CAMERA_S):
+                self._camera = read_camera(camera)
+        now_s = time.time()
+        return Snapshot(
+            at_utc_s=now_s,
+            attended_utc_s=now_s,
+            robot_utc_s=now_s,
+            pid=getpid(),
+            doing="pausing" if moment.doing == "paused" and robot.phase == "moving" else moment.doing,
+            step=moment.step,
+            attempt=moment.attempt,
+            pedal_armed=moment.pedal_armed,
+            asks=moment.asks,
+            question=words,
+            robot=robot.phase,
+            robot_name=robot.name,
+            speed_fraction=robot.speed_fraction,
+            light_lux=self._light.light_lux,
+            temperature_c=self._light.temperature_c,
+            camera_battery_fraction=self._camera.battery_fraction,
+            camera_free_bytes=self._camera.free_bytes,
+            disk_free_bytes=shutil.disk_usage(self.data).free,
+        )
 
     def beat(self) -> None:
         """Write the last known state with the current time."""
@@ -169,12 +181,12 @@ class Reporter:
             newest, (watched_s, robot) = self._newest, self._watched
             if newest.doing == "ended":
                 return
-            told: dict[str, Any] = {
+            told: dict[str, object] = {
                 "at_utc_s": time.time(), "pid": getpid(), "what": what, "done": done, "total": total,
                 "messages": self._news, "activity": activity, "activity_utc_s": since_s,
             }  # fmt: skip
             if watched_s > newest.robot_utc_s:
-                told |= {"robot_utc_s": watched_s, **robot}
+                told |= {"robot_utc_s": watched_s, "robot": robot.phase, "robot_name": robot.name}
             snapshot = newest.model_copy(update=told)
             self._write(lambda: write_snapshot(self.data, self.run_id, snapshot))
 
@@ -184,20 +196,7 @@ class Reporter:
         if time.time() - newest.attended_utc_s < _QUIET_S or newest.doing == "ended":
             return
         asked_s = time.time()
-        for name, robot in self.devices().robots.items():
-            now_s = self.monotonic_s()
-            try:
-                samples = robot.samples(now_s - _WATCHED_S, now_s)
-            except DeviceError:
-                samples = ()
-            phase: RobotPhase = "unknown"
-            if samples:
-                first, last = samples[0], samples[-1]
-                moves = _turns(last.joint_velocities_rad_s) or _turns(last.joints_rad - first.joints_rad)
-                phase = _STOPS.get(last.safety) or ("moving" if moves else "standing")
-            self._watched = (asked_s, {"robot": phase, "robot_name": name})
-            return
-        self._watched = (asked_s, {"robot": "not_connected"})
+        self._watched = (asked_s, watch_robot(self.devices(), self.monotonic_s()))
 
     def _elsewhere(self) -> str:
         """The run's state in a few words, for alerts."""
@@ -208,11 +207,16 @@ class Reporter:
 
     def end(self) -> None:
         """Write the final state and stop; called when the runner ends, for whatever reason."""
-        step, attempt = self._known.get("at", ("", "", 0, False, ""))[1:3]
+        last = self._moment or _Moment()
         self._tower(self.devices(), "ended")
         with self._writing:
             self._newest = Snapshot(
-                at_utc_s=time.time(), pid=getpid(), doing="ended", step=step, attempt=attempt, messages=self._news
+                at_utc_s=time.time(),
+                pid=getpid(),
+                doing="ended",
+                step=last.step,
+                attempt=last.attempt,
+                messages=self._news,
             )
             self._write(lambda: write_snapshot(self.data, self.run_id, self._newest))
         self._heartbeat.end()
@@ -220,25 +224,11 @@ class Reporter:
             self.alarm.follow("ended", self.outcome)
             self.alarm.close()
 
-    def _robot(self, devices: OpenDevices) -> dict[str, Any]:
-        for name, robot in devices.robots.items():
-            try:
-                state = robot.state()
-                stop = _STOPS.get(state.sample.safety)
-                moving = stop is None and _moves(robot)
-            except DeviceError:
-                return {"robot": "unknown", "robot_name": name}
-            phase: RobotPhase = stop or (
-                "moving" if moving or _turns(state.sample.joint_velocities_rad_s) else "standing"
-            )
-            return {"robot": phase, "robot_name": name, "speed_fraction": state.speed_fraction}
-        return {"robot": "not_connected"}
-
     def _tower(self, devices: OpenDevices, standing: Standing) -> None:
         """Set the signal tower; a light box without one, or one that does not answer, is ignored."""
         light = _TOWER[standing]
         for box in devices.lightboxes.values():
-            if light == self._known.get("tower") or self.monotonic_s() < self._due_s.get("tower", 0.0):
+            if light == self._tower_light or self.monotonic_s() < self._due_s.get("tower", 0.0):
                 continue
             try:
                 box.show_tower(light)
@@ -246,32 +236,7 @@ class Reporter:
                 _log.warning("the signal tower cannot be switched: %s", error)
                 self._due_s["tower"] = self.monotonic_s() + _CAMERA_S
             else:
-                self._known["tower"] = light
-
-    def _light(self, devices: OpenDevices) -> Mapping[str, Any]:
-        for box in devices.lightboxes.values():
-            if self._due("light", _LIGHT_S):
-                try:
-                    reading = box.read()
-                except DeviceError:
-                    self._known["light"] = {}
-                else:
-                    self._known["light"] = {"light_lux": reading.light_lux, "temperature_c": reading.temperature_c}
-        return self._known.get("light", {})
-
-    def _camera(self, devices: OpenDevices) -> Mapping[str, Any]:
-        for camera in devices.cameras.values():
-            if self._due("camera", _CAMERA_S):
-                try:
-                    report = camera.report()
-                except DeviceError:
-                    self._known["camera"] = {}
-                else:
-                    self._known["camera"] = {
-                        "camera_battery_fraction": report.battery_fraction,
-                        "camera_free_bytes": report.free_bytes,
-                    }
-        return self._known.get("camera", {})
+                self._tower_light = light
 
     def _frame(self) -> None:
         """Write a frame of the live view while somebody looks; only when the camera is idle."""
@@ -297,14 +262,3 @@ class Reporter:
             write()
         except OSError as error:
             _log.warning("the state for the screens cannot be written: %s", error)
-
-
-def _moves(robot: RobotArm) -> bool:
-    try:
-        return robot.is_moving()
-    except (SafetyStopError, LeaveNeededError):  # its motion was cut short; whoever started it gets the same error
-        return False
-
-
-def _turns(velocities_rad_s: Any) -> bool:
-    return bool(abs(velocities_rad_s).max() > 0.001)

@@ -15,7 +15,8 @@ import pytest
 
 from service.core.errors import ConfigurationError
 from service.monitor.alarm import Alarm
-from service.monitor.reporter import OpenDevices, Reporter
+from service.monitor.devices import OpenDevices
+from service.monitor.reporter import Reporter
 from service.rig import AlertsSection, load_rig
 from tests.support.processes.waiting import until
 from tests.support.rig.bench_rig import BenchArm, BenchRig

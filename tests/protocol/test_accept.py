@@ -35,7 +35,8 @@ from service.core.run.decide import AskOperator
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.dataset.export import export_dataset
-from service.monitor.reporter import OpenDevices, Reporter
+from service.monitor.devices import OpenDevices
+from service.monitor.reporter import Reporter
 from service.people.sessions import People
 from service.runner.operator import AnswerBy
 from service.steps import params_models

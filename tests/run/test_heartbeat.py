@@ -13,7 +13,8 @@ import pytest
 from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import RobotArm, RobotSample, SafetyState
 from service.core.run.state import RunState
-from service.monitor.reporter import OpenDevices, Reporter
+from service.monitor.devices import OpenDevices
+from service.monitor.reporter import Reporter
 from service.monitor.snapshot import STALE_S, Snapshot, read_snapshot, write_snapshot
 from service.store.store import Store
 from service.web.page.run_frame import Banner, robot_banner
