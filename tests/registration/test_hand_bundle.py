@@ -9,8 +9,8 @@ import pytest
 
 from service.compute.capture.hand_bundle import Bundle, Reading, adjust_together
 from service.core.geometry import Array, Transform, align_points, apply, inverse, look_at, rotation_angle_rad
-from tests.steps.test_live import SPHERES_M, camera
-from tests.support.scenes.sphere_images import Scene, exact_outlines
+from tests.support.runs.measuring_rig import SPHERES_M
+from tests.support.scenes.sphere_images import Scene, camera, exact_outlines
 
 CAMERA = camera(1200)
 RADIUS_M = 0.015

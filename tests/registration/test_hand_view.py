@@ -10,8 +10,8 @@ import pytest
 from service.compute.capture.hand_view import HandView, look_at_image
 from service.compute.markers.records import DEFAULTS
 from service.core.geometry import Array, inverse, look_at, rotation_angle_rad
-from tests.steps.test_live import SPHERES_M, camera
-from tests.support.scenes.sphere_images import Scene, exact_outlines
+from tests.support.runs.measuring_rig import SPHERES_M
+from tests.support.scenes.sphere_images import Scene, camera, exact_outlines
 
 RADIUS_M = 0.015
 CAMERA = camera(1200)

@@ -171,9 +171,11 @@ def serves_pages(site: Site, command: str) -> None:
 Check = Callable[[Site, str], None]
 RUN_HERE: dict[str, Check] = {
     "orthocapture protocol check protocols/exvivo_spine.yaml": succeeds,
+    "orthocapture protocol check protocols/dry_run.yaml": succeeds,
     "orthocapture doctor --rig rig.yaml": succeeds,
     "orthocapture run protocols/exvivo_spine.yaml --rig rig.yaml --data runs "
     '--operator "A. Name"': asks_and_is_aborted,
+    'orthocapture run protocols/dry_run.yaml --rig rig.yaml --data runs --operator "A. Name"': asks_and_is_aborted,
     "orthocapture resume latest --data runs": asks_and_is_aborted,
     "orthocapture status latest --data runs": succeeds,
     "orthocapture plan next latest --data runs": succeeds,
@@ -216,6 +218,9 @@ RUN_ELSEWHERE = {
     ),
     "orthocapture plan show protocols/exvivo_spine.yaml --rig rig.yaml": (
         "tests/steps/test_planning.py::test_the_command_plans_from_files_alone"
+    ),
+    "orthocapture plan show protocols/dry_run.yaml --rig rig.yaml": (
+        "tests/rig/test_dry_run.py::test_every_viewpoint_is_planned_from_the_documented_rig_file"
     ),
     "orthocapture spheres --mesh scan.ply --radius-mm 15 --out spheres.json": (
         "tests/scanner/test_mesh_spheres_hard.py::test_command_reads_clouds_and_writes_spheres"

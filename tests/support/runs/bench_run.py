@@ -19,8 +19,9 @@ from service.steps import params_models
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.rig.bench_rig import Answer, BenchRig, ScriptedOperator
+from tests.support.rig.bench_rig import Answer, BenchRig, ScriptedOperator, answer
 
+VIEWS = ["v001", "v002", "v003", "v004"]  # of the capture in PROTOCOL
 PROTOCOL = """\
 id: bench
 version: "1"
@@ -137,3 +138,12 @@ def record_runs(folder: Path) -> tuple[str, str]:
         completed = begin_run(store, PROTOCOL, folder)
         completed.run()
         return completed.run_id, begin_run(store, PROTOCOL, folder).run_id
+
+
+def say(verb: str, **fields: object) -> Answer:
+    """An answer with the step's id, checklist or signature filled in."""
+    return lambda question, _state: answer(question, verb, **fields)
+
+
+class KilledError(BaseException):
+    """The process was killed."""

@@ -19,9 +19,10 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.worker.loop import work
 from simulators.hand.technician import Grip, follow
-from tests.steps.test_live import MEASURED, SPHERES_M, BenchCt, MeasuringRig, camera
 from tests.support.rig.bench_rig import BenchRig, ScriptedOperator
 from tests.support.runs.bench_run import PROTOCOL, Bench
+from tests.support.runs.measuring_rig import MEASURED, SPHERES_M, BenchCt, MeasuringRig
+from tests.support.scenes.sphere_images import camera
 
 STEP = """\
   - id: capture

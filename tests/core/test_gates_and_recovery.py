@@ -1,0 +1,176 @@
+"""Gates judged from measures, and what follows a failure."""
+
+from __future__ import annotations
+
+import pytest
+
+import drivers.errors as device_errors
+import service.core.errors as core_errors
+from service.core.errors import IntegrityError
+from service.core.gates.verdict import describe
+from service.core.protocol.models import Recovery
+from service.core.records.events import (
+    RunAborted,
+    StepMeasured,
+    StepRetried,
+    Uncertainty,
+    ViewpointFailed,
+)
+from service.core.recovery.policy import NEEDS_A_PERSON, PASSING, recovery_policy
+from service.core.run.decide import (
+    AbortRun,
+    Halt,
+    Retry,
+    RunStep,
+    evaluate_gates,
+)
+from tests.support.record.core import Log, toy_protocol
+from tests.support.record.core_log import at_capture, failure, refused
+
+
+@pytest.fixture
+def log() -> Log:
+    return Log()
+
+
+# --- gates -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("measures", "passed"),
+    [
+        ({"views": 3.0, "sharp": 0.2}, True),
+        ({"views": 3.0, "sharp": 1.0}, True),
+        ({"views": 2.999, "sharp": 0.5}, False),
+        ({"views": 3.0, "sharp": 1.001}, False),
+        ({"views": 3.0}, False),
+        ({"views": 3.0, "sharp": float("nan")}, False),
+        ({"views": float("inf"), "sharp": 0.5}, False),
+    ],
+)
+def test_gates(measures: dict[str, float], passed: bool) -> None:
+    step = toy_protocol().step("capture")
+    result = evaluate_gates(step, 1, measures)
+    assert result.passed is passed
+    assert [v.measure for v in result.verdicts] == ["views", "sharp"]
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "outcome"),
+    [(3.0, 4.0, "passed"), (2.0, 2.9, "failed"), (2.9, 4.0, "undecided")],
+)
+def test_a_number_with_its_uncertainty_is_judged_by_its_bounds(lower: float, upper: float, outcome: str) -> None:
+    step = toy_protocol().step("capture")
+    known = {"views": Uncertainty(sigma=0.2, lower=lower, upper=upper)}
+    result = evaluate_gates(step, 1, {"views": 3.2, "sharp": 0.5}, uncertainties=known)
+    verdict = result.verdicts[0]
+    found = "passed" if verdict.passed else "undecided" if verdict.undecided else "failed"
+    assert (found, result.passed) == (outcome, outcome == "passed")
+    assert (verdict.lower, verdict.upper, verdict.sigma) == (lower, upper, 0.2)
+    places = 2 if outcome == "failed" else 1
+    assert f"views {3.2:.{places}f} views, {lower:.{places}f} to {upper:.{places}f}, allowed" in describe(verdict)
+    without = evaluate_gates(step, 1, {"views": 3.2, "sharp": 0.5}).verdicts[0]
+    assert without.passed
+    assert without.lower is None
+    assert " to " not in describe(without)
+
+
+def test_a_gate_falls_away_with_the_step_that_would_have_made_it_measurable() -> None:
+    step = toy_protocol().step("capture")
+    gates = tuple(g.model_copy(update={"unless_skipped": "ct"}) if g.measure == "sharp" else g for g in step.gates)
+    step = step.model_copy(update={"gates": gates})
+    assert not evaluate_gates(step, 1, {"views": 3.0}).passed
+    without = evaluate_gates(step, 1, {"views": 3.0}, skipped={"ct"})
+    assert without.passed
+    assert [v.measure for v in without.verdicts] == ["views"]
+
+
+def test_failed_gates_ask_and_can_be_overridden_only_with_leave_and_reason() -> None:
+    log = at_capture()
+    log.begin()
+    log.measure(views=2.0, sharp=0.5)
+    assert log.question.for_ == "recovery"
+    assert "views 2 views, allowed ≥ 3" in log.question.text
+    assert set(log.question.options) == {"confirm", "redo", "skip", "pause", "abort"}
+    refused(log, "needs a reason", action="skip")
+    log.act("skip", reason="the animal moved")
+    assert log.state.deviations[-1].kind == "gate_overridden"
+    assert log.state.steps["capture"].skipped
+    assert log.state.current == "spray"
+
+
+def test_verdicts_that_do_not_follow_from_the_measures_are_no_evidence() -> None:
+    log = at_capture()
+    log.begin()
+    log.append(StepMeasured(step="capture", attempt=1, measures={"views": 1.0, "sharp": 0.5}))
+    honest = evaluate_gates(log.protocol.step("capture"), 1, {"views": 1.0, "sharp": 0.5})
+    with pytest.raises(IntegrityError, match="do not follow"):
+        log.append(honest.model_copy(update={"passed": True}))
+
+
+# --- recovery --------------------------------------------------------------------------------------------
+
+
+def test_a_retry_keeps_what_was_captured_and_raises_the_attempt() -> None:
+    log = at_capture()
+    log.begin()
+    log.capture(["a", "b"])
+    log.append(failure(log))
+    assert log.decision == Retry("capture", 2, "DeviceTimeoutError: no answer", 1.0)
+    log.append(StepRetried(step="capture", attempt=2, why="timeout"))
+    assert log.decision == RunStep("capture", 2, begin=False)
+    assert set(log.state.step.captured) == {"a", "b"}
+    assert log.state.step.failures == 1
+    log.capture(["c"])
+    assert log.state.step.failures == 0  # progress in between
+    assert log.state.deviations == ()
+
+
+def test_an_operator_grants_a_retry_and_what_was_given_up_gets_another_chance() -> None:
+    log = at_capture()
+    log.begin()
+    log.append(ViewpointFailed(step="capture", attempt=1, viewpoint="b", error="E", message="m", skipped=True))
+    log.append(failure(log, "SafetyStopError", "ask"))
+    assert log.question.for_ == "recovery"
+    with pytest.raises(IntegrityError, match="neither the policy nor the operator"):
+        log.append(StepRetried(step="capture", attempt=2, why="by itself"))
+    log.act("confirm")
+    assert log.decision == Retry("capture", 2, "the operator asked for it", 0.0)
+    refused(log, "already confirmed", action="confirm")
+    log.append(StepRetried(step="capture", attempt=2, why="asked"))
+    assert log.state.step.skipped_viewpoints == ()
+    assert log.state.step.failures == 0
+
+
+def test_recovery_can_abort_the_run(log: Log) -> None:
+    log.begin()
+    log.append(failure(log, "IntegrityError", "abort"))
+    assert log.decision == AbortRun("IntegrityError: no answer")
+    log.append(RunAborted(reason="evidence"))
+    assert log.decision == Halt("aborted")
+    assert log.state.stop_reason == "evidence"
+
+
+@pytest.mark.parametrize(
+    ("error", "failures", "on_failure", "expected"),
+    [
+        ("DeviceUnavailableError", 1, "ask", "retry"),
+        ("DeviceTimeoutError", 2, "abort", "retry"),
+        ("DeviceTimeoutError", 3, "ask", "ask"),
+        ("DeviceBusyError", 1, "ask", "ask"),
+        ("DeviceBusyError", 3, "abort", "abort"),
+        ("SafetyStopError", 1, "abort", "ask"),
+        ("DeviceStorageFullError", 1, "abort", "ask"),
+        ("IntegrityError", 1, "abort", "ask"),
+        ("ComputeError", 1, "ask", "ask"),
+        ("ComputeError", 1, "abort", "abort"),
+    ],
+)
+def test_the_recovery_policy(error: str, failures: int, on_failure: str, expected: str) -> None:
+    recovery = Recovery.model_validate({"retries": 2, "on_failure": on_failure})
+    assert recovery_policy(recovery, error, failures) == expected
+
+
+def test_the_policy_names_errors_that_exist() -> None:
+    for name in PASSING | NEEDS_A_PERSON:
+        assert hasattr(device_errors, name) or hasattr(core_errors, name)

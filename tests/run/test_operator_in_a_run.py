@@ -1,0 +1,224 @@
+"""What an operator does while a run goes on: pause, abort, redo, skip, and the foot pedal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from drivers.interfaces import SafetyState
+from service.core.records.events import (
+    ActionRefused,
+    OperatorAction,
+    StepNote,
+    ViewpointCaptured,
+)
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
+from service.store.store import Store
+from tests.support.rig.bench_rig import Answer
+from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, begin_run, say
+
+
+@pytest.fixture
+def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
+    with Store.open(tmp_path / "data") as store:
+        yield lambda text: begin_run(store, text, tmp_path)
+
+
+@pytest.fixture
+def bench(begin: Callable[[str], Bench]) -> Bench:
+    return begin(PROTOCOL)
+
+
+# --- pause, abort, redo, skip ----------------------------------------------------------------------------
+
+
+def test_pause_in_mid_motion_stops_the_arm_and_resume_goes_on_with_the_next_viewpoint(bench: Bench) -> None:
+    seen: list[tuple[bool, int]] = []
+
+    def pause(move: int) -> None:
+        if move == 3:
+            bench.rig.arm.dawdle()
+            bench.act("pause")
+
+    def paused(what: str) -> None:
+        if what == "paused":
+            seen.append((bench.rig.arm.is_moving(), bench.rig.arm.moves))
+            if len(seen) == 5:
+                bench.act("resume")
+
+    bench.rig.arm.on_move, bench.operator.on_show = pause, paused
+    assert bench.run().status == "completed"
+    assert bench.rig.arm.stopped_short == 1
+    assert seen == [(False, 3)] * 5
+    assert bench.captured() == VIEWS
+
+
+def test_abort_in_mid_motion_stops_the_arm_and_ends_the_run(bench: Bench) -> None:
+    def abort(move: int) -> None:
+        if move == 2:
+            bench.rig.arm.dawdle()
+            bench.act("abort", reason="someone stepped in")
+
+    bench.rig.arm.on_move = abort
+    state = bench.run()
+    assert (state.status, state.stop_reason) == ("aborted", "someone stepped in")
+    assert bench.rig.arm.stopped_short == 1
+    assert not bench.rig.arm.is_moving()
+    assert bench.captured() == VIEWS[:1]
+    bench.must_verify()
+
+
+def test_redo_of_a_viewpoint_while_the_arm_moves_takes_it_again_and_keeps_both(bench: Bench) -> None:
+    bench.rig.arm.on_move = lambda move: (
+        bench.act("redo", step="capture", viewpoint="v001", reason="fly on the lens") if move == 3 else None
+    )
+    state = bench.run()
+    assert state.status == "completed"
+    assert sorted(bench.captured()) == ["v001", *VIEWS]
+    assert [(s.viewpoint, s.reason) for s in state.superseded] == [("v001", "fly on the lens")]
+    assert set(state.steps["capture"].captured) == set(VIEWS)
+    assert state.steps["capture"].measures["viewpoints_captured"] == 4
+
+
+def test_redo_of_a_step_while_the_arm_moves_stops_it_and_begins_again(bench: Bench) -> None:
+    def redo(move: int) -> None:
+        if move == 3:
+            bench.rig.arm.dawdle()
+            bench.act("redo", step="capture", reason="the lamp moved")
+
+    bench.rig.arm.on_move = redo
+    state = bench.run()
+    assert state.status == "completed"
+    assert bench.rig.arm.stopped_short == 1
+    assert bench.captured() == [*VIEWS[:2], *VIEWS]
+    assert {c.attempt for c in bench.payloads(ViewpointCaptured)[2:]} == {2}
+    assert [(s.step, sorted(s.captured)) for s in state.superseded] == [("capture", VIEWS[:2])]
+
+
+def test_an_image_is_recorded_once_the_arm_is_on_its_way_to_the_next(bench: Bench) -> None:
+    recorded: list[int] = []
+    bench.rig.arm.on_move = lambda _move: recorded.append(len(bench.captured()))
+    assert bench.run().status == "completed"
+    assert recorded == [0, 0, 1, 2]
+    assert bench.captured() == VIEWS
+
+
+def test_an_image_that_has_arrived_is_recorded_though_the_next_motion_is_refused(bench: Bench) -> None:
+    def stop(move: int) -> None:
+        if move == 3:
+            bench.rig.arm.safety = SafetyState.PROTECTIVE_STOP
+
+    bench.rig.arm.on_move = stop
+    bench.script("capture", "recovery", say("abort", reason="enough"))
+    assert bench.run().status == "aborted"
+    assert bench.captured() == VIEWS[:2]
+    bench.must_verify()
+
+
+def test_skip_needs_the_protocols_leave_and_a_reason(bench: Bench) -> None:
+    bench.script("fixation", "confirm", say("skip"), say("skip", reason="fixed yesterday"))
+    bench.script("capture", "confirm", say("skip", reason="no time"))
+    state = bench.run()
+    assert state.status == "completed"
+    assert state.steps["fixation"].skipped
+    assert [(d.kind, d.step) for d in state.deviations if d.kind != "automatic"] == [
+        ("refused", "fixation"),
+        ("skip", "fixation"),
+        ("refused", "capture"),
+    ]
+    refused = bench.payloads(ActionRefused)
+    assert "needs a reason" in refused[0].why
+    assert "does not allow" in refused[1].why
+    assert bench.captured() == VIEWS
+
+
+def test_a_confirmation_without_all_ticks_is_refused_and_recorded(bench: Bench) -> None:
+    bench.script("fixation", "confirm", say("confirm", checklist=("wires hold",)))
+    assert bench.run().status == "completed"
+    (refused,) = bench.payloads(ActionRefused)
+    assert "board lies" in refused.why
+    assert any("board lies" in line for line in bench.operator.told)
+
+
+def test_an_irreversible_step_waits_for_its_captures_and_a_signature(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL.replace("recovery: {retries: 2", "skippable: true\n    recovery: {retries: 2"))
+    bench.script("capture", "confirm", say("skip", reason="no time"))
+    bench.script(
+        "spraying",
+        "recovery",
+        say("confirm"),
+        say("sign", meaning="go"),
+        say("redo", step="capture", reason="it is needed after all"),
+    )
+    # After the captures: a confirmation without signature, a signature of the wrong thing, then the right one.
+    bench.script("spraying", "sign", say("confirm"), say("sign", signed_sha256="0" * 64))
+    state = bench.run()
+    assert state.status == "completed"
+    whys = [refused.why for refused in bench.payloads(ActionRefused)]
+    assert len(whys) == 4
+    assert "not passed: capture" in whys[0]
+    assert "signature first" in whys[2]
+    assert "a record other than" in whys[3]
+    (note,) = bench.payloads(StepNote)
+    assert note.note.startswith("Blue applied")
+    assert state.steps["spraying"].signed_by == "Ada"
+
+
+# --- the pedal -------------------------------------------------------------------------------------------
+
+
+def test_the_pedal_confirms_what_is_asked_now_and_nothing_that_is_asked_later(bench: Bench) -> None:
+    box = bench.rig.box
+    assert box is not None
+
+    def press(_question: AskOperator, _state: RunState) -> None:
+        box.presses += 1
+
+    silent = 0
+
+    def nothing(_question: AskOperator, _state: RunState) -> OperatorAction | None:
+        nonlocal silent
+        silent += 1
+        return None
+
+    bench.script("fixation", "confirm", nothing, press)
+    # Presses of the pedal while the robot works do not answer the next question.
+    bench.rig.arm.on_move = lambda _move: press(bench.operator.asked[-1], bench.state())
+    bench.script("spraying", "confirm", nothing, nothing)
+    assert bench.run().status == "completed"
+    confirmed = [a for a in bench.payloads(OperatorAction) if a.action == "confirm"]
+    assert [(a.step, a.via) for a in confirmed] == [("fixation", "pedal"), ("capture", "cli"), ("spraying", "cli")]
+    assert confirmed[0].checklist == ("wires hold", "board lies")
+    assert silent == 3
+
+
+def test_where_the_robot_will_move_the_pedal_is_pressed_twice_within_seconds(bench: Bench) -> None:
+    box = bench.rig.box
+    assert box is not None
+
+    def press(after_s: float) -> Answer:
+        def act(_question: AskOperator, _state: RunState) -> None:
+            bench.ahead_s += after_s
+            box.presses += 1
+
+        return act
+
+    def look(_question: AskOperator, _state: RunState) -> None:
+        assert not bench.rig.arm.moves
+
+    # The second press comes too late and arms again, the third bounces, the fourth counts.
+    bench.script("capture", "confirm", look, press(0), press(10), press(0.1), look, press(2))
+    assert bench.run().status == "completed"
+    confirmed = [a for a in bench.payloads(OperatorAction) if a.step == "capture"]
+    assert [(a.action, a.via) for a in confirmed] == [("confirm", "pedal")]
+    assert ("asking", True) in bench.operator.attended
+    assert sum("press again" in line for line in bench.operator.told) == 3
+
+
+def test_a_run_without_a_light_box_works(bench: Bench) -> None:
+    bench.rig.box = None
+    assert bench.run().status == "completed"
+    assert bench.payloads(ViewpointCaptured)[0].environment == {}
