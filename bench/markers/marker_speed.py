@@ -24,7 +24,7 @@ from bench.machine import RESULTS, machine
 from bench.scenes import rendered
 from service.compute.images.files import read_image, read_reduced
 from service.compute.markers.detect import detect_spheres
-from service.compute.markers.search.image_files import ANCHOR_WIDTH_PX
+from service.compute.markers.search.anchors import ANCHOR_WIDTH_PX
 from service.compute.markers.search.predicted import WIDE, Prediction, Tone, locate_predicted, tone_of
 from service.compute.poses.files.pose_files import read_camera_json, read_poses, read_spheres_json
 from service.core.geometry import inverse

@@ -34,8 +34,9 @@ from service.compute.poses.hybrid.estimate import HybridOptions, HybridPoses, hy
 from service.compute.registration.identification.identity import identify
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import register
+from service.compute.scene import PosedImages
 from service.core.geometry import Array, align_points, apply
-from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M
+from tests.support.scenes.sphere_images import REGISTRATION
 from tests.support.scenes.tracked_scene import TrackedScene, pose_errors, tracked_scene
 
 # Images x points, of which seven images of ten see each; 40x30 is a scene with next to no texture.
@@ -97,37 +98,25 @@ def honest(answer: HybridPoses, made: TrackedScene) -> float:
 def by_colmap(made: TrackedScene) -> dict[str, float]:
     """Two steps: COLMAP's adjustment of the tracks, then the registration by the spheres."""
     poses, seconds = adjusted_by_colmap(made)
-    solved = register_images(
-        made.outlines, poses, made.camera, REGISTRATION_M, RADIUS_M, estimate_scale=True
-    ).registration
+    solved = register_images(made.outlines, PosedImages(poses, made.camera, metric=False), REGISTRATION).registration
     return {**errors(solved.T_scan_camera, made), "adjustment_s": seconds}
 
 
 def start_s(made: TrackedScene) -> float:
     """CPU seconds of what `hybrid_poses` does before its adjustment: identity and a first registration."""
-    one = np.zeros(len(made.poses), dtype=np.int64)
+    images = PosedImages(made.poses, made.camera, metric=False)
     begun = time.process_time()
-    assignments = identify(
-        made.outlines, REGISTRATION_M, made.camera, made.poses, radius_m=RADIUS_M, groups=one, metric=False
-    )
-    register(
-        made.outlines,
-        assignments,
-        made.poses,
-        one,
-        REGISTRATION_M,
-        RADIUS_M,
-        made.camera,
-        RegistrationSettings(estimate_scale=True, pose_covariance="exact"),
-    )
+    assignments = identify(made.outlines, images, REGISTRATION)
+    register(made.outlines, assignments, images, REGISTRATION, RegistrationSettings(pose_covariance="exact"))
     return time.process_time() - begun
 
 
 def adjusted_by_ours(made: TrackedScene, *, robot: bool) -> HybridPoses:
     """One adjustment of tracks and spheres, and of the robot's poses where these take part."""
-    more: dict[str, Any] = {"T_base_camera": made.T_base_camera, "groups": made.groups} if robot else {}
+    images = PosedImages(made.poses, made.camera, groups=made.groups if robot else None, metric=False)
+    T_base_camera = made.T_base_camera if robot else None
     return hybrid_poses(
-        made.poses, made.tracks, made.outlines, made.camera, REGISTRATION_M, RADIUS_M, options=_SPHERES, **more
+        images, made.tracks, made.outlines, REGISTRATION, T_base_camera=T_base_camera, options=_SPHERES
     )
 
 

@@ -27,6 +27,7 @@ from service.compute.pipeline import register_images
 from service.compute.poses.hybrid.estimate import hybrid_poses
 from service.compute.poses.sfm.estimate import SfmModel, reconstruct
 from service.compute.poses.sfm.options import Effort, Mapper, options_for
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, align_points, apply, inverse
 
 COLUMNS = (
@@ -50,9 +51,10 @@ def measure(capture: Capture, effort: Effort, workspace: Path) -> dict[str, dict
     outlines = detect_all(capture.files, capture.camera)
     rows: dict[str, dict[str, float]] = {}
     solved = register_images(
-        outlines, capture.T_base_camera, capture.camera, capture.registration_m, capture.radius_m,
-        groups=capture.stations,
-    ).registration  # fmt: skip
+        outlines,
+        PosedImages(capture.T_base_camera, capture.camera, groups=capture.stations),
+        ScanSpheres(capture.registration_m, capture.radius_m),
+    ).registration
     rows["robot"] = {
         **_errors(solved.T_scan_camera, truth, centre_m), "predicted_error_mm": 1e3 * solved.sigma_at_m(centre_m)
     }  # fmt: skip
@@ -98,9 +100,10 @@ def _from_model(capture: Capture, model: SfmModel, outlines: Sequence[Any], trut
     index = [capture.names.index(name) for name in model.T_world_camera]
     poses = np.array(list(model.T_world_camera.values()))
     solved = register_images(
-        [outlines[i] for i in index], poses, capture.camera, capture.registration_m, capture.radius_m,
-        estimate_scale=True,
-    ).registration  # fmt: skip
+        [outlines[i] for i in index],
+        PosedImages(poses, capture.camera, metric=False),
+        ScanSpheres(capture.registration_m, capture.radius_m),
+    ).registration
     centre_m = capture.registration_m.mean(axis=0)
     T, s = align_points(poses[:, :3, 3], truth[index, :3, 3], with_scale=True)
     expected = np.array([T @ _scaled(P, s) for P in truth[index]])
@@ -116,14 +119,16 @@ def _from_model(capture: Capture, model: SfmModel, outlines: Sequence[Any], trut
 def _hybrid(capture: Capture, model: SfmModel, outlines: Sequence[Any], truth: Array) -> dict[str, float]:
     index = [capture.names.index(name) for name in model.T_world_camera]
     answer = hybrid_poses(
-        np.array(list(model.T_world_camera.values())),
+        PosedImages(
+            np.array(list(model.T_world_camera.values())),
+            capture.camera,
+            groups=[capture.stations[i] for i in index],
+            metric=False,
+        ),
         model.tracks,
         [outlines[i] for i in index],
-        capture.camera,
-        capture.registration_m,
-        capture.radius_m,
+        ScanSpheres(capture.registration_m, capture.radius_m),
         T_base_camera=capture.T_base_camera[index],
-        groups=[capture.stations[i] for i in index],
     )
     error = _increments(answer.T_scan_camera, truth[index]).ravel()
     C = answer.covariance[: error.size, : error.size]

@@ -31,6 +31,8 @@ from service.compute.poses.sfm.estimate import SfmModel, reconstruct
 from service.compute.poses.sfm.options import Effort, Mapper, options_for
 from service.compute.registration.cost import residuals
 from service.compute.registration.joint_poses import with_joint_pose_covariance
+from service.compute.registration.settings import RegistrationSettings
+from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
 from service.core.geometry import Array, Transform, align_points, apply, inverse
 
@@ -171,15 +173,16 @@ def _from_hybrid(capture: Capture, outlines: Outlines, models: Reconstructions) 
     index = [capture.names.index(name) for name in model.T_world_camera]
     mine = [outlines[i] for i in index]
     answer = hybrid_poses(
-        np.array(list(model.T_world_camera.values())),
+        PosedImages(
+            np.array(list(model.T_world_camera.values())),
+            capture.camera,
+            groups=[capture.stations[i] for i in index],
+            metric=False,
+        ),
         model.tracks,
         mine,
-        capture.camera,
-        capture.registration_m,
-        capture.radius_m,
+        ScanSpheres(capture.registration_m, capture.radius_m, covariance_m2=capture.covariance_m2),
         T_base_camera=capture.T_base_camera[index],
-        groups=[capture.stations[i] for i in index],
-        sphere_covariance_m2=capture.covariance_m2,
     )
     solved = _registered(capture, mine, answer.T_world_camera)
     rms_mm = _camera_rms_mm(answer.T_world_camera, capture.T_world_camera[index])
@@ -206,15 +209,11 @@ def _registered(
 ) -> PipelineResult:
     return register_images(
         outlines,
-        poses,
-        capture.camera,
-        capture.registration_m,
-        capture.radius_m,
-        control_centres_m=capture.control_m,
-        groups=groups,
-        estimate_scale=estimate_scale,
-        pose_covariance=pose_covariance,
-        sphere_covariance_m2=capture.covariance_m2,
+        PosedImages(poses, capture.camera, groups=groups, metric=not estimate_scale),
+        ScanSpheres(
+            capture.registration_m, capture.radius_m, control_m=capture.control_m, covariance_m2=capture.covariance_m2
+        ),
+        RegistrationSettings(pose_covariance=pose_covariance),
     )
 
 

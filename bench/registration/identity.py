@@ -16,7 +16,8 @@ from bench.machine import RESULTS
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.records import Evidence, SphereOutline, outline_from_cone
-from service.compute.registration.identification.identity import identify
+from service.compute.registration.identification.identity import identify_each
+from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import apply, inverse, look_at
 from simulators.scene.world import RADIUS_M, Scene
@@ -97,7 +98,7 @@ def run(trials: int, visible: int, n_false: int, noise_px: float) -> dict[str, f
         trial = make_trial(seed, visible, n_false, noise_px)
         begin = time.process_time()
         try:
-            (answer,) = identify([trial.outlines], trial.centres, CAMERA, radius_m=RADIUS_M)
+            (answer,) = identify_each([trial.outlines], CAMERA, ScanSpheres(trial.centres, RADIUS_M))
             markers = answer.markers
         except ComputeError:
             markers = {}

@@ -28,6 +28,7 @@ from service.compute.images.files import read_image
 from service.compute.markers.search.image_files import detect_all, locate_outlines
 from service.compute.pipeline import register_images
 from service.compute.poses.files.pose_files import read_camera_json, read_poses, read_spheres_json
+from service.compute.scene import PosedImages, ScanSpheres
 
 FILES = (("scene01_9504_12", (16, 32, 64, 108)), ("scene01_1920_20", (250, 1000)))
 SOLVE_FROM = "scene01_1920_20"
@@ -62,14 +63,18 @@ def locate_and_register(folder: Path, count: int, workers: int) -> dict[str, obj
         T_world_camera = np.array([poses[originals[i % len(originals)].name] for i in range(count)])
         begin = time.perf_counter()
         located = locate_outlines(
-            files, camera, T_world_camera, known.registration_m, known.radius_m,
-            control_centres_m=known.control_m, workers=workers,
-        )  # fmt: skip
+            files,
+            PosedImages(T_world_camera, camera),
+            ScanSpheres(known.registration_m, known.radius_m, control_m=known.control_m),
+            workers=workers,
+        )
         middle = time.perf_counter()
         solved = register_images(
-            located.outlines, T_world_camera, camera, known.registration_m, known.radius_m,
-            control_centres_m=known.control_m, assignments=located.assignments,
-        )  # fmt: skip
+            located.outlines,
+            PosedImages(T_world_camera, camera),
+            ScanSpheres(known.registration_m, known.radius_m, control_m=known.control_m),
+            assignments=located.assignments,
+        )
         end = time.perf_counter()
     return {
         "distinct": len(originals),
@@ -89,7 +94,9 @@ def solve_only(folder: Path, count: int) -> dict[str, object]:
     files = sorted((folder / "images").glob("*.jpg"))
     poses = read_poses(folder / "poses.csv", [file.name for file in files])
     T_world_camera = np.array([poses[file.name] for file in files])
-    located = locate_outlines(files, camera, T_world_camera, known.registration_m, known.radius_m, workers=2)
+    located = locate_outlines(
+        files, PosedImages(T_world_camera, camera), ScanSpheres(known.registration_m, known.radius_m), workers=2
+    )
     assert located.assignments is not None
     pick = [i % len(files) for i in range(count)]
     rng = np.random.default_rng(0)
@@ -101,7 +108,9 @@ def solve_only(folder: Path, count: int) -> dict[str, object]:
     timed: dict[str, float] = {}
     for label, given in (("propagated", assignments), ("identified", None)):
         begin = time.process_time()
-        register_images(outlines, many, camera, known.registration_m, known.radius_m, assignments=given)
+        register_images(
+            outlines, PosedImages(many, camera), ScanSpheres(known.registration_m, known.radius_m), assignments=given
+        )
         timed[f"{label}_cpu_s"] = time.process_time() - begin
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return {"images": count, "peak_mib": peak, "before_mib": before, **timed}

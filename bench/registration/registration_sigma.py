@@ -24,6 +24,7 @@ from service.compute.pipeline import detect_all, register_images
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.settings import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from simulators.scene.world import RADIUS_M, Scene
 
@@ -92,13 +93,18 @@ def rendered(capture: Capture, outlines: list[tuple[SphereOutline, ...]]) -> dic
     out: dict[str, dict[str, float]] = {}
     for name, (poses, groups) in sources.items():
         solved = register_images(
-            outlines, poses, capture.camera, spheres, capture.radius_m, control_centres_m=controls, groups=groups
+            outlines,
+            PosedImages(poses, capture.camera, groups=groups),
+            ScanSpheres(spheres, capture.radius_m, control_m=controls),
         )
         r = solved.registration
         control = evaluate(
-            outlines, solved.control_assignments, r.T_scan_camera_refined, controls, capture.radius_m, capture.camera,
+            outlines,
+            solved.control_assignments,
+            PosedImages(r.T_scan_camera_refined, capture.camera),
+            ScanSpheres(controls, capture.radius_m),
             registration=r,
-        )  # fmt: skip
+        )
         spared = leave_one_out(r, refined=True)
         sigma = r.sigma_at_m(centre)
         refined = true_error_m(r.T_scan_camera_refined, T_scan_camera, centre)
@@ -199,17 +205,14 @@ def drawn(seed: int, case: Case, views: int = 18) -> tuple[RegistrationResult, T
     result = register(
         outlines,
         [Assignment(m, inverse(T) @ T_world_scan) for m, T in zip(markers, given, strict=True)],
-        given,
-        [0] * views,
-        spheres,
-        RADIUS_M,
-        CAMERA,
+        PosedImages(given, CAMERA),
+        ScanSpheres(
+            spheres,
+            RADIUS_M,
+            covariance_m2=np.tile(np.eye(3) * case.spheres_m**2, (len(scan_m), 1, 1)) if case.spheres_m else None,
+        ),
         RegistrationSettings(
-            pose_covariance=np.tile(stated, (views, 1, 1)) if case.told else "estimate",
-            sphere_covariance_m2=np.tile(np.eye(3) * case.spheres_m**2, (len(scan_m), 1, 1))
-            if case.spheres_m
-            else None,
-            common_errors=case.common,
+            pose_covariance=np.tile(stated, (views, 1, 1)) if case.told else "estimate", common_errors=case.common
         ),
     )
     return result, T_world_scan

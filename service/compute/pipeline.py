@@ -4,25 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import Evaluation, evaluate
 from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.image_files import detect_all, locate_outlines
-from service.compute.registration.cost import Cost
 from service.compute.registration.identification.identity import Assignment, identify
 from service.compute.registration.identification.pairing import CONTROL_GATE, paired
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import OutlineResidual, RegistrationResult, register
-from service.core.errors import DataError
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, Transform, inverse
 from service.core.units import mm
 
 __all__ = ["Detection", "ImageDetections", "PipelineResult", "detect_all", "locate_outlines", "register_images"]
+
+_DEFAULT = RegistrationSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,79 +117,38 @@ def _detection_json(d: Detection) -> dict[str, object]:
 
 def register_images(
     outlines: Sequence[Sequence[SphereOutline]],
-    poses: Array,
-    camera: CameraModel,
-    registration_centres_m: Array,
-    radius_m: float,
+    images: PosedImages,
+    spheres: ScanSpheres,
+    settings: RegistrationSettings = _DEFAULT,
     *,
-    control_centres_m: Array | None = None,
-    groups: Sequence[int] | NDArray[np.int64] | None = None,
-    estimate_scale: bool = False,
-    cost: Cost = "cone",
-    names: Sequence[str] = (),
     assignments: Sequence[Assignment] | None = None,
-    pose_covariance: Array | Literal["estimate", "exact"] = "estimate",
-    sphere_covariance_m2: Array | None = None,
-    intrinsics_covariance: Array | None = None,
 ) -> PipelineResult:
     """Identify, register and evaluate detected outlines.
 
     Args:
         outlines: per image, from `locate_outlines` or `detect_all`.
-        poses: (N, 4, 4) T_world_camera, or T_base_camera in the base frame of each image's group.
-        camera: intrinsics.
-        registration_centres_m: (M, 3) in the scan frame.
-        radius_m: radius of all spheres.
-        control_centres_m: (C, 3) spheres used only for the evaluation, or None.
-        groups: (N,) station of each image; None: all the same.
-        estimate_scale: whether to estimate a scale, for poses that are not metric.
-        cost: residual of the registration.
-        names: image names, for messages and results.
+        images: camera, poses and names of the images. If the poses are not metric, their scale is estimated.
+        spheres: registration spheres, and control spheres if there are any.
+        settings: as for `register`.
         assignments: per image, which outlines are which registration spheres, if `locate_outlines` knows it; None:
             identified here.
-        pose_covariance: of the poses, as for `register`.
-        sphere_covariance_m2: (M, 3, 3) of the registration spheres; None takes them as exact.
-        intrinsics_covariance: of fx, fy, cx, cy, k1, k2, p1, p2, as for `register`.
 
     Raises:
         DataError: the lengths do not agree, or a pose is not finite.
         ComputeError: too few spheres, or an ambiguous or contradictory assignment.
     """
-    n = len(outlines)
-    stations = np.zeros(n, dtype=np.int64) if groups is None else np.asarray(groups, dtype=np.int64)
-    if poses.shape != (n, 4, 4) or len(stations) != n:
-        raise DataError(f"{n} images, but {len(poses)} poses and {len(stations)} stations")
-    if not np.all(np.isfinite(poses)):
-        raise DataError("a camera pose holds a number that is not finite")
-    labels = list(names) or [f"image {i}" for i in range(n)]
+    images.require(len(outlines))
     if assignments is None:
-        assignments = identify(
-            outlines, registration_centres_m, camera, poses,
-            radius_m=radius_m, groups=stations, metric=not estimate_scale, names=labels,
-        )  # fmt: skip
-    registration = register(
-        outlines,
-        assignments,
-        poses,
-        stations,
-        registration_centres_m,
-        radius_m,
-        camera,
-        RegistrationSettings(
-            estimate_scale=estimate_scale,
-            cost=cost,
-            pose_covariance=pose_covariance,
-            sphere_covariance_m2=sphere_covariance_m2,
-            intrinsics_covariance=intrinsics_covariance,
-        ),
-    )
-    controls = np.zeros((0, 3)) if control_centres_m is None else np.asarray(control_centres_m, dtype=np.float64)
-    control = _find_controls(outlines, assignments, registration, controls, radius_m, camera)
+        assignments = identify(outlines, images, spheres)
+    registration = register(outlines, assignments, images, spheres, settings)
+    control = _find_controls(outlines, assignments, registration, images.camera, spheres)
     evaluation = None
     if any(a.markers for a in control):
-        evaluation = evaluate(outlines, control, registration.T_scan_camera, controls, radius_m, camera)
+        registered = PosedImages(registration.T_scan_camera, images.camera)
+        evaluation = evaluate(outlines, control, registered, ScanSpheres(spheres.control_m, spheres.radius_m))
+    labels = images.labels
     records = {(r.image, r.outline): r for r in registration.residuals}
-    images = tuple(
+    detections = tuple(
         ImageDetections(
             labels[i],
             tuple(_detection(o, j, records.get((i, j)), control[i]) for j, o in enumerate(found)),
@@ -199,8 +157,8 @@ def register_images(
         for i, found in enumerate(outlines)
     )
     used = tuple(sorted({r.marker for r in registration.residuals if not r.excluded}))
-    centre = np.asarray(registration_centres_m, dtype=np.float64).mean(axis=0)
-    return PipelineResult(registration, evaluation, images, used, tuple(assignments), control, centre)
+    centre = np.asarray(spheres.centres_m, dtype=np.float64).mean(axis=0)
+    return PipelineResult(registration, evaluation, detections, used, tuple(assignments), control, centre)
 
 
 def _detection(outline: SphereOutline, index: int, record: OutlineResidual | None, control: Assignment) -> Detection:
@@ -217,18 +175,19 @@ def _find_controls(
     outlines: Sequence[Sequence[SphereOutline]],
     assignments: Sequence[Assignment],
     registration: RegistrationResult,
-    controls: Array,
-    radius_m: float,
     camera: CameraModel,
+    spheres: ScanSpheres,
 ) -> tuple[Assignment, ...]:
     """Match outlines not used by the registration to the control spheres' predicted positions."""
     out: list[Assignment] = []
     for i, found in enumerate(outlines):
         T = registration.T_scan_camera[i]
         free = [j for j in range(len(found)) if j not in assignments[i].markers]
-        if len(controls) == 0 or not free or not np.all(np.isfinite(T)):
+        if len(spheres.control_m) == 0 or not free or not np.all(np.isfinite(T)):
             out.append(Assignment())
             continue
-        pairs = paired([found[j] for j in free], inverse(T), controls, radius_m, camera, CONTROL_GATE)
+        pairs = paired(
+            [found[j] for j in free], inverse(T), spheres.control_m, spheres.radius_m, camera, CONTROL_GATE
+        )
         out.append(Assignment({free[d]: m for d, m in pairs.items()}, inverse(T), registration.scale))
     return tuple(out)

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.identification.identity import identify
+from service.compute.registration.identification.identity import identify, identify_each
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, transform
 from tests.support.scenes.sphere_images import (
@@ -47,7 +48,7 @@ def wrong(found: dict[int, int], truth: dict[int, int]) -> dict[int, int]:
 def test_every_marker_of_a_set_is_named_right(seed: int) -> None:
     made = scene(5, seed=seed)
     outlines, truth = noisy_set(made, seed)
-    found = identify(outlines, REGISTRATION_M, made.camera, made.T_world_camera, radius_m=RADIUS_M)
+    found = identify(outlines, PosedImages(made.T_world_camera, made.camera), ScanSpheres(REGISTRATION_M, RADIUS_M))
     for a, t in zip(found, truth, strict=True):
         assert a.markers == t
 
@@ -63,9 +64,9 @@ def test_scale_of_structure_from_motion_is_found(seed: int, scale: float) -> Non
     poses[:, :3, 3] /= scale
     if sum(len(t) >= 4 for t in truth) < 2:  # about one set in sixty: refused, not guessed
         with pytest.raises(ComputeError, match=r"from one image|no image shows four"):
-            identify(outlines, REGISTRATION_M, made.camera, poses, radius_m=RADIUS_M, metric=False)
+            identify(outlines, PosedImages(poses, made.camera, metric=False), ScanSpheres(REGISTRATION_M, RADIUS_M))
         return
-    found = identify(outlines, REGISTRATION_M, made.camera, poses, radius_m=RADIUS_M, metric=False)
+    found = identify(outlines, PosedImages(poses, made.camera, metric=False), ScanSpheres(REGISTRATION_M, RADIUS_M))
     for a, t in zip(found, truth, strict=True):
         assert not wrong(a.markers, t)
         assert len(a.markers) >= len(t) - 1
@@ -86,7 +87,7 @@ def test_four_of_ten_among_three_false_without_poses() -> None:
     named = refused = 0
     for made, outlines, truth in cases:
         try:
-            (a,) = identify([outlines], REGISTRATION_M, made.camera, radius_m=RADIUS_M)
+            (a,) = identify_each([outlines], made.camera, ScanSpheres(REGISTRATION_M, RADIUS_M))
         except ComputeError:
             refused += 1
             continue
@@ -100,7 +101,7 @@ def test_an_image_with_two_spheres_is_named_through_the_poses() -> None:
     outlines, truth = noisy_set(made, 3, n_false=0)
     chosen = list(truth[1])[:2]
     outlines[1] = tuple(outlines[1][d] for d in chosen)
-    found = identify(outlines, REGISTRATION_M, made.camera, made.T_world_camera, radius_m=RADIUS_M)
+    found = identify(outlines, PosedImages(made.T_world_camera, made.camera), ScanSpheres(REGISTRATION_M, RADIUS_M))
     assert [found[1].markers[k] for k in (0, 1)] == [truth[1][d] for d in chosen]
 
 
@@ -112,7 +113,7 @@ def test_poses_off_by_a_millimetre_are_met() -> None:
         [T @ transform(Rotation.from_rotvec(rng.normal(size=3) * 1e-3), rng.normal(size=3) * 6e-4)
          for T in made.T_world_camera]
     )  # fmt: skip
-    found = identify(outlines, REGISTRATION_M, made.camera, poses, radius_m=RADIUS_M)
+    found = identify(outlines, PosedImages(poses, made.camera), ScanSpheres(REGISTRATION_M, RADIUS_M))
     assert all(not wrong(a.markers, t) and len(a.markers) == len(t) for a, t in zip(found, truth, strict=True))
 
 
@@ -121,7 +122,9 @@ def test_stations_are_solved_in_their_own_frames() -> None:
     outlines, truth = noisy_set(made, 6)
     moved = np.array(made.T_world_camera)
     moved[3:] = transform(Rotation.from_rotvec([0, 0, 2.0]), np.array([0.5, 1.2, 0.0])) @ moved[3:]
-    found = identify(outlines, REGISTRATION_M, made.camera, moved, radius_m=RADIUS_M, groups=[0, 0, 0, 1, 1, 1])
+    found = identify(
+        outlines, PosedImages(moved, made.camera, groups=[0, 0, 0, 1, 1, 1]), ScanSpheres(REGISTRATION_M, RADIUS_M)
+    )
     assert all(a.markers == t for a, t in zip(found, truth, strict=True))
 
 
@@ -131,7 +134,7 @@ def test_symmetric_layout_is_called_ambiguous() -> None:
     made = scene(4, seed=1)
     outlines = [exact_outlines(made, i, ring)[0] for i in range(4)]
     with pytest.raises(ComputeError, match="ambiguous"):
-        identify(outlines, ring, made.camera, made.T_world_camera, radius_m=RADIUS_M)
+        identify(outlines, PosedImages(made.T_world_camera, made.camera), ScanSpheres(ring, RADIUS_M))
 
 
 def test_one_image_that_can_be_read_in_two_ways_names_them() -> None:
@@ -140,7 +143,7 @@ def test_one_image_that_can_be_read_in_two_ways_names_them() -> None:
     made = scene(1, seed=1)
     outlines = exact_outlines(made, 0, ring)[0]
     with pytest.raises(ComputeError, match=r"ambiguous: \{0=\d, .*\} and \{0=\d"):
-        identify([outlines], ring, made.camera, radius_m=RADIUS_M)
+        identify_each([outlines], made.camera, ScanSpheres(ring, RADIUS_M))
 
 
 def test_too_few_says_how_many_where() -> None:
@@ -148,7 +151,9 @@ def test_too_few_says_how_many_where() -> None:
     outlines = [exact_outlines(made, i, EVERYTHING)[0][:n] for i, n in ((0, 3), (1, 2))]
     with pytest.raises(ComputeError, match=r"at most 3 .*a\.jpg: 3, b\.jpg: 2"):
         identify(
-            outlines, REGISTRATION_M, made.camera, made.T_world_camera, radius_m=RADIUS_M, names=["a.jpg", "b.jpg"]
+            outlines,
+            PosedImages(made.T_world_camera, made.camera, names=["a.jpg", "b.jpg"]),
+            ScanSpheres(REGISTRATION_M, RADIUS_M),
         )
 
 
@@ -157,11 +162,11 @@ def test_spheres_of_another_scene_are_refused() -> None:
     outlines = [exact_outlines(made, i, REGISTRATION_M)[0] for i in range(4)]
     other = np.random.default_rng(3).uniform(-0.2, 0.2, (10, 3))
     with pytest.raises(ComputeError):
-        identify(outlines, other, made.camera, made.T_world_camera, radius_m=RADIUS_M)
+        identify(outlines, PosedImages(made.T_world_camera, made.camera), ScanSpheres(other, RADIUS_M))
 
 
 def test_poses_of_other_images_are_refused() -> None:
     made = scene(6, seed=4)
     outlines = [exact_outlines(made, i, REGISTRATION_M)[0] for i in range(6)]
     with pytest.raises(ComputeError, match="poses"):
-        identify(outlines, REGISTRATION_M, made.camera, made.T_world_camera[::-1], radius_m=RADIUS_M)
+        identify(outlines, PosedImages(made.T_world_camera[::-1], made.camera), ScanSpheres(REGISTRATION_M, RADIUS_M))

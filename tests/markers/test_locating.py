@@ -17,7 +17,8 @@ from service.compute.images.files import read_image, read_reduced
 from service.compute.markers.cones import cone_of_sphere
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.image_files import LocatedOutlines, detect_all, locate_outlines, spread_views
+from service.compute.markers.search.anchors import spread_views
+from service.compute.markers.search.image_files import LocatedOutlines, detect_all, locate_outlines
 from service.compute.markers.search.predicted import (
     WIDE,
     Prediction,
@@ -27,6 +28,7 @@ from service.compute.markers.search.predicted import (
     visible_cones,
 )
 from service.compute.pipeline import PipelineResult, register_images
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse, look_at, transform
 from tests.support.scenes.sphere_images import (
@@ -92,10 +94,11 @@ def test_as_good_as_the_search_of_whole_images(captured: Captured, poses: str) -
         given_poses[:, :3, 3] /= 3.3
     seen: list[tuple[int, int]] = []
     located = locate_outlines(
-        paths, made.camera, given_poses, REGISTRATION_M, RADIUS_M,
-        control_centres_m=CONTROL_M, metric=poses != "no scale",
+        paths,
+        PosedImages(given_poses, made.camera, metric=poses != "no scale"),
+        ScanSpheres(REGISTRATION_M, RADIUS_M, control_m=CONTROL_M),
         progress=lambda done, total: seen.append((done, total)),
-    )  # fmt: skip
+    )
     assert seen == [(k, N) for k in range(1, N + 1)]
     assert located.count("predicted") == N
     assert located.assignments is not None
@@ -111,10 +114,14 @@ def test_as_good_as_the_search_of_whole_images(captured: Captured, poses: str) -
             assert off * made.camera.fx < 0.5
     scale = poses == "no scale"
     ours = register_images(
-        located.outlines, given_poses, made.camera, REGISTRATION_M, RADIUS_M,
-        estimate_scale=scale, assignments=located.assignments,
-    )  # fmt: skip
-    theirs = register_images(whole, given_poses, made.camera, REGISTRATION_M, RADIUS_M, estimate_scale=scale)
+        located.outlines,
+        PosedImages(given_poses, made.camera, metric=not scale),
+        ScanSpheres(REGISTRATION_M, RADIUS_M),
+        assignments=located.assignments,
+    )
+    theirs = register_images(
+        whole, PosedImages(given_poses, made.camera, metric=not scale), ScanSpheres(REGISTRATION_M, RADIUS_M)
+    )
     assert len(ours.registration.residuals) >= len(theirs.registration.residuals)
     # Pose errors shift the registration whatever the outlines: exact outlines of the same spheres show how far.
     best = perfect(made, located, given_poses, scale)
@@ -138,13 +145,18 @@ def perfect(made: Scene, located: LocatedOutlines, poses: Array, scale: bool) ->
         outlines.append(tuple(by_sphere[m] for m in assignment.markers.values()))
     known = [dataclasses.replace(a, markers=dict(enumerate(a.markers.values()))) for a in located.assignments]
     return register_images(
-        outlines, poses, made.camera, REGISTRATION_M, RADIUS_M, estimate_scale=scale, assignments=known
-    )  # fmt: skip
+        outlines,
+        PosedImages(poses, made.camera, metric=not scale),
+        ScanSpheres(REGISTRATION_M, RADIUS_M),
+        assignments=known,
+    )
 
 
 def test_spheres_that_no_list_names_are_found_too(captured: Captured) -> None:
     made, paths, _ = captured
-    located = locate_outlines(paths, made.camera, made.T_world_camera, REGISTRATION_M, RADIUS_M)
+    located = locate_outlines(
+        paths, PosedImages(made.T_world_camera, made.camera), ScanSpheres(REGISTRATION_M, RADIUS_M)
+    )
     spheres = {sphere for i in range(N) for sphere, off in true_spheres(made, i, located) if off < 1.0}
     assert len({10, 11, 12} & spheres) >= 2  # of those that two anchors show
     assert located.assignments is not None
@@ -158,7 +170,9 @@ def test_an_image_that_shows_nothing_is_searched_whole(captured: Captured, tmp_p
     empty = tmp_path / "blank.png"
     assert cv2.imwrite(str(empty), np.full((made.camera.height, WIDTH, 3), 90, np.uint8))
     files = [empty if i == blank else path for i, path in enumerate(paths)]
-    located = locate_outlines(files, made.camera, made.T_world_camera, REGISTRATION_M, RADIUS_M)
+    located = locate_outlines(
+        files, PosedImages(made.T_world_camera, made.camera), ScanSpheres(REGISTRATION_M, RADIUS_M)
+    )
     assert located.images[blank].how == "searched"
     assert located.outlines[blank] == ()
     assert located.count("predicted") == N - 1
@@ -167,7 +181,7 @@ def test_an_image_that_shows_nothing_is_searched_whole(captured: Captured, tmp_p
 def test_poses_of_other_images_predict_nothing(captured: Captured) -> None:
     made, paths, whole = captured
     turned = np.roll(made.T_world_camera, 3, axis=0)
-    located = locate_outlines(paths, made.camera, turned, REGISTRATION_M, RADIUS_M)
+    located = locate_outlines(paths, PosedImages(turned, made.camera), ScanSpheres(REGISTRATION_M, RADIUS_M))
     assert located.assignments is None
     assert located.count("searched") == N
     assert [len(found) for found in located.outlines] == [len(found) for found in whole]
@@ -176,9 +190,15 @@ def test_poses_of_other_images_predict_nothing(captured: Captured) -> None:
 def test_bad_arguments(captured: Captured, tmp_path: Path) -> None:
     made, paths, _ = captured
     with pytest.raises(DataError, match="poses"):
-        locate_outlines(paths, made.camera, made.T_world_camera[:2], REGISTRATION_M, RADIUS_M)
+        locate_outlines(
+            paths, PosedImages(made.T_world_camera[:2], made.camera), ScanSpheres(REGISTRATION_M, RADIUS_M)
+        )
     with pytest.raises(DataError, match=r"missing\.jpg"):
-        locate_outlines([tmp_path / "missing.jpg"] * N, made.camera, made.T_world_camera, REGISTRATION_M, RADIUS_M)
+        locate_outlines(
+            [tmp_path / "missing.jpg"] * N,
+            PosedImages(made.T_world_camera, made.camera),
+            ScanSpheres(REGISTRATION_M, RADIUS_M),
+        )
 
 
 def test_what_is_not_where_it_is_predicted_is_missing(captured: Captured) -> None:

@@ -21,6 +21,7 @@ from service.compute.evaluation.error_budget import (
 )
 from service.compute.pipeline import register_images
 from service.compute.registration.identification.identity import Assignment
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import apply, inverse, transform
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, exact_outlines, scene
@@ -114,7 +115,9 @@ def budget_of(seed: int, stated_m: float = SIGMA_M) -> ErrorBudget:
     scan = measured(every, seed, stated_m=stated_m)
     seen = [exact_outlines(made, i, every, noise_px=0.05, seed=seed)[0] for i in range(6)]
     solved = register_images(
-        seen, made.T_world_camera, made.camera, scan.centres_m[:10], RADIUS_M, control_centres_m=scan.centres_m[10:]
+        seen,
+        PosedImages(made.T_world_camera, made.camera),
+        ScanSpheres(scan.centres_m[:10], RADIUS_M, control_m=scan.centres_m[10:]),
     )
     registration = solved.registration
     controls = MeasuredSpheres(scan.centres_m[10:], scan.covariance_m2[10:], scan.surface_rms_m)

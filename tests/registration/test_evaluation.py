@@ -14,6 +14,7 @@ from service.compute.markers.records import SphereOutline
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import inverse, transform
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, exact_outlines, scene
@@ -37,12 +38,12 @@ def test_exact_outlines_have_no_error_and_a_shift_has_its_size() -> None:
     found = [exact_outlines(made, i, CONTROL_M) for i in range(4)]
     outlines = [f[0] for f in found]
     assignments = [Assignment(dict(enumerate(f[1]))) for f in found]
-    exact = evaluate(outlines, assignments, truth, CONTROL_M, RADIUS_M, made.camera)
+    exact = evaluate(outlines, assignments, PosedImages(truth, made.camera), ScanSpheres(CONTROL_M, RADIUS_M))
     assert exact.mean_radial_error_mm < 1e-6
     assert exact.mean_reprojection_error_px < 1e-6
     # A sphere moved by d across the view meets its outline's rays at d |cos|, 2 d / π on average.
     shifted = np.array([T @ transform(np.eye(3), np.array([0.001, 0.0, 0.0])) for T in truth])
-    moved = evaluate(outlines, assignments, shifted, CONTROL_M, RADIUS_M, made.camera)
+    moved = evaluate(outlines, assignments, PosedImages(shifted, made.camera), ScanSpheres(CONTROL_M, RADIUS_M))
     assert moved.mean_radial_error_mm == pytest.approx(2 / np.pi, rel=0.08)
     distance = np.mean(np.linalg.norm(truth[:, :3, 3], axis=1))
     expected_px = moved.mean_radial_error_mm * 1e-3 / distance * made.camera.fx
@@ -60,7 +61,12 @@ def test_radial_error_is_the_gap_between_ray_and_hull() -> None:
 def test_no_control_sphere_is_refused() -> None:
     made = scene(2)
     with pytest.raises(ComputeError, match="control"):
-        evaluate([(), ()], [Assignment(), Assignment()], made.T_world_camera, CONTROL_M, RADIUS_M, made.camera)
+        evaluate(
+            [(), ()],
+            [Assignment(), Assignment()],
+            PosedImages(made.T_world_camera, made.camera),
+            ScanSpheres(CONTROL_M, RADIUS_M),
+        )
 
 
 def registered(seed: int, noise_px: float, pose_sigma: tuple[float, float] = (0.0, 0.0)) -> Registered:
@@ -76,7 +82,7 @@ def registered(seed: int, noise_px: float, pose_sigma: tuple[float, float] = (0.
     spheres = [{j: k for j, k in enumerate(f[1]) if k < 10} for f in found]
     controls = [Assignment({j: k - 10 for j, k in enumerate(f[1]) if k >= 10}) for f in found]
     assignments = [Assignment(m, inverse(T) @ made.T_world_scan) for m, T in zip(spheres, poses, strict=True)]
-    result = register(outlines, assignments, poses, [0] * 6, REGISTRATION_M, RADIUS_M, made.camera)
+    result = register(outlines, assignments, PosedImages(poses, made.camera), ScanSpheres(REGISTRATION_M, RADIUS_M))
     return Registered(outlines, controls, result, made.camera)
 
 
@@ -87,7 +93,11 @@ def test_errors_of_control_and_left_out_spheres_have_the_size_predicted(pose_sig
         made = registered(seed, 0.1, pose_sigma)
         for refined, cameras in ((False, made.result.T_scan_camera), (True, made.result.T_scan_camera_refined)):
             control = evaluate(
-                made.outlines, made.controls, cameras, CONTROL_M, RADIUS_M, made.camera, registration=made.result
+                made.outlines,
+                made.controls,
+                PosedImages(cameras, made.camera),
+                ScanSpheres(CONTROL_M, RADIUS_M),
+                registration=made.result,
             )
             spared = leave_one_out(made.result, refined=refined)
             assert len(spared.per_sphere()) >= 6
@@ -113,11 +123,8 @@ def test_a_sphere_displaced_in_the_list_stands_out() -> None:
     result = register(
         [f[0] for f in found],
         assignments,
-        made.T_world_camera,
-        [0] * 6,
-        listed,
-        RADIUS_M,
-        made.camera,
+        PosedImages(made.T_world_camera, made.camera),
+        ScanSpheres(listed, RADIUS_M),
         RegistrationSettings(robust=False),
     )
     radial = {s: r[0] for s, r in leave_one_out(result).per_sphere().items()}
@@ -137,11 +144,8 @@ def test_the_last_three_spheres_cannot_be_spared() -> None:
     result = register(
         [f[0] for f in found],
         assignments,
-        made.T_world_camera,
-        [0] * 4,
-        REGISTRATION_M[[0, 3, 6]],
-        RADIUS_M,
-        made.camera,
+        PosedImages(made.T_world_camera, made.camera),
+        ScanSpheres(REGISTRATION_M[[0, 3, 6]], RADIUS_M),
     )
     with pytest.raises(ComputeError, match="left out"):
         leave_one_out(result)

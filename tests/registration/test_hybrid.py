@@ -12,9 +12,10 @@ from service.compute.camera_covariance import CameraCovariance
 from service.compute.poses.files.pose_covariance import similarity_covariance
 from service.compute.poses.hybrid.bundle import Data, Sigmas, SphereSightings, State, linearise, moved, width
 from service.compute.poses.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses
+from service.compute.scene import PosedImages
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, align_points, inverse, transform
-from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M
+from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION, REGISTRATION_M
 from tests.support.scenes.tracked_scene import TrackedScene, pose_errors, tracked_scene
 
 EXACT_SPHERES = HybridOptions(sphere_sigma_m=1e-6)
@@ -41,11 +42,26 @@ def noisy(
     )
 
 
-def adjust(made: TrackedScene, **more: object) -> HybridPoses:
-    arguments: dict[str, object] = {
-        "T_base_camera": made.T_base_camera, "groups": made.groups, "options": EXACT_SPHERES, **more
-    }  # fmt: skip
-    return hybrid_poses(made.poses, made.tracks, made.outlines, made.camera, REGISTRATION_M, RADIUS_M, **arguments)  # type: ignore[arg-type]
+def adjust(
+    made: TrackedScene,
+    *,
+    robot: bool = True,
+    T_base_camera: Array | None = None,
+    known_camera: CameraCovariance | None = None,
+    options: HybridOptions = EXACT_SPHERES,
+) -> HybridPoses:
+    images = PosedImages(made.poses, made.camera, groups=made.groups if robot else None, metric=False)
+    if robot and T_base_camera is None:
+        T_base_camera = made.T_base_camera
+    return hybrid_poses(
+        images,
+        made.tracks,
+        made.outlines,
+        REGISTRATION,
+        T_base_camera=T_base_camera,
+        known_camera=known_camera,
+        options=options,
+    )
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -91,7 +107,7 @@ def test_covariance_is_honest_with_little_texture(robot: bool) -> None:
         made = tracked_scene(
             seed, images=40, points=30, track_px=0.3, outline_px=0.1, robot_m=5e-4, robot_rad=1e-3, outliers=0.02
         )
-        answer = adjust(made, **({} if robot else {"T_base_camera": None, "groups": None}))
+        answer = adjust(made, robot=robot)
         error = pose_errors(answer.T_scan_camera, made.T_scan_camera).ravel()
         C = answer.covariance[: error.size, : error.size]
         ratios.append(float(error @ np.linalg.solve(C, error)) / error.size)
@@ -126,7 +142,10 @@ def test_false_matches_do_not_matter() -> None:
 
 def test_a_wrong_principal_point_is_found_with_the_calibration_as_prior() -> None:
     made = noisy(5, robot_m=1e-4, robot_rad=1e-4, points=300, camera_error_px=3.0)
-    held, free = adjust(made), adjust(made, lens_covariance=np.diag([4.0, 4.0, 9.0, 9.0]))
+    held, free = (
+        adjust(made),
+        adjust(made, options=dataclasses.replace(EXACT_SPHERES, lens_covariance=np.diag([4.0, 4.0, 9.0, 9.0]))),
+    )
     assert held.camera == made.camera
     assert abs(free.camera.cx - (made.camera.cx - 3.0)) < 1.0
     worse, better = (pose_errors(a.T_scan_camera, made.T_scan_camera) for a in (held, free))
@@ -149,7 +168,7 @@ def test_what_is_not_known_of_the_camera_is_in_the_uncertainty(robot: bool) -> N
             seed, track_px=0.3, outline_px=0.1, robot_m=5e-4, robot_rad=1e-3,
             camera_errors={name: float(d) for name, d in off.items()},
         )  # fmt: skip
-        answer = adjust(made, known_camera=known, **({} if robot else {"T_base_camera": None}))
+        answer = adjust(made, known_camera=known, robot=robot)
         error = pose_errors(answer.T_scan_camera, made.T_scan_camera)
         for ratios, share in ((stated, 0.0), (without, answer.camera_share)):
             sigma = np.sqrt(np.diag(answer.covariance - share)[: error.size])
@@ -160,7 +179,7 @@ def test_what_is_not_known_of_the_camera_is_in_the_uncertainty(robot: bool) -> N
 
 def test_spheres_alone_make_the_poses_metric() -> None:
     made = noisy(6)
-    answer = adjust(made, T_base_camera=None, groups=None)
+    answer = adjust(made, robot=False)
     assert np.array_equal(answer.T_world_camera, answer.T_scan_camera)
     assert answer.sigma_robot_m is None
     assert np.sqrt(np.mean(pose_errors(answer.T_scan_camera, made.T_scan_camera)[:, :3] ** 2)) < 1.5e-4
@@ -178,7 +197,7 @@ def test_an_image_without_a_robot_pose_is_adjusted_all_the_same() -> None:
 def test_what_cannot_be_adjusted_is_refused() -> None:
     made = tracked_scene(8)
     with pytest.raises(DataError, match="stations"):
-        adjust(made, groups=made.groups[:-1])
+        adjust(dataclasses.replace(made, groups=made.groups[:-1]))
     robot = made.T_base_camera.copy()
     robot[5:] = np.nan
     with pytest.raises(ComputeError, match="station 1 has 1 images"):
@@ -227,7 +246,7 @@ def test_covariance_of_structure_from_motion_is_honest() -> None:
     ratios: list[float] = []
     for seed in range(6):
         made = tracked_scene(20 + seed, track_px=0.3, outline_px=1.0)
-        answer = adjust(made, T_base_camera=None, groups=None)  # converged poses, metric
+        answer = adjust(made, robot=False)  # converged poses, metric
         points = answer.points_scan
         C = similarity_covariance(answer.T_scan_camera, dataclasses.replace(made.tracks, points=points), made.camera)
         T, s = align_points(answer.T_scan_camera[:, :3, 3], made.T_scan_camera[:, :3, 3], with_scale=True)

@@ -10,6 +10,7 @@ from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.joint_poses import with_joint_pose_covariance
 from service.compute.registration.result import RegistrationResult
 from service.compute.registration.solve import register
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import DataError
 from service.core.geometry import apply
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, exact_outlines, scene
@@ -27,7 +28,9 @@ def registered(seed: int, errors: np.ndarray) -> tuple[RegistrationResult, np.nd
     seen = [exact_outlines(made, i, REGISTRATION_M, noise_px=0.03, seed=seed) for i in range(N)]
     T_camera_scan = [np.linalg.inv(T) @ made.T_world_scan for T in made.T_world_camera]
     known = [Assignment(dict(enumerate(which)), T) for (_, which), T in zip(seen, T_camera_scan, strict=True)]
-    answer = register([o for o, _ in seen], known, poses, [0] * N, REGISTRATION_M, RADIUS_M, made.camera)
+    answer = register(
+        [o for o, _ in seen], known, PosedImages(poses, made.camera), ScanSpheres(REGISTRATION_M, RADIUS_M)
+    )
     return answer, apply(answer.T_world_scan, CENTRE) - apply(made.T_world_scan, CENTRE)
 
 

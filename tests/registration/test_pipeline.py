@@ -15,6 +15,7 @@ from service.compute.images.files import read_image
 from service.compute.markers.records import SphereOutline
 from service.compute.overlay import draw_overlay
 from service.compute.pipeline import detect_all, register_images
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import DataError
 from service.core.geometry import inverse
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, Scene, render, scene
@@ -45,9 +46,10 @@ def test_files_to_registration(captured: Captured, scale: float) -> None:
     poses = np.array(made.T_world_camera)
     poses[:, :3, 3] /= scale
     result = register_images(
-        outlines, poses, made.camera, REGISTRATION_M, RADIUS_M,
-        control_centres_m=CONTROL_M, estimate_scale=scale != 1.0, names=[p.name for p in paths],
-    )  # fmt: skip
+        outlines,
+        PosedImages(poses, made.camera, metric=scale == 1.0, names=[p.name for p in paths]),
+        ScanSpheres(REGISTRATION_M, RADIUS_M, control_m=CONTROL_M),
+    )
     truth = inverse(made.T_world_scan) @ made.T_world_camera
     assert true_error_m(result.registration.T_scan_camera, truth, np.array([0, 0, 0.05])) < 3e-5
     assert result.registration.scale == pytest.approx(scale, rel=1e-3)
@@ -65,7 +67,9 @@ def test_files_to_registration(captured: Captured, scale: float) -> None:
 
 def test_overlay_draws_on_a_copy(captured: Captured) -> None:
     made, paths, outlines = captured
-    result = register_images(outlines, made.T_world_camera, made.camera, REGISTRATION_M, RADIUS_M)
+    result = register_images(
+        outlines, PosedImages(made.T_world_camera, made.camera), ScanSpheres(REGISTRATION_M, RADIUS_M)
+    )
     image = read_image(paths[0])
     before = image.copy()
     entry = result.images[0]
@@ -131,7 +135,9 @@ def test_orientation_tag_is_ignored(tmp_path: Path) -> None:
 def test_lengths_must_agree(captured: Captured) -> None:
     made, _, outlines = captured
     with pytest.raises(DataError, match="poses"):
-        register_images(outlines, made.T_world_camera[:3], made.camera, REGISTRATION_M, RADIUS_M)
+        register_images(
+            outlines, PosedImages(made.T_world_camera[:3], made.camera), ScanSpheres(REGISTRATION_M, RADIUS_M)
+        )
 
 
 def test_camera_is_needed_at_the_images_size() -> None:

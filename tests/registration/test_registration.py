@@ -16,6 +16,7 @@ from service.compute.registration.cost import Cost, PointCost, cone_residuals, r
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Transform, apply, inverse, rotation_angle_rad, transform
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, Scene, exact_outlines, false_outlines, scene
@@ -44,15 +45,11 @@ def solve(
     assignments: Sequence[Assignment],
     cost: Cost = "cone",
 ) -> RegistrationResult:
-    n = len(outlines)
     return register(
         outlines,
         assignments,
-        made.T_world_camera,
-        [0] * n,
-        REGISTRATION_M,
-        RADIUS_M,
-        made.camera,
+        PosedImages(made.T_world_camera, made.camera),
+        ScanSpheres(REGISTRATION_M, RADIUS_M),
         RegistrationSettings(cost=cost),
     )
 
@@ -125,14 +122,7 @@ def test_scale_is_solved_jointly(seed: int, scale: float) -> None:
     poses[:, :3, 3] /= scale
     start = [Assignment(a.markers, a.T_camera_scan, scale * 1.01) for a in assignments]
     result = register(
-        outlines,
-        start,
-        poses,
-        [0] * 5,
-        REGISTRATION_M,
-        RADIUS_M,
-        made.camera,
-        RegistrationSettings(estimate_scale=True),
+        outlines, start, PosedImages(poses, made.camera, metric=False), ScanSpheres(REGISTRATION_M, RADIUS_M)
     )
     assert result.scale == pytest.approx(scale, rel=1e-6)
     assert result.covariance.shape == (7, 7)
@@ -148,7 +138,12 @@ def test_stations_are_joined_through_the_spheres(seed: int) -> None:
     T_world_second = transform(Rotation.random(rng=rng), rng.uniform(-1, 1, 3))
     poses = np.array(made.T_world_camera)
     poses[3:] = inverse(T_world_second) @ poses[3:]
-    result = register(outlines, assignments, poses, [1, 1, 1, 2, 2, 2], REGISTRATION_M, RADIUS_M, made.camera)
+    result = register(
+        outlines,
+        assignments,
+        PosedImages(poses, made.camera, groups=[1, 1, 1, 2, 2, 2]),
+        ScanSpheres(REGISTRATION_M, RADIUS_M),
+    )
     assert np.allclose(result.T_world_scan, made.T_world_scan, atol=1e-6)
     assert np.allclose(result.T_world_group[1], np.eye(4), atol=1e-12)
     assert np.allclose(result.T_world_group[2], T_world_second, atol=1e-6)

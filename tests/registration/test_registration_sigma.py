@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from service.compute.registration.identification.identity import Assignment, identify
 from service.compute.registration.settings import CommonErrors, RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse, skew, transform
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, Scene, exact_outlines, scene
@@ -37,15 +38,14 @@ def solved(
     return register(
         [f[0] for f in found],
         assignments,
-        poses,
-        [0] * n,
-        spheres,
-        RADIUS_M,
-        made.camera,
+        PosedImages(poses, made.camera),
+        ScanSpheres(
+            spheres,
+            RADIUS_M,
+            covariance_m2=np.tile(np.eye(3) * sphere_sigma_m**2, (10, 1, 1)) if sphere_sigma_m else None,
+        ),
         RegistrationSettings(
-            pose_covariance="estimate" if any(pose_sigma) else "exact",
-            common_errors=NOTHING_COMMON,
-            sphere_covariance_m2=np.tile(np.eye(3) * sphere_sigma_m**2, (10, 1, 1)) if sphere_sigma_m else None,
+            pose_covariance="estimate" if any(pose_sigma) else "exact", common_errors=NOTHING_COMMON
         ),
     )
 
@@ -125,9 +125,12 @@ def test_what_no_view_can_tell_remains() -> None:
     assignments = [Assignment(dict(enumerate(f[1])), inverse(T) @ made.T_world_scan)
                    for f, T in zip(found, made.T_world_camera, strict=True)]  # fmt: skip
     result = register(
-        [f[0] for f in found], assignments, made.T_world_camera, [0] * n, REGISTRATION_M, RADIUS_M, made.camera,
+        [f[0] for f in found],
+        assignments,
+        PosedImages(made.T_world_camera, made.camera),
+        ScanSpheres(REGISTRATION_M, RADIUS_M),
         RegistrationSettings(common_errors=CommonErrors(shift_px=1e-5, growth_px=1e-5, light_px=0.1)),
-    )  # fmt: skip
+    )
     seen = np.concatenate([made.centres_camera(i, REGISTRATION_M) for i in range(n)])
     distance = float(np.mean(np.linalg.norm(seen, axis=1)))
     expected = np.sqrt(3) * 0.1 / made.camera.fx * distance
@@ -141,9 +144,12 @@ def test_covariances_of_the_wrong_shape_are_refused() -> None:
                    for f, T in zip(found, made.T_world_camera, strict=True)]  # fmt: skip
     with pytest.raises(DataError, match="shape"):
         register(
-            [f[0] for f in found], assignments, made.T_world_camera, [0] * 4, REGISTRATION_M, RADIUS_M, made.camera,
+            [f[0] for f in found],
+            assignments,
+            PosedImages(made.T_world_camera, made.camera),
+            ScanSpheres(REGISTRATION_M, RADIUS_M),
             RegistrationSettings(pose_covariance=np.zeros((3, 6, 6))),
-        )  # fmt: skip
+        )
 
 
 def test_a_turned_frame_changes_nothing() -> None:
@@ -179,12 +185,16 @@ def test_refined_cameras_are_placed_as_well_as_stated() -> None:
 def test_exact_outlines_and_poses_of_another_unit(seed: int, with_scale: bool) -> None:
     """Residuals hundreds of times the stated outline errors come from the poses; the scale may be needed first."""
     made = tracked_scene(seed)
-    found = identify(made.outlines, REGISTRATION_M, made.camera, made.poses, radius_m=RADIUS_M, metric=False)
+    found = identify(
+        made.outlines, PosedImages(made.poses, made.camera, metric=False), ScanSpheres(REGISTRATION_M, RADIUS_M)
+    )
     assignments = [Assignment(a.markers, a.T_camera_scan, a.scale if with_scale else None) for a in found]
     result = register(
-        made.outlines, assignments, made.poses, [0] * len(made.poses), REGISTRATION_M, RADIUS_M, made.camera,
-        RegistrationSettings(estimate_scale=True),
-    )  # fmt: skip
+        made.outlines,
+        assignments,
+        PosedImages(made.poses, made.camera, metric=False),
+        ScanSpheres(REGISTRATION_M, RADIUS_M),
+    )
     assert result.scale == pytest.approx(made.scale, rel=1e-3)
     assert result.pose_sigma[0] < 1e-3
     assert not result.excluded

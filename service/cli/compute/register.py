@@ -35,6 +35,7 @@ from service.compute.markers.search.image_files import (
 from service.compute.markers.search.paper_files import detect_file_by_masks, read_boxes
 from service.compute.pipeline import register_images
 from service.compute.poses.files.pose_files import posed_images, read_camera_json, read_spheres_json
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array
 from service.core.units import metres, mm
@@ -120,25 +121,16 @@ def register_command(
             else:
                 located = locate_outlines(
                     files,
-                    model,
-                    T_world_camera,
-                    registration_m,
-                    radius_m,
-                    control_centres_m=control_m,
-                    metric=not estimate_scale,
+                    PosedImages(T_world_camera, model, metric=not estimate_scale),
+                    ScanSpheres(registration_m, radius_m, control_m=control_m),
                     options=options,
                     workers=processes,
                     progress=show,
                 )
         result = register_images(
             located.outlines,
-            T_world_camera,
-            model,
-            registration_m,
-            radius_m,
-            control_centres_m=control_m,
-            estimate_scale=estimate_scale,
-            names=[file.name for file in files],
+            PosedImages(T_world_camera, model, metric=not estimate_scale, names=[file.name for file in files]),
+            ScanSpheres(registration_m, radius_m, control_m=control_m),
             assignments=located.assignments,
         )
         record = result.as_json(model)

@@ -42,6 +42,7 @@ from service.compute.poses.files.robot_files import read_hand_eye, read_stations
 from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.poses.sfm.estimate import SfmModel, reconstruct
 from service.compute.poses.sfm.options import Effort, Refine, SfmOptions, options_for
+from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, align_points, apply
@@ -262,16 +263,18 @@ def _hybrid(
     order = list(dict.fromkeys(stations[name] for name in names)) if stations else []
     nothing = np.full((4, 4), np.nan)
     return hybrid_poses(
-        np.array(list(solved.T_world_camera.values())),
+        PosedImages(
+            np.array(list(solved.T_world_camera.values())),
+            solved.camera,
+            groups=[order.index(stations[name]) for name in names] if stations else None,
+            metric=False,
+            names=names,
+        ),
         solved.tracks,
         outlines,
-        solved.camera,
-        centres_m,
-        radius_m,
+        ScanSpheres(centres_m, radius_m),
         T_base_camera=None if prior is None else np.array([prior.get(name, nothing) for name in names]),
-        groups=[order.index(stations[name]) for name in names] if stations else None,
         known_camera=well_known,
-        names=names,
     )
 
 

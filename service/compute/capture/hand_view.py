@@ -15,8 +15,9 @@ from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import DetectionOptions, SphereOutline
 from service.compute.markers.search.predicted import fit_pose
 from service.compute.planning.information import ViewInformation, view_information
-from service.compute.registration.identification.identity import identify
+from service.compute.registration.identification.identity import identify_each
 from service.compute.registration.identification.pairing import paired
+from service.compute.scene import ScanSpheres
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse
@@ -119,7 +120,7 @@ def _read(
     if len(outlines) < _LEAST_SPHERES:
         return None
     try:
-        (reading,) = identify([outlines], spheres_m, camera, radius_m=radius_m)
+        (reading,) = identify_each([outlines], camera, ScanSpheres(spheres_m, radius_m))
     except ComputeError:
         return None
     return reading.T_camera_scan

@@ -21,6 +21,7 @@ from service.compute.markers.records import SphereOutline
 from service.compute.registration.identification.identity import Assignment, identify
 from service.compute.registration.identification.pairing import paired
 from service.compute.registration.solve import RegistrationResult, register
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 
@@ -98,7 +99,9 @@ def register_station(
     outlines = [tuple(_fewer_points(o) for o in view.outlines) for view in views]
     poses = np.array([view.T_base_camera for view in views]).reshape(-1, 4, 4)
     if T_base_scan is None:
-        assignments = identify(outlines, spheres_m, camera, poses, radius_m=radius_m, names=[v.name for v in views])
+        assignments = identify(
+            outlines, PosedImages(poses, camera, names=[v.name for v in views]), ScanSpheres(spheres_m, radius_m)
+        )
     else:
         assignments = tuple(
             Assignment(paired(found, T, spheres_m, radius_m, camera), T)
@@ -110,11 +113,8 @@ def register_station(
     answer = register(
         [outlines[i] for i in keep],
         [assignments[i] for i in keep],
-        poses[keep],
-        np.zeros(len(keep), dtype=np.int64),
-        spheres_m,
-        radius_m,
-        camera,
+        PosedImages(poses[keep], camera, groups=np.zeros(len(keep), dtype=np.int64)),
+        ScanSpheres(spheres_m, radius_m),
     )
     return Provisional(answer.T_world_scan, answer, tuple(views[i].name for i in keep))
 

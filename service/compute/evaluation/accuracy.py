@@ -20,6 +20,7 @@ from service.compute.registration.normal_equations import (
 )
 from service.compute.registration.prediction import HeldOutRows, Prediction, held_out_rows, predict
 from service.compute.registration.result import RegistrationResult, Solution
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, inverse
 from service.core.units import mm
@@ -73,26 +74,20 @@ def radial_errors_m(points: Array, centre_camera_m: Array, radius_m: float) -> A
 def evaluate(
     outlines: Sequence[Sequence[SphereOutline]],
     assignments: Sequence[Assignment],
-    T_scan_camera: Array,
-    centres_scan_m: Array,
-    radius_m: float,
-    camera: CameraModel,
+    images: PosedImages,
+    controls: ScanSpheres,
     *,
     registration: RegistrationResult | None = None,
-    centre_covariance_m2: Array | None = None,
 ) -> Evaluation:
     """Errors of spheres that were not used in the registration.
 
     Args:
         outlines: per image.
-        assignments: per image, outline → index into `centres_scan_m`.
-        T_scan_camera: (N, 4, 4) registered cameras, metric.
-        centres_scan_m: (C, 3) control spheres.
-        radius_m: radius of the control spheres.
-        camera: intrinsics.
-        registration: predicts the errors; its covariance gives `sigma_mm` and `normalised`. The cameras must be its
+        assignments: per image, outline → index into the control spheres' centres.
+        images: the camera, and registered poses T_scan_camera, metric.
+        controls: the control spheres as `centres_m`, with their covariance.
+        registration: predicts the errors; its covariance gives `sigma_mm` and `normalised`. The poses must be its
             `T_scan_camera` or its `T_scan_camera_refined`.
-        centre_covariance_m2: (C, 3, 3) of the control spheres' centres; None takes them as exact.
 
     Both errors are the paper's: radial, the mean distance between the rays of the outline's points and the surface of
     the sphere; reprojection, the mean distance of the points from the projected outline (geometric, to first order).
@@ -107,16 +102,15 @@ def evaluate(
         )
     stated = None
     if registration is not None:
-        refined = bool(np.allclose(T_scan_camera, registration.T_scan_camera_refined, atol=1e-12, equal_nan=True))
-        rows = held_out_rows(registration.solution, outlines, members, centres_scan_m)
-        spread = None if centre_covariance_m2 is None else centre_covariance_m2[[s for _, _, s in members]]
+        refined = bool(np.allclose(images.poses, registration.T_scan_camera_refined, atol=1e-12, equal_nan=True))
+        rows = held_out_rows(registration.solution, outlines, members, controls.centres_m)
+        spread = None if controls.covariance_m2 is None else controls.covariance_m2[[s for _, _, s in members]]
         stated = predict(registration.solution, rows, refined=refined, centre_covariance_m2=spread)
     errors: list[ControlError] = []
     for k, (i, j, s) in enumerate(members):
-        centre = apply(inverse(T_scan_camera[i]), centres_scan_m[s])
-        errors.append(
-            _error(i, j, s, outlines[i][j].points, centre, radius_m, camera, None if stated is None else stated[k])
-        )
+        centre = apply(inverse(images.poses[i]), controls.centres_m[s])
+        distances = _distances(outlines[i][j].points, centre, controls.radius_m, images.camera)
+        errors.append(_error((i, j, s), distances, centre, None if stated is None else stated[k]))
     return _summary(errors)
 
 
@@ -153,7 +147,8 @@ def leave_one_out(registration: RegistrationResult, *, refined: bool = False) ->
             i, j, _ = problem.members[o]
             base = rest.solution.state.bases[problem.group[o]]
             centre = apply(inverse(T[i]) @ base, problem.centres[m])
-            errors.append(_error(i, j, m, problem.points[o], centre, problem.radius_m, problem.camera, prediction))
+            distances = _distances(problem.points[o], centre, problem.radius_m, problem.camera)
+            errors.append(_error((i, j, m), distances, centre, prediction))
     if not errors:
         raise ComputeError("no sphere can be left out: each is needed", remedy="Use more registration spheres")
     return _summary(errors)
@@ -178,18 +173,26 @@ def _without(full: Solution, weights: Array) -> _Rest:
     return _Rest(solution, dx)
 
 
-def _error(
-    image: int, outline: int, sphere: int, points: Array, centre: Array, radius_m: float, camera: CameraModel,
-    stated: Prediction | None,
-) -> ControlError:  # fmt: skip
+def _distances(points: Array, centre: Array, radius_m: float, camera: CameraModel) -> tuple[float, float]:
+    """Mean radial distance in metres and mean reprojection error in px of an outline's points."""
     radial = radial_errors_m(points, centre, radius_m)
     lifted = np.column_stack([points, np.ones(len(points))])
     distance = np.abs(residuals(lifted, np.broadcast_to(centre, lifted.shape), radius_m, "sampson"))
+    return float(radial.mean()), float(distance.mean()) * 0.5 * (camera.fx + camera.fy)
+
+
+def _error(
+    member: tuple[int, int, int], distances: tuple[float, float], centre: Array, stated: Prediction | None
+) -> ControlError:
+    """The record of one outline (image, outline, sphere)."""
+    radial_m, reprojection_px = distances
     return ControlError(
-        image, outline, sphere, mm(float(radial.mean())), float(distance.mean()) * 0.5 * (camera.fx + camera.fy),
+        *member,
+        mm(radial_m),
+        reprojection_px,
         None if stated is None else mm(stated.sigma_rad * float(np.linalg.norm(centre))),
         None if stated is None else stated.normalised,
-    )  # fmt: skip
+    )
 
 
 def _summary(errors: list[ControlError]) -> Evaluation:

@@ -15,6 +15,7 @@ from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import Cost, PointCost, cone_residuals, residuals_and_derivative
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.settings import RegistrationSettings
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, skew
 
@@ -135,11 +136,8 @@ class Linearised:
 def assemble(
     outlines: Sequence[Sequence[SphereOutline]],
     assignments: Sequence[Assignment],
-    poses: Array,
-    groups: Sequence[int] | NDArray[np.int64],
-    centres_scan_m: Array,
-    radius_m: float,
-    camera: CameraModel,
+    images: PosedImages,
+    spheres: ScanSpheres,
     settings: RegistrationSettings,
 ) -> Problem:
     """Assemble the problem from the arguments of `register`.
@@ -153,6 +151,7 @@ def assemble(
             f"{len(members)} outlines of {len({m for _, _, m in members})} markers do not determine a registration",
             remedy="Use images in which at least four registration spheres are visible",
         )
+    groups, camera = images.stations, images.camera
     used_groups = [int(groups[i]) for i, _, _ in members]
     first = int(groups[0])
     order = sorted(set(used_groups), key=lambda g: (g != first, g))
@@ -166,9 +165,9 @@ def assemble(
         group=np.zeros(0, dtype=np.int64),
         groups=order,
         station=np.array([order.index(int(g)) if int(g) in order else -1 for g in groups]),
-        T_base_camera=np.array(poses, dtype=np.float64),
-        centres=np.asarray(centres_scan_m, dtype=np.float64),
-        radius_m=radius_m,
+        T_base_camera=np.array(images.poses, dtype=np.float64),
+        centres=np.asarray(spheres.centres_m, dtype=np.float64),
+        radius_m=spheres.radius_m,
         camera=camera,
         focal_px=f,
         axes=np.zeros((0, 3)),
@@ -179,9 +178,9 @@ def assemble(
         point_sigma=np.zeros(0),
         common=np.zeros((0, 3, len(prior) - 3)),
         common_prior=prior,
-        sphere_prior=None if settings.sphere_covariance_m2 is None else _block_inverse(settings.sphere_covariance_m2),
-        light_unit_m=float(np.mean(radius_m / np.sin(half))) / f,
-        with_scale=settings.estimate_scale,
+        sphere_prior=None if spheres.covariance_m2 is None else _block_inverse(spheres.covariance_m2),
+        light_unit_m=float(np.mean(spheres.radius_m / np.sin(half))) / f,
+        with_scale=not images.metric,
     )
     return with_outlines(empty, outlines, members)
 

@@ -40,23 +40,19 @@ class RegistrationSettings:
     """What is estimated, by which residual, and the uncertainty of what is given.
 
     Attributes:
-        estimate_scale: whether to estimate a scale, for camera positions that are not metric (structure from motion).
         cost: `cone` uses the three parameters and their covariance; `sampson` the points' geometric distances;
             `algebraic` is the paper's plain x^T E x.
         robust: whether to weight outlines robustly and exclude outliers.
         pose_covariance: (N, 6, 6) of each pose's (position in the unit of the poses, rotation vector in radians) in
             the axes of its base, independent between images; "estimate": isotropic, estimated from the residuals;
             "exact": no pose errors.
-        sphere_covariance_m2: (M, 3, 3) of the centres; None takes them as exact.
         intrinsics_covariance: (4, 4) of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only for poses whose
             errors do not depend on the intrinsics'. None leaves them to the error budget.
         common_errors: prior sizes of errors shared by all outlines of a capture.
     """
 
-    estimate_scale: bool = False
     cost: Cost = "cone"
     robust: bool = True
     pose_covariance: Array | Literal["estimate", "exact"] = field(default="estimate", repr=False)
-    sphere_covariance_m2: Array | None = field(default=None, repr=False)
     intrinsics_covariance: Array | None = field(default=None, repr=False)
     common_errors: CommonErrors = EXPECTED_COMMON_ERRORS

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import Cost
 from service.compute.registration.identification.identity import Assignment
@@ -33,6 +32,7 @@ from service.compute.registration.variance_components import (
     no_pose_noise,
     unknown_pose_noise,
 )
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, transform
 
@@ -46,11 +46,8 @@ __all__ = ["OutlineResidual", "RegistrationResult", "register"]
 def register(
     outlines: Sequence[Sequence[SphereOutline]],
     assignments: Sequence[Assignment],
-    poses: Array,
-    groups: Sequence[int] | NDArray[np.int64],
-    centres_scan_m: Array,
-    radius_m: float,
-    camera: CameraModel,
+    images: PosedImages,
+    spheres: ScanSpheres,
     settings: RegistrationSettings = _DEFAULT,
 ) -> RegistrationResult:
     """Estimate T_world_scan (and scale, and every station's base) by Gauss–Newton over all outlines.
@@ -63,23 +60,20 @@ def register(
     Args:
         outlines: per image, from the detector.
         assignments: per image, outline index → marker index, and an initial pose (from `identify`).
-        poses: (N, 4, 4) T_world_camera; with groups, T_base_camera in the base frame of the image's group.
-        groups: (N,) station of each image; images of one group share a base frame.
-        centres_scan_m: (M, 3) sphere centres in the scan frame, metres.
-        radius_m: radius of the spheres.
-        camera: intrinsics of all images.
+        images: with their poses; images of one station share a base frame.
+        spheres: the registration spheres.
         settings: what is estimated, by which residual, and how well the inputs are known.
 
     Raises:
         ComputeError: the outlines do not determine the answer, or no convergence.
         DataError: a covariance has the wrong shape.
     """
-    problem = assemble(outlines, assignments, poses, groups, centres_scan_m, radius_m, camera, settings)
+    problem = assemble(outlines, assignments, images, spheres, settings)
     _require(problem, np.ones(len(problem.members), dtype=bool))
-    start = _start(problem, assignments, poses, np.asarray(groups))
+    start = _start(problem, assignments, images.poses, images.stations)
     noise = _noise(problem, settings.pose_covariance, start.scale)
     solution = _solve(problem, start, noise, robust=settings.robust, cost=settings.cost)
-    return _result(solution, np.asarray(groups), settings.cost)
+    return _result(solution, images.stations, settings.cost)
 
 
 def _noise(problem: Problem, given: Array | Literal["estimate", "exact"], scale: float) -> PoseNoise:

@@ -16,6 +16,7 @@ from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.poses.sfm.estimate import SfmModel, reconstruct, reconstruct_from
 from service.compute.poses.sfm.options import Mapper, SfmOptions
 from service.compute.poses.sfm.tracks import Tracks
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
 from service.core.units import mm
 from service.jobs.poses import hybrid as hybrid_job
@@ -116,18 +117,21 @@ def hybrid(context: JobContext[hybrid_job.Arguments]) -> JobAnswer:
     found = context.input_json(arguments.outlines)
     stations = sorted({image.station for image in images})
     context.progress("hybrid poses", 0, 1)
+    # The camera is held: overlays and control spheres are read with the calibrated one, which must fit the poses.
     answer = hybrid_poses(
-        np.array([model[name] for name in names]),
+        PosedImages(
+            np.array([model[name] for name in names]),
+            camera,
+            groups=[stations.index(image.station) for image in images],
+            metric=False,
+            names=names,
+        ),
         _unpacked(context.input(arguments.tracks).read_bytes(), names),
         [[outline_from_record(record, camera) for record in found[name]] for name in names],
-        camera,
-        np.array(arguments.spheres_m),
-        arguments.radius_m,
+        ScanSpheres(
+            np.array(arguments.spheres_m), arguments.radius_m, covariance_m2=np.array(arguments.sphere_covariance_m2)
+        ),
         T_base_camera=None if _held(images) else robot_camera_poses(arguments, images),
-        groups=[stations.index(image.station) for image in images],
-        # The camera is held: overlays and control spheres are read with the calibrated one, which must fit the poses.
-        sphere_covariance_m2=np.array(arguments.sphere_covariance_m2),
-        names=names,
     )
     measures = {
         "track_sigma_px": answer.sigma_track_px,

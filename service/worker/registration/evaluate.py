@@ -30,6 +30,7 @@ from service.compute.overlay import draw_overlay
 from service.compute.pipeline import Detection
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.identification.pairing import CONTROL_GATE, paired
+from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
@@ -142,10 +143,8 @@ def _errors(registered: _Registered, measured: _Measured, radius_m: float) -> _E
     answer = evaluate_controls(
         registered.outlines,
         registered.controls,
-        registered.T_scan_camera,
-        measured.control.centres_m,
-        radius_m,
-        registered.camera,
+        PosedImages(registered.T_scan_camera, registered.camera),
+        ScanSpheres(measured.control.centres_m, radius_m),
     )
     return _Errors(
         answer.mean_radial_error_mm, answer.mean_reprojection_error_px, "control spheres", len(answer.errors)

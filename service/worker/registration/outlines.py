@@ -11,6 +11,7 @@ from service.compute.markers.archive import outline_record
 from service.compute.markers.detectors import options_for
 from service.compute.markers.search.image_files import detect_all, locate_outlines, searched_whole
 from service.compute.markers.search.paper_files import detect_file_by_masks
+from service.compute.scene import PosedImages, ScanSpheres
 from service.jobs.registration import detect_spheres as job
 from service.worker.camera import camera_used
 from service.worker.job import JobAnswer, JobContext
@@ -42,15 +43,16 @@ def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:
     else:
         located = locate_outlines(
             files,
-            camera,
-            robot_camera_poses(arguments, images)
-            if model is None
-            else np.array([model[image.viewpoint] for image in images]),
-            np.array(arguments.spheres_m),
-            arguments.radius_m,
-            groups=_numbered(image.station for image in images),
+            PosedImages(
+                robot_camera_poses(arguments, images)
+                if model is None
+                else np.array([model[image.viewpoint] for image in images]),
+                camera,
+                groups=_numbered(image.station for image in images),
+                metric=model is None,
+            ),
+            ScanSpheres(np.array(arguments.spheres_m), arguments.radius_m),
             scenes=_numbered(image.step for image in images),
-            metric=model is None,
             options=options,
             workers=workers,
             progress=show,

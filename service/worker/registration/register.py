@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,8 @@ from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import register_images
 from service.compute.registration.joint_poses import with_joint_pose_covariance
 from service.compute.registration.result import RegistrationResult
+from service.compute.registration.settings import RegistrationSettings
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, inverse
 from service.core.units import mm
@@ -37,21 +38,11 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
     poses, groups, images = _poses(context)
     outlines = _outlines(context, images, camera)
     spheres = np.array(arguments.spheres_m)
-    radius_m = arguments.radius_m
     names = [image.viewpoint for image in images]
-    solve = partial(
-        register_images,
-        outlines,
-        poses,
-        camera,
-        spheres,
-        radius_m,
-        groups=groups,
-        estimate_scale=source not in ("robot", "robot_corrected", "spheres", "hybrid"),
-        names=names,
-        sphere_covariance_m2=np.array(arguments.sphere_covariance_m2),
-    )
-    solved = solve()
+    metric = source in ("robot", "robot_corrected", "spheres", "hybrid")
+    posed = PosedImages(poses, camera, groups=groups, metric=metric, names=names)
+    known = ScanSpheres(spheres, arguments.radius_m, covariance_m2=np.array(arguments.sphere_covariance_m2))
+    solved = register_images(outlines, posed, known)
     answer = solved.registration
     stated = answer
     if arguments.tracks is not None:
@@ -84,7 +75,8 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
         result["T_scan_camera"] = {name: (T_scan_world @ T).tolist() for name, T in zip(names, poses, strict=True)}
         components = {"adjustment": np.array(adjusted["scan_covariance"])[:6, :6], "spheres": components["spheres"]}
     if (lens := _intrinsics_covariance(arguments)) is not None:
-        uncertain = solve(assignments=solved.assignments, intrinsics_covariance=lens)
+        settings = RegistrationSettings(intrinsics_covariance=lens)
+        uncertain = register_images(outlines, posed, known, settings, assignments=solved.assignments)
         components["intrinsics"] = _added(answer, uncertain.registration, refined=source == "robot_corrected")
     covariance = np.sum(list(components.values()), axis=0)
     result["covariance"] = covariance.tolist()

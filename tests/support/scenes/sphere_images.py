@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.records import Evidence, SphereOutline, outline_from_cone
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, apply, inverse, look_at, transform
 
 RADIUS_M = 0.015
@@ -21,6 +22,7 @@ REGISTRATION_M = np.array(
         [0.20, 0.15, 0.065], [0.08, 0.17, 0.05], [-0.07, 0.16, 0.04], [-0.21, 0.155, 0.06], [-0.255, 0.03, 0.05],
     ]
 )  # fmt: skip
+REGISTRATION = ScanSpheres(REGISTRATION_M, RADIUS_M)
 CONTROL_M = np.array([[-0.09, 0.02, 0.09], [0.01, -0.02, 0.06], [0.10, 0.03, 0.085]])
 
 
@@ -39,6 +41,11 @@ class Scene:
     T_world_scan: Array
     T_world_camera: Array
     camera: CameraModel
+
+    @property
+    def images(self) -> PosedImages:
+        """All images with their true poses."""
+        return PosedImages(self.T_world_camera, self.camera)
 
     def centres_camera(self, image: int, centres_scan_m: Array) -> Array:
         return apply(inverse(self.T_world_camera[image]) @ self.T_world_scan, centres_scan_m)

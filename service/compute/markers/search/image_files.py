@@ -2,50 +2,35 @@
 
 from __future__ import annotations
 
-import dataclasses
 import multiprocessing
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import combinations
 from pathlib import Path
-from typing import Literal, Protocol, TypeVar
+from typing import Literal, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.images.files import read_image_of, read_reduced
-from service.compute.markers.cones import cone_of_sphere
-from service.compute.markers.detect import detect_spheres, find_rough
-from service.compute.markers.outlines.refine import refine_outlines
+from service.compute.images.files import read_image_of
+from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
+from service.compute.markers.search.anchors import MapOver, Provisional, register_anchors
 from service.compute.markers.search.predicted import (
-    WIDE,
     Found,
     Prediction,
-    Tone,
-    deviation,
     find_spheres,
-    fit_pose,
-    tone_of,
 )
-from service.compute.registration.identification.identity import Assignment, identify
+from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.identification.pairing import paired
-from service.compute.registration.settings import RegistrationSettings
-from service.compute.registration.solve import register
-from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, apply, inverse
+from service.compute.scene import PosedImages, ScanSpheres
+from service.core.geometry import inverse
 
-_ANCHORS = (2, 4)  # images of a station that are searched first; the larger number if the first do not agree
-_ANCHORS_WITHOUT_SCALE = (3, 6)
-ANCHOR_WIDTH_PX = 1000  # least width of the reduced image on which an anchor is searched
-_ANCHOR_CANDIDATES = 36  # circles examined in an anchor, those with the most votes
 _MOST_FAILED = 0.4  # share of images whose prediction may fail before the prediction itself is doubted
-_SAME_SPHERE = 0.15  # in radii: largest distance of one unlisted sphere seen from two sides
 
 Progress = Callable[[int, int], None]
 DetectFile = Callable[[Path, CameraModel, DetectionOptions], tuple[SphereOutline, ...]]
@@ -81,28 +66,12 @@ class LocatedOutlines:
         return sum(image.how == how for image in self.images)
 
 
-class _Map(Protocol):
-    def __call__(self, work: Callable[[_Item], _Result], items: Iterable[_Item], /) -> Iterable[_Result]: ...
-
-
 @dataclass(frozen=True, slots=True)
 class _Task:
     """One image file and the prediction for it; None: it is searched whole."""
 
     path: Path
     expected: Prediction | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class _Provisional:
-    """The provisional registration from the anchors."""
-
-    T_scan_camera: Array  # (N, 4, 4)
-    scale: float
-    margin: float
-    tone: Tone
-    unlisted_m: Array  # (U, 3) spheres in no list, scan frame
-    anchors: tuple[int, ...]
 
 
 def detect_file(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
@@ -135,9 +104,9 @@ def detect_all(
     Raises:
         DataError: an image cannot be used; the message names the first one.
     """
-    with _mapping(workers, len(image_paths)) as mapped:
+    with _mapping(workers, len(image_paths)) as map_over:
         work = partial(_detected, detect or detect_file, camera, options)
-        return tuple(_counted(mapped(work, image_paths), len(image_paths), progress))
+        return tuple(_counted(map_over(work, image_paths), len(image_paths), progress))
 
 
 def _detected(
@@ -148,15 +117,10 @@ def _detected(
 
 def locate_outlines(
     image_paths: Sequence[Path],
-    camera: CameraModel,
-    poses: Array,
-    registration_centres_m: Array,
-    radius_m: float,
+    images: PosedImages,
+    spheres: ScanSpheres,
     *,
-    control_centres_m: Array | None = None,
-    groups: Sequence[int] | NDArray[np.int64] | None = None,
     scenes: Sequence[int] | NDArray[np.int64] | None = None,
-    metric: bool = True,
     options: DetectionOptions = DEFAULTS,
     workers: int = 1,
     progress: Progress | None = None,
@@ -170,15 +134,10 @@ def locate_outlines(
 
     Args:
         image_paths: N JPEG, PNG or TIFF files of the camera's size.
-        camera: intrinsics.
-        poses: (N, 4, 4) T_world_camera, or T_base_camera in the base frame of each image's group.
-        registration_centres_m: (M, 3) in the scan frame.
-        radius_m: radius of all spheres.
-        control_centres_m: (C, 3) spheres used only for the evaluation, or None.
-        groups: (N,) station of each image; None: all the same.
+        images: their camera and poses.
+        spheres: registration and control spheres.
         scenes: (N,) images of the same number show the same spheres; between numbers, spheres that are in no list may
             have come or gone. None: all the same.
-        metric: whether the poses' positions are in metres.
         options: of the detector.
         workers: number of processes; 1 computes in this one.
         progress: called with (done, total) after each image.
@@ -187,43 +146,41 @@ def locate_outlines(
         DataError: lengths do not agree, or an image cannot be used; the message names the first one.
     """
     n = len(image_paths)
-    stations = np.zeros(n, dtype=np.int64) if groups is None else np.asarray(groups, dtype=np.int64)
-    if poses.shape != (n, 4, 4) or len(stations) != n:
-        raise DataError(f"{n} images, but {len(poses)} poses and {len(stations)} stations")
-    if not np.all(np.isfinite(poses)):
-        raise DataError("a camera pose holds a number that is not finite")
+    images.require(n)
+    stations = images.stations
     shown = np.zeros(n, dtype=np.int64) if scenes is None else np.asarray(scenes, dtype=np.int64)
     sets = [np.nonzero((stations == g) & (shown == s))[0] for g in np.unique(stations) for s in np.unique(shown)]
-    controls = np.zeros((0, 3)) if control_centres_m is None else np.asarray(control_centres_m, dtype=np.float64)
-    spheres = np.vstack([registration_centres_m, controls])
-    n_registration = len(registration_centres_m)
-    with _mapping(workers, n) as mapped:
-        look = partial(_look, camera=camera, options=options)
-        first = _provisional(
-            image_paths, camera, poses, stations, [mine for mine in sets if len(mine)],
-            spheres, n_registration, radius_m,
-            metric=metric, options=options, mapped=mapped,
-        )  # fmt: skip
+    with _mapping(workers, n) as map_over:
+        look = partial(_look, camera=images.camera, options=options)
+        first = register_anchors(image_paths, images, spheres, [m for m in sets if len(m)], options, map_over)
         if first is None:
-            found = tuple(_counted(mapped(look, [_Task(path) for path in image_paths]), n, progress))
+            found = tuple(_counted(map_over(look, [_Task(path) for path in image_paths]), n, progress))
             return searched_whole([f.outlines for f in found])
-        spheres = np.vstack([spheres, first.unlisted_m])
+        centres = np.vstack([spheres.centres_m, spheres.control_m, first.unlisted_m])
         tasks = [
-            _Task(path, Prediction(inverse(T), spheres, radius_m, first.margin, first.tone))
+            _Task(path, Prediction(inverse(T), centres, spheres.radius_m, first.margin, first.tone))
             for path, T in zip(image_paths, first.T_scan_camera, strict=True)
         ]
-        found = tuple(_counted(mapped(look, tasks), n, progress))
+        found = tuple(_counted(map_over(look, tasks), n, progress))
         again = [i for i, f in enumerate(found) if f.spheres is not None]
         if len(again) < (1 - _MOST_FAILED) * n:
-            whole = dict(zip(again, mapped(look, [_Task(image_paths[i]) for i in again]), strict=True))
+            whole = dict(zip(again, map_over(look, [_Task(image_paths[i]) for i in again]), strict=True))
             return searched_whole([whole.get(i, f).outlines for i, f in enumerate(found)])
+    return _located(found, first, images.camera, spheres)
+
+
+def _located(
+    found: Sequence[Found], first: Provisional, camera: CameraModel, spheres: ScanSpheres
+) -> LocatedOutlines:
+    """What was found at the predicted places, with the registration spheres identified."""
+    centres = np.vstack([spheres.centres_m, spheres.control_m, first.unlisted_m])
     assignments: list[Assignment] = []
     for f, T in zip(found, first.T_scan_camera, strict=True):
         if f.spheres is None:
-            named = paired(f.outlines, inverse(T), spheres, radius_m, camera)
+            named = paired(f.outlines, inverse(T), centres, spheres.radius_m, camera)
         else:
             named = dict(enumerate(f.spheres))
-        markers = {d: m for d, m in named.items() if m < n_registration}
+        markers = {d: m for d, m in named.items() if m < len(spheres.centres_m)}
         assignments.append(Assignment(markers, inverse(T), first.scale))
     return LocatedOutlines(
         tuple(f.outlines for f in found),
@@ -247,143 +204,8 @@ def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> Found:
     return find_spheres(read_image_of(task.path, camera), camera, task.expected, options)
 
 
-def _look_reduced(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
-    """The clearest outlines of an anchor; identification needs only some, so doubtful ones are dropped."""
-    image, smaller = read_reduced(path, camera, ANCHOR_WIDTH_PX)
-    few = dataclasses.replace(options, max_candidates=min(_ANCHOR_CANDIDATES, options.max_candidates))
-    roughs = find_rough(image, smaller, few)
-    outlines = refine_outlines(image, smaller, [r.cone for r in roughs], few, scores=[r.score for r in roughs])
-    kept: list[SphereOutline] = []
-    for outline in outlines:
-        if outline is not None and all(deviation(outline.cone, other.cone)[0] > 0.6 for other in kept):
-            kept.append(outline)
-    return tuple(kept)
-
-
-def _provisional(
-    image_paths: Sequence[Path],
-    camera: CameraModel,
-    poses: Array,
-    stations: NDArray[np.int64],
-    sets: Sequence[NDArray[np.int64]],
-    spheres: Array,
-    n_registration: int,
-    radius_m: float,
-    *,
-    metric: bool,
-    options: DetectionOptions,
-    mapped: _Map,
-) -> _Provisional | None:
-    """The registration of a few images of each of the `sets`; None if no reliable one is found."""
-    seen: dict[int, tuple[SphereOutline, ...]] = {}
-    look = partial(_look_reduced, camera=camera, options=options)
-    nothing: tuple[SphereOutline, ...] = ()
-    for per_station in _ANCHORS if metric else _ANCHORS_WITHOUT_SCALE:
-        chosen = [i for mine in sets for i in spread_views(poses, mine, per_station)]
-        if len(chosen) > 0.5 * len(poses):
-            return None  # a search of whole images costs little more
-        new = [i for i in chosen if i not in seen]
-        seen |= dict(zip(new, mapped(look, [image_paths[i] for i in new]), strict=True))
-        outlines = [seen.get(i, nothing) for i in range(len(poses))]
-        try:
-            assignments = identify(
-                outlines, spheres[:n_registration], camera, poses, radius_m=radius_m, groups=stations, metric=metric
-            )
-            solved = register(
-                outlines, assignments, poses, stations, spheres[:n_registration], radius_m, camera,
-                RegistrationSettings(estimate_scale=not metric),
-            )  # fmt: skip
-        except ComputeError:
-            continue  # more anchors may help; if not, the search of all images reports the error
-        used = {(r.image, r.outline) for r in solved.residuals if not r.excluded}
-        agreeing = {i for i, _ in used}
-        if any(len(agreeing.intersection(mine.tolist())) < 2 for mine in sets):
-            continue
-        T_scan_camera = solved.T_scan_camera
-        off = [
-            _pose_error(outlines[i], assignments[i], inverse(T_scan_camera[i]), spheres, radius_m)
-            for i in sorted(agreeing)
-        ]
-        markers = [outlines[i][j] for i, j in sorted(used)]
-        return _Provisional(
-            T_scan_camera,
-            solved.scale,
-            # The anchors share part of their poses' error; the next image's may be several times as large.
-            float(np.clip(0.03 + 4 * max(off), 0.05, WIDE)),
-            tone_of(markers),
-            _unlisted(outlines, assignments, T_scan_camera, spheres, radius_m),
-            tuple(sorted(seen)),
-        )
-    return None
-
-
-def spread_views(poses: Array, members: NDArray[np.int64], count: int) -> list[int]:
-    """`count` of the images `members`, spread over their poses: a central one, then always the farthest."""
-    place = poses[members, :3, 3]
-    spread = float(np.median(np.linalg.norm(place - np.median(place, axis=0), axis=1)))
-    views = np.hstack([place / max(spread, 1e-12), poses[members, :3, 2]])
-    chosen = [int(np.argmin(np.linalg.norm(views - np.median(views, axis=0), axis=1)))]
-    while len(chosen) < min(count, len(members)):
-        gap = np.min([np.linalg.norm(views - views[k], axis=1) for k in chosen], axis=0)
-        chosen.append(int(np.argmax(gap)))
-    return [int(members[k]) for k in chosen]
-
-
-def _pose_error(
-    outlines: Sequence[SphereOutline], assignment: Assignment, T: Array, spheres: Array, radius_m: float
-) -> float:
-    """How far (in radii) the best pose from this image alone moves the spheres: the error of its given pose."""
-    index = list(assignment.markers.items())
-    if len(index) < 4:
-        return 0.0
-    centres = spheres[[m for _, m in index]]
-    axes = np.array([outlines[j].cone.axis for j, _ in index])
-    half = np.array([outlines[j].cone.half_angle_rad for j, _ in index])
-    own = fit_pose(axes, half, centres, radius_m, T)
-    moved = [
-        deviation(cone_of_sphere(a, radius_m), cone_of_sphere(b, radius_m))[0]
-        for a, b in zip(apply(own, centres), apply(T, centres), strict=True)
-    ]
-    return float(np.median(moved))
-
-
-def _unlisted(
-    outlines: Sequence[Sequence[SphereOutline]],
-    assignments: Sequence[Assignment],
-    T_scan_camera: Array,
-    spheres: Array,
-    radius_m: float,
-) -> Array:
-    """(U, 3) spheres in no list that two anchors show at one place."""
-    rays: list[tuple[int, Array, Array, float]] = []  # image, origin, direction, half angle
-    for i, found in enumerate(outlines):
-        T = T_scan_camera[i]
-        for j, outline in enumerate(found):
-            if j in assignments[i].markers:
-                continue
-            place = apply(T, outline.centre_camera_m(radius_m))
-            if len(spheres) and np.linalg.norm(spheres - place, axis=1).min() < 1.5 * radius_m:
-                continue
-            rays.append((i, T[:3, 3], T[:3, :3] @ outline.cone.axis, outline.cone.half_angle_rad))
-    kept: list[Array] = []
-    for (i, a, u, half_a), (k, b, v, half_b) in combinations(rays, 2):
-        if i == k or abs(float(u @ v)) > 0.9999:
-            continue
-        s, t = np.linalg.lstsq(np.column_stack([u, -v]), b - a, rcond=None)[0]
-        near_a, near_b = a + s * u, b + t * v
-        middle = 0.5 * (near_a + near_b)
-        if s < 2 * radius_m or t < 2 * radius_m or np.linalg.norm(near_a - near_b) > _SAME_SPHERE * radius_m:
-            continue
-        sizes = (np.arcsin(radius_m / s) / half_a, np.arcsin(radius_m / t) / half_b)
-        if max(abs(size - 1) for size in sizes) < 0.04 and all(
-            np.linalg.norm(middle - other) > 1.5 * radius_m for other in [*kept, *spheres]
-        ):
-            kept.append(middle)
-    return np.array(kept).reshape(-1, 3)
-
-
 @contextmanager
-def _mapping(workers: int, items: int) -> Generator[_Map]:
+def _mapping(workers: int, items: int) -> Generator[MapOver]:
     """A map over processes, or the plain one for a single worker."""
     if workers <= 1 or items <= 1:
         yield map

@@ -7,6 +7,7 @@ components estimated from the data.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -24,6 +25,7 @@ from service.compute.poses.sfm.tracks import Tracks
 from service.compute.registration.identification.identity import identify
 from service.compute.registration.settings import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, skew, transform
 
@@ -41,6 +43,8 @@ class HybridOptions:
         robot_sigma_m: initial sigma of the robot's positions; estimated from the data.
         robot_sigma_rad: initial sigma of its orientations; estimated from the data.
         track_sigma_px: initial sigma of the tracks; estimated from the data.
+        lens_covariance: (4, 4) of the calibrated fx, fy, cx, cy, to refine them with the calibration as a prior;
+            None: the camera is fixed.
     """
 
     sphere_sigma_m: float = 5e-6
@@ -49,6 +53,7 @@ class HybridOptions:
     robot_sigma_m: float = 1e-3
     robot_sigma_rad: float = 2e-3
     track_sigma_px: float = 0.4
+    lens_covariance: Array | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,8 +135,7 @@ class HybridPoses:
         """Predicted target registration error at a point (3,) of the scan: 3D standard deviation, metres.
 
         For the set of images as a whole, aligned to the true one by its camera positions: errors of single images
-            average
-        out, common errors remain.
+        average out, common errors remain.
         """
         n = len(self.T_scan_camera)
         v = point_scan_m - self.T_scan_camera[:, :3, 3]
@@ -147,38 +151,26 @@ class HybridPoses:
 
 
 def hybrid_poses(
-    poses: Array,
+    images: PosedImages,
     tracks: Tracks,
     outlines: Sequence[Sequence[SphereOutline]],
-    camera: CameraModel,
-    centres_scan_m: Array,
-    radius_m: float,
+    spheres: ScanSpheres,
     *,
     T_base_camera: Array | None = None,
-    groups: Sequence[int] | NDArray[np.int64] | None = None,
-    lens_covariance: Array | None = None,
     known_camera: CameraCovariance | None = None,
-    sphere_covariance_m2: Array | None = None,
-    names: Sequence[str] = (),
     options: HybridOptions | None = None,
 ) -> HybridPoses:
     """Adjust tracks, spheres and robot poses together.
 
     Args:
-        poses: (N, 4, 4) T_world_camera from structure from motion, in any frame and scale.
+        images: with poses from structure from motion, in any frame and scale, and the camera with which the outlines
+            were made. Their stations are those of the robot.
         tracks: of the same model.
         outlines: per image, from the detector.
-        camera: intrinsics of all images, with which the outlines were made.
-        centres_scan_m: (M, 3) registration spheres in the scan frame, metres.
-        radius_m: radius of the spheres.
-        T_base_camera: (N, 4, 4) from the robot and the hand-eye calibration, each in its group's base frame; NaN for
-            images without a robot pose. None: only the spheres give the metric frame.
-        groups: (N,) station of each image; None: all the same.
-        lens_covariance: (4, 4) of the calibrated fx, fy, cx, cy, to refine them with the calibration as a prior;
-            None: the camera is fixed.
+        spheres: the registration spheres; without a covariance, options.sphere_sigma_m.
+        T_base_camera: (N, 4, 4) from the robot and the hand-eye calibration, each in its station's base frame; NaN
+            for images without a robot pose. None: only the spheres give the metric frame.
         known_camera: covariance of a fixed camera, which is propagated to the poses. None: taken as exact.
-        sphere_covariance_m2: (M, 3, 3) of the centres; None: options.sphere_sigma_m.
-        names: of the images, for messages.
         options: settings.
 
     Raises:
@@ -186,59 +178,59 @@ def hybrid_poses(
         ComputeError: the spheres cannot be identified, the registration fails, or the adjustment is undetermined.
     """
     settings = options or HybridOptions()
-    n = len(poses)
-    stations = np.zeros(n, dtype=np.int64) if groups is None else np.asarray(groups, dtype=np.int64)
+    n, stations = len(images.poses), images.stations
     if len(outlines) != n or len(stations) != n or (T_base_camera is not None and T_base_camera.shape != (n, 4, 4)):
         raise DataError(f"{n} camera poses, but {len(outlines)} images' outlines and {len(stations)} stations")
-    one = np.zeros(n, dtype=np.int64)
-    assignments = identify(
-        outlines, centres_scan_m, camera, poses, radius_m=radius_m, groups=one, metric=False, names=names
-    )
+    # Structure from motion has one frame for all stations, and no scale.
+    one = dataclasses.replace(images, groups=None, metric=False)
+    assignments = identify(outlines, one, spheres)
     # Only for initial values and to find wrong outlines: the adjustment itself models the errors of the poses.
     start = register(
         outlines,
         assignments,
-        poses,
         one,
-        centres_scan_m,
-        radius_m,
-        camera,
-        RegistrationSettings(estimate_scale=True, pose_covariance="exact"),
+        dataclasses.replace(spheres, covariance_m2=None),
+        RegistrationSettings(pose_covariance="exact"),
     )
     used = tracks.thinned(settings.most_observations)
-    sightings = _sightings(outlines, start)
     bases, order, group = _bases(start.T_scan_camera, T_base_camera, stations)
     state = State(
         cameras=start.T_scan_camera,
-        points=np.vstack([apply(inverse(start.T_world_scan), start.scale * used.points), centres_scan_m]),
+        points=np.vstack([apply(inverse(start.T_world_scan), start.scale * used.points), spheres.centres_m]),
         bases=bases,
-        camera=camera,
+        camera=images.camera,
     )
-    f = 0.5 * (camera.fx + camera.fy)
-    common = settings.common_errors or EXPECTED_COMMON_ERRORS
-    spheres = sphere_covariance_m2
-    if spheres is None:
-        spheres = np.broadcast_to(settings.sphere_sigma_m**2 * np.eye(3), (len(centres_scan_m), 3, 3))
-    distance_m = float(np.mean(radius_m / np.sin(sightings.half_angles)))
-    data = Data(
-        tracks=used,
-        sightings=sightings,
-        centres=centres_scan_m,
-        centre_whitening=whitening_of(spheres),
-        common_sigma_px=np.repeat([common.shift_px, common.growth_px, common.light_px], [2, 1, 3]),
-        light_unit_m=distance_m / f,
-        radius_m=radius_m,
-        robot=T_base_camera if order else None,
-        group=group,
-        calibrated=camera,
-        lens_covariance=lens_covariance,
-    )
+    data = _data(used, _sightings(outlines, start), spheres, images.camera, settings)
+    if order:
+        data = dataclasses.replace(data, robot=T_base_camera, group=group)
     sigmas = Sigmas(settings.track_sigma_px, 1.0, settings.robot_sigma_m, settings.robot_sigma_rad)
     solution = solve(state, data, sigmas)
     share = np.zeros_like(solution.covariance)
-    if known_camera is not None and lens_covariance is None:
+    if known_camera is not None and settings.lens_covariance is None:
         share = camera_share(solution, data, known_camera)
     return _answer(solution, share, order, len(used.points), start)
+
+
+def _data(
+    tracks: Tracks, sightings: SphereSightings, spheres: ScanSpheres, camera: CameraModel, settings: HybridOptions
+) -> Data:
+    """The measurements of tracks and spheres, with their priors."""
+    common = settings.common_errors or EXPECTED_COMMON_ERRORS
+    covariance = spheres.covariance_m2
+    if covariance is None:
+        covariance = np.broadcast_to(settings.sphere_sigma_m**2 * np.eye(3), (len(spheres.centres_m), 3, 3))
+    distance_m = float(np.mean(spheres.radius_m / np.sin(sightings.half_angles)))
+    return Data(
+        tracks=tracks,
+        sightings=sightings,
+        centres=spheres.centres_m,
+        centre_whitening=whitening_of(covariance),
+        common_sigma_px=np.repeat([common.shift_px, common.growth_px, common.light_px], [2, 1, 3]),
+        light_unit_m=distance_m / (0.5 * (camera.fx + camera.fy)),
+        radius_m=spheres.radius_m,
+        calibrated=camera,
+        lens_covariance=settings.lens_covariance,
+    )
 
 
 def _answer(

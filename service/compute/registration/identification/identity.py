@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -14,6 +13,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.identification.hypotheses import Hypothesis, image_hypotheses, rivals
 from service.compute.registration.identification.pairing import ROBOT_GATE, Sightings, match, sightings
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse, rotation_angle_rad, transform
 
@@ -41,53 +41,89 @@ class _Reading:
     cost: float  # mean angle in marker radii
 
 
+@dataclass(frozen=True, slots=True)
+class _Station:
+    """The images of one station, which share a base frame, and what each shows on its own."""
+
+    readings: Sequence[list[Hypothesis]]
+    seen: Sequence[Sightings]
+    poses: Array  # (N, 4, 4)
+    centres: Array  # (M, 3)
+    radius_m: float
+    metric: bool
+    where: str  # its name, for messages
+    counts: str  # number of outlines of its images, for messages
+
+
 def identify(
     outlines: Sequence[Sequence[SphereOutline]],
-    sphere_centres_m: Array,
-    camera: CameraModel,
-    poses: Array | None = None,
-    *,
-    radius_m: float,
-    groups: Sequence[int] | NDArray[np.int64] | None = None,
-    metric: bool = True,
-    names: Sequence[str] = (),
+    images: PosedImages,
+    spheres: ScanSpheres,
 ) -> tuple[Assignment, ...]:
-    """Assign markers to outlines.
+    """Assign the registration spheres to outlines, station by station, so that all poses of a station agree.
 
     Args:
-        outlines: per image.
-        sphere_centres_m: (M, 3) registration spheres in the scan frame; other detections stay unassigned.
-        camera: intrinsics.
-        poses: (N, 4, 4) T_world_camera, each in the frame of its group; None: every image is identified on its own.
-        radius_m: radius of the spheres.
-        groups: (N,) station of each image.
-        metric: whether the poses' positions are in metres; otherwise the scale is estimated too.
-        names: of the images, for messages.
+        outlines: per image; those of other spheres stay unassigned.
+        images: with their poses. If these are not metric, their scale is estimated too.
+        spheres: the registration spheres.
 
     Raises:
         ComputeError: too few spheres are visible, more than one assignment fits, or none fits all poses.
     """
-    names = list(names) or [f"image {i}" for i in range(len(outlines))]
-    centres = np.asarray(sphere_centres_m, dtype=np.float64)
-    seen = [sightings(o, radius_m, camera) for o in outlines]
-    readings = [image_hypotheses(o, centres, radius_m, camera) for o in outlines]
+    names, poses, stations = images.labels, images.poses, images.stations
+    centres = np.asarray(spheres.centres_m, dtype=np.float64)
+    seen = [sightings(o, spheres.radius_m, images.camera) for o in outlines]
+    readings = [image_hypotheses(o, centres, spheres.radius_m, images.camera) for o in outlines]
     _require_any(readings, outlines, names, len(centres))
-    if poses is None:
-        return _each_alone(readings, names)
-    stations = np.zeros(len(outlines), dtype=np.int64) if groups is None else np.asarray(groups)
     out: list[Assignment] = [Assignment()] * len(outlines)
     for g in sorted(set(stations.tolist())):
         members = np.nonzero(stations == g)[0]
-        where = f"station {g}" if len(set(stations.tolist())) > 1 else ""
-        reading = _solve_group(
-            [readings[i] for i in members], [seen[i] for i in members], poses[members], centres, radius_m,
-            metric=metric, where=where, counts=", ".join(f"{names[i]}: {len(outlines[i])}" for i in members[:12]),
-        )  # fmt: skip
+        station = _Station(
+            [readings[i] for i in members],
+            [seen[i] for i in members],
+            poses[members],
+            centres,
+            spheres.radius_m,
+            images.metric,
+            f"station {g}" if len(set(stations.tolist())) > 1 else "",
+            ", ".join(f"{names[i]}: {len(outlines[i])}" for i in members[:12]),
+        )
+        reading = _solve_station(station)
         for k, i in enumerate(members):
             T = np.array(poses[i], dtype=np.float64)
             T[:3, 3] *= reading.scale
             out[i] = Assignment(reading.markers[k], inverse(T) @ reading.T_world_scan, reading.scale)
     return tuple(out)
+
+
+def identify_each(
+    outlines: Sequence[Sequence[SphereOutline]], camera: CameraModel, spheres: ScanSpheres, names: Sequence[str] = ()
+) -> tuple[Assignment, ...]:
+    """Assign the registration spheres to the outlines of each image on its own, without poses.
+
+    Among several images, an ambiguous one stays unassigned.
+
+    Raises:
+        ComputeError: no image shows four spheres, or all that do are ambiguous.
+    """
+    labels = list(names) or [f"image {i}" for i in range(len(outlines))]
+    centres = np.asarray(spheres.centres_m, dtype=np.float64)
+    readings = [image_hypotheses(o, centres, spheres.radius_m, camera) for o in outlines]
+    _require_any(readings, outlines, labels, len(centres))
+    unclear = [k for k, r in enumerate(readings) if rivals(r)]
+    if unclear and len(unclear) == sum(bool(r) for r in readings):
+        k = unclear[0]
+        raise ComputeError(
+            f"the arrangement of spheres is ambiguous: {_named(readings[k][0].markers)} and "
+            + " and ".join(_named(r.markers) for r in rivals(readings[k])[:3])
+            + " explain the outlines alike",
+            where=labels[k],
+            remedy="Show more of the spheres in one image, or place them less symmetrically",
+        )
+    return tuple(
+        Assignment(dict(r[0].markers), r[0].T_camera_scan) if r and k not in unclear else Assignment()
+        for k, r in enumerate(readings)
+    )
 
 
 def _require_any(
@@ -108,59 +144,52 @@ def _require_any(
     )
 
 
-def _each_alone(readings: Sequence[list[Hypothesis]], names: Sequence[str]) -> tuple[Assignment, ...]:
-    """Assignments of images without poses; among several images, an ambiguous one stays unassigned."""
-    unclear = [k for k, r in enumerate(readings) if rivals(r)]
-    if unclear and len(unclear) == sum(bool(r) for r in readings):
-        k = unclear[0]
-        raise ComputeError(
-            f"the arrangement of spheres is ambiguous: {_named(readings[k][0].markers)} and "
-            + " and ".join(_named(r.markers) for r in rivals(readings[k])[:3])
-            + " explain the outlines alike",
-            where=names[k],
-            remedy="Show more of the spheres in one image, or place them less symmetrically",
-        )
-    return tuple(
-        Assignment(dict(r[0].markers), r[0].T_camera_scan) if r and k not in unclear else Assignment()
-        for k, r in enumerate(readings)
-    )
-
-
 def _named(markers: dict[int, int]) -> str:
     """An assignment in words: outline = sphere, counted from 0."""
     return "{" + ", ".join(f"{d}={m}" for d, m in sorted(markers.items())) + "}"
 
 
-def _solve_group(
-    readings: Sequence[list[Hypothesis]],
-    seen: Sequence[Sightings],
-    poses: Array,
-    centres: Array,
-    radius_m: float,
-    *,
-    metric: bool,
-    where: str,
-    counts: str,
-) -> _Reading:
+def _solve_station(station: _Station) -> _Reading:
+    """The assignment on which the images of a station agree."""
+    readings, n_images = station.readings, len(station.poses)
     if not any(readings):
         raise ComputeError(
-            f"too few spheres are visible in the images of this station to tell which is which ({counts})",
-            where=where,
+            f"too few spheres are visible in the images of this station to tell which is which ({station.counts})",
+            where=station.where,
             remedy="Capture at least one image with four or more registration spheres from this station",
         )
-    if not metric and sum(bool(r) for r in readings) < 2:
-        raise _scale_unknown(where, counts)
-    starts = _metric_starts(readings, poses) if metric else _similarity_starts(readings, poses)
+    n_hypotheses = sum(bool(r) for r in readings)
+    if not station.metric and n_hypotheses < 2:
+        raise _scale_unknown(station)
+    best = _clear_best(_solutions(station), station.where)
+    if not station.metric and n_images > 1 and sum(len(m) > 0 for m in best.markers) < 2:
+        raise _scale_unknown(station)
+    agreeing = _agreeing(best, readings)
+    if n_hypotheses >= 3 and agreeing < 0.34 * n_hypotheses:
+        raise ComputeError(
+            f"the poses contradict the images: {agreeing} of {n_hypotheses} images agree with one registration",
+            where=station.where,
+            remedy="Check that the poses belong to these images, their convention and their unit",
+        )
+    return best
+
+
+def _solutions(station: _Station) -> list[_Reading]:
+    """Every distinct solution to which the single images lead, the best first."""
     solved: list[_Reading] = []
     tried: set[frozenset[tuple[int, int, int]]] = set()
-    for T, s in starts:
-        first = _read(T, s, seen, poses, centres, radius_m)
+    starts = _metric_starts if station.metric else _similarity_starts
+    for T, s in starts(station.readings, station.poses):
+        first = _read(T, s, station)
         key = frozenset((k, d, m) for k, r in enumerate(first.markers) for d, m in r.items())
         if first.total < 4 or key in tried:
             continue
         tried.add(key)
-        solved.append(_polish(first, seen, poses, centres, radius_m, metric=metric))
-    solved.sort(key=lambda r: (-r.total, r.cost))
+        solved.append(_polish(first, station))
+    return sorted(solved, key=lambda r: (-r.total, r.cost))
+
+
+def _clear_best(solved: list[_Reading], where: str) -> _Reading:
     if not solved:
         raise ComputeError(
             "no assignment of the spheres agrees with the camera poses",
@@ -177,25 +206,14 @@ def _solve_group(
                 where=where,
                 remedy="Place the spheres less symmetrically, or show more of them in an image",
             )
-    support = sum(len(m) > 0 for m in best.markers)
-    n_hypotheses = sum(bool(r) for r in readings)
-    agreeing = _agreeing(best, readings)
-    if not metric and len(poses) > 1 and support < 2:
-        raise _scale_unknown(where, counts)
-    if n_hypotheses >= 3 and agreeing < 0.34 * n_hypotheses:
-        raise ComputeError(
-            f"the poses contradict the images: {agreeing} of {n_hypotheses} images agree with one registration",
-            where=where,
-            remedy="Check that the poses belong to these images, their convention and their unit",
-        )
     return best
 
 
-def _scale_unknown(where: str, counts: str) -> ComputeError:
+def _scale_unknown(station: _Station) -> ComputeError:
     return ComputeError(
         "the scale of the poses cannot be determined from one image",
-        where=where,
-        remedy=f"At least two images must show four or more registration spheres (spheres found: {counts})",
+        where=station.where,
+        remedy=f"At least two images must show four or more registration spheres (spheres found: {station.counts})",
     )
 
 
@@ -265,30 +283,28 @@ def _camera_centres(T_world_scan: Transform, s: float, pose: Transform, centres:
     return (apply(T_world_scan, centres) - s * pose[:3, 3]) @ pose[:3, :3]
 
 
-def _read(
-    T_world_scan: Transform, s: float, seen: Sequence[Sightings], poses: Array, centres: Array, radius_m: float
-) -> _Reading:
+def _read(T_world_scan: Transform, s: float, station: _Station) -> _Reading:
+    """The outlines that lie where a solution predicts spheres."""
     markers: list[dict[int, int]] = []
     cost, total = 0.0, 0
-    for sight, pose in zip(seen, poses, strict=True):
-        c = _camera_centres(T_world_scan, s, pose, centres)
-        pairs = match(sight, c, radius_m, ROBOT_GATE)
+    for sight, pose in zip(station.seen, station.poses, strict=True):
+        c = _camera_centres(T_world_scan, s, pose, station.centres)
+        pairs = match(sight, c, station.radius_m, ROBOT_GATE)
         markers.append({d: m for d, m, _ in pairs})
         cost += sum(angle / sight.half_angles[d] for d, _, angle in pairs)
         total += len(pairs)
     return _Reading(T_world_scan, s, tuple(markers), total, cost / max(total, 1))
 
 
-def _polish(
-    reading: _Reading, seen: Sequence[Sightings], poses: Array, centres: Array, radius_m: float, *, metric: bool
-) -> _Reading:
+def _polish(reading: _Reading, station: _Station) -> _Reading:
     """Least squares on the directions of all matched spheres, alternating with matching until nothing changes."""
+    seen, poses, radius_m, metric = station.seen, station.poses, station.radius_m, station.metric
     for _ in range(4):
         index = [(k, d, m) for k, r in enumerate(reading.markers) for d, m in r.items()]
         image = np.array([k for k, _, _ in index])
         axes = np.array([seen[k].axes[d] for k, d, _ in index])
         half = np.array([seen[k].half_angles[d] for k, d, _ in index])
-        model = centres[[m for _, _, m in index]]
+        model = station.centres[[m for _, _, m in index]]
         R, origin = poses[image, :3, :3], poses[image, :3, 3]
         T0, s0 = reading.T_world_scan, reading.scale
 
@@ -313,7 +329,7 @@ def _polish(
         # From a tenth of a radius on, a match is doubtful.
         fit = least_squares(fun, np.zeros(6 if metric else 7), loss="soft_l1", f_scale=0.1, x_scale="jac")
         T, s = unpack(np.asarray(fit.x))
-        new = _read(T, s, seen, poses, centres, radius_m)
+        new = _read(T, s, station)
         same = new.markers == reading.markers
         if new.total < 4:
             return reading
