@@ -25,7 +25,7 @@ from service.compute.arm.kinematics import matching_arm
 from service.compute.calibration.board.board import Board, BoardView
 from service.compute.calibration.board_poses.design import NOTHING, Aims, Taken
 from service.compute.calibration.board_poses.knowledge import BoardKnowledge, refined_knowledge
-from service.compute.calibration.hand_eye.estimate import calibrate_hand_eye
+from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.record import board_corners
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
 from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
@@ -155,9 +155,15 @@ def measure(seed: int) -> dict[str, Any]:
     boards = np.array([locate_view(view, _BOARD, solved.camera)[0] for view in hand.views])
     flanges, joints = np.array(hand.flanges), np.array(hand.joints)
     answer = calibrate_hand_eye(
-        flanges, boards, corners=board_corners(hand.views, _BOARD, solved.camera), joints_rad=joints,
-        arm=matching_arm(joints, flanges), T_board_turned=_BOARD.half_turn(),
-    )  # fmt: skip
+        HandEyeViews(
+            flanges,
+            boards,
+            corners=board_corners(hand.views, _BOARD, solved.camera),
+            joints_rad=joints,
+            arm=matching_arm(joints, flanges),
+        ),
+        T_board_turned=_BOARD.half_turn(),
+    )
     best = answer if answer.corrected is None else answer.corrected
     off = (best.T_flange_camera - room.scene.T_flange_camera)[:3, 3]
     return {

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from bench.machine import RESULTS, commit, machine
 from service.compute.arm.correction import corrected_T_base_flange
 from service.compute.arm.kinematics import arm_model
-from service.compute.calibration.hand_eye.estimate import HandEyeResult, calibrate_hand_eye
+from service.compute.calibration.hand_eye.answers import HandEyeResult
+from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.core.geometry import Array
 from simulators.scene.world import Scene
 from tests.support.scenes.board_sessions import (
@@ -48,7 +49,9 @@ def independent_noise(seeds: int) -> list[dict[str, Any]]:
         squares: list[float] = []
         for seed in range(seeds):
             session = noisy_session(count, mm, deg, seed)
-            result = calibrate_hand_eye(session.T_base_flange, session.T_camera_board, corners=session.corners)
+            result = calibrate_hand_eye(
+                HandEyeViews(session.T_base_flange, session.T_camera_board, corners=session.corners)
+            )
             for method, T in result.methods.items():
                 errors.setdefault(method, []).append(1e3 * float(np.linalg.norm((T - T_FLANGE_CAMERA)[:3, 3])))
             ratios.append(errors["weighted"][-1] / result.sigma_mm)
@@ -99,11 +102,13 @@ def _one(scene: Scene, views: list[Shot], session: Session) -> dict[str, Any]:
     reported = np.array([scene.nominal_flange(shot.q) for shot in views])
     begun = time.monotonic()
     result = calibrate_hand_eye(
-        session.T_base_flange,
-        session.T_camera_board,
-        corners=session.corners,
-        joints_rad=session.joints_rad,
-        arm=arm_model("UR10e"),
+        HandEyeViews(
+            session.T_base_flange,
+            session.T_camera_board,
+            corners=session.corners,
+            joints_rad=session.joints_rad,
+            arm=arm_model("UR10e"),
+        )
     )
     seconds = time.monotonic() - begun
     errors = {name: scene_error_mm(scene, views, reported @ T) for name, T in result.methods.items()}

@@ -12,7 +12,11 @@ Hash = str  # SHA-256 of an artefact
 
 
 class Camera(JobRecord):
-    """Intrinsics as CameraModel writes them: pixels, OpenCV's distortion; k3 … k6 only where they are not zero."""
+    """Intrinsics as CameraModel writes them: pixels, OpenCV's distortion; k3 … k6 only where they are not zero.
+
+    Not CameraModel itself, which computes and does not know which of its fields were set: a record is written out
+    again with exactly the fields that were read, so that the JSON of an event, and with it its hash, stays the same.
+    """
 
     width: int
     height: int

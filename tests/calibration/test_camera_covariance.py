@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.compute.calibration.hand_eye.estimate import BoardCorners, calibrate_hand_eye
+from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
 from service.compute.camera_model import CameraModel
 from service.compute.poses.files.pose_covariance import blocks, similarity_covariance
@@ -43,9 +44,10 @@ def test_hand_eye_states_what_another_calibration_of_the_camera_would_change() -
             [locate(BOARD.points(), p, camera, T) for p, T in zip(pixels, session.T_camera_board, strict=True)]
         )
         result = calibrate_hand_eye(
-            session.T_base_flange, boards, corners=BoardCorners(BOARD.points(), pixels, camera),
-            camera_covariance=known, bootstrap=30,
-        )  # fmt: skip
+            HandEyeViews(session.T_base_flange, boards, corners=BoardCorners(BOARD.points(), pixels, camera)),
+            camera_covariance=known,
+            bootstrap=30,
+        )
         error_mm = 1e3 * float(np.linalg.norm((result.T_flange_camera - T_FLANGE_CAMERA)[:3, 3]))
         alone = result.covariance - result.camera_share
         without.append(error_mm / (1e3 * float(np.sqrt(np.trace(alone[:3, :3])))))

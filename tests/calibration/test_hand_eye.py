@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.board.board import half_turn
-from service.compute.calibration.hand_eye.estimate import Method, calibrate_hand_eye, place_board
+from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.hand_eye.fit import Method
+from service.compute.calibration.hand_eye.placement import place_board
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, inverse, look_at, rotation_angle_rad, transform
 
@@ -48,7 +50,7 @@ def _error_mm(T: Transform) -> float:
 
 @pytest.mark.parametrize("method", ["weighted", "park", "daniilidis", "tsai", "horaud", "andreff"])
 def test_exact_data_gives_the_exact_answer(method: Method) -> None:
-    result = calibrate_hand_eye(*_session(12), method=method, bootstrap=5)
+    result = calibrate_hand_eye(HandEyeViews(*_session(12)), method=method, bootstrap=5)
     assert _error_mm(result.T_flange_camera) < 1e-6
     np.testing.assert_allclose(result.T_base_board, T_BASE_BOARD, atol=1e-9)
     assert result.method == method
@@ -60,7 +62,7 @@ def test_exact_data_gives_the_exact_answer(method: Method) -> None:
 def test_noisy_robot_stays_within_the_bootstrap_sigma() -> None:
     ratios: list[float] = []
     for seed in range(6):
-        result = calibrate_hand_eye(*_session(40, noise_mm=0.15, noise_deg=0.02, seed=seed), seed=seed)
+        result = calibrate_hand_eye(HandEyeViews(*_session(40, noise_mm=0.15, noise_deg=0.02, seed=seed)), seed=seed)
         assert _error_mm(result.T_flange_camera) < 0.2
         assert result.held_out_mm.mean() >= result.residual_mm.mean()
         assert 0.1 < result.held_out_mm.mean() < 0.8
@@ -79,7 +81,7 @@ def test_half_turned_boards_are_turned_back(flips: list[bool], seed: int) -> Non
     assert turn is not None
     hands, boards = _session(14, noise_mm=0.1, noise_deg=0.02, seed=seed)
     mixed = np.where(np.array(flips)[:, None, None], boards @ turn, boards)
-    result = calibrate_hand_eye(hands, mixed, T_board_turned=turn, bootstrap=2)
+    result = calibrate_hand_eye(HandEyeViews(hands, mixed), T_board_turned=turn, bootstrap=2)
     assert _error_mm(result.T_flange_camera) < 0.5
     # the whole group may be turned: this cannot be detected and does not matter
     assert list(result.turned) in (flips, [not f for f in flips])
@@ -90,30 +92,30 @@ def test_unresolved_half_turns_show_in_the_residuals() -> None:
     assert turn is not None
     hands, boards = _session(14)
     boards[3] = boards[3] @ turn
-    assert calibrate_hand_eye(hands, boards, bootstrap=2).residual_mm.max() > 5
+    assert calibrate_hand_eye(HandEyeViews(hands, boards), bootstrap=2).residual_mm.max() > 5
 
 
 def test_motions_that_determine_nothing_are_refused() -> None:
     hands, boards = _session(12)
     with pytest.raises(ComputeError, match="at least 6"):
-        calibrate_hand_eye(hands[:5], boards[:5])
+        calibrate_hand_eye(HandEyeViews(hands[:5], boards[:5]))
     axis = [transform(Rotation.from_euler("z", 8 * k, degrees=True), np.array([0.01 * k, 0, 0])) for k in range(10)]
     with pytest.raises(ComputeError, match="one axis only"):
-        calibrate_hand_eye(np.stack(axis), np.stack(axis))
+        calibrate_hand_eye(HandEyeViews(np.stack(axis), np.stack(axis)))
     small = [
         transform(Rotation.from_rotvec(np.deg2rad(v)), v) for v in np.random.default_rng(0).uniform(-3, 3, (10, 3))
     ]
     with pytest.raises(ComputeError, match="turned by"):
-        calibrate_hand_eye(np.stack(small), np.stack(small))
+        calibrate_hand_eye(HandEyeViews(np.stack(small), np.stack(small)))
 
 
 def test_data_that_do_not_belong_together_are_refused() -> None:
     hands, boards = _session(8)
     with pytest.raises(DataError, match="do not match"):
-        calibrate_hand_eye(hands, boards[:-1])
+        calibrate_hand_eye(HandEyeViews(hands, boards[:-1]))
     boards[2, 0, 3] = np.nan
     with pytest.raises(DataError, match="finite"):
-        calibrate_hand_eye(hands, boards)
+        calibrate_hand_eye(HandEyeViews(hands, boards))
     with pytest.raises(DataError, match="do not match"):
         place_board(hands[:0], boards[:0], T_FLANGE_CAMERA)
 

@@ -26,8 +26,10 @@ from service.compute.arm.kinematics import (
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.board_poses.plan import suggest_board_poses
 from service.compute.calibration.board_poses.plan_plot import draw_board_plan
-from service.compute.calibration.hand_eye.estimate import BoardCorners, HandEyeResult, calibrate_hand_eye
+from service.compute.calibration.hand_eye.answers import HandEyeResult
+from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.record import hand_eye_record, read_arm_correction
+from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.poses.files.pose_files import write_poses_csv
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, inverse
@@ -56,17 +58,19 @@ def _error_mm(T: Array) -> float:
 
 def _solve(session: Session, *, bootstrap: int = 40) -> HandEyeResult:
     return calibrate_hand_eye(
-        session.T_base_flange, session.T_camera_board, corners=session.corners, bootstrap=bootstrap
+        HandEyeViews(session.T_base_flange, session.T_camera_board, corners=session.corners), bootstrap=bootstrap
     )
 
 
 def _with_joints(session: Session) -> HandEyeResult:
     return calibrate_hand_eye(
-        session.T_base_flange,
-        session.T_camera_board,
-        corners=session.corners,
-        joints_rad=session.joints_rad,
-        arm=UR10E,
+        HandEyeViews(
+            session.T_base_flange,
+            session.T_camera_board,
+            corners=session.corners,
+            joints_rad=session.joints_rad,
+            arm=UR10E,
+        ),
         bootstrap=20,
     )
 
@@ -102,7 +106,7 @@ def test_a_wrong_pose_is_named_and_has_no_say() -> None:
     poses = session.T_base_flange.copy()
     poses[5, 0, 3] += 0.004
     poses[[11, 12]] = poses[[12, 11]]
-    result = calibrate_hand_eye(poses, session.T_camera_board, corners=session.corners, bootstrap=10)
+    result = calibrate_hand_eye(HandEyeViews(poses, session.T_camera_board, corners=session.corners), bootstrap=10)
     assert set(result.excluded) == {5, 11, 12}
     assert "mm" in result.excluded[5]
     assert _error_mm(result.T_flange_camera) < 0.06
@@ -119,9 +123,11 @@ def test_corners_numbered_from_the_other_end_are_renumbered() -> None:
     pixels = camera.project(seen.reshape(-1, 3)).reshape(16, -1, 2)
     flip = np.isin(np.arange(16), [2, 7, 8])
     result = calibrate_hand_eye(
-        session.T_base_flange,
-        np.where(flip[:, None, None], session.T_camera_board @ turn, session.T_camera_board),
-        corners=BoardCorners(points, np.where(flip[:, None, None], pixels[:, ::-1], pixels), camera),
+        HandEyeViews(
+            session.T_base_flange,
+            np.where(flip[:, None, None], session.T_camera_board @ turn, session.T_camera_board),
+            corners=BoardCorners(points, np.where(flip[:, None, None], pixels[:, ::-1], pixels), camera),
+        ),
         T_board_turned=turn,
         bootstrap=10,
     )

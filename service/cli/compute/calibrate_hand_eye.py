@@ -36,7 +36,9 @@ from service.compute.arm.kinematics import ARM_MODELS, ArmModel, arm_model, matc
 from service.compute.calibration.board.images import find_boards, usable_views
 from service.compute.calibration.board_poses.plan import SuggestedPose, suggest_board_poses
 from service.compute.calibration.board_poses.plan_plot import draw_board_plan
-from service.compute.calibration.hand_eye.estimate import HandEyeResult, Method, calibrate_hand_eye
+from service.compute.calibration.hand_eye.answers import HandEyeResult
+from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.hand_eye.fit import Method
 from service.compute.calibration.hand_eye.record import board_corners, hand_eye_record
 from service.compute.calibration.hand_eye.setup import Setup
 from service.compute.calibration.intrinsics.estimate import locate_view
@@ -112,12 +114,14 @@ def hand_eye_command(
         joints_rad, kinematics = _arm(joints, arm, names, T_base_flange)
         corners = board_corners(usable.views, target, model)
         result = calibrate_hand_eye(
-            T_base_flange,
-            np.array([locate_view(view, target, model)[0] for view in usable.views]),
+            HandEyeViews(
+                T_base_flange,
+                np.array([locate_view(view, target, model)[0] for view in usable.views]),
+                corners=corners,
+                joints_rad=joints_rad,
+                arm=kinematics,
+            ),
             method=method,
-            corners=corners,
-            joints_rad=joints_rad,
-            arm=kinematics,
             T_board_turned=target.half_turn(),
             setup=setup,
             camera_covariance=read_camera_covariance(camera),

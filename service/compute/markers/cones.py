@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compute.descent import gauss_newton
 from service.core.geometry import Array
 
 
@@ -99,23 +100,21 @@ def angles_to(cone: Cone, rays: Array) -> Array:
 
 def fit_cone(rays: Array, weights: Array, start: Cone, iterations: int = 4) -> Cone:
     """Weighted least-squares fit of a cone to unit rays (N, 3) by angular (geometric) distance; Gauss–Newton."""
-    cone = start
-    for _ in range(iterations):
-        frame = cone.frame()
-        local = rays @ frame
-        azimuth = np.arctan2(local[:, 1], local[:, 0])
-        residual = angles_to(cone, rays)
-        J = distance_gradient(azimuth)
+
+    def step_at(cone: Cone) -> Array:
+        local = rays @ cone.frame()
+        J = distance_gradient(np.arctan2(local[:, 1], local[:, 0]))
         weighted = J.T * weights
         try:
-            step = np.linalg.solve(weighted @ J, -weighted @ residual)
-        except np.linalg.LinAlgError:  # all points in one place
-            return cone
-        axis = cone.axis + frame[:, :2] @ step[:2]
-        cone = Cone(axis / np.linalg.norm(axis), cone.half_angle_rad + float(step[2]))
-        if float(np.abs(step).max()) < 1e-8:
-            break
-    return cone
+            return np.asarray(np.linalg.solve(weighted @ J, -weighted @ angles_to(cone, rays)), dtype=np.float64)
+        except np.linalg.LinAlgError:  # all points in one place: the cone stays
+            return np.zeros(3)
+
+    def moved(cone: Cone, step: Array) -> Cone:
+        axis = cone.axis + cone.frame()[:, :2] @ step[:2]
+        return Cone(axis / np.linalg.norm(axis), cone.half_angle_rad + float(step[2]))
+
+    return gauss_newton(start, step_at, moved, most=iterations, settled=1e-8)
 
 
 def distance_gradient(azimuth_rad: Array) -> Array:

@@ -167,7 +167,11 @@ def _blocks(problem: Problem, rows: Linearised, weights: Array) -> Blocks:
 
 
 def _descend(problem: Problem, state: State, weighting: _Weighting, cost: Cost) -> State:
-    """Gauss–Newton; a step that would increase the objective is halved."""
+    """Gauss–Newton; a step that would increase the objective is halved.
+
+    Halving, not damping: the poses' errors are eliminated with their own covariance, and a shorter step shortens them
+    in proportion.
+    """
     prior = problem.prior()
     previous, best, dx, poses = np.inf, state, np.zeros(problem.size), state.poses
     share = 1.0

@@ -14,7 +14,7 @@ from service.compute.arm.correction import corrected_T_base_flange
 from service.compute.arm.inverse_kinematics import nearest_posture
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.board_poses.plan import suggest_board_poses
-from service.compute.calibration.hand_eye.estimate import HandEyeAnswer
+from service.compute.calibration.hand_eye.answers import HandEyeAnswer
 from service.compute.calibration.hand_eye.record import read_arm_correction
 from service.compute.camera_model import CameraModel
 from service.core.errors import OrthocaptureError

@@ -10,7 +10,7 @@ import numpy as np
 from service.compute.arm.kinematics import matching_arm
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.board.images import UsableViews, usable_views
-from service.compute.calibration.hand_eye.estimate import calibrate_hand_eye
+from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.record import board_corners, hand_eye_record
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
 from service.compute.calibration.intrinsics.record import intrinsics_record
@@ -71,11 +71,13 @@ def _hand_eye(
     joints = np.array([image.joints_rad for image in used], dtype=np.float64)
     arm = matching_arm(joints, T_base_flange) if joints.shape == (len(used), 6) else None
     solved = calibrate_hand_eye(
-        T_base_flange,
-        T_camera_board,
-        corners=board_corners(usable.views, board, camera),
-        joints_rad=None if arm is None else joints,
-        arm=arm,
+        HandEyeViews(
+            T_base_flange,
+            T_camera_board,
+            corners=board_corners(usable.views, board, camera),
+            joints_rad=None if arm is None else joints,
+            arm=arm,
+        ),
         T_board_turned=board.half_turn(),
     )
     record = hand_eye_record(solved, [image.viewpoint for image in used])

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from service.compute.calibration.board.board import BoardView
-from service.compute.calibration.hand_eye.estimate import calibrate_hand_eye
+from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.record import hand_eye_record
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics
 from service.compute.calibration.intrinsics.record import intrinsics_record
@@ -126,7 +126,9 @@ def _calibrated() -> tuple[Session, dict[str, Any], dict[str, float]]:
     warnings = calibration_warnings(solved, validation, uncertainty)
     used = [_NAMES[k] for k in map(int, solved.views)]
     excluded = {_NAMES[view.index]: view.reason for view in solved.excluded}
-    hands = calibrate_hand_eye(session.T_base_flange, session.T_camera_board, corners=session.corners, bootstrap=10)
+    hands = calibrate_hand_eye(
+        HandEyeViews(session.T_base_flange, session.T_camera_board, corners=session.corners), bootstrap=10
+    )
     hand_eye = hand_eye_record(hands, _NAMES)
     result: dict[str, Any] = {
         "camera": solved.camera.record(),

@@ -10,12 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.board.board import Board, BoardView
-from service.compute.calibration.hand_eye.weighted import cross, linearise
+from service.compute.calibration.hand_eye.weighted import linearise
 from service.compute.calibration.intrinsics.adjustment import parameters_of
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, Transform, increment, inverse, transform
+from service.core.geometry import Array, Transform, increment, inverse, skew, transform
 
 _ARM_M, _ARM_RAD = 0.7e-3, 1e-3  # per axis: pose error of an uncalibrated arm
 _ROUNDS = 6
@@ -143,7 +143,7 @@ def nominal_knowledge(
     spread[:3, :3], spread[3:6, 3:6] = t.mount_m * np.eye(3), t.mount_rad * np.eye(3)
     turns = np.diag([t.tilt_rad, t.tilt_rad, t.turn_rad])
     spread[6:9, 6:9] = np.diag([t.place_m, t.place_m, t.height_m])
-    spread[6:9, 9:] = cross((R @ middle)[None])[0] @ turns  # rotated about its middle, not about its first corner
+    spread[6:9, 9:] = skew(R @ middle) @ turns  # rotated about its middle, not about its first corner
     spread[9:, 9:] = turns
     return BoardKnowledge(camera, T_flange_camera, T_base_board, spread, t.focal, t.centre)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.compute.calibration.hand_eye.estimate import HandEyeAnswer
+from service.compute.calibration.hand_eye.answers import HandEyeAnswer
 from service.compute.calibration.hand_eye.reprojection import projection_jacobian
 from service.compute.calibration.hand_eye.weighted import linearise
 from service.compute.camera_model import CameraModel

@@ -10,8 +10,9 @@ import numpy as np
 
 from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
 from service.compute.calibration.board.board import Board, BoardView
+from service.compute.calibration.hand_eye.answers import HandEyeAnswer, HandEyeResult
 from service.compute.calibration.hand_eye.closed_form import distance
-from service.compute.calibration.hand_eye.estimate import BoardCorners, HandEyeAnswer, HandEyeResult
+from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.calibration.hand_eye.setup import Setup
 from service.compute.camera_model import CameraModel
 from service.core.errors import DataError

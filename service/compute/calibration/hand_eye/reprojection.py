@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.calibration.hand_eye.weighted import cross, linearise
+from service.compute.calibration.hand_eye.weighted import linearise
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, Transform, increment, inverse
+from service.core.geometry import Array, Transform, increment, inverse, skew
 
 _STEP_M = 1e-6
 _ITERATIONS = 30
@@ -53,7 +53,7 @@ def projection_jacobian(points_m: Array, T_camera_board: Array, camera: CameraMo
         axis=-1,
     )
     arms = (points - T_camera_board[:, None, :3, 3]).reshape(-1, 3)
-    turn = -to_point @ cross(arms).reshape(*shape, 3, 3)
+    turn = -to_point @ skew(arms).reshape(*shape, 3, 3)
     return project(points), np.concatenate([to_point, turn], axis=-1)
 
 

@@ -13,7 +13,7 @@ prior φ ~ N(0, s²) in units of usual tolerances. The variances σ_t², σ_r² 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,14 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from service.compute.descent import gauss_newton, largest
 from service.core.errors import ComputeError
-from service.core.geometry import Array, Transform, increment
+from service.core.geometry import Array, Transform, increment, skew
 
 FLOOR_M = 2e-7
 _ITERATIONS = 8
+_SETTLED = 1e-10  # largest step of the transforms (m, rad) at convergence
+_SETTLED_ARM = 1e-5  # the same of the arm's parameters, in tolerances
 _SELECTION_ROUNDS = 80
 _UNDETERMINED = "the views do not determine the hand-eye transform"
 _SINGULAR = 3e-7  # smallest accepted pivot of the scaled normal matrix
@@ -97,25 +100,18 @@ def linearise(hands: Array, boards: Array, X: Transform, B: Transform) -> tuple[
     e[:, 3:] = Rotation.from_matrix(gap_R).as_rotvec()
     J = np.zeros((n, 6, 12))
     J[:, :3, :3] = -gap_R
-    J[:, :3, 3:6] = -gap_R @ cross(X[None, :3, 3])
+    J[:, :3, 3:6] = -gap_R @ skew(X[None, :3, 3])
     J[:, 3:, 3:6] = -gap_R
     J[:, :3, 6:9] = Rh
-    J[:, :3, 9:] = -Rh @ cross(flange_t - B[:3, 3])
+    J[:, :3, 9:] = -Rh @ skew(flange_t - B[:3, 3])
     J[:, 3:, 9:] = Rh
     JM = np.zeros((n, 6, 6))
     turned = gap_R @ Rx
     arm = -Rx.T @ X[:3, 3] - boards[:, :3, 3]  # from the board's origin to the flange, camera axes
     JM[:, :3, :3] = -turned
-    JM[:, :3, 3:] = turned @ cross(arm)
+    JM[:, :3, 3:] = turned @ skew(arm)
     JM[:, 3:, 3:] = -turned
     return e, J, JM
-
-
-def cross(v: Array) -> Array:
-    """(N, 3, 3) matrices with cross(v) @ p = v × p."""
-    out = np.zeros((len(v), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return out - np.swapaxes(out, 1, 2)
 
 
 def _grams(views: Views, noise: Noise, X: Transform, B: Transform) -> tuple[Array, Array]:
@@ -164,7 +160,7 @@ def _factor(scaled: Array) -> Array:
 
 
 def solve(views: Views, noise: Noise, X: Transform, B: Transform, *, iterations: int = _ITERATIONS) -> Fit:
-    """Gauss-Newton least squares weighted by `noise`, in increments scaled by the normal matrix.
+    """Gauss–Newton least squares weighted by `noise`, in increments scaled by the normal matrix.
 
     Args:
         views: the measurements.
@@ -177,20 +173,27 @@ def solve(views: Views, noise: Noise, X: Transform, B: Transform, *, iterations:
         ComputeError: the views do not determine the answer.
     """
     prior = _prior(noise, views.kind)
-    fit = Fit(X, B, np.zeros(len(prior)), np.zeros((12 + len(prior),) * 2))
-    for _ in range(iterations):
+
+    def minimum_at(fit: Fit) -> tuple[Array, Array]:
+        """Increments of the transforms and of the arm's parameters, and their covariance."""
         grams, _ = _grams(views, noise, fit.T_flange_camera, fit.T_base_board)
         step, covariance, _ = _minimum(grams.sum(axis=0), prior)
-        settled = np.abs(step[:12]).max() < 1e-10 and np.abs(step[12:] - fit.arm).max(initial=0.0) < 1e-5
-        fit = Fit(
+        return np.concatenate([step[:12], step[12:] - fit.arm]), covariance
+
+    def moved(fit: Fit, step: Array) -> Fit:
+        return Fit(
             increment(fit.T_flange_camera, step[:3], step[3:6]),
             increment(fit.T_base_board, step[6:9], step[9:12]),
-            step[12:],
-            covariance,
+            fit.arm + step[12:],
+            fit.covariance,
         )
-        if settled:
-            break
-    return fit
+
+    def size(step: Array) -> float:
+        return max(largest(step[:12]) / _SETTLED, float(np.abs(step[12:]).max(initial=0.0)) / _SETTLED_ARM)
+
+    start = Fit(X, B, np.zeros(len(prior)), np.zeros((12 + len(prior),) * 2))
+    fit = gauss_newton(start, lambda fit: minimum_at(fit)[0], moved, most=iterations, settled=1.0, size=size)
+    return replace(fit, covariance=minimum_at(fit)[1])
 
 
 def estimate_noise(views: Views, X: Transform, B: Transform, start: Noise, *, floor_m: float = FLOOR_M) -> Noise:

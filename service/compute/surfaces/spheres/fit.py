@@ -96,6 +96,7 @@ def fit_sphere(samples: Samples, start: Array, radius: float, band: float) -> Sp
     centre = start.copy()
     weights = np.zeros(len(points))
     unit, residual, cosine = np.zeros_like(points), np.zeros(len(points)), np.zeros(len(points))
+    # Reweighting, not least squares with a fixed cost: the band shrinks with the residuals until both settle.
     for _ in range(40):
         ray = points - centre
         distance = np.linalg.norm(ray, axis=1)
