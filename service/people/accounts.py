@@ -7,6 +7,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, func, insert, select, update
 
+from service.core.records.events import AccountChanged
 from service.people.credentials.passwords import Passwords, new_token, require_password, require_pin, token_sha256
 from service.people.errors import AccountError, LinkError
 from service.people.person import Account, Invitation, Person
@@ -97,7 +98,8 @@ class Accounts:
                 .where(accounts.c.account == name)
                 .values(state="active", failures=0, locked_until_utc_s=0.0, **secrets)
             )
-            record_change(self._store, connection, name, name, "state", "invited", "active", stored=secrets)
+            change = AccountChanged(account=name, field="state", old="invited", new="active")
+            record_change(self._store, connection, name, change, secrets)
         return name
 
     def invite(self, by: Person, account: str, full_name: str, role: Role) -> str:
@@ -126,9 +128,8 @@ class Accounts:
             values = {"state": "invited", "failures": 0, "locked_until_utc_s": 0.0, **nothing}
             connection.execute(update(accounts).where(accounts.c.account == account).values(**values))
             end_sessions(self._store, connection, account, actor=by.account)
-            record_change(
-                self._store, connection, by.account, account, "state", row.state, "invited", why, stored=nothing
-            )
+            change = AccountChanged(account=account, field="state", old=row.state, new="invited", reason=why)
+            record_change(self._store, connection, by.account, change, nothing)
             return self._new_link(connection, account, INVITATION_S, actor=by.account)
 
     # --- an administrator's changes ---
@@ -145,7 +146,8 @@ class Accounts:
                 self._require_another_administrator(connection, row)
             connection.execute(update(accounts).where(accounts.c.account == account).values(role=role))
             end_sessions(self._store, connection, account, actor=by.account)
-            record_change(self._store, connection, by.account, account, "role", row.role, role, why)
+            change = AccountChanged(account=account, field="role", old=row.role, new=role, reason=why)
+            record_change(self._store, connection, by.account, change)
 
     def disable(self, by: Person, account: str, reason: str) -> None:
         """Disable an account and end its sign-ins and links. Raises AccountError, also for the last administrator."""
@@ -159,7 +161,8 @@ class Accounts:
             connection.execute(update(accounts).where(accounts.c.account == account).values(state="disabled"))
             end_sessions(self._store, connection, account, actor=by.account)
             self._void_links(connection, account)
-            record_change(self._store, connection, by.account, account, "state", row.state, "disabled", why)
+            change = AccountChanged(account=account, field="state", old=row.state, new="disabled", reason=why)
+            record_change(self._store, connection, by.account, change)
 
     def enable(self, by: Person, account: str, reason: str) -> None:
         """Enable a disabled account again with its old password. Raises AccountError."""
@@ -175,7 +178,8 @@ class Accounts:
                     remedy="Reset the account for a new link if its owner cannot sign in",
                 )
             connection.execute(update(accounts).where(accounts.c.account == account).values(state="active"))
-            record_change(self._store, connection, by.account, account, "state", "disabled", "active", why)
+            change = AccountChanged(account=account, field="state", old="disabled", new="active", reason=why)
+            record_change(self._store, connection, by.account, change)
 
     def end_wait(self, by: Person, account: str) -> None:
         """End an account's wait after wrong passwords. Raises AccountError."""
@@ -183,9 +187,10 @@ class Accounts:
             row = get_account(connection, account)
             values = {"failures": 0, "locked_until_utc_s": 0.0}
             connection.execute(update(accounts).where(accounts.c.account == account).values(**values))
-            record_change(
-                self._store, connection, by.account, account, "lock_out", f"{row.failures} wrong passwords", "ended"
+            change = AccountChanged(
+                account=account, field="lock_out", old=f"{row.failures} wrong passwords", new="ended"
             )
+            record_change(self._store, connection, by.account, change)
 
     # --- one's own ---
 
@@ -208,9 +213,8 @@ class Accounts:
             connection.execute(update(accounts).where(accounts.c.account == person.account).values(**values))
             if which == "password":
                 end_sessions(self._store, connection, person.account, actor=person.account, keep=person.screen)
-            record_change(
-                self._store, connection, person.account, person.account, which, "set", "changed", stored=values
-            )
+            change = AccountChanged(account=person.account, field=which, old="set", new="changed")
+            record_change(self._store, connection, person.account, change, values)
 
     # --- within a transaction ---
 
@@ -224,17 +228,8 @@ class Accounts:
         state: str,
         secrets: dict[str, str],
     ) -> None:
-        made = record_change(
-            self._store,
-            connection,
-            actor,
-            name,
-            "created",
-            "",
-            f"{role}, {state}",
-            full_name=full_name,
-            stored=secrets,
-        )
+        change = AccountChanged(account=name, field="created", old="", new=f"{role}, {state}", full_name=full_name)
+        made = record_change(self._store, connection, actor, change, secrets)
         connection.execute(
             insert(accounts).values(
                 account=name,
@@ -252,9 +247,8 @@ class Accounts:
         self._void_links(connection, account)
         token = new_token()
         stored = {"token_sha256": token_sha256(token)}
-        made = record_change(
-            self._store, connection, actor, account, "link", "", f"valid for {valid_s / 3600:.0f} h", stored=stored
-        )
+        change = AccountChanged(account=account, field="link", old="", new=f"valid for {valid_s / 3600:.0f} h")
+        made = record_change(self._store, connection, actor, change, stored)
         expires_utc_s = datetime.fromisoformat(made.at_utc).timestamp() + valid_s
         connection.execute(insert(invitations).values(account=account, expires_utc_s=expires_utc_s, used=0, **stored))
         return token

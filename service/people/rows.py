@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 from sqlalchemy import Connection, Row, delete, select
 
@@ -19,7 +19,6 @@ from service.store.verification.people_checks import session_sha256
 
 SERVICE = "web"  # actor of events that no signed-in person caused
 SESSION_S = 12 * 3600.0
-Outcome = Literal["signed_in", "refused", "locked_out", "signed_out", "screen_locked", "screen_unlocked", "ended"]
 _NAME = re.compile(r"[a-z][a-z0-9._-]{1,31}")
 _RESERVED = frozenset({"web", "runner", "worker", "site", "service", "camera", "robot", "orthocapture", "nobody"})
 
@@ -118,47 +117,35 @@ def record_change(
     store: Store,
     connection: Connection,
     actor: str,
-    account: str,
-    field: str,
-    old: str,
-    new: str,
-    reason: str = "",
-    *,
-    full_name: str = "",
-    stored: Mapping[str, str] | None = None,
+    change: AccountChanged,
+    secrets: Mapping[str, str] | None = None,
 ) -> Event:
     """Record a change of an account in the transaction that makes it. Returns the event.
 
-    `stored` holds the stored forms of new secrets by column; only their hashes go into the chain.
+    `secrets` holds the stored forms of new secrets by column; only their hashes go into the chain.
     """
-    hashes = {column: sha256_text(value) for column, value in (stored or {}).items()}
-    change = AccountChanged(
-        account=account, field=field, old=old, new=new, reason=reason, full_name=full_name, stored=hashes
-    )
-    (event,) = store.append_site(connection, [change], actor=actor)
+    hashes = {column: sha256_text(value) for column, value in (secrets or {}).items()}
+    (event,) = store.append_site(connection, [change.model_copy(update={"stored": hashes})], actor=actor)
     return event
 
 
 def record_sign_in(
     store: Store,
     connection: Connection,
-    outcome: Outcome,
+    sign_in: SignInRecorded,
     *,
-    account: str,
-    screen: str = "",
-    address: str = "",
     actor: str = SERVICE,
     session: Mapping[str, Any] | None = None,
 ) -> None:
-    """Record the outcome of a sign-in in its transaction. `session` is the row of a new session."""
+    """Record the outcome of a sign-in in its transaction. The hash of `session`, the row of a new one, is added."""
     known = "" if session is None else session_sha256(session)
-    event = SignInRecorded(account=account, outcome=outcome, screen=screen, address=address, session_sha256=known)
-    store.append_site(connection, [event], actor=actor)
+    store.append_site(connection, [sign_in.model_copy(update={"session_sha256": known})], actor=actor)
 
 
 def end_sessions(store: Store, connection: Connection, account: str, *, actor: str, keep: str = "") -> None:
     """End and record all sign-ins of an account except that of the screen `keep`."""
     chosen = (sessions.c.account == account) & (sessions.c.screen != keep)
     for row in connection.execute(select(sessions.c.screen).where(chosen)).all():
-        record_sign_in(store, connection, "ended", account=account, screen=row.screen, actor=actor)
+        outcome = SignInRecorded(account=account, outcome="ended", screen=row.screen)
+        record_sign_in(store, connection, outcome, actor=actor)
     connection.execute(delete(sessions).where(chosen))

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from argon2 import PasswordHasher
 from sqlalchemy import Connection, Row, delete, insert, select, update
 
+from service.core.records.events import AccountChanged, SignInRecorded
 from service.people.accounts import Accounts
 from service.people.credentials.badges import Badges
 from service.people.credentials.passwords import Passwords, new_token, token_sha256
@@ -93,16 +94,8 @@ class People:
                 }
                 connection.execute(insert(sessions).values(**session, seen_utc_s=now, locked=0, pin_failures=0))
                 self._reset_failures(connection, row, password)
-                record_sign_in(
-                    self._store,
-                    connection,
-                    "signed_in",
-                    account=row.account,
-                    screen=screen,
-                    address=address,
-                    actor=row.account,
-                    session=session,
-                )
+                outcome = SignInRecorded(account=row.account, outcome="signed_in", screen=screen, address=address)
+                record_sign_in(self._store, connection, outcome, actor=row.account, session=session)
             return token
 
     def check_password(self, account: str, password: str) -> None:
@@ -129,7 +122,7 @@ class People:
     def refuse_address(self, address: str) -> None:
         """Record that an address has failed too often and must wait."""
         with self._store.database.writing() as connection:
-            record_sign_in(self._store, connection, "locked_out", account="", address=address)
+            record_sign_in(self._store, connection, SignInRecorded(account="", outcome="locked_out", address=address))
 
     def _checked(self, typed: str, secret: str, address: str, known_by: KnownBy = "password") -> Row[Any]:
         name = plain_name(typed)
@@ -153,13 +146,12 @@ class People:
                 )
                 waits = wait_s > 0
             # An unknown name is not recorded, because it may be a password typed into the wrong field.
-            record_sign_in(
-                self._store,
-                connection,
-                "locked_out" if waits else "refused",
+            outcome = SignInRecorded(
                 account=row.account if row is not None else "",
+                outcome="locked_out" if waits else "refused",
                 address=address,
             )
+            record_sign_in(self._store, connection, outcome)
         raise SignInRefusedError(
             f"name and {NAMES[known_by]} do not belong together, or the account has to wait",
             where="password",
@@ -181,7 +173,8 @@ class People:
             stored = {"password_hash": self._passwords.hash(password)}
             values |= stored
             name = row.account
-            record_change(self._store, connection, name, name, "password", "set", "hashed anew", stored=stored)
+            change = AccountChanged(account=name, field="password", old="set", new="hashed anew")
+            record_change(self._store, connection, name, change, stored)
         connection.execute(update(accounts).where(accounts.c.account == row.account).values(**values))
 
     # --- sign-ins ---
@@ -216,14 +209,8 @@ class People:
     def sign_out(self, person: Person) -> None:
         """End this person's sign-in on this screen."""
         with self._store.database.writing() as connection:
-            record_sign_in(
-                self._store,
-                connection,
-                "signed_out",
-                account=person.account,
-                screen=person.screen,
-                actor=person.account,
-            )
+            outcome = SignInRecorded(account=person.account, outcome="signed_out", screen=person.screen)
+            record_sign_in(self._store, connection, outcome, actor=person.account)
             connection.execute(delete(sessions).where(sessions.c.screen == person.screen))
 
     def lock(self, person: Person) -> None:
@@ -246,14 +233,12 @@ class People:
             failures = 0 if matches else row.pin_failures + 1
             ended = failures >= FREE_FAILURES
             with self._store.database.writing() as connection:
-                record_sign_in(
-                    self._store,
-                    connection,
-                    "screen_unlocked" if matches else "ended" if ended else "refused",
+                outcome = SignInRecorded(
                     account=person.account,
+                    outcome="screen_unlocked" if matches else "ended" if ended else "refused",
                     screen=person.screen,
-                    actor=person.account if matches else SERVICE,
                 )
+                record_sign_in(self._store, connection, outcome, actor=person.account if matches else SERVICE)
                 here = sessions.c.screen == person.screen
                 if ended:
                     connection.execute(delete(sessions).where(here))
@@ -290,9 +275,8 @@ class People:
             chosen = (sessions.c.screen == screen) & (sessions.c.account == person.account)
             if connection.execute(select(sessions.c.screen).where(chosen)).one_or_none() is None:
                 raise AccountError(f"you have no sign-in {screen!r}", where="screen", remedy="It may have ended")
-            record_sign_in(
-                self._store, connection, "ended", account=person.account, screen=screen, actor=person.account
-            )
+            outcome = SignInRecorded(account=person.account, outcome="ended", screen=screen)
+            record_sign_in(self._store, connection, outcome, actor=person.account)
             connection.execute(delete(sessions).where(chosen))
 
     def _session(self, connection: Connection, token: str) -> Row[Any] | None:
@@ -307,16 +291,19 @@ class People:
             update(sessions).where(sessions.c.screen == screen, sessions.c.locked == 0).values(locked=1)
         )
         if changed.rowcount:
-            record_sign_in(self._store, connection, "screen_locked", account=account, screen=screen, actor=actor)
+            outcome = SignInRecorded(account=account, outcome="screen_locked", screen=screen)
+            record_sign_in(self._store, connection, outcome, actor=actor)
 
     def _end_expired(self, connection: Connection, now: float) -> None:
         expired = sessions.c.created_utc_s <= now - SESSION_S
         for row in connection.execute(select(sessions.c.account, sessions.c.screen).where(expired)).all():
-            record_sign_in(self._store, connection, "ended", account=row.account, screen=row.screen)
+            outcome = SignInRecorded(account=row.account, outcome="ended", screen=row.screen)
+            record_sign_in(self._store, connection, outcome)
         connection.execute(delete(sessions).where(expired))
 
     def _end(self, connection: Connection, token: str) -> None:
         row = self._session(connection, token) if token else None
         if row is not None:
-            record_sign_in(self._store, connection, "ended", account=row.account, screen=row.screen)
+            outcome = SignInRecorded(account=row.account, outcome="ended", screen=row.screen)
+            record_sign_in(self._store, connection, outcome)
             connection.execute(delete(sessions).where(sessions.c.screen == row.screen))

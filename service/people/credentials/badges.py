@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from sqlalchemy import select, update
 
+from service.core.records.events import AccountChanged
 from service.people.credentials.passwords import Passwords, plain_badge
 from service.people.errors import AccountError
 from service.people.person import Person
@@ -58,4 +59,5 @@ class Badges:
                 raise AccountError(f"{account} has no badge", where="badge", remedy="Nothing has to be done")
             connection.execute(update(accounts).where(accounts.c.account == account).values(**values))
             old = "enrolled" if row.badge_hash else ""
-            record_change(self._store, connection, by.account, account, "badge", old, new, reason, stored=values)
+            change = AccountChanged(account=account, field="badge", old=old, new=new, reason=reason)
+            record_change(self._store, connection, by.account, change, values)

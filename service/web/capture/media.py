@@ -14,6 +14,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from fastapi import Path as UrlPath
 from fastapi.responses import FileResponse
+from pydantic import BaseModel, Field
 from sqlalchemy import select
 
 from service.core.errors import OrthocaptureError
@@ -33,8 +34,6 @@ router = APIRouter(tags=["media"])
 RunId = Annotated[str, UrlPath(pattern=r"^[0-9A-Za-z_-]{1,64}$")]
 Sha256 = Annotated[str, UrlPath(pattern=r"^[0-9a-f]{64}$")]
 Viewpoint = Annotated[str, UrlPath(pattern=r"^[0-9A-Za-z_.+-]{1,64}$")]
-StepName = Annotated[str, Query(pattern=r"^[0-9A-Za-z_-]{0,64}$")]
-Number = Annotated[int | None, Query(ge=1, le=2**53)]
 
 _FOR_EVER = "private, max-age=31536000, immutable"  # its address holds the hash of its content
 _ASK_AGAIN = "private, no-cache"
@@ -101,6 +100,24 @@ def run_file(
     return FileResponse(path, media_type=media_type, headers=headers, filename=safe_name(ref.original_name, sha256))
 
 
+class ImageQuery(BaseModel):
+    """Which image of a viewpoint to show, and how.
+
+    Attributes:
+        step: that took it; "" for the last step that has it.
+        attempt: of the step; None for the valid image.
+        seq: event of the image; None for the valid image.
+        width: wanted width in pixels; the copy has the nearest width on offer.
+        marked: whether outlines of the spheres are drawn over it.
+    """
+
+    step: str = Field("", pattern=r"^[0-9A-Za-z_-]{0,64}$")
+    attempt: int | None = Field(None, ge=1, le=10_000)
+    seq: int | None = Field(None, ge=1, le=2**53)
+    width: int = Field(1280, ge=64, le=4096)
+    marked: bool = False
+
+
 @router.get(
     "/runs/{run_id}/images/{viewpoint}",
     name="viewpoint_image",
@@ -112,19 +129,15 @@ def viewpoint_image(
     site: CurrentSite,
     run_id: RunId,
     viewpoint: Viewpoint,
-    step: StepName = "",
-    attempt: Annotated[int | None, Query(ge=1, le=10_000)] = None,
-    seq: Number = None,
-    width: Annotated[int, Query(ge=64, le=4096)] = 1280,
-    marked: bool = False,
+    wanted: Annotated[ImageQuery, Query()],
 ) -> Response:
-    """The image of a viewpoint, the valid one unless `attempt` or `seq` asks for another, for the screen."""
+    """A copy of a viewpoint's image for the screen."""
     log = site.run(run_id)
-    capture = find_capture(log, viewpoint, step=step, attempt=attempt, seq=seq)
+    capture = find_capture(log, viewpoint, step=wanted.step, attempt=wanted.attempt, seq=wanted.seq)
     if capture is None:
         raise HTTPException(404, f"there is no image of viewpoint {viewpoint} in this run")
-    size = nearest_width(width, IMAGE_WIDTHS)
-    source = mark_source(log, capture) if marked else ""
+    size = nearest_width(wanted.width, IMAGE_WIDTHS)
+    source = mark_source(log, capture) if wanted.marked else ""
     ref = capture.payload.artefacts[0]
     tag = f'"{ref.sha256}-{size}{f"-{source}" if source else ""}"'
     if request.headers.get("if-none-match") == tag:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
+from pydantic import BaseModel, Field
 
 from service.audit.runs.search import RESULT_WORDS, RESULTS, RunWanted, find_runs
 from service.core.errors import OrthocaptureError
@@ -28,7 +30,6 @@ from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["home"])
 _PAGE = 12
-Sought = Annotated[str, Query(max_length=200)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,29 +65,36 @@ class Startable:
     changes: tuple[str, ...] = ()  # against the approved content of its id and version
 
 
+class HomeQuery(BaseModel):
+    """Page number and search of the first page."""
+
+    page: int = Field(1, ge=1, le=100_000)
+    q: str = Field("", max_length=200)
+    since: str = Field("", max_length=200)
+    until: str = Field("", max_length=200)
+    result: str = Field("", max_length=200)
+
+    def wanted(self) -> RunWanted:
+        """The search."""
+        return RunWanted(self.q, self.since, self.until, self.result if self.result in RESULTS else "")
+
+
 @router.get("/", name="home", dependencies=[Depends(requires("read"))])
 def home(
     request: Request,
     site: CurrentSite,
     person: SignedInPerson,
-    page: Annotated[int, Query(ge=1, le=100_000)] = 1,
-    q: Sought = "",
-    since: Sought = "",
-    until: Sought = "",
-    result: Sought = "",
+    asked_for: Annotated[HomeQuery, Query()],
 ) -> HTMLResponse:
-    """Runs under way first (those that a process drives before the others), then those that have ended, newest first.
+    """The runs in progress, then those that have ended, newest first, or those that match a search.
 
-    Only the runs of the page shown are read whole; where some are sought, those that fit are shown.
+    Only the runs of the page shown are read whole.
     """
-    driven = set(site.launcher.driven_runs())
-    under_way = site.store.open_runs() | driven
-    wanted = RunWanted(q, since, until, result if result in RESULTS else "")
+    wanted = asked_for.wanted()
     found = {run.run_id: run for run in find_runs(site.store, wanted)}
-    newest_first = [row for row in site.store.runs()[::-1] if row.run_id in found]
-    rows = sorted(newest_first, key=lambda row: (row.run_id not in driven, row.run_id not in under_way))
+    rows = _in_order(site, found)
     pages = max(1, -(-len(rows) // _PAGE))
-    page = min(page, pages)
+    page = min(asked_for.page, pages)
     lines = [_line(site, row) for row in rows[_PAGE * (page - 1) : _PAGE * page]]
     asked = person.may("operate") and not wanted.active
     startable = [startable_of(path.name, site) for path in site.protocol_files()] if asked else []
@@ -132,24 +140,25 @@ def theme(
     return response
 
 
+def _in_order(site: Site, found: Collection[str]) -> list[RunRow]:
+    """The found runs: first those that a process drives, then other open ones, then ended ones, each newest first."""
+    driven = set(site.launcher.driven_runs())
+    under_way = site.store.open_runs() | driven
+    newest_first = [row for row in site.store.runs()[::-1] if row.run_id in found]
+    return sorted(newest_first, key=lambda row: (row.run_id not in driven, row.run_id not in under_way))
+
+
+def _unreadable(row: RunRow, fault: str) -> RunLine:
+    return RunLine(
+        row.run_id, row.run_id, row.created_utc, "", row.simulated, "unreadable", "", 0, 0, 0, "", fault=fault
+    )
+
+
 def _line(site: Site, row: RunRow) -> RunLine:
     try:
         log = site.run(row.run_id)
     except OrthocaptureError as error:
-        return RunLine(
-            row.run_id,
-            row.run_id,
-            row.created_utc,
-            "",
-            row.simulated,
-            "unreadable",
-            "",
-            0,
-            0,
-            0,
-            "",
-            fault=str(error),
-        )
+        return _unreadable(row, str(error))
     state = log.state
     # Imported here: one small file a run is read for those under way only.
     from service.monitor.snapshot import read_snapshot  # noqa: PLC0415

@@ -55,11 +55,14 @@ class TimeChart:
 def time_chart(
     points: Sequence[TimePoint], *, title: str, unit: str, from_zero: bool = True, limit: float | None = None
 ) -> TimeChart | None:
-    """Points in the order of time; None without any.
+    """A chart of points in the order of time; None without any.
 
     Args:
+        points: oldest first.
+        title: of the chart.
+        unit: of the values.
         from_zero: the axis begins at zero; otherwise it spans the values.
-        limit: at most so much, where a protocol says it.
+        limit: the largest value that the protocol allows; None if it sets no limit.
     """
     if not points:
         return None
@@ -76,17 +79,8 @@ def time_chart(
         return round(_TOP + (_HEIGHT - _TOP - _BOTTOM) * (high - value) / (high - low), 1)
 
     marks = tuple(
-        TimeMark(
-            x(at_s), y(p.value), p.simulated,
-            f"{p.value:.5g} {unit}, {p.at_utc[:16].replace('T', ' ')} UTC, {p.of}"
-            + (", simulated" if p.simulated else ""),
-        )
+        TimeMark(x(at_s), y(p.value), p.simulated, _mark_words(p, unit))
         for at_s, p in zip(times, points, strict=True)
-    )  # fmt: skip
-    lines = tuple(
-        "M" + "L".join(f"{mark.x} {mark.y}" for mark in of)
-        for simulated in (False, True)
-        if len(of := [mark for mark in marks if mark.simulated == simulated]) > 1
     )
     newest = points[-1].value
     summary = f"{len(points)} value{'' if len(points) == 1 else 's'}, the newest {newest:.5g} {unit}".rstrip()
@@ -99,12 +93,23 @@ def time_chart(
         summary=summary,
         height=_HEIGHT,
         marks=marks,
-        lines=lines,
+        lines=_lines(marks),
         x_ticks=tuple(Tick(x(at_s), words) for at_s, words in _days(first, last)),
         y_ticks=tuple(Tick(y(k * spacing), f"{k * spacing:.{digits}f}") for k in count),
         limit=y(limit) if drawn and limit is not None else None,
         limit_text="" if limit is None else f"limit of the newest run {limit:g}",
     )
+
+
+def _mark_words(point: TimePoint, unit: str) -> str:
+    at = point.at_utc[:16].replace("T", " ")
+    return f"{point.value:.5g} {unit}, {at} UTC, {point.of}" + (", simulated" if point.simulated else "")
+
+
+def _lines(marks: Sequence[TimeMark]) -> tuple[str, ...]:
+    """SVG paths through the marks of real rigs and of simulated ones, where there is more than one."""
+    groups = ([mark for mark in marks if mark.simulated == simulated] for simulated in (False, True))
+    return tuple("M" + "L".join(f"{mark.x} {mark.y}" for mark in group) for group in groups if len(group) > 1)
 
 
 def _range(values: Sequence[float], limit: float | None, *, from_zero: bool) -> tuple[float, float]:

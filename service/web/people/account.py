@@ -6,6 +6,7 @@ from typing import Annotated, cast
 
 from fastapi import APIRouter, Depends, Form, Path, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from pydantic import BaseModel, Field
 
 from service.core.errors import OrthocaptureError
 from service.people.errors import AccountError, AccountJustChangedError, SignInRefusedError
@@ -125,29 +126,35 @@ def set_up_page(request: Request, site: CurrentSite, token: Token) -> HTMLRespon
     return _set_up_form(request, site, token, None)
 
 
+class SetUpForm(BaseModel):
+    """What a person chooses behind a one-time link; only the first administrator also chooses the two names."""
+
+    password: str = Field(max_length=256)
+    repeated: str = Field(max_length=256)
+    pin: str = Field(max_length=12)
+    account: str = Field("", max_length=80)
+    full_name: str = Field("", max_length=80)
+
+
 @router.post("/set-up/{token}", name="set_up", response_class=RedirectResponse, status_code=303)
 def set_up(
     request: Request,
     site: CurrentSite,
     token: Token,
-    password: Secret,
-    repeated: Secret,
-    pin: Pin,
-    account: Name = "",
-    full_name: Name = "",
+    form: Annotated[SetUpForm, Form()],
 ) -> Response:
     """Use a link: the first administrator chooses a name, everybody a password and a PIN."""
     invitation = site.people.accounts.invitation(token)
     try:
-        _require_same(password, repeated)
+        _require_same(form.password, form.repeated)
         if invitation.account:
-            site.people.accounts.accept(token, password, pin)
+            site.people.accounts.accept(token, form.password, form.pin)
         else:
-            site.people.accounts.set_up(token, account, full_name, password, pin)
+            site.people.accounts.set_up(token, form.account, form.full_name, form.password, form.pin)
     except AccountError as error:
         if wants_json(request):
             raise
-        return _set_up_form(request, site, token, error, account, full_name)
+        return _set_up_form(request, site, token, error, form.account, form.full_name)
     return _go("/sign-in?done=set-up")
 
 

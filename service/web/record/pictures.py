@@ -102,26 +102,8 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[DrawnOutline] = (), *, 
             remedy=_REMEDY,
         )
     check_picture(content, path.name, partly=True)
-    how = cv2.IMREAD_COLOR
-    for flag, k in (
-        (cv2.IMREAD_REDUCED_COLOR_8, 8),
-        (cv2.IMREAD_REDUCED_COLOR_4, 4),
-        (cv2.IMREAD_REDUCED_COLOR_2, 2),
-    ):
-        if full[0] // k >= width:
-            how = flag
-            break
     with _DECODING:
-        try:
-            image = cv2.imdecode(data, how if upright else how | cv2.IMREAD_IGNORE_ORIENTATION)
-        except cv2.error as error:
-            raise DataError("the picture cannot be decoded", where=path.name, remedy=_REMEDY) from error
-        if image is None:
-            raise DataError("the file is not a picture that can be decoded", where=path.name, remedy=_REMEDY)
-        height, present = image.shape[:2]
-        if present > width:
-            image = cv2.resize(image, (width, max(1, round(height * width / present))), interpolation=cv2.INTER_AREA)
-        picture = np.asarray(image, dtype=np.uint8)
+        picture = _decoded(data, full[0], width, path.name, upright=upright)
         if marks:
             draw_marks(picture, marks, picture.shape[1] / full[0])
         quality = 80 if width <= WIDTHS[-1] else 88
@@ -129,6 +111,25 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[DrawnOutline] = (), *, 
     if not done:
         raise DataError("the picture cannot be encoded", where=path.name, remedy=_REMEDY)
     return encoded.tobytes()
+
+
+def _decoded(data: NDArray[np.uint8], full: int, width: int, name: str, *, upright: bool) -> NDArray[np.uint8]:
+    """Decode a picture of the width `full` at the smallest scale that suffices, and reduce it to `width`."""
+    import cv2  # noqa: PLC0415 - a web process starts without it
+    import numpy as np  # noqa: PLC0415
+
+    scales = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
+    how = next((flag for k, flag in scales.items() if full // k >= width), cv2.IMREAD_COLOR)
+    try:
+        image = cv2.imdecode(data, how if upright else how | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        raise DataError("the picture cannot be decoded", where=name, remedy=_REMEDY) from error
+    if image is None:
+        raise DataError("the file is not a picture that can be decoded", where=name, remedy=_REMEDY)
+    height, present = image.shape[:2]
+    if present > width:
+        image = cv2.resize(image, (width, max(1, round(height * width / present))), interpolation=cv2.INTER_AREA)
+    return np.asarray(image, dtype=np.uint8)
 
 
 def draw_marks(picture: NDArray[np.uint8], marks: Sequence[DrawnOutline], scale: float) -> None:
