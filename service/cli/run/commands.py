@@ -40,6 +40,7 @@ from service.core.records.events import GateVerdict
 from service.core.recovery.ways_on import takes_words, ways_on
 from service.core.run.fold import fold
 from service.core.run.state import RunState, StepState
+from service.jobs.capture import live_summary, live_view
 from service.logs.file_log import file_log
 from service.monitor.alarm import alarm_of
 from service.monitor.devices import OpenDevices
@@ -209,23 +210,23 @@ def status_record(run_id: str, state: RunState) -> dict[str, Any]:
                 "measures": dict(s.measures),
                 "gates": [v.model_dump() | {"standing": _standing(v, s), "text": describe(v)} for v in s.verdicts],
                 "live": [
-                    {"viewpoint": job.result["viewpoint"], **job.measures}
+                    {"viewpoint": live_view.KIND.read_answer(job.result).viewpoint, **job.measures}
                     for job in s.jobs.values()
-                    if job.kind == "live_view" and job.status == "finished"
+                    if job.kind == live_view.KIND.name and job.status == "finished"
                 ],
             }
             for name, s in state.steps.items()
         },
-        "next_best_views": next_best_views(state),
+        "next_best_views": [view.plain() for view in next_best_views(state)],
     }
 
 
-def next_best_views(state: RunState) -> list[dict[str, Any]]:
-    """The suggested views in a run's newest summary of its images, as plain data; empty before the first one."""
+def next_best_views(state: RunState) -> tuple[live_summary.Suggestion, ...]:
+    """The suggested views in a run's newest summary of its images; empty before the first one."""
     jobs = [job for step in state.steps.values() for job in step.jobs.values()]
-    done = [job for job in jobs if job.kind == "live_summary" and job.status == "finished"]
+    done = [job for job in jobs if job.kind == live_summary.KIND.name and job.status == "finished"]
     newest = max(done, key=lambda job: job.enqueued_seq, default=None)
-    return [] if newest is None else list(newest.result["next_best_views"])
+    return () if newest is None else live_summary.KIND.read_answer(newest.result).next_best_views
 
 
 def drive(

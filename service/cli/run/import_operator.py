@@ -14,17 +14,20 @@ from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.jobs.words import term
 from service.runner.operator import AnswerBy
+from service.steps.kinds import ct_import, image_import, scan_import
 
 
 def part_of(protocol: Protocol, step_id: str) -> PhotographRole | FileRole | None:
     """The part of an import that a step imports; None if it imports nothing."""
-    step = protocol.step(step_id)
-    match step.kind:
-        case "image_import":
-            return step.params.model_dump()["photographs"]
-        case "scan_import":
-            return step.params.model_dump()["device"] or "scan"
-        case "ct_import":
+    params = protocol.step(step_id).params
+    match params:
+        case image_import.Params():
+            return params.photographs
+        case scan_import.Params(device="control_scan"):
+            return "control_scan"
+        case scan_import.Params(device="scan" | None):
+            return "scan"
+        case ct_import.Params():
             return "ct"
         case _:
             return None

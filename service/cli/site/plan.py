@@ -99,7 +99,7 @@ def next_command(
         state = fold(protocol, store.events(run_id))
     views = next_best_views(state)
     if json:
-        print_json({"run": run_id, "next_best_views": views})
+        print_json({"run": run_id, "next_best_views": [view.plain() for view in views]})
         return
     if not views:
         console.print("No capture step has asked for more views.")
@@ -108,5 +108,5 @@ def next_command(
     for heading in ("viewpoint", "predicted error after it (mm)", "coverage after it"):
         table.add_column(heading)
     for view in views:
-        table.add_row(view["viewpoint"], f"{view['predicted_error_mm']:.3f}", f"{100 * view['coverage']:.0f} %")
+        table.add_row(view.viewpoint, f"{view.predicted_error_mm:.3f}", f"{100 * view.coverage:.0f} %")
     print_table(table)
