@@ -153,4 +153,4 @@ def test_what_a_clock_offset_means_stands_beside_it(tmp_path: Path) -> None:
     assert "counts from when it was switched on: only its drift matters" in page
     assert "1279.000 s behind this machine's" in page
     assert "Beyond It sets the times in the device's own files. Order and times of the record do not depend" in page
-    assert "a large or negative one is no fault" in page
+    assert "a large or negative value is not a fault" in page

@@ -136,7 +136,7 @@ def test_looking_at_another_step_changes_nothing(web: WebSite, run_id: str) -> N
     browser = web.browser("technician")
     web.take_control(run_id, browser)
     page = browser.get(f"/runs/{run_id}", params={"step": "spraying"}).text
-    assert "nothing can be changed here" in page
+    assert "Nothing can be changed here" in page
     assert "This cannot be undone" in page
     assert "Back to the current step" in page
     assert browser.get(f"/runs/{run_id}", params={"step": "../../etc"}).status_code == 200
