@@ -1,0 +1,1 @@
+"""Fusion of CT and scan into one ground-truth mesh."""

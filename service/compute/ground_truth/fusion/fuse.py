@@ -1,0 +1,190 @@
+"""Fuses a CT mesh and a scan, in one frame, into one mesh: the CT in the wound, the scan elsewhere, no step between.
+
+The triangulation of the CT carries the result, which is watertight where the CT is. Its vertices move onto the scan
+by a weight that rises smoothly from 0 to 1 over the overlap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.ground_truth.distances.neighbours import PointIndex
+from service.compute.ground_truth.fusion.overlap import (
+    Mask,
+    OverlapLimits,
+    WoundLimits,
+    components,
+    distance_to,
+    overlap,
+    propose_wound,
+    vertex_normals,
+)
+from service.compute.ground_truth.fusion.regions import Correction, corrected
+from service.compute.ground_truth.surface import IntArray, Surface
+from service.core.errors import ComputeError
+from service.core.geometry import Array, place_jacobian
+
+
+class Source(IntEnum):
+    """Where a vertex comes from."""
+
+    CT = 0
+    SCAN = 1
+    BLEND = 2
+
+
+@dataclass(frozen=True, slots=True)
+class FusionSettings:
+    """How two meshes are fused.
+
+    Attributes:
+        blend_m: width of the overlap over which the weight rises.
+        sigma_ct_m, sigma_scan_m: standard deviation of each surface along its normal, as of its spheres.
+        alignment_covariance: (6, 6) of T_scan_ct as in `evaluation.closure.Alignment`; None: known exactly.
+        keep_scan_only: whether parts of the scan that the CT lacks are added, unconnected.
+        least_part_m2: smaller unconnected parts of the CT are left out.
+        overlap, wound: limits.
+    """
+
+    blend_m: float = 0.003
+    sigma_ct_m: float = 1.0e-4
+    sigma_scan_m: float = 5.0e-5
+    alignment_covariance: Array | None = field(default=None, repr=False)
+    keep_scan_only: bool = True
+    least_part_m2: float = 2e-6
+    overlap: OverlapLimits = field(default_factory=OverlapLimits)
+    wound: WoundLimits = field(default_factory=WoundLimits)
+
+
+@dataclass(frozen=True, slots=True)
+class Fused:
+    """The ground truth.
+
+    Attributes:
+        surface: in the frame of the sources.
+        source: (V,) of Source.
+        weight: (V,) of the scan, 0 to 1.
+        sigma_m: (V,) standard deviation along the normal.
+        wound: (V,) in the wound region, as proposed and corrected.
+        ct_offset_m: median height of the CT above the scan, outside the wound: its bias if the scan is right.
+        ct_spread_m: robust standard deviation of the same heights.
+        folded: faces that the move turned over.
+        corrections: that were applied.
+    """
+
+    surface: Surface
+    source: NDArray[np.uint8] = field(repr=False)
+    weight: Array = field(repr=False)
+    sigma_m: Array = field(repr=False)
+    wound: Mask = field(repr=False)
+    ct_offset_m: float
+    ct_spread_m: float
+    folded: int
+    corrections: tuple[Correction, ...]
+
+    def share(self, source: Source) -> float:
+        """Share of the vertices from this source."""
+        return float(np.mean(self.source == source))
+
+
+def fuse(
+    ct: Surface,
+    scan: Surface,
+    up: Array,
+    settings: FusionSettings | None = None,
+    corrections: Sequence[Correction] = (),
+) -> Fused:
+    """Fuse a CT mesh and a scan.
+
+    Args:
+        ct: in the scan's frame, vertices shared between faces, outward faces.
+        scan: its holes are where the CT is taken, besides the wound.
+        up: (3,) direction away from the table, by which hollows are told from undersides.
+        settings: the defaults if None.
+        corrections: regions that people drew.
+
+    Raises:
+        ComputeError: a source has no faces, or the two nowhere agree.
+    """
+    chosen = settings or FusionSettings()
+    carrier = _without_specks(ct, chosen.least_part_m2)
+    seen = overlap(carrier, scan, chosen.overlap)
+    if not seen.covered.any():
+        raise ComputeError("CT and scan nowhere agree", remedy="Check that both are in the same frame and unit")
+    wound = corrected(propose_wound(carrier, seen.covered, up, chosen.wound), carrier.vertices_m, corrections)
+    usable = seen.covered & ~wound
+    weight = _smooth_step(distance_to(carrier.vertices_m, ~usable) / chosen.blend_m)
+    move = seen.nearest_m - carrier.vertices_m
+    moved = Surface(carrier.vertices_m + weight[:, None] * move, carrier.faces)
+    folded = int(np.sum(np.einsum("fi,fi->f", moved.area_vectors_m2, carrier.area_vectors_m2) < 0))
+    sigma = _sigma(carrier, weight, np.linalg.norm(move, axis=1), chosen)
+    height = seen.offset_m[usable] if usable.any() else np.zeros(1)
+    offset = float(np.median(height))
+    source = np.where(weight <= 0, Source.CT, np.where(weight >= 1, Source.SCAN, Source.BLEND)).astype(np.uint8)
+    fused = Fused(
+        moved, source, weight, sigma, wound, offset, 1.4826 * float(np.median(np.abs(height - offset))), folded,
+        tuple(corrections),
+    )  # fmt: skip
+    return _with_scan_only(fused, carrier, scan, chosen) if chosen.keep_scan_only else fused
+
+
+def _smooth_step(x: Array) -> Array:
+    """0 up to 0, 1 from 1 on, with continuous curvature between."""
+    t = np.clip(x, 0.0, 1.0)
+    return t**3 * (10 + t * (6 * t - 15))
+
+
+def _sigma(carrier: Surface, weight: Array, gap: Array, settings: FusionSettings) -> Array:
+    """(V,) standard deviation along the normal; where both count, their disagreement does, too."""
+    ct = np.full(len(weight), settings.sigma_ct_m**2)
+    if settings.alignment_covariance is not None:
+        normals = vertex_normals(carrier)
+        J = np.einsum("ni,nik->nk", normals, place_jacobian(carrier.vertices_m))
+        ct += np.einsum("nk,kl,nl->n", J, settings.alignment_covariance, J)
+    between = (weight * (1 - weight) * gap) ** 2
+    return np.sqrt((weight * settings.sigma_scan_m) ** 2 + (1 - weight) ** 2 * ct + between)
+
+
+def _without_specks(ct: Surface, least_m2: float) -> Surface:
+    """The CT without small unconnected parts (noise) and without vertices that no face has."""
+    if not ct.is_mesh:
+        raise ComputeError("fusion needs a mesh of the CT", remedy="Extract its surface first")
+    labels = components(ct, np.ones(len(ct.vertices_m), dtype=np.bool_))
+    part = labels[ct.faces[:, 0]]
+    area = np.bincount(part, np.linalg.norm(ct.area_vectors_m2, axis=1))
+    return compact(ct.vertices_m, ct.faces[area[part] >= least_m2])[0]
+
+
+def compact(vertices: Array, faces: IntArray) -> tuple[Surface, IntArray]:
+    """The mesh without vertices that no face has, and the former index (V,) of each that is left."""
+    kept, index = np.unique(faces, return_inverse=True)
+    return Surface(vertices[kept], index.reshape(-1, 3)), kept
+
+
+def _with_scan_only(fused: Fused, carrier: Surface, scan: Surface, settings: FusionSettings) -> Fused:
+    """With the faces of the scan that are far from the CT, as parts of their own."""
+    far_m = 2 * settings.overlap.distance_m
+    far = PointIndex(carrier.vertices_m).nearest(scan.vertices_m)[0] > far_m
+    extra, _ = compact(scan.vertices_m, scan.faces[far[scan.faces].all(axis=1)])
+    n = len(extra.vertices_m)
+    if n == 0:
+        return fused
+    return Fused(
+        Surface(
+            np.concatenate([fused.surface.vertices_m, extra.vertices_m]),
+            np.concatenate([fused.surface.faces, extra.faces + len(fused.surface.vertices_m)]),
+        ),
+        np.concatenate([fused.source, np.full(n, Source.SCAN, dtype=np.uint8)]),
+        np.concatenate([fused.weight, np.ones(n)]),
+        np.concatenate([fused.sigma_m, np.full(n, settings.sigma_scan_m)]),
+        np.concatenate([fused.wound, np.zeros(n, dtype=np.bool_)]),
+        fused.ct_offset_m,
+        fused.ct_spread_m,
+        fused.folded,
+        fused.corrections,
+    )

@@ -1,0 +1,175 @@
+"""Where a scan covers the surface of a CT well enough to replace it, and which part of the rest is a wound."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from service.compute.ground_truth.distances.neighbours import PointIndex
+from service.compute.ground_truth.distances.triangle_tree import TriangleTree
+from service.compute.ground_truth.surface import IntArray, Surface
+from service.core.errors import ComputeError
+from service.core.geometry import Array
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class OverlapLimits:
+    """When the scan stands for the CT's surface; metres.
+
+    Attributes:
+        distance_m: largest distance between the two; beyond, they show different surfaces.
+        cosine: least cosine between their normals.
+        rim_m: width of the strip along the scan's holes and ends that is not used: there it was seen at a grazing
+            angle.
+    """
+
+    distance_m: float = 0.0015
+    cosine: float = 0.5
+    rim_m: float = 0.001
+
+
+@dataclass(frozen=True, slots=True)
+class Overlap:
+    """For each vertex of the CT (V,): the nearest place of the scan (V, 3), and whether the scan is good there.
+
+    Attributes:
+        nearest_m: (V, 3).
+        offset_m: (V,) height of the CT above the scan there, along the CT's outward normal.
+        covered: (V,).
+    """
+
+    nearest_m: Array = field(repr=False)
+    offset_m: Array = field(repr=False)
+    covered: Mask = field(repr=False)
+
+
+def overlap(ct: Surface, scan: Surface, limits: OverlapLimits | None = None) -> Overlap:
+    """Compare a CT mesh with a scan, both in one frame, with outward faces."""
+    bounds = limits or OverlapLimits()
+    used = np.unique(scan.faces)
+    rough = PointIndex(scan.vertices_m[used]).nearest(ct.vertices_m)[0]
+    near = rough <= bounds.distance_m + _longest_edge(scan)
+    found = TriangleTree(scan).nearest(ct.vertices_m[near], rough[near])
+    normals = vertex_normals(ct)
+    nearest, covered, offset = ct.vertices_m.copy(), near.copy(), np.full(len(near), np.inf)
+    nearest[near] = found.points_m
+    offset[near] = np.einsum("ni,ni->n", ct.vertices_m[near] - found.points_m, normals[near])
+    covered[near] = (found.distance_m <= bounds.distance_m) & (
+        np.einsum("ni,ni->n", normals[near], scan.face_normals[found.faces]) >= bounds.cosine
+    )
+    rim = rim_vertices(scan)
+    if len(rim):
+        index = np.flatnonzero(covered)
+        away = PointIndex(scan.vertices_m[rim]).nearest(nearest[index])[0]
+        covered[index[away < bounds.rim_m]] = False
+    return Overlap(nearest, offset, covered)
+
+
+@dataclass(frozen=True, slots=True)
+class WoundLimits:
+    """What counts as a wound.
+
+    Attributes:
+        closing_m: uncovered places nearer than twice this to one another are one, with what lies between.
+        least_area_m2: of the surface.
+        least_depth_m: mean depth below the rim.
+        least_facing: mean cosine between its normals and up, so that undersides and sides are none.
+    """
+
+    closing_m: float = 0.003
+    least_area_m2: float = 5e-5
+    least_depth_m: float = 0.002
+    least_facing: float = 0.2
+
+
+def propose_wound(ct: Surface, covered: Mask, up: Array, limits: WoundLimits | None = None) -> Mask:
+    """(V,) vertices of the CT in hollows that open upwards and that the scan lacks; all False if there are none.
+
+    Args:
+        ct: the CT's mesh.
+        covered: (V,) `Overlap.covered`.
+        up: (3,) direction away from the table.
+    """
+    bounds = limits or WoundLimits()
+    lacking = _closed(ct.vertices_m, ~covered, bounds.closing_m)
+    labels = components(ct, lacking)
+    wound = np.zeros(len(lacking), dtype=np.bool_)
+    if not lacking.any():
+        return wound
+    height = ct.vertices_m @ (up / np.linalg.norm(up))
+    vectors = np.repeat(ct.area_vectors_m2 / 3, 3, axis=0)
+    corner = ct.faces.ravel()
+    size = np.bincount(corner, np.linalg.norm(vectors, axis=1), len(lacking))
+    facing = np.bincount(corner, vectors @ (up / np.linalg.norm(up)), len(lacking))
+    rim = np.zeros(len(lacking), dtype=np.bool_)
+    crossing = lacking[ct.faces].any(axis=1) & ~lacking[ct.faces].all(axis=1)
+    rim[ct.faces[crossing].ravel()] = True
+    rim &= lacking
+    n = int(labels.max()) + 1
+    which = labels[lacking]
+    area = np.bincount(which, size[lacking], n)
+    level = np.bincount(which, (size * height)[lacking], n) / np.maximum(area, 1e-300)
+    on_rim = np.bincount(labels[rim], minlength=n)
+    edge = np.bincount(labels[rim], height[rim], n) / np.maximum(on_rim, 1)
+    hollow = (area >= bounds.least_area_m2) & (edge - level >= bounds.least_depth_m) & (on_rim > 0)
+    hollow &= np.bincount(which, facing[lacking], n) >= bounds.least_facing * area
+    wound[lacking] = hollow[which]
+    return wound
+
+
+def components(surface: Surface, chosen: Mask) -> IntArray:
+    """(V,) number of the connected part that each chosen vertex is in; -1 for the others."""
+    index = np.full(len(chosen), -1, dtype=np.int64)
+    index[chosen] = np.arange(int(chosen.sum()))
+    faces = index[surface.faces]
+    a = np.concatenate([faces[:, 0], faces[:, 1], faces[:, 2]])
+    b = np.concatenate([faces[:, 1], faces[:, 2], faces[:, 0]])
+    both = (a >= 0) & (b >= 0)
+    n = int(chosen.sum())
+    graph = coo_matrix((np.ones(int(both.sum()), dtype=np.int8), (a[both], b[both])), shape=(n, n))
+    out = np.full(len(chosen), -1, dtype=np.int64)
+    out[chosen] = connected_components(graph, directed=False)[1]
+    return out
+
+
+def rim_vertices(surface: Surface) -> IntArray:
+    """(K,) vertices on edges that only one face has."""
+    f, n = surface.faces, len(surface.vertices_m)
+    ends = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
+    keys, counts = np.unique(ends[:, 0] * n + ends[:, 1], return_counts=True)
+    alone = keys[counts == 1]
+    return np.unique(np.concatenate([alone // n, alone % n]))
+
+
+def vertex_normals(surface: Surface) -> Array:
+    """(V, 3) area-weighted unit normals; zero for vertices without faces."""
+    corner = surface.faces.ravel()
+    vectors = np.repeat(surface.area_vectors_m2, 3, axis=0)
+    total = np.stack([np.bincount(corner, vectors[:, k], len(surface.vertices_m)) for k in range(3)], axis=1)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+
+
+def distance_to(points: Array, chosen: Mask) -> Array:
+    """(N,) distance from each point (N, 3) to the nearest chosen one; infinite if none is chosen."""
+    if not chosen.any():
+        return np.full(len(points), np.inf)
+    return PointIndex(points[chosen]).nearest(points)[0]
+
+
+def _closed(points: Array, chosen: Mask, radius: float) -> Mask:
+    """Grown and shrunk by a radius, so that gaps and islands between chosen points are chosen, too."""
+    grown = distance_to(points, chosen) <= radius
+    return chosen | (distance_to(points, ~grown) > radius)
+
+
+def _longest_edge(surface: Surface) -> float:
+    if not surface.is_mesh:
+        raise ComputeError("fusion needs meshes, not point clouds", remedy="Export the scan with faces")
+    p = surface.vertices_m[surface.faces]
+    return float(np.sqrt(np.max(np.sum((p - np.roll(p, 1, axis=1)) ** 2, axis=2))))

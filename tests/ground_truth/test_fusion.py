@@ -1,0 +1,209 @@
+"""Fusion of CT and scan: accuracy against a known surface, the seam, sources, corrections, and the frames' checks."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from service.compute.ground_truth.frames import close_transforms, distance_changes
+from service.compute.ground_truth.fusion.cut_out import Markers, without_markers
+from service.compute.ground_truth.fusion.fuse import Fused, FusionSettings, Source, fuse
+from service.compute.ground_truth.fusion.overlap import rim_vertices
+from service.compute.ground_truth.fusion.regions import Box, Correction, Prism, corrected, outline
+from service.compute.ground_truth.surface import IntArray, Surface
+from service.core.errors import ComputeError, DataError
+from service.core.geometry import Array, transform
+
+UP = np.array([0.0, 0.0, 1.0])
+HALF_M = (0.030, 0.025)
+WOUND_M = 0.010  # half width of the hollow that the scanner does not see into
+BIAS_M, CT_NOISE_M, SCAN_NOISE_M = 1.0e-4, 4e-5, 5e-5
+
+
+def height(x: Array, y: Array) -> Array:
+    """The true surface: gentle hills, and a hollow 12 mm deep."""
+    hills = 0.0015 * np.sin(x / 0.008) * np.cos(y / 0.007)
+    return 0.03 + hills - 0.012 * np.exp(-(((x**2 + y**2) / WOUND_M**2) ** 2))
+
+
+def grid(spacing_m: float) -> tuple[Array, Array, IntArray]:
+    x, y = np.meshgrid(*(np.linspace(-half, half, round(2 * half / spacing_m) + 1) for half in HALF_M), indexing="ij")
+    index = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = index[:-1, :-1].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel(), index[:-1, 1:].ravel()
+    return x.ravel(), y.ravel(), np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+
+
+def ct_mesh(noise_m: float = 0.0) -> Surface:
+    """A closed block whose top is the surface, everywhere too high by BIAS_M."""
+    x, y, faces = grid(5e-4)
+    z = height(x, y) + BIAS_M + np.random.default_rng(1).normal(0, noise_m, len(x))
+    n = len(x)
+    ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    keys, counts = np.unique(ends[:, 0] * n + ends[:, 1], return_counts=True)
+    rim = {tuple(sorted((int(k) // n, int(k) % n))) for k in keys[counts == 1]}
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    side = np.array([e for e in directed.tolist() if tuple(sorted(e)) in rim])
+    p, q = side.T
+    walls = np.concatenate([np.stack([p, p + n, q], axis=1), np.stack([q, p + n, q + n], axis=1)])
+    vertices = np.concatenate([np.stack([x, y, z], axis=1), np.stack([x, y, np.zeros(n)], axis=1)])
+    return Surface(vertices, np.concatenate([faces, faces[:, ::-1] + n, walls]))
+
+
+def scan_mesh(noise_m: float = 0.0) -> Surface:
+    """The surface without the hollow, in a grid of its own."""
+    x, y, faces = grid(4e-4)
+    seen = np.hypot(x, y) > WOUND_M
+    z = height(x, y) + np.random.default_rng(2).normal(0, noise_m, len(x))
+    return Surface(np.stack([x, y, z], axis=1), faces[seen[faces].all(axis=1)])
+
+
+@cache
+def fused(ct_noise_m: float = 0.0, scan_noise_m: float = 0.0) -> Fused:
+    return fuse(ct_mesh(ct_noise_m), scan_mesh(scan_noise_m), UP)
+
+
+def top_error(of: Fused) -> tuple[IntArray, Array]:
+    """Indices of the vertices on top, away from the block's edges, and how far each is above the truth."""
+    p = of.surface.vertices_m
+    top = np.flatnonzero((p[:, 2] > 0.01) & np.all(np.abs(p[:, :2]) < np.array(HALF_M) - 0.006, axis=1))
+    x, y, z = p[top].T
+    step = 1e-6
+    slope = np.hypot(
+        (height(x + step, y) - height(x - step, y)) / (2 * step),
+        (height(x, y + step) - height(x, y - step)) / (2 * step),
+    )
+    return top, (z - height(x, y)) / np.sqrt(1 + slope**2)
+
+
+def test_the_fused_mesh_is_within_a_tenth_of_a_millimetre_and_the_scans_part_within_its_noise() -> None:
+    result = fused(CT_NOISE_M, SCAN_NOISE_M)
+    top, error = top_error(result)
+    assert np.sqrt(np.mean(error**2)) <= 1e-4
+    of_scan = error[result.source[top] == Source.SCAN]
+    assert len(of_scan) > 0.3 * len(top)
+    assert np.sqrt(np.mean(of_scan**2)) <= 6e-5
+    assert result.ct_offset_m == pytest.approx(BIAS_M, abs=2e-5)
+    assert result.ct_spread_m == pytest.approx(np.hypot(CT_NOISE_M, 0.6 * SCAN_NOISE_M), rel=0.35)
+
+
+def test_there_is_no_step_at_the_seam() -> None:
+    result = fused()
+    top, error = top_error(result)
+    above = np.full(len(result.surface.vertices_m), np.nan)
+    above[top] = error
+    edges = np.concatenate([result.surface.faces[:, [0, 1]], result.surface.faces[:, [1, 2]]])
+    jump = np.abs(above[edges[:, 0]] - above[edges[:, 1]])
+    assert np.nanmax(jump) <= 5e-5
+    assert np.ptp(error) > 0.8 * BIAS_M  # there is something to blend
+    assert result.folded == 0
+
+
+def test_the_ct_is_in_the_wound_the_scan_outside_and_the_mesh_closed() -> None:
+    result = fused(CT_NOISE_M, SCAN_NOISE_M)
+    p = result.surface.vertices_m
+    away = np.hypot(p[:, 0], p[:, 1])
+    top, _ = top_error(result)
+    assert np.all(result.source[top][away[top] < WOUND_M - 5e-4] == Source.CT)
+    assert np.all(result.source[top][away[top] > WOUND_M + 0.0065] == Source.SCAN)
+    assert np.any(result.source[top] == Source.BLEND)
+    assert np.all(result.wound[top][away[top] < WOUND_M - 1e-3])
+    assert not np.any(result.wound[p[:, 2] < 0.001])  # the underside lacks the scan, too, but is no wound
+    assert trimesh.Trimesh(p, result.surface.faces, process=False).is_watertight
+    assert len(rim_vertices(result.surface)) == 0
+
+
+def test_sigma_is_each_sources_and_includes_the_alignment() -> None:
+    result = fused()
+    assert np.all(result.sigma_m[result.source == Source.SCAN] == pytest.approx(5e-5))
+    assert np.all(result.sigma_m[result.source == Source.CT] == pytest.approx(1e-4))
+    covariance = np.diag([0, 0, 4e-8, 0, 0, 0])  # 0.2 mm along z
+    aligned = fuse(ct_mesh(), scan_mesh(), UP, FusionSettings(alignment_covariance=covariance))
+    bottom = aligned.surface.vertices_m[:, 2] < 1e-6
+    inner = bottom & np.all(np.abs(aligned.surface.vertices_m[:, :2]) < 0.02, axis=1)
+    assert aligned.sigma_m[inner] == pytest.approx(np.hypot(1e-4, 2e-4))
+
+
+def test_a_person_overrules_the_proposal() -> None:
+    elsewhere = Box(transform(np.eye(3), np.array([0.018, 0.015, 0.03])), np.array([0.006, 0.006, 0.02]))
+    drawn = (Correction(elsewhere, from_ct=True, by="A. Surgeon"),)
+    result = fuse(ct_mesh(), scan_mesh(), UP, corrections=drawn)
+    within = Box(elsewhere.T_world_box, elsewhere.size_m - 4e-4)  # at the box's faces the blend begins
+    inside = within.contains(result.surface.vertices_m)
+    assert np.all(result.source[inside] == Source.CT)
+    assert np.all(result.wound[inside])
+    assert result.corrections == drawn
+    mask = corrected(np.ones(1, dtype=bool), np.zeros((1, 3)), [Correction(elsewhere, False, "A. Surgeon")])
+    assert mask.all()  # outside the box nothing changes
+
+
+def test_what_only_the_scan_shows_is_kept_as_a_part_of_its_own() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.004)
+    scan = scan_mesh()
+    more = Surface(
+        np.concatenate([scan.vertices_m, np.add(ball.vertices, [0.0, 0.0, 0.06])]),
+        np.concatenate([scan.faces, np.array(ball.faces) + len(scan.vertices_m)]),
+    )
+    result = fuse(ct_mesh(), more, UP)
+    added = result.surface.vertices_m[:, 2] > 0.05
+    assert added.sum() == len(ball.vertices)
+    assert np.all(result.source[added] == Source.SCAN)
+    markers = Markers(np.array([[0.0, 0.0, 0.06]]), 0.004, UP, post_radius_m=0.003, post_length_m=0.04)
+    cut = without_markers(result, markers)
+    assert not np.any(markers.near(cut.surface.vertices_m))
+    assert np.min(np.hypot(*cut.surface.vertices_m[cut.surface.vertices_m[:, 2] > 0.025, :2].T)) > 0.005
+    assert len(cut.sigma_m) == len(cut.source) == len(cut.surface.vertices_m) < len(result.sigma_m)
+
+
+def test_surfaces_in_different_frames_are_refused() -> None:
+    with pytest.raises(ComputeError, match="nowhere agree"):
+        fuse(ct_mesh(), scan_mesh().moved(transform(np.eye(3), np.array([0.0, 0.0, 0.5]))), UP)
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_a_prism_holds_what_lies_in_its_outline(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(0, 0.02, (50, 3))
+    prism = outline(points, rng.normal(size=3))
+    middle, (low, high) = prism.polygon_m.mean(axis=0), prism.depth_m
+    larger = Prism(prism.T_world_plane, middle + 1.001 * (prism.polygon_m - middle), (low - 1e-6, high + 1e-6))
+    assert larger.contains(points).all()
+    assert not larger.contains(points + 1.0).any()
+    with pytest.raises(DataError):
+        Prism(np.eye(4), np.zeros((2, 2)), (0.0, 1.0))
+
+
+@given(vector=st.tuples(*[st.floats(-2, 2)] * 3), shift_mm=st.floats(0.0, 3.0))
+@settings(max_examples=20, deadline=None)
+def test_the_loop_closes_by_what_one_way_is_off(vector: tuple[float, float, float], shift_mm: float) -> None:
+    T_world_scan = transform(Rotation.from_rotvec(vector), np.array([0.1, 0.2, 0.3]))
+    T_scan_ct = transform(Rotation.from_rotvec([0.3, -0.2, 1.0]), np.array([-0.2, 0.0, 0.1]))
+    off = transform(np.eye(3), np.array([1e-3 * shift_mm, 0.0, 0.0]))
+    points = np.random.default_rng(0).normal(0, 0.1, (8, 3))
+    loop = close_transforms(T_scan_ct, T_world_scan, T_world_scan @ off @ T_scan_ct, points)
+    assert loop.rms_m == pytest.approx(1e-3 * shift_mm, abs=1e-12)
+    assert loop.worst_m == pytest.approx(1e-3 * shift_mm, abs=1e-12)
+    assert loop.rotation_rad == pytest.approx(0.0, abs=1e-7)
+
+
+def test_a_sphere_that_moved_in_transport_changes_its_distances_only() -> None:
+    before = np.random.default_rng(4).normal(0, 0.1, (6, 3))
+    after = before[::-1].copy() @ Rotation.from_rotvec([0.1, 0.5, -0.3]).as_matrix().T + 0.3
+    pairs = [(i, 5 - i) for i in range(6)]
+    assert distance_changes(before, after, pairs).worst_m == pytest.approx(0.0, abs=1e-12)
+    moved = before.copy()
+    moved[2] += 4e-4 * (before[2] - before[0]) / np.linalg.norm(before[2] - before[0])
+    change = distance_changes(moved, after, pairs)
+    assert change.worst_m == pytest.approx(4e-4, abs=1e-9)
+    assert 2 in change.worst
+    assert change.rms_m < change.worst_m
+    still = [abs(c) for c, pair in zip(change.change_m, change.pairs, strict=True) if 2 not in pair]
+    assert max(still) < 1e-12
+    with pytest.raises(ComputeError, match="no distance"):
+        distance_changes(before, after, pairs[:1])
