@@ -37,6 +37,7 @@ _COMMANDS = {
     "audit": "service.cli.evidence.audit:audit_app",
     "store": "service.cli.evidence.store:store_app",
     "replay": "service.cli.evidence.replay:replay_command",
+    "export": "service.cli.evidence.export:export_command",
     "protocol": "service.cli.site.protocol:protocol_app",
     "plan": "service.cli.site.plan:plan_app",
 }

@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -60,10 +61,20 @@ def export_dataset(summary: RunSummary, folder: Path, not_in_yet: Sequence[str] 
     write_camera_json(folder / "camera.json", camera)
     write_poses_csv(folder / "poses.csv", poses)
     write_transforms_json(folder / "transforms.json", camera, {f"images/{name}": T for name, T in poses.items()})
-    later = summary.better_later()
     vertices_m, faces = summary.scan_mesh()
     trimesh.Trimesh(vertices_m, faces, process=False).export(folder / "mesh.ply")
     description = {
+        **described_run(summary, best, not_in_yet),
+        "poses": "poses.csv is T_scan_camera: x right, y down, z forward; transforms.json has OpenGL axes",
+        "image_sha256": sources,
+    }
+    (folder / "dataset.json").write_text(json.dumps(description, indent=1), encoding="utf-8")
+
+
+def described_run(summary: RunSummary, own: str, not_in_yet: Sequence[str]) -> dict[str, Any]:
+    """What `dataset.json` says of the run, as plain data; `own` is the name of its registration."""
+    later = summary.better_later()
+    return {
         "run": summary.run_id,
         "simulated": summary.root.simulated,
         "origin": summary.root.origin,
@@ -72,8 +83,7 @@ def export_dataset(summary: RunSummary, folder: Path, not_in_yet: Sequence[str] 
         "protocol_sha256": summary.root.protocol_sha256,
         "frame": "scan",
         "unit": "m",
-        "poses": "poses.csv is T_scan_camera: x right, y down, z forward; transforms.json has OpenGL axes",
-        "pose_source": best,
+        "pose_source": own,
         "evaluation": [row.plain() for row in summary.table()],
         "gates": _gates(summary),
         "gates_explained": BOUNDS_HOLD,
@@ -84,9 +94,7 @@ def export_dataset(summary: RunSummary, folder: Path, not_in_yet: Sequence[str] 
         "not_in_yet": list(not_in_yet),
         "deviations": [d.text for d in summary.state.deviations if not d.is_note],
         "head_of_chain_sha256": summary.events[-1].sha256,
-        "image_sha256": sources,
     }
-    (folder / "dataset.json").write_text(json.dumps(description, indent=1), encoding="utf-8")
 
 
 def _gates(summary: RunSummary) -> dict[str, list[str]]:

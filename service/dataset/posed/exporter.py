@@ -55,7 +55,14 @@ def exporter(name: str) -> Exporter:
     return known[name]
 
 
-def write_data_set(dataset: DataSet, how: Exporter, target: Path, *, personal: bool = True) -> None:
+def write_data_set(
+    dataset: DataSet,
+    how: Exporter,
+    target: Path,
+    *,
+    personal: bool = True,
+    leaving: Callable[[Path], None] = lambda _sums: None,
+) -> None:
     """Write a data set into a new folder, with `dataset.json`, `splits.json` and `SHA256SUMS` beside the format.
 
     Args:
@@ -63,13 +70,15 @@ def write_data_set(dataset: DataSet, how: Exporter, target: Path, *, personal: b
         how: the format.
         target: a new folder; it appears when it is whole.
         personal: False leaves GPS, owner and serial numbers out of resampled pictures.
+        leaving: called with the list of checksums when all is written, before the folder has its name.
 
     Raises:
         DataError: the target exists, the data set does not fit into the format, or a picture cannot be read.
         ConfigurationError: another process is writing the same export.
     """
     ready = undistorted_data_set(dataset, personal=personal) if how.pinhole else dataset
-    with export_folder(target, f"{how.name} 1 {ready.identity} {'' if personal else 'impersonal'}") as folder:
+    identity = f"{how.name} 1 {ready.identity} {'with' if personal else 'without'} personal data"
+    with export_folder(target, identity, leaving) as folder:
         how.write(ready, folder)
         folder.json("dataset.json", {"format": how.name, "simulated": dataset.simulated, **dataset.statement})
         folder.json("splits.json", {"simulated": dataset.simulated, **ready.splits.named()})

@@ -76,7 +76,9 @@ class ExportFolder:
 
 
 @contextlib.contextmanager
-def export_folder(target: Path, identity: str) -> Generator[ExportFolder]:
+def export_folder(
+    target: Path, identity: str, leaving: Callable[[Path], None] = lambda _sums: None
+) -> Generator[ExportFolder]:
     """A folder that appears at `target` when the block ends without an error.
 
     Until then it is `.NAME.part` beside it. After an interruption the same export goes on with the files that are
@@ -85,6 +87,7 @@ def export_folder(target: Path, identity: str) -> Generator[ExportFolder]:
     Args:
         target: a new folder in an existing one.
         identity: of what is exported, and how.
+        leaving: called with the list of checksums when all is written, before the folder has its name.
 
     Raises:
         DataError: the target exists, its parent does not, or something else has the name of the unfinished folder.
@@ -114,6 +117,7 @@ def export_folder(target: Path, identity: str) -> Generator[ExportFolder]:
         folder = ExportFolder(root)
         yield folder
         folder.close()
+        leaving(root / SUMS)
         root.replace(target)
         about.unlink()
     _sync(target.parent)

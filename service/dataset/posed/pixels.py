@@ -153,7 +153,9 @@ class Cropped:
 
 
 def undistorted_data_set(dataset: DataSet, *, personal: bool = True) -> DataSet:
-    """The same views with pinhole cameras (`pinhole_of`) and resampled pictures."""
+    """The same views with pinhole cameras (`pinhole_of`) and resampled pictures; unchanged if none is distorted."""
+    if not any(view.camera.distortion.any() for view in dataset.views):
+        return dataset
     views = tuple(dataclasses.replace(view, camera=pinhole_of(view.camera)) for view in dataset.views)
     pixels = Undistorted(dataset, personal=personal)
     return dataclasses.replace(dataset, identity=f"{dataset.identity} undistorted", views=views, pixels=pixels)

@@ -1,0 +1,165 @@
+"""The posed data set of a finished run, from its record."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from service.compute.camera_model import CameraModel
+from service.compute.pixels.masks import Ball, hull_mask, posts_below
+from service.compute.pixels.splits import splits
+from service.compute.pixels.surface import Surface
+from service.core.errors import DataError
+from service.core.geometry import Array, Transform, apply, inverse, skew
+from service.core.picture_files import PNG_BEGINS
+from service.core.units import metres
+from service.dataset.export import described_run
+from service.dataset.posed.pixels import Photographs
+from service.dataset.posed.records import DataSet, Mesh, Pixels, View
+from service.dataset.summary import RunSummary
+from service.jobs.registration.register import Registration
+
+_POINTS = 2000  # of the mesh, by which the sparse views are chosen
+_CANDIDATES = 300  # faces whose normals are tried as the board's
+_WITHIN, _LEVEL = 0.7, 0.996  # cosines: of the board from the cameras' direction, of level faces from the board
+_LEAST_LEVEL = 0.05  # share of the surface that must be level
+
+
+def data_set_of(summary: RunSummary, not_in_yet: Sequence[str] = (), *, personal: bool = True) -> DataSet:
+    """Images, poses and mesh of a run in the frame of its scan, which is the data set's `world`.
+
+    The poses are those of the run's own registration, with the camera that it was made with. Images with control
+    spheres are left out: these were taken away before the scan. A pose's covariance is that of the registration,
+    which is common to all images.
+
+    Args:
+        summary: the run.
+        not_in_yet: results that have not arrived yet, in words.
+        personal: False leaves GPS, owner and serial numbers out of the pictures.
+
+    Raises:
+        DataError: the run has no evaluated registration, no scan, or no registered image.
+    """
+    own = summary.best()
+    spheres = summary.result("scan_import").get("spheres_m")
+    if own is None or spheres is None:
+        raise DataError("the run has no evaluated registration", where=summary.run_id, remedy="Finish the run first")
+    registered = summary.registrations()[own]
+    files = _photographs(summary, registered)
+    if not files:
+        raise DataError(
+            "no image of the data set is registered", where=summary.run_id, remedy="Repeat the registration"
+        )
+    vertices_m, faces = summary.scan_mesh()
+    mesh = Mesh(np.asarray(vertices_m, dtype=np.float64), np.asarray(faces, dtype=np.int64))
+    views = tuple(_view(name, path, registered) for name, (path, _) in sorted(files.items()))
+    simulated = summary.root.simulated
+    pixels = _pixels(summary, views, mesh, {name: path for name, (path, _) in files.items()}, personal)
+    hashes = {view.file: files[view.name][1] for view in views}
+    return DataSet(
+        identity=_identity(summary, own, hashes),
+        simulated=simulated,
+        statement={**described_run(summary, own, not_in_yet), "image_sha256": hashes},
+        views=views,
+        pixels=pixels,
+        mesh=mesh,
+        splits=splits({view.name: _sees(view, mesh) for view in views}),
+    )
+
+
+def specimen_pixels(summary: RunSummary, view: View) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """(H, W) pixels between the spheres, which stand around the specimen."""
+    return hull_mask(view.camera, view.T_world_camera, np.array(summary.result("scan_import")["spheres_m"]))
+
+
+def _photographs(summary: RunSummary, registered: Registration) -> dict[str, tuple[Path, str]]:
+    """File and hash of each registered image, by viewpoint."""
+    found: dict[str, tuple[Path, str]] = {}
+    for capture in summary.captures():
+        photograph = capture.artefacts[0]
+        if capture.viewpoint in registered.T_scan_camera and photograph.kind == "image":
+            path = summary.store.artefact_path(photograph.sha256)
+            found[capture.viewpoint] = (path, photograph.sha256)
+    return found
+
+
+def _view(name: str, path: Path, registered: Registration) -> View:
+    with path.open("rb") as file:
+        suffix = ".png" if file.read(len(PNG_BEGINS)) == PNG_BEGINS else ".jpg"
+    camera = CameraModel.from_record((registered.full_camera or registered.camera).model_dump())
+    T_scan_camera = np.array(registered.T_scan_camera[name])
+    covariance = pose_covariance(np.array(registered.T_world_scan), np.array(registered.covariance), T_scan_camera)
+    return View(name, suffix, camera, T_scan_camera, covariance)
+
+
+def pose_covariance(T_world_scan: Transform, covariance: Array, T_scan_camera: Transform) -> Array:
+    """(6, 6) covariance of T_scan_camera that the covariance (6 or 7, …) of T_world_scan causes.
+
+    T_scan_camera = T_world_scan^-1 T_world_camera with the camera held: with R of T_world_scan and the vector a from
+    its origin to the camera, in the world's axes, d_scan = R^T (a x w - d) and w_scan = -R^T w.
+    """
+    R = T_world_scan[:3, :3]
+    J = np.zeros((6, 6))
+    J[:3, :3], J[3:, 3:] = -R.T, -R.T
+    J[:3, 3:] = R.T @ skew(R @ T_scan_camera[:3, 3])
+    return J @ covariance[:6, :6] @ J.T
+
+
+def _pixels(summary: RunSummary, views: Sequence[View], mesh: Mesh, files: dict[str, Path], personal: bool) -> Pixels:
+    radius_m = metres(summary.protocol.spheres.radius_mm)
+    balls = tuple(Ball(np.array(centre), radius_m) for centre in summary.result("scan_import")["spheres_m"])
+    up = upwards(mesh, np.mean([v.T_world_camera[:3, 3] for v in views], axis=0) - np.mean(mesh.vertices_m, axis=0))
+    height = mesh.vertices_m @ up
+    # A post is not recorded; it stands below its sphere, is thinner, and ends on the board.
+    posts = tuple(
+        post
+        for ball in balls
+        for post in posts_below([ball], up, max(radius_m, float(ball.centre_m @ up - height.min())), radius_m)
+    )
+    mark = "SIMULATED" if summary.root.simulated else ""
+    return Photographs(files, Surface(mesh.vertices_m, mesh.faces), balls, posts, personal=personal, mark=mark)
+
+
+def upwards(mesh: Mesh, about: Array) -> Array:
+    """Unit normal (3,) of the board: the direction, within 45° of `about`, to which most of the surface is level.
+
+    Where no direction has a twentieth of the surface, `about` itself.
+    """
+    a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
+    vector = np.cross(b - a, c - a)
+    area = np.linalg.norm(vector, axis=1)
+    normal = vector / np.maximum(area, 1e-300)[:, None]
+    up = about / np.linalg.norm(about)
+    normal *= np.where(normal @ up < 0, -1.0, 1.0)[:, None]  # of a scan, faces may turn either way
+    candidates = normal[:: max(1, len(normal) // _CANDIDATES)]
+    candidates = candidates[candidates @ up > _WITHIN]
+    if not len(candidates):
+        return up
+    level = np.array([area[normal @ candidate > _LEVEL].sum() for candidate in candidates])
+    best = int(level.argmax())
+    if level[best] < _LEAST_LEVEL * area.sum():
+        return up
+    mean = (area[:, None] * normal)[normal @ candidates[best] > _LEVEL].sum(axis=0)
+    return mean / np.linalg.norm(mean)
+
+
+def _sees(view: View, mesh: Mesh) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Which of some vertices of the mesh are within the image."""
+    points = mesh.vertices_m[:: max(1, len(mesh.vertices_m) // _POINTS)]
+    camera = view.camera
+    before = apply(inverse(view.T_world_camera), points)
+    with np.errstate(all="ignore"):
+        pixels = camera.project(before)
+    inside = (pixels > -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)
+    return inside[:, 0] & inside[:, 1] & (before[:, 2] > 0)
+
+
+def _identity(summary: RunSummary, own: str, hashes: dict[str, str]) -> str:
+    registered = summary.registrations()[own].model_dump(mode="json")
+    scan = summary.artefacts("scan_mesh")[-1].sha256
+    inputs = json.dumps([own, registered, hashes, scan], sort_keys=True)
+    return f"{summary.run_id} {hashlib.sha256(inputs.encode()).hexdigest()}"
