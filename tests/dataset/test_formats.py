@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -276,6 +277,18 @@ def test_the_loader_of_hdf5_needs_only_numpy_and_h5py(dataset: DataSet, tmp_path
         [sys.executable, "-c", script], cwd=folder, env={}, capture_output=True, text=True, check=True
     )
     assert done.stdout.split() == [str(len(dataset.views)), "False"]
+
+
+def test_the_ten_lines_of_the_documents_project_the_mesh_into_the_image(dataset: DataSet, tmp_path: Path) -> None:
+    folder = written(dataset, "hdf5", tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "data_set.md").read_text(encoding="utf-8")
+    (snippet,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    script = snippet + "np.savez('found.npz', pixels=pixels, shown=shown)\n"
+    subprocess.run([sys.executable, "-c", script], cwd=folder, env={}, check=True)
+    with np.load(folder / "found.npz") as found:
+        assert np.abs(found["pixels"] - truth_px(dataset.views[0])).max() < 0.01
+        assert found["shown"].any()
+        assert not found["shown"].all()  # some corners are behind the solid
 
 
 def test_hdf5_holds_image_depth_and_pose(dataset: DataSet, tmp_path: Path) -> None:
