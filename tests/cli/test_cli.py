@@ -28,7 +28,7 @@ COMMAND = Path(sys.executable).with_name("orthocapture")
 COMMANDS = (
     "demo", "serve", "run", "resume", "import", "act", "note", "status", "runs", "compare", "history", "worker",
     "doctor", "calibrate", "sfm", "register", "spheres", "layout", "evaluate", "simulate", "audit", "store", "replay",
-    "protocol", "plan",
+    "export", "protocol", "plan",
 )  # fmt: skip
 
 
