@@ -414,10 +414,6 @@ class Lightbox(Device, Protocol):
         """Return the current light level, temperature and relay state."""
         ...
 
-    def set_shutter_relay(self, closed: bool) -> None:
-        """Close or open the shutter relay."""
-        ...
-
     def pedal_presses(self) -> int:
         """Return the number of pedal presses since the box started; an increase means a new press."""
         ...

@@ -99,15 +99,6 @@ class SerialLightbox:
             monotonic_s=time.monotonic(),
         )
 
-    def set_shutter_relay(self, closed: bool) -> None:
-        """Switch the shutter relay. Raises DeviceFaultError if the box then reports another state."""
-        if self._ask(f"SHUTTER {int(closed)}", "SHUTTER") != str(int(closed)):
-            raise DeviceFaultError(
-                "the shutter relay did not switch",
-                where=self._config.port,
-                remedy="Check the relay and its supply, then try again",
-            )
-
     def pedal_presses(self) -> int:
         """Return the number of pedal presses since the box was powered up."""
         return int(self._number("PEDAL"))

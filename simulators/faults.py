@@ -70,10 +70,6 @@ class FaultPlan:
         """Return the plan as JSON that parse() reads; counters are not included."""
         return _FAULTS.dump_json(self.faults).decode()
 
-    def for_device(self, *devices: str) -> FaultPlan:
-        """Return a new plan with the faults of these devices only."""
-        return FaultPlan(tuple(fault for fault in self.faults if fault.device in devices))
-
     def check(self, device: str, message: str) -> Fault | None:
         """Count this message and return the fault that is due for it, or None."""
         with self._lock:

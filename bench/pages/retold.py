@@ -119,8 +119,11 @@ def _tell(
             version=payload.version,
         )
         jobs.keys[payload.job] = payload.idempotency_key
-        jobs.names[payload.job] = store.enqueue_job(run_id, job, actor=actor).job_id
-        return store.events(run_id, store.head(run_id) - 1)[-1].sha256
+        store.record(run_id, [], actor=actor, jobs=[job])
+        enqueued = store.events(run_id, store.head(run_id) - 1)[-1]
+        assert isinstance(enqueued.payload, JobEnqueued)
+        jobs.names[payload.job] = enqueued.payload.job
+        return enqueued.sha256
     if isinstance(payload, JobFinished):
         finished = store.finish_job(
             jobs.claim(payload),

@@ -29,7 +29,6 @@ from service.core.geometry import Array, Transform, apply, inverse, look_at, tra
 from simulators.scene.world import RADIUS_M, Scene
 
 SOURCES = ("true", "disturbed", "smooth", "robot")
-CENTRE_M = np.array([0.0, 0.0, 0.05])
 SFM_NOISE = (3e-5 / np.sqrt(3), np.radians(0.003) / np.sqrt(3))  # per coordinate: 0.03 mm and 0.003° in total
 ARM_NOISE = (4e-4, 4e-4)
 

@@ -334,15 +334,6 @@ class Store:
         with self._database.reading() as connection:
             return queue.started(connection, run_id)
 
-    def enqueue_job(self, run_id: str, job: NewJob, *, actor: str) -> Job:
-        """Enqueue a job, or return the existing job with its key."""
-        self.record(run_id, [], actor=actor, jobs=[job])
-        with self._database.reading() as connection:
-            found = queue.find_by_key(connection, run_id, job.idempotency_key)
-        if found is None:
-            raise IntegrityError(f"the job just enqueued is not there: {job.idempotency_key}", where=run_id)
-        return found
-
     def open_jobs(self, run_id: str | None = None, *, lane: Lane | None = None) -> int:
         """Number of jobs of a run, or of all runs, that are queued or being computed.
 

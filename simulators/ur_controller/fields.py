@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 Version = tuple[int, int]
-BEGINNING: Version = (0, 0)
 NEVER: Version = (99, 0)
 
 VECTORS_6: tuple[str, ...] = (

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 
 REQUEST_PROTOCOL_VERSION = ord("V")
 GET_CONTROL_VERSION = ord("v")
-TEXT_MESSAGE = ord("M")
 DATA_PACKAGE = ord("U")
 SETUP_OUTPUTS = ord("O")
 SETUP_INPUTS = ord("I")

@@ -19,6 +19,7 @@ from service.store.records import NewJob
 from service.web.record.board_images import board_uses
 from tests.support.pages.web import WebSite, web_site
 from tests.support.record.core import EYE
+from tests.support.record.store import enqueue
 from tests.support.runs.calibrated_run import PROTOCOL, RIG, begin_calibrated_run, capture
 
 REASON = "no board of 16 × 23 inner corners in the image (searched at widths [1200, 1920])"
@@ -47,7 +48,7 @@ def look(web: WebSite, run_id: str, name: str, shade: int, **result: Any) -> str
     """Record a board image and the worker's findings in it; returns the image's hash."""
     sha256 = capture(web, run_id, "calibration", name, EYE, kind="board_image", shade=shade)
     arguments = {"image": {"viewpoint": name, "sha256": sha256}}
-    web.store.enqueue_job(run_id, NewJob("board_view", "calibration", 1, name, arguments), actor="runner")
+    enqueue(web.store, run_id, NewJob("board_view", "calibration", 1, name, arguments), actor="runner")
     job = web.store.claim_job("worker", 60)
     assert job is not None
     seen = {"viewpoint": name, "size": [900, 600], **result}

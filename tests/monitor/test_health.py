@@ -15,6 +15,7 @@ from service.core.records.events import DeviceOpened, DeviceTrouble
 from service.monitor.snapshot import Snapshot, write_snapshot
 from service.store.records import NewJob
 from tests.support.pages.web import HOST, Browser, WebSite, web_site
+from tests.support.record.store import enqueue
 from tests.support.runs.bench_run import Bench
 
 
@@ -45,9 +46,9 @@ def scrape(site: WebSite) -> dict[str, dict[tuple[str, ...], float]]:
     return found
 
 
-def enqueue(site: WebSite, bench: Bench) -> None:
+def let_wait(site: WebSite, bench: Bench) -> None:
     job = NewJob("locate_spheres", "fixation", 1, "key", {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10})
-    site.store.enqueue_job(bench.run_id, job, actor="test")
+    enqueue(site.store, bench.run_id, job, actor="test")
 
 
 def test_a_healthy_site_says_so_to_anybody_and_nothing_more(site: WebSite) -> None:
@@ -60,7 +61,7 @@ def test_a_healthy_site_says_so_to_anybody_and_nothing_more(site: WebSite) -> No
 
 
 def test_a_job_without_a_worker_is_not_healthy_until_one_lives(site: WebSite) -> None:
-    enqueue(site, site.begin_run())
+    let_wait(site, site.begin_run())
     answer = site.browser().get("/health")
     assert (answer.status_code, answer.json()["worker"]["what"]) == (503, "1 jobs wait, and no worker is running")
     # In an empty folder beside it: the worker has nothing to do and stays alive.
@@ -102,7 +103,7 @@ def test_a_database_that_was_moved_away_is_not_healthy(site: WebSite) -> None:
 def test_the_figures_are_those_of_the_record(site: WebSite) -> None:
     site.record_run()
     bench = site.begin_run()
-    enqueue(site, bench)
+    let_wait(site, bench)
     report = {"identity": {"kind": "camera"}, "clock_offset_s": -2.5, "problems": ["the battery is low"]}
     site.store.record(bench.run_id, [DeviceOpened(device="camera", report=report)], actor="runner")
     found = scrape(site)
@@ -134,7 +135,7 @@ def test_a_run_that_is_driven_shows_its_pace_and_its_arm(site: WebSite) -> None:
 
 def test_a_finished_job_tells_how_long_it_took(site: WebSite) -> None:
     bench = site.begin_run()
-    enqueue(site, bench)
+    let_wait(site, bench)
     job = site.store.claim_job("worker", 30)
     assert job is not None
     site.store.finish_job(job, measures={}, duration_s=0.0)

@@ -21,7 +21,7 @@ from service.logs.secrets import without_secrets
 from service.store.records import NewJob
 from service.store.store import Store
 from service.worker.loop import work
-from tests.support.record.store import capture, start_run
+from tests.support.record.store import capture, enqueue, start_run
 from tests.support.rig.host_fake_driver import Fake, FakeConfig
 from tests.support.rig.rig import REPOSITORY, command
 from tests.support.runs.bench_run import PROTOCOL, begin_run, record_runs
@@ -111,7 +111,7 @@ def test_a_worker_says_which_job_of_which_run_failed_and_why(tmp_path: Path) -> 
     with Store.open(tmp_path / "data") as store:
         run_id = start_run(store)
         arguments = {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10}
-        job = store.enqueue_job(run_id, NewJob("locate_spheres", "scan", 1, "key", arguments), actor="test")
+        job = enqueue(store, run_id, NewJob("locate_spheres", "scan", 1, "key", arguments), actor="test")
         with file_log(tmp_path / "data", "worker"):
             work(store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _total: None)
     (failed,) = [line for line in lines(tmp_path / "data") if line["event"] == "job_failed"]

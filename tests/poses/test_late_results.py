@@ -55,7 +55,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import web_site
 from tests.support.processes.waiting import until
-from tests.support.record.store import rows
+from tests.support.record.store import enqueue, rows
 from tests.support.rig.rig import REPOSITORY, command, orthocapture
 from tests.support.runs.registration_record import registration_record
 from tests.support.runs.reported_run import evaluation
@@ -106,7 +106,7 @@ class Run:
 
     def job(self, kind: str, step: str, name: str, priority: int, **arguments: Any) -> None:
         key = f"{step}/0/{kind}/{name}/0"
-        self.store.enqueue_job(self.run_id, NewJob(kind, step, 1, key, arguments, priority=priority), actor="runner")
+        enqueue(self.store, self.run_id, NewJob(kind, step, 1, key, arguments, priority=priority), actor="runner")
 
     def finish(self, kind: str, result: Mapping[str, Any], late_s: float | None = None) -> None:
         job = self.store.claim_job("worker", 60.0, kinds=[kind])

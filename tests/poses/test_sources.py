@@ -29,6 +29,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.record.known_spheres import best_registration as shown_registration
 from service.worker.loop import work
+from tests.support.record.store import enqueue
 from tests.support.runs.recorded_run import record_run
 from tests.support.runs.registration_record import registration_record
 
@@ -285,7 +286,7 @@ def test_a_result_that_arrives_after_the_end_of_a_run_is_recorded_as_late_signed
         done = next(e.payload for e in store.events(run_id) if _is_registration(e.payload))
         assert isinstance(done, JobEnqueued)
         again = NewJob("register", done.step, done.attempt, "later", done.arguments, priority=LATER)
-        store.enqueue_job(run_id, again, actor="worker")
+        enqueue(store, run_id, again, actor="worker")
         assert work(store, until_idle=True, stop=lambda: False, progress=lambda _w, _d, _t: None) == 1
         end = store.events(run_id)[-1].payload
         assert isinstance(end, JobFinished)

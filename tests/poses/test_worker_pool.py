@@ -23,6 +23,7 @@ from service.worker import loop
 from service.worker.job import JobAnswer, RecordedContext
 from service.worker.loop import work
 from service.worker.pool import Pool, work_side_by_side
+from tests.support.record import store as records
 from tests.support.record.store import start_run
 
 ROOT_DIR = Path(__file__).parents[2]
@@ -48,7 +49,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 
 def enqueue(store: Store, run: str, name: str, priority: int = WAITED, kind: str = "layout") -> Job:
-    return store.enqueue_job(run, NewJob(kind, "registration", 1, name, {}, priority=priority), actor="runner")
+    return records.enqueue(store, run, NewJob(kind, "registration", 1, name, {}, priority=priority), actor="runner")
 
 
 def silent(_what: str, _done: int, _total: int) -> None:

@@ -25,6 +25,7 @@ from service.store.records import NewJob
 from service.store.store import Store
 from service.worker.loop import work
 from tests.support.pages.web import web_site
+from tests.support.record.store import enqueue
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
 
 GB = 10**9
@@ -180,7 +181,7 @@ def test_an_export_leaves_the_evidence_its_room(bench: Bench, tmp_path: Path, se
 
 def test_a_worker_begins_nothing_on_a_disk_that_is_nearly_full(bench: Bench, set_free: SetFree) -> None:
     arguments = {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10}
-    bench.store.enqueue_job(bench.run_id, NewJob("locate_spheres", "fixation", 1, "key", arguments), actor="test")
+    enqueue(bench.store, bench.run_id, NewJob("locate_spheres", "fixation", 1, "key", arguments), actor="test")
     set_free(LEAST_FREE_BYTES - 1)
     looks: list[str] = []
 

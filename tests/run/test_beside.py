@@ -11,7 +11,7 @@ from service.cli.run.beside import worker_beside
 from service.core.records.events import JobFailed
 from service.store.records import NewJob
 from service.store.store import Store
-from tests.support.record.store import start_run
+from tests.support.record.store import enqueue, start_run
 
 
 def worker_of(data: Path) -> psutil.Process:
@@ -27,7 +27,7 @@ def test_a_worker_that_is_killed_is_replaced_and_the_run_gets_its_answer(tmp_pat
             worker = worker_of(tmp_path)
             worker.kill()
             job = NewJob("locate_spheres", "capture", 1, "key", {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10})
-            store.enqueue_job(run, job, actor="runner")
+            enqueue(store, run, job, actor="runner")
             deadline_s = time.monotonic() + 90
             while not any(isinstance(event.payload, JobFailed) for event in store.events(run)):
                 assert time.monotonic() < deadline_s, told

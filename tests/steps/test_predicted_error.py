@@ -16,10 +16,10 @@ from service.compute.planning.coverage import (
 )
 from service.compute.planning.information import (
     mounting_covariance,
+    point_sigmas_m,
     pose_covariance,
     pose_scatter,
     predicted_information,
-    target_error,
     view_information,
 )
 from service.compute.planning.next_best_view import Candidate, CurrentInformation, next_best_views
@@ -66,7 +66,11 @@ def test_more_views_predict_less_error_and_one_sphere_none_at_all() -> None:
     made = scene(8, seed=1)
     views = informations(made)
     centre = apply(made.T_world_scan, CENTRE_M)
-    errors = [target_error(views[:n], centre, sigma_m=1e-3, sigma_rad=1e-3).at_m(centre[None])[0] for n in (1, 3, 8)]
+    errors: list[float] = []
+    for n in (1, 3, 8):
+        scatter = pose_scatter(views[:n], 1e-3, 1e-3)
+        covariance = pose_covariance([view.information for view in views[:n]], scatter)
+        errors.append(float(point_sigmas_m(covariance, np.zeros((1, 3)))[0]))
     assert errors[0] > errors[1] > errors[2] > 0
     one = predicted_information(made.T_world_camera[0], centre[None], RADIUS_M, centre, np.eye(3) * 1e-8)
     with pytest.raises(ComputeError, match="do not determine"):

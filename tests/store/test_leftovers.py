@@ -14,7 +14,7 @@ from service.store.files.leftovers import leftovers, remove_leftovers
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.record.store import capture, captured, files_of, put_image, start_run
+from tests.support.record.store import capture, captured, enqueue, files_of, put_image, start_run
 from tests.support.rig.rig import REPOSITORY, orthocapture
 
 HOLDER = """
@@ -107,7 +107,7 @@ def test_what_a_runner_at_work_may_still_record_stays(tmp_path: Path) -> None:
 def test_what_a_worker_at_work_may_still_record_stays(tmp_path: Path) -> None:
     with Store.open(tmp_path) as store:
         run = start_run(store)
-        store.enqueue_job(run, NewJob("register", "capture", 1, "key"), actor="runner")
+        enqueue(store, run, NewJob("register", "capture", 1, "key"), actor="runner")
         assert store.claim_job("a worker", 30.0) is not None
         ref = put_image(store, "v1")
         must_stay(store)

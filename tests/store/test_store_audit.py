@@ -22,7 +22,7 @@ from service.store.records import SITE, NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import show, verify
-from tests.support.record.store import CountedIds, SteppedClock, capture, rows, start_run, tamper
+from tests.support.record.store import CountedIds, SteppedClock, capture, enqueue, rows, start_run, tamper
 
 RUN = "20261121-120000-000003"
 
@@ -36,7 +36,7 @@ def data(tmp_path: Path) -> Path:
         assert run == RUN
         for viewpoint in ("v1", "v2", "v3"):
             capture(store, run, viewpoint)
-        store.enqueue_job(run, NewJob("registration", "register", 1, "key"), actor="runner")
+        enqueue(store, run, NewJob("registration", "register", 1, "key"), actor="runner")
         job = store.claim_job("worker 1", 10)
         assert job is not None
         ref = store.put_bytes(b"{}", kind="result", media_type="application/json", original_name="result.json")

@@ -20,7 +20,7 @@ from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.processes.waiting import until
-from tests.support.record.store import CountedIds, SteppedClock, start_run
+from tests.support.record.store import CountedIds, SteppedClock, enqueue, start_run
 
 ROOT_DIR = Path(__file__).parents[2]
 JOB = NewJob("registration", "register", 1, "register-1", {"sigma_px": 0.5, "views": [1, 2]})
@@ -40,17 +40,17 @@ def store(tmp_path: Path, clock: SteppedClock) -> Iterator[Store]:
 
 def test_enqueueing_twice_gives_the_first_job_and_appends_nothing(store: Store) -> None:
     run = start_run(store)
-    first = store.enqueue_job(run, JOB, actor="runner")
-    again = store.enqueue_job(run, NewJob("registration", "register", 1, "register-1", {"other": 1}), actor="runner")
+    first = enqueue(store, run, JOB, actor="runner")
+    again = enqueue(store, run, NewJob("registration", "register", 1, "register-1", {"other": 1}), actor="runner")
     assert again == first
     assert [event.payload.kind for event in store.events(run)] == ["run_started", "job_enqueued"]
     other_run = start_run(store)
-    assert store.enqueue_job(other_run, JOB, actor="runner").job_id != first.job_id
+    assert enqueue(store, other_run, JOB, actor="runner").job_id != first.job_id
 
 
 def test_a_job_from_claim_to_finish(store: Store) -> None:
     run = start_run(store)
-    store.enqueue_job(run, JOB, actor="runner")
+    enqueue(store, run, JOB, actor="runner")
     assert store.claim_job("w", 10, kinds=["evaluation"]) is None
     job = store.claim_job("w", 10, kinds=["registration", "evaluation"], run_id=run)
     assert job is not None
@@ -76,7 +76,7 @@ def test_a_job_from_claim_to_finish(store: Store) -> None:
 
 def test_expired_lease_is_reclaimed_and_the_late_worker_refused(store: Store, clock: SteppedClock) -> None:
     run = start_run(store)
-    store.enqueue_job(run, JOB, actor="runner")
+    enqueue(store, run, JOB, actor="runner")
     slow = store.claim_job("slow", 10)
     assert slow is not None
     clock.passed_s = 9
@@ -101,7 +101,7 @@ def test_expired_lease_is_reclaimed_and_the_late_worker_refused(store: Store, cl
 
 def test_failure_is_retried_until_the_limit(store: Store) -> None:
     run = start_run(store)
-    store.enqueue_job(run, JOB, actor="runner")
+    enqueue(store, run, JOB, actor="runner")
     for attempt in (1, 2, 3):
         job = store.claim_job("w", 10)
         assert job is not None
@@ -115,7 +115,7 @@ def test_failure_is_retried_until_the_limit(store: Store) -> None:
 
 def test_hopeless_failure_is_final_at_once(store: Store) -> None:
     run = start_run(store)
-    store.enqueue_job(run, JOB, actor="runner")
+    enqueue(store, run, JOB, actor="runner")
     job = store.claim_job("w", 10)
     assert job is not None
     (event,) = store.fail_job(job, DataError("no mesh"), retry=False)
@@ -125,7 +125,7 @@ def test_hopeless_failure_is_final_at_once(store: Store) -> None:
 
 def test_a_job_that_kills_its_workers_fails_in_the_end(store: Store, clock: SteppedClock) -> None:
     run = start_run(store)
-    store.enqueue_job(run, JOB, actor="runner")
+    enqueue(store, run, JOB, actor="runner")
     for _try in range(3):
         assert store.claim_job("w", 10) is not None
         clock.passed_s += 11
@@ -232,7 +232,7 @@ time.sleep(100)
 def test_leases_of_a_killed_process_are_taken_over_at_once(tmp_path: Path) -> None:
     with Store.open(tmp_path) as store:
         run = start_run(store)
-        enqueued = store.enqueue_job(run, JOB, actor="runner")
+        enqueued = enqueue(store, run, JOB, actor="runner")
         with subprocess.Popen(
             [sys.executable, "-c", HOLDER, str(tmp_path)], cwd=ROOT_DIR, stdout=subprocess.PIPE
         ) as holder:

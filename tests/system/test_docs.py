@@ -27,6 +27,7 @@ from service.core.records.events import JobFailed
 from service.steps import step_kinds
 from service.store.records import NewJob
 from service.store.store import Store
+from tests.support.record.store import enqueue
 from tests.support.runs.bench_run import record_runs
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, render, scene
 
@@ -119,7 +120,7 @@ def serves_until_terminated(site: Site, command: str) -> None:
     words = shlex.split(command)
     with Store.open(site.folder / "runs") as store:
         job = NewJob("locate_spheres", "fixation", 1, "docs", {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10})
-        store.enqueue_job(site.begun, job, actor="test")
+        enqueue(store, site.begun, job, actor="test")
         with subprocess.Popen([SCRIPTS / words[0], *words[1:]], cwd=site.folder, stdout=subprocess.DEVNULL) as worker:
             try:
                 while not any(isinstance(event.payload, JobFailed) for event in store.events(site.begun)):

@@ -23,7 +23,7 @@ from service.store.signatures.timestamps import Authority, timestamp
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of, populate
-from tests.support.record.store import SteppedClock, capture, rows, start_run, tamper
+from tests.support.record.store import SteppedClock, capture, enqueue, rows, start_run, tamper
 from tests.support.record.time_stamp_authority import time_stamp_authority
 
 
@@ -40,7 +40,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run = start_run(store)
         capture(store, run, "v1")
         for key in ("one", "two"):
-            store.enqueue_job(run, NewJob("registration", "register", 1, key), actor="runner")
+            enqueue(store, run, NewJob("registration", "register", 1, key), actor="runner")
         job = store.claim_job("worker 1", 10)
         assert job is not None
         ref = store.put_bytes(b"{}", kind="result", media_type="application/json", original_name="result.json")

@@ -168,7 +168,8 @@ def _complete_run(store: Store, folder: Path, authority: Authority) -> str:
 def _jobs(store: Store, run_id: str) -> None:
     """Add a job that finished with a file, one that failed after retries, and one that is waiting."""
     for key in ("one", "two", "three"):
-        store.enqueue_job(run_id, NewJob("registration", "capture", 1, key, {"sigma_px": 0.5}), actor="runner")
+        job = NewJob("registration", "capture", 1, key, {"sigma_px": 0.5})
+        store.record(run_id, [], actor="runner", jobs=[job])
     job = store.claim_job("worker 1", 10.0)
     assert job is not None
     answer = store.put_bytes(
@@ -214,7 +215,7 @@ def _open_run(store: Store, folder: Path, people: People) -> None:
     bench = begin_run(store, PROTOCOL, folder)
     Control(store).take(bench.run_id, _person(people, "emmy"))
     store.lease(bench.run_id, "runner", 1.0)
-    store.enqueue_job(bench.run_id, NewJob("registration", "capture", 1, "four"), actor="runner")
+    store.record(bench.run_id, [], actor="runner", jobs=[NewJob("registration", "capture", 1, "four")])
     store.claim_job("worker 2", 1.0, run_id=bench.run_id)
     # From here on commits stay in the write-ahead log: a signature, and one event after it.
     with closing(sqlite3.connect(database_path(folder / "data"))) as connection:

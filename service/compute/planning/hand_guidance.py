@@ -20,7 +20,6 @@ from service.core.units import deg
 _FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # C0: columns are x, y, z of the camera
 _COARSE_FROM_M = 0.10  # distances above are given in steps of five centimetres, below in steps of one
 _ANGLE_STEP_DEG = 5.0
-RELEASE = "hold it there and release the shutter"
 
 
 @dataclass(frozen=True, slots=True)

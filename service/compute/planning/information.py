@@ -33,19 +33,6 @@ class ViewInformation:
     spheres: int
 
 
-@dataclass(frozen=True, slots=True)
-class TargetError:
-    """Covariance (6, 6) of the scan's pose about `centre_m`, and scatter P (6, 6) of the camera poses."""
-
-    centre_m: Array  # (3,) base frame
-    covariance: Array = field(repr=False)
-    pose_covariance: Array = field(repr=False)
-
-    def at_m(self, points_m: Array) -> Array:
-        """Standard deviation (N,) in 3D at points (N, 3) of the base frame, metres."""
-        return point_sigmas_m(self.covariance, points_m - self.centre_m)
-
-
 def view_information(
     T_base_camera: Transform,
     T_base_scan: Transform,
@@ -158,18 +145,6 @@ def mounting_covariance(
     d = np.sqrt(np.diag(normal))
     M = np.linalg.solve(normal / np.outer(d, d), moved / d[:, None]) / d[:, None]
     return M @ covariance @ M.T
-
-
-def target_error(
-    views: Sequence[ViewInformation], centre_m: Array, *, sigma_m: float, sigma_rad: float
-) -> TargetError:
-    """Error of the registration from these views of one station, including their observed scatter.
-
-    Raises:
-        ComputeError: the views do not determine the pose.
-    """
-    P = pose_scatter(views, sigma_m, sigma_rad)
-    return TargetError(centre_m, pose_covariance([v.information for v in views], P), P)
 
 
 def point_sigmas_m(covariance: Array, points_m: Array) -> Array:

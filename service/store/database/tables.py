@@ -18,7 +18,6 @@ from sqlalchemy import (
 )
 
 APPEND_ONLY = ("runs", "events", "artefacts", "checkpoints", "timestamps", "event_index")
-TRIGGERS = tuple(f"{table}_no_{verb}" for table in APPEND_ONLY for verb in ("update", "delete", "replace"))
 
 metadata = MetaData()
 

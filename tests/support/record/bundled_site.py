@@ -15,6 +15,7 @@ from service.audit.verify import bundle_verifier
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.store import Store
+from tests.support.record.store import enqueue
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 
 
@@ -33,7 +34,7 @@ def record(folder: Path, protocol: str = PROTOCOL) -> tuple[Path, str]:
     """Record a completed run with a job and a changed key; returns the data folder and the run's id."""
     with Store.open(folder / "data") as store:
         bench = begin_run(store, protocol, folder)
-        store.enqueue_job(bench.run_id, NewJob("detect", "fixation", 1, "key", {"of": "x"}), actor="runner")
+        enqueue(store, bench.run_id, NewJob("detect", "fixation", 1, "key", {"of": "x"}), actor="runner")
         job = store.claim_job("worker 1", 10)
         assert job is not None
         ref = store.put_bytes(b"{}", kind="result", media_type="application/json", original_name="result.json")

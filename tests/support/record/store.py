@@ -11,7 +11,7 @@ from pathlib import Path
 from service.core.records.events import ArtefactRef, RunStarted, ViewpointCaptured
 from service.store.database.engine import database_path
 from service.store.durable_effects import DurableFiles
-from service.store.records import NewArtefact
+from service.store.records import Job, NewArtefact, NewJob
 from service.store.store import Store
 
 IDENTITY4 = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -247,3 +247,9 @@ def tamper(data_dir: Path, *statements: str) -> None:
 def files_of(data_dir: Path) -> Iterator[Path]:
     """Every file below the artefact folder."""
     return (path for path in (data_dir / "artefacts").rglob("*") if path.is_file())
+
+
+def enqueue(store: Store, run_id: str, job: NewJob, *, actor: str) -> Job:
+    """Enqueue a job with no other event, and return it, or the existing job with its key."""
+    store.record(run_id, [], actor=actor, jobs=[job])
+    return next(found for found in store.jobs(run_id) if found.idempotency_key == job.idempotency_key)

@@ -256,9 +256,6 @@ class BenchLightbox:
     def read(self) -> EnvironmentReading:
         return EnvironmentReading(812.0, 21.5, False, time.monotonic())
 
-    def set_shutter_relay(self, closed: bool) -> None:
-        raise NotImplementedError
-
     def pedal_presses(self) -> int:
         return self.presses
 

@@ -30,6 +30,7 @@ from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.worker.loop import work
+from tests.support.record.store import enqueue
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, exact_outlines, scene
 from tests.support.scenes.sphere_meshes import MeshBuilder, cap
 
@@ -158,7 +159,7 @@ class _Recorder:
         self, step: str, attempt: int, kind: str, arguments: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Any], tuple[ArtefactRef, ...]]:
         job = NewJob(kind, step, attempt, f"{step}/{attempt}/{kind}", arguments, version=self.version)
-        self.store.enqueue_job(self.run_id, job, actor="runner")
+        enqueue(self.store, self.run_id, job, actor="runner")
         assert work(self.store, until_idle=True, stop=lambda: False, progress=lambda _w, _d, _t: None) == 1
         end: Any = self.store.events(self.run_id)[-1].payload
         assert end.kind == "job_finished", end

@@ -23,7 +23,6 @@ from service.steps.context import LeaveToMove, StationLayout
 from simulators.__main__ import main as simulate
 from tests.support.rig.bench_rig import BenchArm, BenchCamera, numbered
 
-_READY_S = 30.0
 _STATION = {"robot": "robot", "scene_centre_m": [0.75, 0.0, -0.1], "approach_azimuth_deg": 180}
 _BENCH = StationLayout("station_1", "robot", (0.0, 0.8, 0.0), (0.0, -1.0, 0.0))  # of the in-memory arm
 VIEWS = ("v001", "v002", "v003")

@@ -27,7 +27,6 @@ from service.core.geometry import Array
 SYSTEMATIC_PER_BLUR = 0.05
 MOST_SIGMA_PX = 0.5  # of an edge point; without a real outline, edges within the search range scatter more
 TEXTURE_FACTOR = 3.0  # sigma of an edge point over the one from its own profile
-REACH = 0.04  # of the radius: search range of `approach_outlines`
 _BLOCKS = 16  # of an outline, for the noise that neighbouring edge points share
 _TRIALS = 150  # of RANSAC; few, because the rough outline is near
 _FIRST_PROFILES, _FIRST_OF_LARGE = 48, 32
@@ -96,7 +95,7 @@ def refine_outlines(
 def approach_outlines(
     image_bgr: NDArray[np.uint8], camera: CameraModel, roughs: Sequence[Cone], options: DetectionOptions = DEFAULTS
 ) -> list[Approached | None]:
-    """Cones refined on pixels averaged across the outline; `roughs` must be good to REACH of their radii."""
+    """Cones refined on pixels averaged across the outline; `roughs` must be good to 4 % of their radii."""
     if not roughs:
         return []
     radius_px = float(np.median([c.half_angle_rad for c in roughs])) * camera.fx
