@@ -23,6 +23,7 @@ from service.core.units import metres
 from service.dataset.posed.of_run import data_set_of, pose_covariance, upwards
 from service.dataset.posed.records import Mesh
 from service.store.verification.verify import verify
+from tests.support.runs.bench_run import record_runs
 
 RECORDED = Path(__file__).parents[1] / "data" / "recorded" / "2026-11-23.tar.xz"
 
@@ -133,6 +134,14 @@ def test_what_cannot_be_is_refused(recorded: Path, tmp_path: Path, arguments: tu
     assert status != 0
     assert words in printed
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_is_not_complete_is_not_exported(tmp_path: Path) -> None:
+    record_runs(tmp_path)
+    status, printed = export(tmp_path / "data", "--format", "gltf", "--out", str(tmp_path / "out"))
+    assert status != 0
+    assert "Only a completed run is exported" in printed
+    assert {path.name for path in tmp_path.iterdir() if "out" in path.name} == set()
 
 
 def test_the_covariance_of_a_pose_is_that_of_the_registration_seen_from_the_scan(recorded: Path) -> None:

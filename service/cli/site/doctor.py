@@ -42,7 +42,7 @@ from service.store.store import Store
 _PARTS = {
     "rtde_control": "ur-rtde: arms of Universal Robots cannot be driven",
     "pycolmap": "pycolmap: camera poses cannot be found from images alone",
-    "embreex": "embreex: rigs cannot be simulated",
+    "embreex": "embreex: rigs cannot be simulated, depth cannot be computed",
 }
 _LOW_DISK_BYTES = 20e9  # roughly a full capture of RAW and JPEG with its scans
 
