@@ -36,7 +36,8 @@ from simulators.sony_camera.server import CameraServer
 from simulators.ur_controller import rtde_codec
 from simulators.ur_controller.controller import Controller
 from simulators.ur_controller.kinematics import MODELS
-from simulators.ur_controller.server import LineLink, RtdeLink, ScriptLink, Server
+from simulators.ur_controller.links import LineLink, RtdeLink, ScriptLink
+from simulators.ur_controller.server import Server
 
 _HOST = f"127.{100 + os.getpid() % 100}.{os.getpid() // 100 % 250}.7"  # the ports of a robot are fixed
 _CYCLES = 4  # of the controller after the bytes
@@ -361,7 +362,7 @@ def _hands(data: bytes, _: Path) -> None:
 
 
 _SIMULATOR: dict[str, Any] = {"errors": (SimulatorError,), "says_place": False}
-_ROBOT = "simulators.ur_controller.server:"
+_ROBOT = "simulators.ur_controller.links:"
 _BOTH = (*BYTES, *TEXT)
 TARGETS: tuple[Target, ...] = (
     Target("ur_rtde", f"{_ROBOT}RtdeLink.receive", _robot(RtdeLink), _rtde_streams, **_SIMULATOR),
