@@ -357,12 +357,12 @@ def test_stalled_stream_is_not_taken_for_a_still_arm() -> None:
 
 @pytest.mark.parametrize(("on", "server"), [("rtde_V", "RTDE"), ("dashboard_connect", "dashboard")])
 def test_mute_server_does_not_hang_the_driver(on: str, server: str) -> None:
-    with faulty(56, {"on": on, "kind": "stall"}):
-        with (
-            pytest.raises(DeviceUnavailableError, match=rf"the {server} server did not answer within 0\.5 s"),
-            opened(address(56), connect_timeout_s=0.5),
-        ):
-            pass
+    with (
+        faulty(56, {"on": on, "kind": "stall"}),
+        pytest.raises(DeviceUnavailableError, match=rf"the {server} server did not answer within 0\.5 s"),
+        opened(address(56), connect_timeout_s=0.5),
+    ):
+        pass
 
 
 def test_nobody_there() -> None:
