@@ -239,7 +239,7 @@ def test_a_reason_is_chosen_or_written(server: Served, browser: Browser) -> None
         page.get_by_role("button", name="Skip").click()
         dialog = page.get_by_role("dialog", name="Skip this step")
         assert all(box(row)["height"] >= 48 for row in dialog.locator(".presets label").all())
-        dialog.get_by_text("Another reason, in my own words").click()
+        dialog.get_by_text("Something else, in my own words").click()
         dialog.get_by_role("button", name="Skip the step").click()
         expect(dialog).to_be_visible()  # the reason is missing
         dialog.get_by_text("A device is out of order").click()
