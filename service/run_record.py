@@ -21,7 +21,7 @@ from service.core.run.state import JobState, RunState
 from service.jobs.words import term
 from service.steps import params_models
 from service.steps.context import JobRequest, JobResult
-from service.steps.poses.time_left import Left, missing_results
+from service.steps.poses.time_left import PendingResult, missing_results
 from service.store.database.engine import RESTORE
 from service.store.queue.leases import RunLease
 from service.store.records import NewArtefact, NewJob
@@ -115,7 +115,7 @@ def read_log(store: Store, run_id: str, protocol: Protocol) -> RunRecord:
     return RunFollower(store, run_id, protocol).now()
 
 
-def results_to_come(log: RunRecord) -> list[Left]:
+def results_to_come(log: RunRecord) -> list[PendingResult]:
     """The planned registrations that have not arrived yet, with the time left; empty if all have."""
     started = log.store.jobs_started(log.run_id)
     cores = os.cpu_count() or 1

@@ -23,7 +23,7 @@ import yaml
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from service.compute.arm.kinematics import matching_arm
 from service.compute.calibration.board.board import Board, BoardView
-from service.compute.calibration.board_poses.design import NOTHING, Aims, Taken
+from service.compute.calibration.board_poses.design import NOTHING, CalibrationTargets, ChosenViews
 from service.compute.calibration.board_poses.knowledge import BoardKnowledge, refined_knowledge
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.record import board_corners
@@ -111,7 +111,7 @@ def capture(
     room: Room, wanted: BoardPoses, solve: Sequence[str], nominal: BoardKnowledge, before: Shoot | None
 ) -> tuple[Shoot, PlannedBoard]:
     """Plan the images of a step stage by stage, as the step does, and take them."""
-    aims = Aims("intrinsics" in solve, "hand_eye" in solve, wanted.coverage)
+    aims = CalibrationTargets("intrinsics" in solve, "hand_eye" in solve, wanted.coverage)
     planner = Planner(wanted, _BOARD, aims, np.array(room.layout.approach), room.mount, room.feasible)
     lens_known = "intrinsics" not in solve
     shoot = Shoot()
@@ -125,7 +125,7 @@ def capture(
         if shoot.views:
             known = _refined(nominal, shoot, lens_known=lens_known)
             poses = np.array(shoot.flanges) @ known.T_flange_camera
-            taken = Taken(poses, tuple(view.corners for view in shoot.views))
+            taken = ChosenViews(poses, tuple(view.corners for view in shoot.views))
         planned = planner.next(why, count, known, taken, seed=shoot.poses)
         for T in planned.T_base_camera:
             room.photograph(planner.sent(T, known), shoot)

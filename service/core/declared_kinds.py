@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 from service.core.errors import ConfigurationError
 
 
-class Declared(Protocol):
+class DeclaredKind(Protocol):
     """What every kind has."""
 
     @property
@@ -19,7 +19,7 @@ class Declared(Protocol):
         ...
 
 
-K = TypeVar("K", bound=Declared)
+K = TypeVar("K", bound=DeclaredKind)
 
 
 def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:

@@ -34,7 +34,7 @@ class Camera(JobRecord):
     k6: float = 0.0
 
 
-class Photographed(JobRecord):
+class ImagesCamera(JobRecord):
     """The camera of a job's images.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""The kinds of steps: those of service/steps/kinds, and those of plug-ins."""
+"""Steps: their kinds (in kinds/ and in plug-ins) and the parts that these share."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def step_kinds() -> dict[str, StepKind[Any]]:
     """All step kinds by name: every module of service/steps/kinds, and those of plug-ins.
 
     Raises:
-        ConfigurationError: two declare the same name, or an entry point names something else than a StepKind.
+        ConfigurationError: two declare the same name, or an entry point names something that is not a StepKind.
     """
     kinds: dict[str, StepKind[Any]] = declared_kinds(f"{__name__}.kinds", GROUP, StepKind)
     return dict(sorted(kinds.items()))

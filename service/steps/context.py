@@ -1,4 +1,4 @@
-"""What a step is given and what it gives back: StepContext, StepOutcome, StepKind."""
+"""The interface of a step: its kind, the context in which it runs, and its outcome."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from service.store.records import NewArtefact
 
 P = TypeVar("P", bound=Record)
 A = TypeVar("A", bound=JobRecord)
-_NOTHING: Mapping[str, Reference | Each | None] = {}
+_NO_REFERENCES: Mapping[str, Reference | Each | None] = {}
 
 
 class StepInterruptedError(OrthocaptureError):
@@ -33,7 +33,7 @@ class StepInterruptedError(OrthocaptureError):
 
 @dataclass(frozen=True, slots=True)
 class StationLayout:
-    """What a technician knows of a station: which arm stands there and where the scene is, in its base frame."""
+    """A station of the rig: which arm stands there, and where the scene is in that arm's base frame."""
 
     name: str
     robot: str  # device name in rig.yaml
@@ -43,9 +43,9 @@ class StationLayout:
 
 @dataclass(frozen=True, slots=True)
 class LeaveToMove:
-    """A person's recorded confirmation, for the arms: each takes it once, so an arm that has lost it needs another.
+    """A person's recorded confirmation that the arms may move. Each arm uses it once; after a stop it needs another.
 
-    `not_before_monotonic_s` is the host's time.monotonic() when it was not given yet.
+    `not_before_monotonic_s` is a time.monotonic() of the host before the confirmation was given.
     """
 
     seq: int  # of its event
@@ -57,9 +57,9 @@ class Devices(Protocol):
     """The open devices of a rig, by role; opened on first use. Raises ConfigurationError if the rig has none."""
 
     def robot(self, station: str) -> RobotArm:
-        """The arm at a station, configured with its payload, and let move if a person has.
+        """The arm at a station, configured with its payload, and free to move if a person has confirmed it.
 
-        Raises SafetyStopError, LeaveNeededError where it was stopped after that person had confirmed.
+        Raises SafetyStopError or LeaveNeededError if it was stopped after that confirmation.
         """
         ...
 
@@ -68,11 +68,11 @@ class Devices(Protocol):
         ...
 
     def scanner(self, name: str | None = None) -> Scanner:
-        """The export folder of the scanner of this name, or of the only one."""
+        """The scanner of this name; without a name, the only one."""
         ...
 
     def ct(self) -> CtSource:
-        """The CT suite's folder."""
+        """The folder in which the CT suite puts its files."""
         ...
 
     def lightbox(self) -> Lightbox | None:
@@ -80,41 +80,41 @@ class Devices(Protocol):
         ...
 
     def layout(self, station: str) -> StationLayout:
-        """Where things are at a station."""
+        """Which arm and scene a station has."""
         ...
 
     def nominal_T_flange_camera(self) -> Transform:
-        """The camera mount's drawing."""
+        """(4, 4) The camera on the flange according to the drawing of the mount, metres."""
         ...
 
     def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
-        """What the arm must keep clear of, and the lens where it is described."""
+        """Obstacles that the arm must avoid, and the lens if the rig file describes it."""
         ...
 
     def lens(self) -> LensSection | None:
-        """Focal length and sensor as the rig file states them."""
+        """Focal length and sensor as the rig file states them, if it does."""
         ...
 
     def imported(self) -> ImportList | None:
-        """What was captured earlier, in a run that imports it; None in one that captures."""
+        """The files to import, in a run that imports what was captured earlier; None in a run that captures."""
         ...
 
     def watch(self, on_open: Callable[[str, DeviceReport], None], before_open: Callable[[str], None]) -> None:
-        """Have every device that is opened from now on reported, by its name in rig.yaml, before and after."""
+        """Call `before_open` and `on_open` around the opening of each device, with its name in rig.yaml."""
         ...
 
     def let_move(self, leave: LeaveToMove) -> None:
-        """A person lets the arms move: each is told when it is next asked for by its station, once."""
+        """Let the arms move: each arm is told once, when `robot` next asks for it."""
         ...
 
     def reopen(self, device: Device) -> None:
-        """Open a device again after its link dropped. An arm moves again after a new leave only."""
+        """Open a device again after its connection was lost. An arm then needs a new leave to move."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class JobRequest:
-    """Work for the registration worker; `arguments` as they are recorded, with references to earlier answers."""
+    """Work for the worker; `arguments` as they are recorded, with references to earlier answers."""
 
     kind: str
     arguments: Mapping[str, Any]
@@ -126,21 +126,20 @@ class JobRequest:
         cls,
         kind: JobKind[A, Any],
         arguments: A,
-        taken: Mapping[str, Reference | Each | None] = _NOTHING,
+        references: Mapping[str, Reference | Each | None] = _NO_REFERENCES,
         priority: int = WAITED,
     ) -> JobRequest:
         """A request with typed arguments.
 
         Args:
             kind: of the job.
-            arguments: with the values of whatever earlier jobs gave.
-            taken: fields of the arguments (`camera`, `registrations/colmap`) in which such a value stands, and the
-                reference that is recorded in its place; None where nothing can be referred to, so that the value
-                itself is recorded.
-            priority: see service.core.priorities.
+            arguments: with values, also where they come from earlier jobs.
+            references: field of the arguments (`camera`, `registrations/colmap`) → the reference that is recorded
+                instead of its value; None where no job computed the value, which is then recorded itself.
+            priority: see service.core.jobs.priorities.
         """
         recorded = arguments.plain()
-        for path, reference in taken.items():
+        for path, reference in references.items():
             if reference is not None:
                 *parents, field = path.split("/")
                 place = recorded
@@ -152,7 +151,7 @@ class JobRequest:
 
 @dataclass(frozen=True, slots=True)
 class JobResult:
-    """What the worker answered."""
+    """The worker's answer to a job."""
 
     measures: Mapping[str, float]
     artefacts: tuple[ArtefactRef, ...]
@@ -160,7 +159,7 @@ class JobResult:
 
 
 class Evidence(Protocol):
-    """Where a step writes down what happens. Nothing that cannot be recorded is done."""
+    """Where a step records what happens. What cannot be recorded is not done."""
 
     def record(self, *payloads: Payload, artefacts: tuple[NewArtefact, ...] = (), actor: str = "") -> None:
         """Append events (and artefact rows) in one transaction."""
@@ -175,7 +174,7 @@ class Evidence(Protocol):
         ...
 
     def path(self, ref: ArtefactRef) -> Path:
-        """Where the bytes of an artefact lie."""
+        """The file that holds an artefact."""
         ...
 
     def holds(self, sha256: str) -> bool:
@@ -183,31 +182,31 @@ class Evidence(Protocol):
         ...
 
     def captures(self, step_id: str) -> tuple[View, ...]:
-        """The valid captures of a step's current attempt, this moment's included, in order."""
+        """The valid captures of a step's current attempt, up to this moment, in order."""
         ...
 
     def run_jobs(self, *requests: JobRequest) -> tuple[JobResult, ...]:
-        """Enqueue jobs (once, whatever restarts) and wait for the worker's results, in order."""
+        """Enqueue jobs, only once even after restarts, and wait for the worker's results, in order."""
         ...
 
     def enqueue(self, request: JobRequest, name: str) -> None:
-        """Enqueue a job without waiting for it, once for each `name` (and again after it has failed)."""
+        """Enqueue a job without waiting for it: once for each `name`, and again if it has failed."""
         ...
 
     def asked(self) -> tuple[Literal["release", "finish"], ...]:
-        """What people at screens have asked of this step so far, in order."""
+        """What people have asked of this step on the pages so far, in order."""
         ...
 
     def jobs(self, step_id: str) -> tuple[JobState, ...]:
-        """The jobs of a step, as they stand at this moment, in the order in which they were enqueued."""
+        """The jobs of a step in their present state, in the order in which they were enqueued."""
         ...
 
     def state(self) -> RunState:
-        """The run as it stands at this moment."""
+        """The present state of the run."""
         ...
 
     def require_space(self) -> None:
-        """Before each photograph: raises SpaceShortError where the disk would soon be full."""
+        """Call before each photograph. Raises SpaceShortError if the disk would soon be full."""
         ...
 
 
@@ -227,7 +226,7 @@ class StepContext:
     wait: Callable[[float], None]
     operator: str
     tell: Callable[[str], None]  # one line of news for the operator
-    busy: Callable[[str], None] = lambda _what: None  # said before a call that takes its time, until the checkpoint
+    busy: Callable[[str], None] = lambda _what: None  # call before a long call, with what it does
 
     @property
     def state(self) -> StepState:
@@ -241,7 +240,7 @@ class StepContext:
 
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
-    """The numbers a step measured (gates judge them), what it produced, and its Result."""
+    """What a step measured (gates judge it), the files it produced, and its Result."""
 
     measures: MeasureRecord
     artefacts: tuple[ArtefactRef, ...] = ()
@@ -251,7 +250,7 @@ class StepOutcome:
 
 @dataclass(frozen=True, slots=True)
 class BeforeStep:
-    """What a kind's words may tell: the step's title, how many images are to be taken, and at which stations."""
+    """What a kind's announcement may mention: title, number of images still to take, and stations."""
 
     title: str
     views_left: int
@@ -259,7 +258,7 @@ class BeforeStep:
 
     @property
     def at_stations(self) -> str:
-        """` at station 1`, or nothing."""
+        """` at station 1`, or "" without stations."""
         return f" at {self.stations}" if self.stations else ""
 
     def images(self, of: str = "") -> str:
@@ -269,7 +268,7 @@ class BeforeStep:
 
 @dataclass(frozen=True, slots=True)
 class Announcement:
-    """What a confirmation does: the large words of its button after `Confirm: `, and a line below."""
+    """What a confirmation starts: the text of its button after `Confirm: `, and a line below it."""
 
     does: str
     below: str = "Nothing moves."
@@ -290,8 +289,8 @@ class StepKind(Generic[P]):
         execute: does it.
         registered_by: the step whose registrations the measures are of, where they are RegistrationMeasures; None:
             this step itself.
-        words: what a person reads who is about to confirm it.
-        drawing: that is shown beside the instructions (service/web/run/drawings), where the protocol names no other.
+        words: what a person reads before confirming it.
+        drawing: shown beside the instructions (service/web/run/drawings) if the protocol names no other.
     """
 
     name: str

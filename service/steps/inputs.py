@@ -1,4 +1,4 @@
-"""What earlier steps left behind, as typed arguments of jobs, with the references that are recorded."""
+"""Results of earlier steps as typed arguments of jobs, with the references that are recorded in their place."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ R = TypeVar("R", bound=JobRecord)
 
 
 @dataclass(frozen=True, slots=True)
-class Taken(Generic[R]):
-    """The answer with which an earlier step ended, and the job that gave it."""
+class EarlierAnswer(Generic[R]):
+    """The answer that became an earlier step's result, and the job that computed it."""
 
     answer: R
-    job: JobState | None  # None: nobody computed it in this run
+    job: JobState | None  # None: no job of this run computed it
 
     def reference(self, field: str) -> Reference | None:
         """A part of the answer (`details/spheres/*/covariance_m2`), "" for all of it; None without a job."""
@@ -32,8 +32,8 @@ class Taken(Generic[R]):
         return None if self.job is None else Reference(self.job.job, path)
 
 
-def taken(context: StepContext, step_id: str, kind: JobKind[Any, R]) -> Taken[R]:
-    """What an earlier step's job of a kind answered. Raises ConfigurationError if the step has no such answer."""
+def earlier_answer(context: StepContext, step_id: str, kind: JobKind[Any, R]) -> EarlierAnswer[R]:
+    """The result of an earlier step, as the answer of a kind of job. Raises ConfigurationError if it is not one."""
     result = result_of(context, step_id)
     try:
         answer = kind.read_answer(result)
@@ -41,13 +41,13 @@ def taken(context: StepContext, step_id: str, kind: JobKind[Any, R]) -> Taken[R]
         raise ConfigurationError(
             f"step {context.step.id!r} needs {kind.words} of step {step_id!r}, which has none",
             where=f"step {context.step.id}",
-            remedy="Name a step that gives it in the protocol",
+            remedy="Name a step in the protocol that computes it",
         ) from error
-    return Taken(answer, answered_by(context.run.steps[step_id]))
+    return EarlierAnswer(answer, answered_by(context.run.steps[step_id]))
 
 
 def answered_by(state: StepState) -> JobState | None:
-    """The newest job whose answer is part of the step's result."""
+    """The newest job whose answer is part of the step's result; None if no job computed it."""
     done = [job for job in state.jobs.values() if job.status == "finished" and job.result]
     for job in sorted(done, key=lambda job: job.enqueued_seq, reverse=True):
         if all(name in state.result and state.result[name] == value for name, value in job.result.items()):
@@ -81,9 +81,9 @@ def artefact_of(context: StepContext, step_id: str, kind: str) -> ArtefactRef:
 
 
 def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[Photograph]:
-    """Every valid photograph of the given capture steps with its pose, in order of capture.
+    """Every valid photograph of the given capture steps with its pose, in the order of capture.
 
-    Events recorded since this step began (its own images) are read through the evidence, not the stale state.
+    Read from the evidence, because the context's state lacks events since the step began, such as its own images.
     """
     images: list[Photograph] = []
     for step_id in step_ids:
@@ -121,16 +121,16 @@ def _photograph(capture: View, step_id: str, look: hand_view.Answer | None) -> P
 
 
 def robot_pose_of(view: View) -> dict[str, Any]:
-    """The robot's pose at a photograph, as fields of a Photograph; empty where there was no robot."""
+    """The robot's pose at a photograph, as fields of a Photograph; empty if no robot held the camera."""
     if isinstance(view, ViewpointCaptured):
         return {"T_base_flange": view.T_base_flange, "joints_rad": view.joints_rad}
     return {}
 
 
 def held_views(context: StepContext, step_id: str) -> dict[str, hand_view.Answer]:
-    """By photograph: what the worker found in the hand-held images of a step.
+    """What the worker found in the hand-held images of a step, by the SHA-256 of the photograph.
 
-    Without a CT each image refines where all were: the newest poses count.
+    Without a CT, each new image refines the poses of all: the newest ones are used.
     """
     names = (hand_view.KIND.name, hand_board.KIND.name)
     done = [j for j in context.evidence.jobs(step_id) if j.kind in names and j.status == "finished"]
@@ -145,24 +145,24 @@ def held_views(context: StepContext, step_id: str) -> dict[str, hand_view.Answer
 
 
 @dataclass(frozen=True, slots=True)
-class Mounted:
-    """How the camera sat on the arm, and what of it is recorded as a reference."""
+class CameraMounting:
+    """How the camera was mounted on the arm, and the references that are recorded in its place."""
 
     mounting: Mounting
-    taken: Mapping[str, Reference | Each | None]
+    references: Mapping[str, Reference | Each | None]
 
 
-def mounting_of(context: StepContext, step_id: str, stations: Iterable[str]) -> Mounted:
-    """What turns the robot's poses into camera poses (worker/poses/robot_poses.py).
+def mounting_of(context: StepContext, step_id: str, stations: Iterable[str]) -> CameraMounting:
+    """What turns robot poses into camera poses (service/worker/poses/robot_poses.py).
 
-    The arm's correction is of one arm: it names the stations where that arm stood.
+    A correction belongs to one arm: it is given with the stations at which that arm stood.
     """
-    found = taken(context, step_id, calibrate.KIND)
+    found = earlier_answer(context, step_id, calibrate.KIND)
     hand_eye = found.answer.hand_eye
     correction = None if hand_eye is None else hand_eye.arm_correction
     references = {"T_flange_camera": found.reference("T_flange_camera")}
     if correction is None:
-        return Mounted(Mounting(T_flange_camera=found.answer.T_flange_camera, arm_correction=None), references)
+        return CameraMounting(Mounting(T_flange_camera=found.answer.T_flange_camera, arm_correction=None), references)
     robots = set(result_of(context, step_id)["robots"])
     mine = tuple(sorted({station for station in stations if context.devices.layout(station).robot in robots}))
     mounting = Mounting(
@@ -170,10 +170,10 @@ def mounting_of(context: StepContext, step_id: str, stations: Iterable[str]) -> 
         arm_correction=ArmCorrection.model_validate(correction.plain()),
         arm_stations=mine,
     )
-    return Mounted(mounting, {**references, "arm_correction": found.reference("hand_eye/arm_correction")})
+    return CameraMounting(mounting, {**references, "arm_correction": found.reference("hand_eye/arm_correction")})
 
 
-def intrinsics_covariance_of(found: Taken[calibrate.Answer]) -> ParameterCovariance | None:
-    """Of a calibration, with the names of its parameters; None where nobody has computed it."""
+def intrinsics_covariance_of(found: EarlierAnswer[calibrate.Answer]) -> ParameterCovariance | None:
+    """Covariance of a calibration's intrinsics, with the parameters' names; None if it was not computed."""
     record = found.answer.details.intrinsics
     return None if record is None else record.covariance

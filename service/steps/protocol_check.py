@@ -14,7 +14,7 @@ from service.core.text.yaml_tree import FieldPath, Plain, Problem, field_name, p
 from service.rig import RigSection
 from service.steps import step_kinds
 from service.steps.measures import Measure, RegistrationMeasures
-from service.steps.poses.sources import Wanted
+from service.steps.poses.sources import WantedRegistrations
 
 # Sections of the file: field → between what it is plausible, in the field's unit.
 _SECTIONS: Mapping[tuple[str, str], tuple[float, float, str]] = {
@@ -34,7 +34,11 @@ def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, 
     if not issubclass(kind.measures, RegistrationMeasures):
         return kind.measures.declared()
     registering = kind.registered_by(step.params, protocol_steps) if kind.registered_by is not None else step
-    return None if registering is None else kind.measures.declared_for(Wanted.of(registering.params).registrations)
+    return (
+        None
+        if registering is None
+        else kind.measures.declared_for(WantedRegistrations.of(registering.params).registrations)
+    )
 
 
 def implausible(loaded: LoadedProtocol, rig: RigSection | None = None) -> tuple[Problem, ...]:

@@ -140,7 +140,7 @@ def utc_text(at: datetime) -> str:
     return at.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
-class Ids(Protocol):
+class IdSource(Protocol):
     """The source of names for runs, jobs and tokens; unique within the data folder."""
 
     def new_run(self, at: datetime) -> str:

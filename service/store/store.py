@@ -16,7 +16,7 @@ from service.core.jobs.priorities import Lane
 from service.core.records.events import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
 from service.store.database.engine import LOOK, RESTORE, Database, database_path, open_database
 from service.store.database.tables import artefacts, event_index, events, heads, runs
-from service.store.durable_effects import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock
+from service.store.durable_effects import Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock
 from service.store.errors import UnknownRunError
 from service.store.events import ROOT, append, read_events, to_event
 from service.store.files.artefacts import ArtefactFiles, chunks_of, insert_artefacts, read_artefacts
@@ -37,7 +37,7 @@ class Store:
     """
 
     def __init__(
-        self, database: Database, folder: ArtefactFiles, files: Files, clock: Clock, ids: Ids, path: Path
+        self, database: Database, folder: ArtefactFiles, files: Files, clock: Clock, ids: IdSource, path: Path
     ) -> None:
         self._database = database
         self._folder = folder
@@ -52,7 +52,7 @@ class Store:
         cls,
         data_dir: Path,
         clock: Clock | None = None,
-        ids: Ids | None = None,
+        ids: IdSource | None = None,
         files: Files | None = None,
         *,
         create: bool = True,

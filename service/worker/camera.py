@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from service.compute.camera_model import CameraModel
 from service.compute.images.resolution import camera_at
-from service.jobs.records import Camera, Photographed
+from service.jobs.records import Camera, ImagesCamera
 
 
 def camera_of(record: Camera) -> CameraModel:
@@ -12,13 +12,13 @@ def camera_of(record: Camera) -> CameraModel:
     return CameraModel.from_record(record.plain())
 
 
-def camera_used(arguments: Photographed) -> CameraModel:
+def camera_used(arguments: ImagesCamera) -> CameraModel:
     """The camera at the size of the images that a job uses."""
     camera = camera_of(arguments.camera)
     return camera if arguments.reduced_to is None else camera_at(camera, *arguments.reduced_to)
 
 
-def camera_reduced(arguments: Photographed) -> CameraModel | None:
+def camera_reduced(arguments: ImagesCamera) -> CameraModel | None:
     """The camera at the size of the photographs, where the job uses reduced copies of them; else None."""
     if arguments.reduced_to is not None:
         return camera_of(arguments.camera)

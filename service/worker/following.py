@@ -14,7 +14,7 @@ from service.core.records.events import Event
 from service.core.results.arrival import late_s
 from service.core.run.fold import advance
 from service.run_record import RunFollower, recorded_protocol, recorded_root
-from service.steps.poses.sources import due
+from service.steps.poses.due_jobs import due
 from service.store.records import Job, NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
@@ -23,7 +23,7 @@ from service.worker.job import JobAnswer
 _log = logging.getLogger(__name__)
 
 
-class Following:
+class FollowedRuns:
     """The runs that a worker has jobs of, each read as far as it went when the last of them ended."""
 
     def __init__(self, store: Store) -> None:

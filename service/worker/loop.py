@@ -26,7 +26,7 @@ from service.store.store import Store
 from service.worker.job import Handler, JobAnswer, JobContext, handler_of
 
 if TYPE_CHECKING:
-    from service.worker.following import Following
+    from service.worker.following import FollowedRuns
 
 _log = logging.getLogger(__name__)
 _LEASE_S = 30.0
@@ -56,7 +56,7 @@ def work(
         finished: told after each job.
     """
     name = f"worker {socket.gethostname()}:{os.getpid()}"
-    following: Following | None = None
+    following: FollowedRuns | None = None
     done = 0
     waiting = False
     while not stop():
@@ -80,14 +80,14 @@ def work(
     return done
 
 
-def _following(store: Store) -> Following:
+def _following(store: Store) -> FollowedRuns:
     """Imported at the first job, as the job's function is."""
-    from service.worker.following import Following  # noqa: PLC0415 - all step kinds come with it, which takes a second
+    from service.worker.following import FollowedRuns  # noqa: PLC0415 - all step kinds come with it, which takes a second
 
-    return Following(store)
+    return FollowedRuns(store)
 
 
-def _do(store: Store, job: Job, progress: Callable[[str, int, int], None], following: Following) -> None:
+def _do(store: Store, job: Job, progress: Callable[[str, int, int], None], following: FollowedRuns) -> None:
     started_s = time.monotonic()
     at(run=job.run_id, step=job.step, job=job.job_id)
     answer = JobAnswer({})

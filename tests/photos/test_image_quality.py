@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from service.compute.images.quality import image_quality
-from service.steps.capture.spoilt import IN_A_ROW, LookedAt, last_in_a_row, why_spoilt
+from service.steps.capture.spoilt import IN_A_ROW, ImageSharpness, last_in_a_row, why_spoilt
 from tests.support.scenes.sphere_images import REGISTRATION_M, render, scene
 
 Grey = NDArray[np.uint8]
@@ -48,8 +48,8 @@ def test_a_black_image_and_one_without_edges_are_not_measured() -> None:
     assert np.isnan(plain.edge_px)
 
 
-def looked(*edges_px: float | None, width: int = 1920) -> list[LookedAt]:
-    return [LookedAt(f"v{i}", f"hash {i}", e, e is None, width) for i, e in enumerate(edges_px)]
+def looked(*edges_px: float | None, width: int = 1920) -> list[ImageSharpness]:
+    return [ImageSharpness(f"v{i}", f"hash {i}", e, e is None, width) for i, e in enumerate(edges_px)]
 
 
 def test_an_image_is_judged_by_the_sharpest_beside_it() -> None:

@@ -22,7 +22,9 @@ from service.dataset.summary import RunSummary
 from service.run_record import RunRecord
 from service.run_start import recorded_run
 from service.steps import params_models
-from service.steps.poses.sources import PLANNED, decisive, due, registration_ways
+from service.steps.poses.due_jobs import due
+from service.steps.poses.registration_jobs import recorded_registration_jobs
+from service.steps.poses.sources import PLANNED, decisive
 from service.steps.poses.time_left import missing_results
 from service.store.records import NewJob
 from service.store.store import Store
@@ -161,7 +163,7 @@ def test_each_job_is_due_when_its_input_is_there_and_once(tmp_path: Path) -> Non
         "triangulated",
     ]  # in parallel
     run.finish("register")
-    found = registration_ways(run.protocol, run.state, run.protocol.step("registration"))
+    found = recorded_registration_jobs(run.protocol, run.state, run.protocol.step("registration"))
     assert found is not None
     assert set(found.arrived) == {"robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid"}
     assert run.due() == []
@@ -185,7 +187,7 @@ def test_a_size_that_is_no_reduction_of_the_photographs_is_left_out_and_holds_no
     effort = "structure_from_motion: {max_image_size: 1600, max_features: 1500, neighbours: 8}"
     run = _Run(protocol((effort, effort + "\n      reduced: [640x360, 4752x3168]")))
     run.finish("detect_spheres")
-    found = registration_ways(run.protocol, run.state, run.protocol.step("registration"))
+    found = recorded_registration_jobs(run.protocol, run.state, run.protocol.step("registration"))
     assert found is not None
     assert set(found.failed) == {"colmap_4752x3168"}
     left = {one.name: one.failed for one in missing_results(run.protocol, run.state, {}, NOW, 2)}

@@ -9,8 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.board.board import Board, BoardView
-from service.compute.calibration.board_poses.candidates import PoseWishes, board_candidates
-from service.compute.calibration.board_poses.design import NOTHING, Aims, as_taken, choose_poses, predict
+from service.compute.calibration.board_poses.candidates import ViewRange, board_candidates
+from service.compute.calibration.board_poses.design import (
+    NOTHING,
+    CalibrationTargets,
+    as_taken,
+    choose_poses,
+    predict,
+)
 from service.compute.calibration.board_poses.knowledge import (
     BoardKnowledge,
     Tolerances,
@@ -30,7 +36,7 @@ MOUNT = transform(np.eye(3), np.array([0.0, -0.055, 0.095]))
 MIDDLE = np.array([0.77, 0.0, 0.21])
 APPROACH = np.array([-1.0, 0.0, 0.0])
 SMALL = Tolerances(0.001, 0.002, 0.003, 0.003, 0.005, 0.005, 0.004, 0.002)
-AIMS = Aims()
+AIMS = CalibrationTargets()
 
 
 USUAL = Tolerances()
@@ -40,9 +46,9 @@ def nominal(tolerances: Tolerances = USUAL) -> BoardKnowledge:
     return nominal_knowledge(CAMERA, MOUNT, MIDDLE, APPROACH, BOARD, tolerances=tolerances)
 
 
-@pytest.mark.parametrize(("wishes", "tolerances"), [(FIRST, Tolerances()), (PoseWishes(), SMALL)])
+@pytest.mark.parametrize(("wishes", "tolerances"), [(FIRST, Tolerances()), (ViewRange(), SMALL)])
 def test_every_planned_pose_holds_the_whole_board_within_the_tolerances(
-    wishes: PoseWishes, tolerances: Tolerances
+    wishes: ViewRange, tolerances: Tolerances
 ) -> None:
     known = nominal(tolerances)
     found = board_candidates(known, BOARD, wishes, APPROACH)
@@ -61,8 +67,8 @@ def test_every_planned_pose_holds_the_whole_board_within_the_tolerances(
 
 def test_a_design_covers_the_image_and_predicts_what_its_images_come_to() -> None:
     known = nominal(SMALL)
-    candidates = board_candidates(known, BOARD, PoseWishes(), APPROACH)
-    aims = Aims(coverage=1.0, corner_sigma_px=0.05)
+    candidates = board_candidates(known, BOARD, ViewRange(), APPROACH)
+    aims = CalibrationTargets(coverage=1.0, corner_sigma_px=0.05)
     poses = choose_poses(candidates, 30, known, BOARD, aims)
     prediction = predict(as_taken(known, BOARD, poses), known, BOARD, aims)
     assert prediction.images == len(poses) == 30
@@ -82,7 +88,7 @@ def test_a_design_covers_the_image_and_predicts_what_its_images_come_to() -> Non
 
 def test_what_the_arm_cannot_take_is_not_planned_and_enough_is_enough() -> None:
     known = nominal(SMALL)
-    candidates = board_candidates(known, BOARD, PoseWishes(), APPROACH)
+    candidates = board_candidates(known, BOARD, ViewRange(), APPROACH)
     near = choose_poses(candidates, 10, known, BOARD, AIMS, feasible=lambda T: T[0, 3] < MIDDLE[0])
     assert len(near) == 10
     assert (near[:, 0, 3] < MIDDLE[0]).all()
@@ -97,7 +103,7 @@ def test_the_first_images_tell_where_board_mount_and_lens_are(seed: int) -> None
     known = nominal()
     hands, boards, _, _ = known.draws(1, seed=50 + seed)
     truth, board = hands[0], boards[0]
-    wishes = PoseWishes(tilts_deg=(8, 24, 38), distances_m=(0.78,))
+    wishes = ViewRange(tilts_deg=(8, 24, 38), distances_m=(0.78,))
     poses = board_candidates(nominal(SMALL), BOARD, wishes, APPROACH).T_base_camera
     flanges: list[Array] = []
     views: list[BoardView] = []

@@ -18,7 +18,7 @@ from service.compute.arm.correction import ArmCorrection, corrected_T_base_flang
 from service.compute.arm.inverse_kinematics import postures
 from service.compute.arm.kinematics import arm_model
 from service.compute.capture.live import LiveView, clipped_fraction, register_station, sharpness
-from service.compute.markers.search.predicted import NEAR, Found, Prediction, find_spheres, tone_of
+from service.compute.markers.search.predicted import NEAR, ImageOutlines, Prediction, find_spheres, tone_of
 from service.compute.planning.coverage import (
     CoverageLimits,
 )
@@ -269,7 +269,7 @@ def measured_run(
 
     def exactly(*_args: Any) -> Any:
         seen = exact_outlines(Scene(T_base_scan, np.array(here), made), 0, SPHERES_M, 0.1, margin_px=30)[0]
-        return Found(tuple(seen), None, {})
+        return ImageOutlines(tuple(seen), None, {})
 
     def serve(_what: str) -> None:
         job = bench.store.claim_job("test", 30, kinds=list(known))

@@ -22,7 +22,7 @@ _GRACE_S = 0.25  # before a long computation begins: the page that asked is answ
 _REST_S = 0.001  # between two chunks, so that pages come first
 
 
-class Copyable(Protocol):
+class CopyableResult(Protocol):
     """What can be computed."""
 
     def copy(self) -> Self:
@@ -30,7 +30,7 @@ class Copyable(Protocol):
         ...
 
 
-T = TypeVar("T", bound=Copyable)
+T = TypeVar("T", bound=CopyableResult)
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,7 +81,7 @@ ReportMaker = Callable[[AuditReport, int], bytes]  # from what verifying gave; u
 
 
 @dataclass(frozen=True, slots=True)
-class _Head:
+class _ChainHead:
     seq: int
     sha256: str
     at_utc: str
@@ -267,10 +267,10 @@ def _require_same(listed: ManifestEntry, sha256: str, path: Path) -> None:
         )
 
 
-def _head(connection: Connection, run_id: str) -> _Head:
+def _head(connection: Connection, run_id: str) -> _ChainHead:
     last = select(event_table.c.seq, event_table.c.sha256, event_table.c.at_utc).where(event_table.c.run_id == run_id)
     row = connection.execute(last.order_by(event_table.c.seq.desc()).limit(1)).one()
-    return _Head(row.seq, row.sha256, row.at_utc)
+    return _ChainHead(row.seq, row.sha256, row.at_utc)
 
 
 def _event_lines(connection: Connection, run_id: str) -> Iterator[bytes]:

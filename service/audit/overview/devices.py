@@ -12,12 +12,12 @@ from service.audit.record.queries import (
     plain,
     read_rows,
 )
-from service.core.equipment.camera_bodies import Bodies, bodies_of
+from service.core.equipment.camera_bodies import CameraBodies, bodies_of
 
 _LOOKED_AT = 500  # photographs, the newest: one that states another body is an image that departs, which is judged
 
 
-def bodies_of_run(connection: Connection, run_id: str, opened: Iterable[EventRow]) -> Bodies:
+def bodies_of_run(connection: Connection, run_id: str, opened: Iterable[EventRow]) -> CameraBodies:
     """Serial numbers of the cameras. `opened`: its events device_opened with their payloads."""
     rows = connection.execute(
         text(

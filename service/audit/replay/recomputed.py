@@ -38,7 +38,7 @@ class _Pair:
     now: JobState
 
 
-class Recomputed:
+class RecomputedJobs:
     """The jobs of a run, with the answers that the replay gave."""
 
     def __init__(self, state: RunState) -> None:
@@ -87,7 +87,7 @@ class Recomputed:
         return measures
 
 
-def drifts(summary: RunSummary, recomputed: Recomputed) -> Iterator[Drift]:
+def drifts(summary: RunSummary, recomputed: RecomputedJobs) -> Iterator[Drift]:
     """For every registration that was computed again."""
     spheres = summary.result("scan_import").get("spheres_m")
     if not spheres:

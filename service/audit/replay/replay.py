@@ -14,7 +14,7 @@ import numpy as np
 
 from service.audit.record.run import RecordedFiles, RecordedRun
 from service.audit.replay.differences import Comparison, Difference, compare_data, compare_files
-from service.audit.replay.recomputed import Drift, Recomputed, drifts
+from service.audit.replay.recomputed import Drift, RecomputedJobs, drifts
 from service.core.errors import ConfigurationError, IntegrityError, OrthocaptureError
 from service.core.gates.verdict import evaluate_gates
 from service.core.jobs.references import jobs_of, resolve
@@ -181,7 +181,7 @@ def replay(
             where=str(run.data_dir),
             remedy="See `orthocapture audit verify`; restore the file from a copy",
         )
-    recomputed = Recomputed(run.state)
+    recomputed = RecomputedJobs(run.state)
     recorded = jobs_of(run.state)
     replays: list[JobReplay] = []
     with tempfile.TemporaryDirectory(prefix="orthocapture-replay-") as folder:
@@ -241,7 +241,7 @@ def _replay_job(
     step: str,
     job: JobState,
     arguments: Mapping[str, Any],
-    recomputed: Recomputed,
+    recomputed: RecomputedJobs,
     progress: Progress,
 ) -> JobReplay:
     recorded = _finished(run, job)
@@ -316,7 +316,7 @@ def _compare_artefacts(
     return ArtefactReplay(old.original_name, old.kind, old.sha256, new.sha256, content)
 
 
-def _gates(run: RecordedRun, recomputed: Recomputed) -> Iterator[GateReplay]:
+def _gates(run: RecordedRun, recomputed: RecomputedJobs) -> Iterator[GateReplay]:
     """The gates of every step whose measures hold a recomputed one.
 
     That the recorded verdicts follow from the recorded measures is what reading the run has shown: `fold` refuses

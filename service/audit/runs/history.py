@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from sqlalchemy import Connection, text
 
-from service.audit.runs.search import FoundRun, RunWanted, find_runs
+from service.audit.runs.search import FoundRun, RunSearch, find_runs
 from service.store.store import Store
 
 InstrumentKind = Literal["camera", "lens", "arm"]
@@ -83,7 +83,7 @@ class HistoryRow:
 
 def history(store: Store) -> list[HistoryRow]:
     """Every run with a calibration or an accuracy, oldest first."""
-    runs = find_runs(store, RunWanted())[::-1]
+    runs = find_runs(store, RunSearch())[::-1]
     with store.database.reading() as connection:
         calibrations = _calibrations(connection)
         devices = _devices(connection)

@@ -29,7 +29,7 @@ _ERROR = "mean_radial_error_mm"  # the measure of an evaluation that says how ac
 
 
 @dataclass(frozen=True, slots=True)
-class RunWanted:
+class RunSearch:
     """Which runs are wanted; an empty field wants all."""
 
     q: str = ""  # words, all of which are found somewhere in what people said of the run
@@ -95,7 +95,7 @@ class FoundRun:
         return "\n".join(map(str, parts)).casefold()
 
 
-def find_runs(store: Store, wanted: RunWanted) -> list[FoundRun]:
+def find_runs(store: Store, wanted: RunSearch) -> list[FoundRun]:
     """The runs that are wanted, newest first. A root that cannot be read leaves its fields empty."""
     with store.database.reading() as connection:
         every = _every(connection)

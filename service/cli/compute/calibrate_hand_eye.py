@@ -137,7 +137,7 @@ def hand_eye_command(
             count=suggest if setup == "eye-in-hand" else 0,
             reachable=None
             if kinematics is None or joints_rad is None
-            else _Reach(kinematics, joints_rad, T_base_flange),
+            else _Reachability(kinematics, joints_rad, T_base_flange),
         )
         record: dict[str, Any] = {
             **hand_eye_record(result, names, setup),
@@ -157,7 +157,7 @@ def hand_eye_command(
         console.print(f"written: {out}")
 
 
-class _Reach:
+class _Reachability:
     """Whether an arm can reach a pose from the joint positions of the nearest recorded pose."""
 
     def __init__(self, arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from service.audit.runs.comparison import ComparedRun, RunComparison, compare_runs
 from service.audit.runs.history import history, history_csv
-from service.audit.runs.search import RESULT_WORDS, RESULTS, FoundRun, RunWanted, find_runs
+from service.audit.runs.search import RESULT_WORDS, RESULTS, FoundRun, RunSearch, find_runs
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -43,7 +43,7 @@ def runs_command(
     """List the recorded runs, newest first: all, or those that match."""
     if result and result not in RESULTS:
         raise typer.BadParameter(f"{result!r} is not one of {', '.join(RESULTS)}", param_hint="--result")
-    wanted = RunWanted(search, _day(since, "--since"), _day(until, "--until"), result)
+    wanted = RunSearch(search, _day(since, "--since"), _day(until, "--until"), result)
     with reporting_errors(json), Store.open(data, create=False) as store:
         found = find_runs(store, wanted)
     if json:

@@ -20,7 +20,7 @@ _FIRST_WAIT_S, _LONGEST_WAIT_S = 1.0, 60.0  # before a dead worker is replaced; 
 @contextmanager
 def worker_beside(data: Path, tell: Callable[[str], object]) -> Generator[None]:
     """Run a worker process until the end of this block or of this process; `tell` is called when one dies."""
-    beside = _Beside(data, tell)
+    beside = _WorkerProcess(data, tell)
     keeper = threading.Thread(target=beside.keep, name="keeper of the worker", daemon=True)
     keeper.start()
     try:
@@ -31,7 +31,7 @@ def worker_beside(data: Path, tell: Callable[[str], object]) -> Generator[None]:
         beside.end()
 
 
-class _Beside:
+class _WorkerProcess:
     def __init__(self, data: Path, tell: Callable[[str], object]) -> None:
         self.over = threading.Event()
         self._tell = tell

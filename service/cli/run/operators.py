@@ -131,7 +131,7 @@ class ScreenOperator(_Operator):
 
 
 @dataclass
-class _Accepting:
+class _AcceptanceForm:
     """An acceptance that is being typed: its reason, the hash of its figures, and the name once given."""
 
     reason: str
@@ -149,7 +149,7 @@ class TerminalOperator(_Operator):
     who: Identity | None = None  # the person who types
     _asked: AskOperator | None = None
     _typed: bytes = b""
-    _accepting: _Accepting | None = None
+    _accepting: _AcceptanceForm | None = None
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
         """Show a new question once; then return the answer if a line was typed."""
@@ -201,7 +201,7 @@ class TerminalOperator(_Operator):
         if why:
             self.display.console.print(Text("Why: ") + why, soft_wrap=False)
 
-    def _accept(self, accepting: _Accepting, line: str, state: RunState) -> AnswerBy | None:
+    def _accept(self, accepting: _AcceptanceForm, line: str, state: RunState) -> AnswerBy | None:
         """Read first the name, then the password, each on its own line; the run is attended to in between."""
         if not accepting.name:
             accepting.name = line.strip() or self.name
@@ -249,7 +249,7 @@ class TerminalOperator(_Operator):
             if not reason:
                 self.display.tell("accept needs a reason: type `accept`, a space and the reason")
                 return None
-            self._accepting = _Accepting(reason, state.step.gates_sha256)
+            self._accepting = _AcceptanceForm(reason, state.step.gates_sha256)
             self.display.tell(f"who accepts it? The name of the {demanded_role(self.protocol, state)}, then Enter:")
             return None
         target, _, rest = reason.partition(" ")

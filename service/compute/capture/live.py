@@ -49,7 +49,7 @@ class Sharpness:
 
 
 @dataclass(frozen=True, slots=True)
-class Provisional:
+class ProvisionalRegistration:
     """The registration of one station's images so far.
 
     `registration.residuals` count the `used` images. `T_base_scan` maps the scan (or CT) frame to the station's base.
@@ -84,7 +84,7 @@ def register_station(
     radius_m: float,
     camera: CameraModel,
     T_base_scan: Transform | None = None,
-) -> Provisional:
+) -> ProvisionalRegistration:
     """Register the images of one station.
 
     Args:
@@ -116,7 +116,7 @@ def register_station(
         PosedImages(poses[keep], camera, groups=np.zeros(len(keep), dtype=np.int64)),
         ScanSpheres(spheres_m, radius_m),
     )
-    return Provisional(answer.T_world_scan, answer, tuple(views[i].name for i in keep))
+    return ProvisionalRegistration(answer.T_world_scan, answer, tuple(views[i].name for i in keep))
 
 
 def sharpness(image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], camera: CameraModel) -> Sharpness:

@@ -155,12 +155,12 @@ def leave_one_out(registration: RegistrationResult, *, refined: bool = False) ->
 
 
 @dataclass(frozen=True, slots=True)
-class _Rest:
+class _PartialSolution:
     solution: Solution
     step: Array  # (n,) of the common unknowns
 
 
-def _without(full: Solution, weights: Array) -> _Rest:
+def _without(full: Solution, weights: Array) -> _PartialSolution:
     problem, lines, prior = full.problem, full.linearised, full.problem.prior()
     blocks = compress(lines.J, lines.A, lines.r, problem.image, problem.n_images, weights)
     marginal = marginalise(blocks, full.pose_root, full.outline_factor)
@@ -170,7 +170,7 @@ def _without(full: Solution, weights: Array) -> _Rest:
     solution = replace(
         full, state=state, weights=weights, blocks=blocks, marginal=marginal, covariance=inverse_symmetric(H)
     )
-    return _Rest(solution, dx)
+    return _PartialSolution(solution, dx)
 
 
 def _distances(points: Array, centre: Array, radius_m: float, camera: CameraModel) -> tuple[float, float]:

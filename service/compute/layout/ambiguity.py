@@ -47,7 +47,7 @@ class Confusion:
 
 
 @dataclass(frozen=True, slots=True)
-class Bounded:
+class BoundedLength:
     """A length in metres with one-sided 99 % bounds; all three values are equal if no uncertainty is known."""
 
     value_m: float
@@ -80,12 +80,12 @@ class LayoutReport:
         problems: what must be changed, in words; empty if the layout passes.
     """
 
-    margin: Bounded
-    margin_of_five: Bounded
+    margin: BoundedLength
+    margin_of_five: BoundedLength
     worst: tuple[Confusion, ...]
     margin_by_count_m: dict[int, float]
     sphere_margins_m: Array
-    depth: Bounded
+    depth: BoundedLength
     extent_m: float
     largest_gap_rad: float
     problems: tuple[str, ...]
@@ -210,7 +210,7 @@ def layout_record(report: LayoutReport) -> dict[str, Any]:
     }
 
 
-def layout_bounds(report: LayoutReport) -> dict[str, tuple[Bounded, float]]:
+def layout_bounds(report: LayoutReport) -> dict[str, tuple[BoundedLength, float]]:
     """The numbers of a layout that gates judge, by measure name, each with its required value (m)."""
     found = {
         "layout_margin_mm": (report.margin, REQUIRED_MARGIN_M),
@@ -339,29 +339,29 @@ def _by_count(centres: Array, matches: Matches, order: IntArray) -> dict[int, Ma
     return found
 
 
-_NO_BOUND = Bounded(np.inf, np.inf, np.inf)
+_NO_BOUND = BoundedLength(np.inf, np.inf, np.inf)
 
 
-def _least(centres: Array, joint: Array | None, matches: Matches) -> Bounded:
+def _least(centres: Array, joint: Array | None, matches: Matches) -> BoundedLength:
     """The least misfit, bounded by the least of all lower bounds and the least of all upper ones."""
     if joint is None:
         least = float(matches.misfit.min())
-        return Bounded(least, least, least)
+        return BoundedLength(least, least, least)
     found = bounded_misfits(centres, joint, matches.seen, matches.taken)
     lower, upper = float(found.lower_m.min()), float(found.upper_m.min())
-    return Bounded(float(np.clip(found.misfit_m.min(), lower, upper)), lower, upper)
+    return BoundedLength(float(np.clip(found.misfit_m.min(), lower, upper)), lower, upper)
 
 
-def _depth(centres: Array, singular: Array, axes: Array, joint: Array | None) -> Bounded:
+def _depth(centres: Array, singular: Array, axes: Array, joint: Array | None) -> BoundedLength:
     """RMS height over the best plane, with the first-order variance of a singular value."""
     n = len(centres)
     depth = float(singular[2] / np.sqrt(n))
     if joint is None:
-        return Bounded(depth, depth, depth)
+        return BoundedLength(depth, depth, depth)
     height = (centres - centres.mean(axis=0)) @ axes[2]
     slope = np.outer(height / max(float(singular[2]), 1e-9) / np.sqrt(n), axes[2]).ravel()
     sigma = float(np.sqrt(slope @ joint @ slope))
-    return Bounded(depth, max(depth - _QUANTILE * sigma, 0.0), depth + _QUANTILE * sigma)
+    return BoundedLength(depth, max(depth - _QUANTILE * sigma, 0.0), depth + _QUANTILE * sigma)
 
 
 def _joint(covariance: Array | None, n: int) -> Array | None:

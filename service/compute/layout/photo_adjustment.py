@@ -90,7 +90,7 @@ class Photograph:
 
 
 @dataclass(frozen=True, slots=True)
-class Adjusted:
+class AdjustedLayout:
     """The adjusted spheres and poses.
 
     Attributes:
@@ -113,7 +113,7 @@ def adjust(
     T_photo_first: Sequence[Transform],
     radius_m: float,
     prior: LensPrior,
-) -> Adjusted:
+) -> AdjustedLayout:
     """Adjust spheres, poses and camera to all outlines by Gauss–Newton with Huber weights.
 
     Args:
@@ -149,7 +149,7 @@ def adjust(
     )
     _, covariance, chi2 = problem.step(x)
     count = 3 * len(centres_m)
-    return Adjusted(
+    return AdjustedLayout(
         x.centres,
         covariance[:count, :count] * max(1.0, chi2),
         tuple(transform(R, t) for R, t in zip(x.rotations, x.shifts, strict=True)),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from service.compute.layout.ambiguity import distances
-from service.compute.layout.photo_adjustment import Adjusted, LensPrior, Photograph, adjust
+from service.compute.layout.photo_adjustment import AdjustedLayout, LensPrior, Photograph, adjust
 from service.compute.markers.cones import Cone
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, align_points, apply, inverse
@@ -101,7 +101,7 @@ class _Group:
 
 def _adjusted(
     photographs: Sequence[Photograph], group: _Group, centres: Array, radius_m: float, prior: LensPrior
-) -> Adjusted:
+) -> AdjustedLayout:
     chosen: list[Photograph] = []
     spheres: list[IntArray] = []
     for k, ids in zip(group.photographs, group.spheres, strict=True):
@@ -113,11 +113,11 @@ def _adjusted(
 
 
 def _joined(
-    photographs: Sequence[Photograph], group: _Group, found: Adjusted, k: int, radius_m: float, prior: LensPrior
-) -> tuple[_Group, Adjusted]:
+    photographs: Sequence[Photograph], group: _Group, found: AdjustedLayout, k: int, radius_m: float, prior: LensPrior
+) -> tuple[_Group, AdjustedLayout]:
     """The group with photograph k added by its best-fitting assignment; unchanged if none fits."""
     places = places_by_size(photographs[k].cones, radius_m)
-    best: tuple[_Group, Adjusted] | None = None
+    best: tuple[_Group, AdjustedLayout] | None = None
     best_rank = (True, np.inf)
     for T_first_photo, pairs in _readings(found.centres_m, places):
         ids = np.full(len(places), -1, dtype=np.int64)
@@ -149,11 +149,11 @@ def _nearest_m(centres: Array) -> float:
 def _reduced(
     photographs: Sequence[Photograph],
     group: _Group,
-    found: Adjusted,
+    found: AdjustedLayout,
     expected: int,
     radius_m: float,
     prior: LensPrior,
-) -> tuple[_Group, Adjusted]:
+) -> tuple[_Group, AdjustedLayout]:
     """Without the spheres seen in the fewest photographs, which are other round objects."""
     count = np.bincount(np.concatenate([i[i >= 0] for i in group.spheres]), minlength=len(found.centres_m))
     kept = np.sort(np.argsort(-count, kind="stable")[:expected])

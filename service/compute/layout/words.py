@@ -18,7 +18,7 @@ _SAME_HEIGHT_M = 0.005
 
 
 @dataclass(frozen=True, slots=True)
-class ShownMove:
+class PhotographedMove:
     """A move in a photograph.
 
     Attributes:
@@ -36,7 +36,7 @@ class ShownMove:
 
 def show_move(
     move: Move, centres_m: Array, up: Array, T_photo_centres: Transform, camera: CameraModel, limit_m: float
-) -> ShownMove:
+) -> PhotographedMove:
     """The move as seen in a photograph taken with `camera`.
 
     Args:
@@ -66,4 +66,4 @@ def show_move(
         f"Move sphere {move.sphere}, {where} of the photograph, {' and '.join(parts)}; the margin is then predicted "
         f"to be {mm(move.margin_m):.1f} mm ({mm(limit_m):.1f} mm are needed)"
     )
-    return ShownMove(words, start, end, higher)
+    return PhotographedMove(words, start, end, higher)

@@ -10,7 +10,7 @@ from service.core.records.events import DeviceOpened, Event, View
 
 
 @dataclass(frozen=True, slots=True)
-class Bodies:
+class CameraBodies:
     """The serial numbers of a run's cameras.
 
     Attributes:
@@ -53,7 +53,7 @@ class Bodies:
         )
 
 
-def bodies(events: Sequence[Event]) -> Bodies:
+def bodies(events: Sequence[Event]) -> CameraBodies:
     """The serial numbers in a run's events."""
     opened = [event.payload for event in events if isinstance(event.payload, DeviceOpened)]
     stated = (event.payload.camera.get("body_serial") for event in events if isinstance(event.payload, View))
@@ -61,7 +61,7 @@ def bodies(events: Sequence[Event]) -> Bodies:
     return bodies_of(identities, (str(number or "") for number in stated))
 
 
-def bodies_of(identities: Iterable[tuple[str, Mapping[str, Any]]], stated: Iterable[str]) -> Bodies:
+def bodies_of(identities: Iterable[tuple[str, Mapping[str, Any]]], stated: Iterable[str]) -> CameraBodies:
     """The serial numbers of cameras.
 
     Args:
@@ -71,7 +71,7 @@ def bodies_of(identities: Iterable[tuple[str, Mapping[str, Any]]], stated: Itera
     wires = {
         str(identity.get("serial") or ""): name for name, identity in identities if identity.get("kind") == "camera"
     }
-    return Bodies(wires, tuple(dict.fromkeys(number for number in stated if number)))
+    return CameraBodies(wires, tuple(dict.fromkeys(number for number in stated if number)))
 
 
 def _same(one: str, other: str) -> bool:

@@ -8,7 +8,7 @@ from service.core.errors import IllegalTransitionError
 from service.core.gates.verdict import describe_judged
 from service.core.protocol.models import AcceptedBy, Protocol
 from service.core.records.events import GateVerdict, OperatorAction
-from service.core.run.state import Accepted, RunState, StepState
+from service.core.run.state import AcceptedDeviation, RunState, StepState
 
 ROLE_OF: Mapping[AcceptedBy, str] = {"supervisor": "supervisor", "another_supervisor": "supervisor"}
 
@@ -86,7 +86,7 @@ def acceptor_refusal(
     return None
 
 
-def describe_accepted(accepted: Accepted) -> str:
+def describe_accepted(accepted: AcceptedDeviation) -> str:
     """One line on an acceptance: `coverage 0.896, allowed ≥ 0.9; accepted by Emmy (supervisor): the reason`."""
     figures = "; ".join(describe_judged(verdict) for verdict in accepted.verdicts)
     how = {"claimed": ", by claim", "pin": ", by PIN", "badge": ", by badge"}.get(accepted.identified, "")

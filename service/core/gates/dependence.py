@@ -8,7 +8,7 @@ from typing import Any
 
 from service.core.gates.acceptance import describe_accepted
 from service.core.protocol.models import Protocol, Step
-from service.core.run.state import Accepted, RunState
+from service.core.run.state import AcceptedDeviation, RunState
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +17,7 @@ class AcceptedGate:
 
     step: str
     title: str
-    accepted: Accepted
+    accepted: AcceptedDeviation
 
     @property
     def text(self) -> str:

@@ -1,8 +1,9 @@
-"""References: what a job takes from an earlier job stands in its arguments as a place in that job's answer, no copy.
+"""References: where a job uses part of an earlier job's answer, its arguments name that part and do not copy it.
 
 In the JSON of an event a reference is an object with one key. `{"$from": {"job": "…", "field": "result/camera"}}` is
-one part of one answer; `{"$each": {"jobs": ["capture/0/live_view/"], "upto_seq": 81, "field": "artefacts/0/sha256",
-"without": []}}` is the same part of every job whose key begins so and that had finished by that event.
+one part of one answer. `{"$each": {"jobs": ["capture/0/live_view/"], "upto_seq": 81, "field": "artefacts/0/sha256",
+"without": []}}` is the same part of the answer of every job whose key begins with one of `jobs` and that had finished
+by event `upto_seq`.
 """
 
 from __future__ import annotations
@@ -38,13 +39,13 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class Each:
-    """The same part of many earlier answers, in the order in which the jobs were enqueued: its size does not grow.
+    """The same part of many earlier answers, in the order in which their jobs were enqueued. Its size is constant.
 
     Attributes:
-        jobs: beginnings of the jobs' keys (`step/generation/kind/`), in the order of the list.
+        jobs: prefixes of the jobs' keys (`step/generation/kind/`); the answers follow in the order of these prefixes.
         upto_seq: only jobs that had finished by this event count.
         field: as in `Reference`.
-        without: ids of jobs that do not count, such as those of images that were taken again.
+        without: ids of jobs to leave out, such as those of images that were taken again.
     """
 
     jobs: tuple[str, ...]
@@ -59,12 +60,17 @@ class Each:
 
     def members(self, jobs: Jobs) -> list[JobState]:
         """The jobs that it stands for."""
-        finished = [
+        without = frozenset(self.without)
+        chosen = [
             job
-            for job in sorted(jobs.values(), key=lambda job: job.enqueued_seq)
-            if job.status == "finished" and job.ended_seq <= self.upto_seq and job.job not in self.without
+            for job in jobs.values()
+            if job.idempotency_key.startswith(self.jobs)
+            and job.status == "finished"
+            and job.ended_seq <= self.upto_seq
+            and job.job not in without
         ]
-        return [job for key in self.jobs for job in finished if job.idempotency_key.startswith(key)]
+        chosen.sort(key=lambda job: job.enqueued_seq)
+        return [job for key in self.jobs for job in chosen if job.idempotency_key.startswith(key)]
 
 
 def jobs_of(state: RunState) -> dict[str, JobState]:

@@ -12,7 +12,7 @@ from service.core.gates.acceptance import acceptance_refusal, demanded_role
 from service.core.gates.dependence import dependent_steps, used_steps
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import OperatorVerb
-from service.core.recovery.words import AGAIN, OTHERWISE, REMEDIES, UNKNOWN_REMEDY, Again
+from service.core.recovery.words import AGAIN, OTHERWISE, REMEDIES, UNKNOWN_REMEDY, RepeatedStep
 from service.core.run.actions import redo_refusal, skip_refusal, unmet_requirements
 from service.core.run.state import RunState, StepState
 from service.core.run.state_transitions import seconds_between
@@ -129,7 +129,7 @@ def _all_taken(step: Step, now: StepState) -> bool:
     return not now.mend and 0 < planned_views(step) <= len(now.captured)
 
 
-def _again_of(step: Step) -> Again:
+def _again_of(step: Step) -> RepeatedStep:
     return AGAIN.get(step.kind, OTHERWISE)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Again:
+class RepeatedStep:
     """What trying a kind of step again means after its figures were outside their limits.
 
     Attributes:
@@ -23,20 +23,22 @@ class Again:
     computes: bool = True
 
 
-OTHERWISE = Again("Put right what the figures show, then try this step again")
-AGAIN: Mapping[str, Again] = {
-    "checklist": Again("Do the open items, tick them, and confirm again", device=False, computes=False),
-    "layout_check": Again("Move the spheres as it says, then take another photograph"),
-    "ct_import": Again("Put another series into the CT folder and import it"),
-    "calibration": Again("Take the board images that are missing and compute again; the others are kept"),
-    "viewpoint_capture": Again("Take the views that are missing or would help; the others are kept"),
-    "manual_capture": Again("Take the images that are missing or would help; the others are kept"),
-    "scan_import": Again("Scan again, export the scan, and import it"),
-    "timed_application": Again(
+OTHERWISE = RepeatedStep("Put right what the figures show, then try this step again")
+AGAIN: Mapping[str, RepeatedStep] = {
+    "checklist": RepeatedStep("Do the open items, tick them, and confirm again", device=False, computes=False),
+    "layout_check": RepeatedStep("Move the spheres as it says, then take another photograph"),
+    "ct_import": RepeatedStep("Put another series into the CT folder and import it"),
+    "calibration": RepeatedStep("Take the board images that are missing and compute again; the others are kept"),
+    "viewpoint_capture": RepeatedStep("Take the views that are missing or would help; the others are kept"),
+    "manual_capture": RepeatedStep("Take the images that are missing or would help; the others are kept"),
+    "scan_import": RepeatedStep("Scan again, export the scan, and import it"),
+    "timed_application": RepeatedStep(
         "Judge it again as it is; the time since the coating runs on", same=True, device=False, computes=False
     ),
-    "registration": Again("Compute it again; the same images give the same figures", same=True, device=False),
-    "evaluation": Again("Compute it again; the same registration gives the same figures", same=True, device=False),
+    "registration": RepeatedStep("Compute it again; the same images give the same figures", same=True, device=False),
+    "evaluation": RepeatedStep(
+        "Compute it again; the same registration gives the same figures", same=True, device=False
+    ),
 }
 
 # Error class → what a person does before trying again. Every class in drivers/errors.py has an entry.

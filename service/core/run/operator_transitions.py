@@ -10,7 +10,7 @@ from service.core.protocol.models import Protocol
 from service.core.records.events import Event, OperatorAction
 from service.core.run.actions import refuse
 from service.core.run.lifecycle import redo
-from service.core.run.state import Accepted, DeviationKind, Leave, RunState, StepState
+from service.core.run.state import AcceptedDeviation, DeviationKind, Leave, RunState, StepState
 from service.core.run.state_transitions import UNMEASURED, change, deviate, go, pass_on, supersede
 
 
@@ -30,7 +30,9 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
         case "sign":
             return change(state, state.current, signed=True, signed_by=event.actor)
         case "accept":
-            accepted = Accepted(event.seq, event.actor, p.role, p.identified, p.reason, failed_gates(state.step))
+            accepted = AcceptedDeviation(
+                event.seq, event.actor, p.role, p.identified, p.reason, failed_gates(state.step)
+            )
             state = deviate(state, event, "gate_accepted", state.current, describe_accepted(accepted))
             return go(protocol, state, "gates_accepted", accepted=accepted)
         case "skip":

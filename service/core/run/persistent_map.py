@@ -11,7 +11,7 @@ Value = TypeVar("Value")
 
 
 @dataclass(slots=True)
-class _Shared(Generic[Value]):
+class _Versions(Generic[Value]):
     """What all versions of a mapping share: the values of each key, with the version that added each."""
 
     values: dict[str, list[tuple[int, Value]]] = field(default_factory=dict[str, list[tuple[int, Value]]])
@@ -29,7 +29,7 @@ class PersistentMap(Mapping[str, Value]):
     __slots__ = ("_length", "_shared", "_version")
 
     def __init__(self, items: Mapping[str, Value] | None = None) -> None:
-        shared = _Shared[Value]()
+        shared = _Versions[Value]()
         for key, value in (items or {}).items():
             shared.values[key] = [(0, value)]
         self._shared, self._version, self._length = shared, 0, len(shared.values)
@@ -45,7 +45,7 @@ class PersistentMap(Mapping[str, Value]):
         return PersistentMap({**self, key: value})
 
     @classmethod
-    def _next(cls, shared: _Shared[Value], length: int) -> PersistentMap[Value]:
+    def _next(cls, shared: _Versions[Value], length: int) -> PersistentMap[Value]:
         following = cls.__new__(cls)
         following._shared, following._version, following._length = shared, shared.newest, length
         return following

@@ -74,7 +74,7 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True)
-class Accepted:
+class AcceptedDeviation:
     """A person's acceptance of a step's figures outside their limits."""
 
     seq: int  # of the operator_action event
@@ -106,7 +106,7 @@ class StepState:
     verdicts: tuple[GateVerdict, ...] = ()
     gates_passed: bool = False
     gates_sha256: str = ""  # of the gates_evaluated event: what a signature of this step binds
-    accepted: Accepted | None = None  # set if a person accepted figures outside the limits
+    accepted: AcceptedDeviation | None = None  # set if a person accepted figures outside the limits
     passed_sha256: str = ""  # of the step_passed event: what the release of an irreversible step binds
     passed_seq: int = 0
     failure: Failure | None = None

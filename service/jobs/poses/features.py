@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from service.jobs.kind import JobKind, NoAnswer
-from service.jobs.records import ImageFile, Photographed
+from service.jobs.records import ImageFile, ImagesCamera
 
 
-class FrontEndArguments(Photographed):
+class FrontEndArguments(ImagesCamera):
     """Of features and of matches; `effort` are SfmOptions."""
 
     effort: dict[str, Any]

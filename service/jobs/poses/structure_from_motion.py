@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from service.jobs.kind import JobKind, NoAnswer
-from service.jobs.records import Hash, Matrix, Photograph, Photographed
+from service.jobs.records import Hash, ImagesCamera, Matrix, Photograph
 
 
-class Arguments(Photographed):
+class Arguments(ImagesCamera):
     """What is mapped, and how.
 
     Attributes:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from service.jobs.kind import JobKind, NoAnswer
-from service.jobs.records import Hash, Matrix, Mounting, ParameterCovariance, Photograph, Photographed, Point
+from service.jobs.records import Hash, ImagesCamera, Matrix, Mounting, ParameterCovariance, Photograph, Point
 
 
-class SceneArguments(Photographed, Mounting):
+class SceneArguments(ImagesCamera, Mounting):
     """What all jobs of a registration have in common.
 
     Attributes:

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.design import Aims, Prediction, Taken
+from service.compute.calibration.board_poses.design import CalibrationTargets, ChosenViews, Prediction
 from service.compute.calibration.board_poses.knowledge import BoardKnowledge, refined_knowledge
 from service.compute.camera_model import CameraModel
 from service.compute.planning.motion_plan import able_postures
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.text.counts import counted
-from service.steps.board.looks import BoardLooks, Look
+from service.steps.board.looks import BoardLooks, SearchedBoardImage
 from service.steps.board.plan import (
     START,
     BoardPoses,
@@ -94,7 +94,7 @@ class BoardCapture:
             for pose in note["poses"]
         )
 
-    def _more(self, looks: Sequence[Look]) -> tuple[Viewpoint, ...]:
+    def _more(self, looks: Sequence[SearchedBoardImage]) -> tuple[Viewpoint, ...]:
         """Which poses to add now; none when all that is wanted is there, or no more may be replaced."""
         seen = [look for look in looks if look.seen]
         planned = sum(len(n["poses"]) for n in self._notes if n["why"] != "replacement")
@@ -120,7 +120,7 @@ class BoardCapture:
             return self._plan("start", START - planned, looks)
         return self._rest(looks)
 
-    def _rest(self, looks: Sequence[Look]) -> tuple[Viewpoint, ...]:
+    def _rest(self, looks: Sequence[SearchedBoardImage]) -> tuple[Viewpoint, ...]:
         planned = sum(len(n["poses"]) for n in self._notes if n["why"] != "replacement")
         return self._plan("rest", self.wanted.count - planned, looks)
 
@@ -146,7 +146,7 @@ class BoardCapture:
         self,
         why: Why,
         count: int,
-        looks: Sequence[Look],
+        looks: Sequence[SearchedBoardImage],
         *,
         enough: Callable[[Prediction, Prediction], bool] | None = None,
         advise: Callable[[int, str, str], str] | None = None,
@@ -197,7 +197,7 @@ class BoardCapture:
         return Planner(
             self.wanted,
             self.board,
-            Aims("intrinsics" in self.solve, "hand_eye" in self.solve, coverage),
+            CalibrationTargets("intrinsics" in self.solve, "hand_eye" in self.solve, coverage),
             np.array(layout.approach),
             self._mount,
             self._feasible(known),
@@ -217,12 +217,12 @@ class BoardCapture:
         )  # fmt: skip
         return lambda T: bool(able_postures(T, situation))
 
-    def _taken(self, looks: Sequence[Look], known: BoardKnowledge, planner: Planner) -> Taken:
+    def _taken(self, looks: Sequence[SearchedBoardImage], known: BoardKnowledge, planner: Planner) -> ChosenViews:
         """The images with a board, and poses that are decided and not taken yet."""
         seen = [look for look in looks if look.seen and look.view is not None]
         poses = np.array([np.array(look.capture.T_base_flange) @ known.T_flange_camera for look in seen])
         pixels = tuple(look.view.corners for look in seen if look.view is not None)
-        taken = Taken(poses.reshape(-1, 4, 4), pixels)
+        taken = ChosenViews(poses.reshape(-1, 4, 4), pixels)
         there = {look.capture.viewpoint for look in looks}
         given_up = set(self.context.state.skipped_viewpoints)
         waiting = [v for v in self.poses() if v.name not in there and v.name not in given_up]
@@ -235,7 +235,7 @@ class BoardCapture:
         """Where camera, mount and board are, by all images of the board so far, of earlier attempts too."""
         return self._knowledge(self.looks())
 
-    def _knowledge(self, looks: Sequence[Look]) -> BoardKnowledge:
+    def _knowledge(self, looks: Sequence[SearchedBoardImage]) -> BoardKnowledge:
         """From the images so far; before them from an earlier step's, or as rig file and protocol state it."""
         seen = [look for look in looks if look.seen]
         if self._known is not None and self._known.measured == len(seen) > 0:
@@ -285,13 +285,13 @@ class BoardCapture:
             again=to_take_again(self.context),
         )
 
-    def looks(self, *, wait: bool = True) -> list[Look]:
+    def looks(self, *, wait: bool = True) -> list[SearchedBoardImage]:
         """Every valid image with what was found in it."""
         if wait:
             self._looks.wait()
         return self._looks.of(self.context.step.id)
 
-    def _measures(self, looks: Sequence[Look]) -> dict[str, float]:
+    def _measures(self, looks: Sequence[SearchedBoardImage]) -> dict[str, float]:
         poses, captures = self.poses(), self.context.evidence.captures(self.context.step.id)
         return {
             "viewpoints_planned": float(len(poses)),
@@ -312,7 +312,9 @@ _WORDS: Mapping[Why, str] = {
 }
 
 
-def _refine(nominal: BoardKnowledge, looks: Sequence[Look], board: Board, *, lens_known: bool) -> BoardKnowledge:
+def _refine(
+    nominal: BoardKnowledge, looks: Sequence[SearchedBoardImage], board: Board, *, lens_known: bool
+) -> BoardKnowledge:
     pick = np.unique(np.linspace(0, len(looks) - 1, min(len(looks), _MOST_FOR_LENS)).round().astype(int))
     some = [looks[k] for k in pick]
     views = [look.view for look in some if look.view is not None]
@@ -327,6 +329,6 @@ def _middle(known: BoardKnowledge, board: Board) -> Array:
     return apply(known.T_base_board, board.points().mean(axis=0))
 
 
-def _same_base(before: Sequence[Look], station: str, seen: Sequence[Look]) -> bool:
+def _same_base(before: Sequence[SearchedBoardImage], station: str, seen: Sequence[SearchedBoardImage]) -> bool:
     """Whether an earlier step's images were taken from this station."""
     return all(look.capture.station == station for look in (*before, *seen))

@@ -13,12 +13,12 @@ from service.core.records.events import ViewpointCaptured
 from service.core.run.state import JobState
 from service.jobs.calibration import board_view
 from service.jobs.records import ImageFile
-from service.steps.capture.spoilt import LookedAt, row_to_stop_for, stop_for_lens, why_spoilt
+from service.steps.capture.spoilt import ImageSharpness, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.context import JobRequest, StepContext
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class SearchedBoardImage:
     """One board image and what was found in it."""
 
     capture: ViewpointCaptured
@@ -37,7 +37,7 @@ class BoardLooks:
     context: StepContext
     board: Board
     earlier: str | None = None
-    _read: dict[str, Look] = field(default_factory=dict[str, Look])
+    _read: dict[str, SearchedBoardImage] = field(default_factory=dict[str, SearchedBoardImage])
     _told: set[str] = field(default_factory=set[str])
 
     def begin(self) -> None:
@@ -63,11 +63,11 @@ class BoardLooks:
             self.context.progress("looking for the board", len(jobs) - left, len(jobs))
             self.context.wait(0.05)
 
-    def of(self, step: str) -> list[Look]:
+    def of(self, step: str) -> list[SearchedBoardImage]:
         """Every valid image of a step that has been looked at, with what was found in it."""
         jobs = self._by_image(step)
         spoilt = why_spoilt(self._looked_at(step))
-        out: list[Look] = []
+        out: list[SearchedBoardImage] = []
         for capture in self.context.evidence.captures(step):
             sha256 = capture.artefacts[0].sha256
             job = jobs.get(sha256)
@@ -76,15 +76,15 @@ class BoardLooks:
             look = self._look(capture, job)
             if not all(capture.verdicts.values()):
                 departs = [name for name, passed in capture.verdicts.items() if not passed]
-                look = Look(capture, False, f"not as wanted: {', '.join(departs)}")
+                look = SearchedBoardImage(capture, False, f"not as wanted: {', '.join(departs)}")
             elif sha256 in spoilt:
-                look = Look(capture, False, spoilt[sha256], spoilt=True)
+                look = SearchedBoardImage(capture, False, spoilt[sha256], spoilt=True)
             if not look.seen:
                 self._tell(look)
             out.append(look)
         return out
 
-    def spoilt_in_a_row(self) -> list[LookedAt]:
+    def spoilt_in_a_row(self) -> list[ImageSharpness]:
         """Blurred or black images with which this step's images end, where they are to stop it.
 
         Where all so far are black, whoever looks for the first board says so.
@@ -107,28 +107,32 @@ class BoardLooks:
     def _by_image(self, step: str) -> dict[str, JobState]:
         return {str(j.arguments["image"]["sha256"]): j for j in self._jobs(step) if j.status != "enqueued"}
 
-    def _looked_at(self, step: str) -> list[LookedAt]:
+    def _looked_at(self, step: str) -> list[ImageSharpness]:
         """In the order of capture."""
         jobs = self._by_image(step)
         ordered = [jobs.get(capture.artefacts[0].sha256) for capture in self.context.evidence.captures(step)]
-        return [LookedAt.of(j, int(j.result["size"][0])) for j in ordered if j is not None and "size" in j.result]
+        return [
+            ImageSharpness.of(j, int(j.result["size"][0])) for j in ordered if j is not None and "size" in j.result
+        ]
 
-    def _look(self, capture: ViewpointCaptured, job: JobState) -> Look:
+    def _look(self, capture: ViewpointCaptured, job: JobState) -> SearchedBoardImage:
         sha256 = capture.artefacts[0].sha256
         if sha256 not in self._read:
             self._read[sha256] = self._as_read(capture, job)
         return self._read[sha256]
 
-    def _as_read(self, capture: ViewpointCaptured, job: JobState) -> Look:
+    def _as_read(self, capture: ViewpointCaptured, job: JobState) -> SearchedBoardImage:
         if job.status == "failed" or not job.result.get("seen"):
             why = job.message if job.status == "failed" else str(job.result.get("reason", "not looked at"))
-            return Look(capture, False, why)
+            return SearchedBoardImage(capture, False, why)
         ref = job.artefacts[0]
         record = json.loads(self.context.evidence.path(ref).read_bytes())
         view = BoardView(np.array(record["indices"], dtype=np.int64), np.array(record["corners"], dtype=np.float64))
-        return Look(capture, True, "", ref.sha256, view, (int(record["size"][0]), int(record["size"][1])))
+        return SearchedBoardImage(
+            capture, True, "", ref.sha256, view, (int(record["size"][0]), int(record["size"][1]))
+        )
 
-    def _tell(self, look: Look) -> None:
+    def _tell(self, look: SearchedBoardImage) -> None:
         sha256 = look.capture.artefacts[0].sha256
         if sha256 not in self._told:
             self._told.add(sha256)

@@ -10,12 +10,12 @@ import numpy as np
 from pydantic import Field
 
 from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.candidates import PoseWishes, board_candidates
+from service.compute.calibration.board_poses.candidates import ViewRange, board_candidates
 from service.compute.calibration.board_poses.design import (
     NOTHING,
-    Aims,
+    CalibrationTargets,
+    ChosenViews,
     Prediction,
-    Taken,
     as_taken,
     choose_poses,
     predict,
@@ -31,7 +31,7 @@ from service.steps.notes import BoardPrediction
 
 Why = Literal["first", "start", "rest", "replacement", "mend"]
 #: The first image is taken from further away and steeply: nobody knows yet where exactly the board lies.
-FIRST = PoseWishes(tilts_deg=(8.0, 14.0, 24.0), distances_m=(0.78, 0.82, 0.86))
+FIRST = ViewRange(tilts_deg=(8.0, 14.0, 24.0), distances_m=(0.78, 0.82, 0.86))
 START = 6  # images after which camera, mount and board are known well enough to plan the rest
 _USUAL_FOCAL = 1.2  # focal length over the image's longer side, where the rig file does not tell
 _UNKNOWN_FOCAL = 0.25
@@ -44,10 +44,10 @@ class BoardPoses(Record):
     prefix: str  # of the names of the views
     count: Annotated[int, Field(ge=4, le=300)]  # how many images
     # Of the camera from the vertical.
-    tilts_deg: tuple[Annotated[float, Field(ge=0, le=60)], ...] = PoseWishes().tilts_deg
-    rolls_deg: tuple[float, ...] = PoseWishes().rolls_deg  # of the camera about its axis
+    tilts_deg: tuple[Annotated[float, Field(ge=0, le=60)], ...] = ViewRange().tilts_deg
+    rolls_deg: tuple[float, ...] = ViewRange().rolls_deg  # of the camera about its axis
     # From the camera to the board.
-    distances_m: tuple[Annotated[float, Field(ge=0.2, le=2)], ...] = PoseWishes().distances_m
+    distances_m: tuple[Annotated[float, Field(ge=0.2, le=2)], ...] = ViewRange().distances_m
     above_scene_m: float = 0.09  # height of the board over the scene's centre, roughly
     long_side: Literal["across", "along"] = "across"  # how the board lies, seen from the robot
     place_tolerance_mm: Annotated[float, Field(gt=0, le=100)] = 30.0  # of the board's middle
@@ -56,9 +56,9 @@ class BoardPoses(Record):
     replacements: Annotated[int, Field(ge=0, le=100)] = 12  # in one attempt, for images without a board
 
     @property
-    def wishes(self) -> PoseWishes:
+    def wishes(self) -> ViewRange:
         """As the planner takes them."""
-        return PoseWishes(self.tilts_deg, self.rolls_deg, self.distances_m)
+        return ViewRange(self.tilts_deg, self.rolls_deg, self.distances_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class Planner:
 
     wanted: BoardPoses
     board: Board
-    aims: Aims
+    aims: CalibrationTargets
     approach: Array
     nominal_mount: Transform
     feasible: Callable[[Transform], bool]
@@ -90,7 +90,7 @@ class Planner:
         why: Why,
         count: int,
         known: BoardKnowledge,
-        taken: Taken = NOTHING,
+        taken: ChosenViews = NOTHING,
         *,
         enough: Callable[[Prediction], bool] | None = None,
         seed: int = 0,
@@ -106,11 +106,11 @@ class Planner:
         everything = taken.plus(future.T_base_camera, future.pixels)
         return PlannedBoard(poses, predict(everything, known, self.board, self.aims))
 
-    def prediction(self, taken: Taken, known: BoardKnowledge) -> Prediction:
+    def prediction(self, taken: ChosenViews, known: BoardKnowledge) -> Prediction:
         """What images will come to without further ones."""
         return predict(taken, known, self.board, self.aims)
 
-    def with_planned(self, taken: Taken, T_base_camera: Array, known: BoardKnowledge) -> Taken:
+    def with_planned(self, taken: ChosenViews, T_base_camera: Array, known: BoardKnowledge) -> ChosenViews:
         """With poses that are decided and not taken yet."""
         future = as_taken(known, self.board, T_base_camera)
         return taken.plus(future.T_base_camera, future.pixels)

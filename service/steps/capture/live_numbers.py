@@ -22,10 +22,10 @@ from service.jobs.calibration import calibrate
 from service.jobs.capture import live_summary, live_view
 from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Photograph, Point
 from service.jobs.surfaces import coverage_points, locate_spheres
+from service.steps.capture.spoilt import SPOILT, ImageSharpness, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.capture.plan.viewpoints import Viewpoint
-from service.steps.capture.spoilt import SPOILT, LookedAt, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.context import JobRequest, StepContext
-from service.steps.inputs import artefact_of, mounting_of, robot_pose_of, taken
+from service.steps.inputs import artefact_of, earlier_answer, mounting_of, robot_pose_of
 from service.steps.notes import SUGGESTION, suggested_views
 
 ERROR, COVERAGE = "predicted_target_error_mm", "specimen_coverage"
@@ -108,7 +108,7 @@ class LiveAnalysis:
             arguments = live_view.Arguments(
                 **self.shared.fields(mounted.mounting), image=image, surface=self._surface(), earlier=earlier
             )
-            references = {**self.shared.taken, **mounted.taken, "earlier": looks}
+            references = {**self.shared.taken, **mounted.references, "earlier": looks}
             request = JobRequest.of(live_view.KIND, arguments, references, LIVE)
             self.context.evidence.enqueue(request, sha256)
         self._tell()
@@ -155,7 +155,7 @@ class LiveAnalysis:
             self._suggest(failed, answer.measures, found.next_best_views, retakes, again)
         return dict(answer.measures)
 
-    def spoilt_in_a_row(self) -> list[LookedAt]:
+    def spoilt_in_a_row(self) -> list[ImageSharpness]:
         """Blurred or black images with which this step's images end, where they are to stop it."""
         mine = self._looked_at(self.context.step.id)
         return row_to_stop_for(self.context, mine, self._looked_at(*self.params.images_of))
@@ -237,13 +237,13 @@ class LiveAnalysis:
         each = replace(every, without=without)
         return files, each if resolve(each.record(), jobs) == list(files) else None
 
-    def _looked_at(self, *steps: str) -> list[LookedAt]:
+    def _looked_at(self, *steps: str) -> list[ImageSharpness]:
         """The images of these steps that have been looked at, in the order of capture."""
         by_image = {j.arguments["image"]["sha256"]: j for j in self._jobs("live_view") if j.status == "finished"}
         captures = [capture for step in steps for capture in self.context.evidence.captures(step)]
         hashes = [capture.artefacts[0].sha256 for capture in captures]
         width = self.shared.camera.width
-        return [LookedAt.of(by_image[sha256], width) for sha256 in hashes if sha256 in by_image]
+        return [ImageSharpness.of(by_image[sha256], width) for sha256 in hashes if sha256 in by_image]
 
     def _surface(self) -> str | None:
         done = [job for job in self._jobs("coverage_points") if job.status == "finished"]
@@ -318,9 +318,9 @@ class Shared:
     @classmethod
     def of(cls, context: StepContext, params: Live) -> Shared:
         """From what earlier steps found. Raises ConfigurationError where one of them did not."""
-        scan = taken(context, params.spheres_of, locate_spheres.KIND)
-        calibration = taken(context, params.calibration, calibrate.KIND)
-        hand_eye = taken(context, params.hand_eye, calibrate.KIND)
+        scan = earlier_answer(context, params.spheres_of, locate_spheres.KIND)
+        calibration = earlier_answer(context, params.calibration, calibrate.KIND)
+        hand_eye = earlier_answer(context, params.hand_eye, calibrate.KIND)
         record = hand_eye.answer.hand_eye
         if record is None:
             raise ConfigurationError(

@@ -20,7 +20,7 @@ _MOST_NAMES = 6
 
 
 @dataclass(frozen=True, slots=True)
-class LookedAt:
+class ImageSharpness:
     """What a job found of one image, as far as sharpness goes.
 
     Attributes:
@@ -35,14 +35,14 @@ class LookedAt:
     width: int
 
     @classmethod
-    def of(cls, job: JobState, width: int) -> LookedAt:
+    def of(cls, job: JobState, width: int) -> ImageSharpness:
         """From the answer of a finished job that looked at one image."""
         image = job.arguments["image"]
         edge_px = job.measures.get("image_edge_px")
         return cls(image["viewpoint"], image["sha256"], edge_px, bool(job.result.get("black")), width)
 
 
-def why_spoilt(images: Sequence[LookedAt], others: Sequence[LookedAt] = ()) -> dict[str, str]:
+def why_spoilt(images: Sequence[ImageSharpness], others: Sequence[ImageSharpness] = ()) -> dict[str, str]:
     """The reason of each spoilt image by its SHA-256.
 
     Args:
@@ -61,9 +61,9 @@ def why_spoilt(images: Sequence[LookedAt], others: Sequence[LookedAt] = ()) -> d
     return reasons
 
 
-def last_in_a_row(images: Sequence[LookedAt], reasons: Mapping[str, str]) -> list[LookedAt]:
+def last_in_a_row(images: Sequence[ImageSharpness], reasons: Mapping[str, str]) -> list[ImageSharpness]:
     """The spoilt images with which a sequence ends, in order of capture; none where they are too few to mean more."""
-    row: list[LookedAt] = []
+    row: list[ImageSharpness] = []
     for image in reversed(images):
         if image.sha256 not in reasons:
             break
@@ -84,7 +84,9 @@ def spoilt_before(context: StepContext) -> set[str]:
     }
 
 
-def row_to_stop_for(context: StepContext, images: Sequence[LookedAt], others: Sequence[LookedAt]) -> list[LookedAt]:
+def row_to_stop_for(
+    context: StepContext, images: Sequence[ImageSharpness], others: Sequence[ImageSharpness]
+) -> list[ImageSharpness]:
     """The spoilt images in a row with which a step's images end, where they are to stop it; else none.
 
     Args:
@@ -102,7 +104,7 @@ def may_stop(context: StepContext) -> bool:
     return sum(note.note == SPOILT and "advice" in note.data for note in context.state.notes) < _MOST_STOPS
 
 
-def stop_for_lens(context: StepContext, row: Sequence[LookedAt]) -> None:
+def stop_for_lens(context: StepContext, row: Sequence[ImageSharpness]) -> None:
     """Note what a person is to do and which images are then taken again.
 
     Raises:

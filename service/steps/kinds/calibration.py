@@ -23,7 +23,7 @@ from service.steps.board.plan import BoardPoses
 from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.capture.plan.viewpoints import ViewpointSet, plan_viewpoints
 from service.steps.context import ROBOT_MOVES, Announcement, JobRequest, JobResult, StepContext, StepKind, StepOutcome
-from service.steps.inputs import captured_images, result_of, taken
+from service.steps.inputs import captured_images, earlier_answer, result_of
 from service.steps.measures import CaptureMeasures, Count, FineMm, Measure, Mm, Px, Share
 
 _FEWEST_KNOWN = 3  # whole boards, before a part of one may count
@@ -203,7 +203,7 @@ def _solve(
     )
     references: dict[str, Reference | None] = {}
     if camera is not None and params.intrinsics_of is not None:
-        references["camera"] = taken(context, params.intrinsics_of, calibrate.KIND).reference("camera")
+        references["camera"] = earlier_answer(context, params.intrinsics_of, calibrate.KIND).reference("camera")
     if capture is not None:
         corners = tuple(looks[image.sha256].corners_sha256 if image.sha256 in looks else None for image in images)
         known = capture.knowledge() if None in corners else None

@@ -1,6 +1,7 @@
 """Step kind `evaluation`: the paper's errors on the control spheres, for each source of camera poses.
 
-It judges the registrations that are there; one that arrives later is evaluated then (service/steps/poses/sources.py).
+It evaluates the registrations that have arrived; a later one is evaluated when it arrives
+(service/steps/poses/due_jobs.py).
 """
 
 from __future__ import annotations
@@ -15,18 +16,18 @@ from service.core.units import metres
 from service.jobs.registration import evaluate, register
 from service.jobs.surfaces import locate_spheres
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
-from service.steps.inputs import captured_images, result_of, taken
+from service.steps.inputs import captured_images, earlier_answer, result_of
 from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures
-from service.steps.poses.sources import registration_ways
+from service.steps.poses.registration_jobs import recorded_registration_jobs
 
 
 class Params(Record):
-    """Where the control spheres were seen and measured."""
+    """Where the control spheres were photographed and measured."""
 
-    registration: str  # step whose registrations are judged
-    images_of: tuple[str, ...]  # control captures
+    registration: str  # step whose registrations are evaluated
+    images_of: tuple[str, ...]  # capture steps that show the control spheres
     scan: str  # the registered scan
-    control_scan: str | None = None  # scan or CT that still holds the control spheres; None: spheres left out in turn
+    control_scan: str | None = None  # scan or CT with the control spheres; None: each sphere is left out in turn
     ct: str | None = None  # CT import, for the loop closures of the error budget
 
 
@@ -51,24 +52,26 @@ class Measures(RegistrationMeasures[EvaluatedRegistration]):
 
 
 class Result(Record):
-    """The paper's table, one row a registration, and the error budget of each."""
+    """The paper's table, with one row for each registration, and the error budget of each."""
 
     table: tuple[dict[str, Any], ...]
     budgets: dict[str, dict[str, Any]]
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Let the worker evaluate every registration that has arrived on the control captures."""
+    """Let the worker evaluate every registration that has arrived on the control spheres."""
     registered: Mapping[str, Any] = result_of(context, params.registration)["registrations"]
     registrations = {name: register.KIND.read_answer(record) for name, record in registered.items()}
     references: dict[str, Reference | None] = {}
-    found = registration_ways(context.protocol, context.run, context.protocol.step(params.registration))
+    found = recorded_registration_jobs(context.protocol, context.run, context.protocol.step(params.registration))
     arrived = {} if found is None else found.arrived
     registrations |= {name: register.KIND.read_answer(job.result) for name, job in arrived.items()}
     references |= {f"registrations/{name}": Reference(job.job, "result") for name, job in arrived.items()}
     scans = {"scan": params.scan, "control_scan": params.control_scan, "ct": params.ct}
     measured = {
-        name: None if step is None or step in context.run.skipped else taken(context, step, locate_spheres.KIND)
+        name: None
+        if step is None or step in context.run.skipped
+        else earlier_answer(context, step, locate_spheres.KIND)
         for name, step in scans.items()
     }
     references |= {name: found.reference("") for name, found in measured.items() if found is not None}

@@ -26,7 +26,7 @@ from service.steps.capture.held_camera import HeldCamera
 from service.steps.capture.live_numbers import COVERAGE, ERROR, CoverageRule, seen_words
 from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
-from service.steps.inputs import artefact_of, held_views, taken
+from service.steps.inputs import artefact_of, earlier_answer, held_views
 from service.steps.measures import Count, PredictedMeasures, Share
 
 _KINDS = {"dataset": "image", "control": "control_image", "calibration": "board_image"}
@@ -127,7 +127,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     return guide.outcome()
 
 
-def _shared(context: StepContext, params: Params) -> _Shared:
+def _shared(context: StepContext, params: Params) -> _CommonArguments:
     """The arguments that all jobs of the step have in common."""
     board = params.purpose == "calibration"
     places = [
@@ -160,7 +160,7 @@ def _shared(context: StepContext, params: Params) -> _Shared:
                 remedy="Add a section `board`",
             )
         size = {"columns": described.columns, "rows": described.rows, "square_m": metres(described.square_mm)}
-        return _Shared({**shared, **size, "sensor_width_mm": params.sensor_width_mm}, {})
+        return _CommonArguments({**shared, **size, "sensor_width_mm": params.sensor_width_mm}, {})
     if params.calibration is None:
         raise ConfigurationError(
             "images of the specimen need the calibrated camera",
@@ -170,7 +170,7 @@ def _shared(context: StepContext, params: Params) -> _Shared:
     error, covers = (next((g for g in context.step.gates if g.measure == m), None) for m in (ERROR, COVERAGE))
     if context.protocol.spheres.colour is not None:
         shared["colour"] = context.protocol.spheres.colour
-    calibration = taken(context, params.calibration, calibrate.KIND)
+    calibration = earlier_answer(context, params.calibration, calibrate.KIND)
     spheres, rough, spheres_from = _spheres(context, params)
     fields = {
         **shared,
@@ -183,7 +183,7 @@ def _shared(context: StepContext, params: Params) -> _Shared:
         "limit_m": metres(error.max if error and error.max is not None else 0.35),
         "min_coverage": covers.min if covers and covers.min is not None else 0.0,
     }
-    return _Shared(fields, {"camera": calibration.reference("camera"), "spheres_m": spheres_from})
+    return _CommonArguments(fields, {"camera": calibration.reference("camera"), "spheres_m": spheres_from})
 
 
 def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], bool, Reference | None]:
@@ -194,7 +194,7 @@ def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], b
     for name in params.spheres_of:
         state = context.run.steps.get(name)
         if state is not None and state.result.get("spheres_m"):
-            found = taken(context, name, layout.KIND)
+            found = earlier_answer(context, name, layout.KIND)
             rough = context.protocol.step(name).kind == "layout_check"
             return found.answer.spheres_m, rough, found.reference("spheres_m")
     raise ConfigurationError(
@@ -205,7 +205,7 @@ def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], b
 
 
 @dataclass(frozen=True, slots=True)
-class _Shared:
+class _CommonArguments:
     """Fields of the arguments of all jobs of the step, and what of them is recorded as a reference."""
 
     fields: Mapping[str, Any]
@@ -218,7 +218,7 @@ class _Guide:
 
     context: StepContext
     params: Params
-    shared: _Shared
+    shared: _CommonArguments
     told: str = ""
 
     @property

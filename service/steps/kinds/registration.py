@@ -1,7 +1,7 @@
 """Step kind `registration`: T_world_scan from every image and marker, for each source of camera poses.
 
-The step decides by the sources that its gates and those of the evaluation name, and by the robot's poses, which take
-seconds. All others are computed afterwards, beside whatever the run does next (service/steps/poses/sources.py).
+The step waits for the sources that its gates and those of the evaluation name, and for the robot's poses, which take
+seconds. The others are computed while the run goes on (service/steps/poses/registration_jobs.py).
 """
 
 from __future__ import annotations
@@ -21,31 +21,38 @@ from service.jobs.registration import detect_spheres
 from service.jobs.surfaces import locate_spheres
 from service.jobs.words import term
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
-from service.steps.inputs import Mounted, captured_images, intrinsics_covariance_of, mounting_of, taken
+from service.steps.inputs import (
+    CameraMounting,
+    captured_images,
+    earlier_answer,
+    intrinsics_covariance_of,
+    mounting_of,
+)
 from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures
-from service.steps.poses.sources import DEFAULT_SOURCES, PLANNED, Source, Wanted, Ways, decisive, posed, ways
+from service.steps.poses.registration_jobs import RegistrationJobs, registration_jobs
+from service.steps.poses.sources import DEFAULT_SOURCES, PLANNED, Source, WantedRegistrations, decisive, posed
 
 
 class StructureFromMotion(Record):
-    """How much effort structure from motion makes."""
+    """How much effort structure from motion makes: more features and pairs take longer."""
 
-    max_image_size: int = 3200  # longer side that features are looked for at, px
-    max_features: int = 8000  # features of an image
-    neighbours: int = 12  # pairs an image, chosen by the robot's poses
+    max_image_size: int = 3200  # features are searched in images reduced to this longer side, px
+    max_features: int = 8000  # features per image
+    neighbours: int = 12  # images that each image is matched with, chosen by the robot's poses
 
 
 class Params(Record):
     """Which images, which scan, which camera poses."""
 
     images_of: tuple[str, ...]  # capture steps with the images
-    control_images_of: tuple[str, ...] = ()  # these see the control spheres and are kept for the evaluation too
+    control_images_of: tuple[str, ...] = ()  # capture steps that see the control spheres, for the evaluation too
     calibration: str  # step with the intrinsics
     hand_eye: str | None = None  # step with T_flange_camera; None: no robot carried the camera
     scan: str  # step that imported the scan
     poses: tuple[Source, ...] = DEFAULT_SOURCES  # where the camera poses come from; each gives a registration
     structure_from_motion: StructureFromMotion = StructureFromMotion()  # sizes and numbers of features
     detector: Literal["classical", "paper"] = "classical"  # "paper" searches every image whole, for comparison
-    reduced: tuple[str, ...] = ()  # "1920x1080": lower resolutions, for the comparison that the paper makes
+    reduced: tuple[str, ...] = ()  # such as 1920x1080: lower resolutions, for the paper's comparison
     reduced_poses: tuple[Literal["colmap", "glomap"], ...] = ("colmap",)  # sources of poses for the reduced images
 
     @field_validator("reduced")
@@ -53,7 +60,7 @@ class Params(Record):
     def _sizes(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         for size in value:
             if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", size):
-                raise ValueError(f"a resolution reads 1920x1080, not {size!r}")
+                raise ValueError(f"a resolution is written like 1920x1080, not {size!r}")
         return value
 
 
@@ -84,18 +91,18 @@ class Measures(RegistrationMeasures[OneRegistration]):
 
 
 class Result(Record):
-    """The registrations that were there when the step decided, by source and resolution; outlines at full size."""
+    """The registrations that the step was judged by, by source and resolution; the outlines at full size."""
 
     outlines_sha256: str
     registrations: dict[str, dict[str, Any]]
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Detect the spheres and register the sources that the decision needs; whatever else is due goes on its way."""
-    wanted, waited = Wanted.of(params), decisive(context.protocol, context.step)
+    """Detect the spheres, and register every source that the step waits for; the others are enqueued as well."""
+    waited = decisive(context.protocol, context.step)
     outlines = _search(context, params)
     root = arguments_name(outlines.arguments)
-    later = [name for name in wanted.registrations if name not in waited]
+    later = [name for name in WantedRegistrations.of(params).registrations if name not in waited]
     context.note(PLANNED, decisive=list(waited), later=later)
     seen = -1
     while True:
@@ -105,13 +112,13 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
             context.wait(0.2)
             continue
         seen = state.seq
-        found = ways(state, context.step.id, wanted, waited, outlines, root)
+        found = registration_jobs(state, context.step, waited, outlines, root)
         for name in waited:
             if name in found.failed:
                 raise ComputeError(
                     f"no registration with {name} poses: {found.failed[name]}",
                     where=context.step.id,
-                    remedy="Put right what these words name, or take what is missing; then try again",
+                    remedy="Correct what the message names, or take the missing images; then try again",
                 )
         context.progress(_words(found), len(found.arrived.keys() & set(waited)), len(waited))
         if all(name in found.arrived for name in waited):
@@ -121,16 +128,16 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 
 def _search(context: StepContext, params: Params) -> JobRequest:
-    """The search for outlines: everything that the jobs after it have in common, and how to search."""
+    """The search for outlines; the jobs after it share most of its arguments."""
     images = captured_images(context, [*params.images_of, *params.control_images_of])
     if not posed(images) and not set(params.poses) <= {"colmap", "glomap"}:
         raise ConfigurationError(
-            "no image has a pose, and the registration asks for others than those of the images alone",
+            "no image has a pose, but the registration asks for poses that do not come from the images alone",
             where=f"step {context.step.id}",
-            remedy="Let its `poses` be colmap and glomap",
+            remedy="Set `poses` of the step to colmap and glomap",
         )
-    scan = taken(context, params.scan, locate_spheres.KIND)
-    calibration = taken(context, params.calibration, calibrate.KIND)
+    scan = earlier_answer(context, params.scan, locate_spheres.KIND)
+    calibration = earlier_answer(context, params.calibration, calibrate.KIND)
     mounted = _mounting(context, params, images)
     lens = intrinsics_covariance_of(calibration)
     known: dict[str, Any] = {} if lens is None else {"intrinsics_covariance": lens}
@@ -145,7 +152,7 @@ def _search(context: StepContext, params: Params) -> JobRequest:
         detector=params.detector,
     ).model_copy(update={**mounted.mounting.set_fields(), **known})
     references = {
-        **mounted.taken,
+        **mounted.references,
         "camera": calibration.reference("camera"),
         "spheres_m": scan.reference("spheres_m"),
         "sphere_covariance_m2": scan.reference("details/spheres/*/covariance_m2"),
@@ -155,20 +162,20 @@ def _search(context: StepContext, params: Params) -> JobRequest:
     return JobRequest.of(detect_spheres.KIND, arguments, references)
 
 
-def _mounting(context: StepContext, params: Params, images: list[Photograph]) -> Mounted:
-    """Where the camera sat on the arm; nothing where a person held it."""
+def _mounting(context: StepContext, params: Params, images: list[Photograph]) -> CameraMounting:
+    """How the camera was mounted on the arm; empty where a person held it."""
     if params.hand_eye is None:
-        return Mounted(Mounting(), {})
+        return CameraMounting(Mounting(), {})
     return mounting_of(context, params.hand_eye, (image.station for image in images))
 
 
-def _words(found: Ways) -> str:
+def _words(found: RegistrationJobs) -> str:
     working = [task.request.kind for task in found.tasks if task.job and task.job.status == "enqueued"]
     return ", ".join(map(term, dict.fromkeys(working))) or "registration"
 
 
-def _outcome(found: Ways) -> StepOutcome:
-    """What is there by now; a source that nobody waited for is among it if it has come."""
+def _outcome(found: RegistrationJobs) -> StepOutcome:
+    """The registrations so far, including any that arrived although the step did not wait for them."""
     done = [(task, task.job) for task in found.tasks if task.job is not None and task.job.status == "finished"]
     outlines = next(job for task, job in done if task.request.kind == "detect_spheres")
     registrations = {name: OneRegistration.read(job.measures) for name, job in found.arrived.items()}

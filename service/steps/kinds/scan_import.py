@@ -11,7 +11,7 @@ from service.core.units import metres
 from service.jobs.surfaces import locate_spheres
 from service.steps.arrivals import keep_mesh, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
-from service.steps.inputs import result_of, taken
+from service.steps.inputs import earlier_answer, result_of
 from service.steps.layouts import layout_uncertainties
 from service.steps.measures import Count, Measure, SphereMeasures
 
@@ -76,7 +76,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     )
     references: dict[str, Reference | None] = {}
     if params.compare_with is not None and params.compare_with not in context.run.skipped:
-        reference = taken(context, params.compare_with, locate_spheres.KIND)
+        reference = earlier_answer(context, params.compare_with, locate_spheres.KIND)
         compared = {
             "reference_m": reference.answer.spheres_m,
             "reference_covariances_m2": tuple(s.covariance_m2 for s in reference.answer.details.spheres),

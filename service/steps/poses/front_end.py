@@ -1,7 +1,7 @@
-"""Features and matches of images: begun while the images arrive, completed when a registration wants them.
+"""Features and matches of images: computed while the images arrive, and completed by the registration.
 
-Both are functions of the images alone, so that it changes nothing in the result when or in which process they were
-made. Which pairs are matched early follows from where the images are to be taken.
+Both depend only on the images, so the result does not depend on when or in which process they were computed. The
+pairs to match early follow from the planned viewpoints.
 """
 
 from __future__ import annotations
@@ -27,32 +27,32 @@ from service.jobs.poses import features, match
 from service.jobs.records import ImageFile
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import JobRequest, StepContext
-from service.steps.inputs import Taken, taken
+from service.steps.inputs import EarlierAnswer, earlier_answer
 from service.store.records import NewJob
 
 _SOURCES_OF_IMAGES = frozenset({"colmap", "glomap", "hybrid", "triangulated"})
-IMAGES_A_JOB, PAIRS_A_JOB = 8, 100  # of what is left for the registration
+IMAGES_A_JOB, PAIRS_A_JOB = 8, 100  # in the jobs that complete them
 
 
 @dataclass
 class EarlyFeatures:
-    """Has every image's features found as soon as it is captured. The capture never waits for them."""
+    """Enqueues the features of every image as soon as it is captured. The capture never waits for them."""
 
     context: StepContext
-    camera: Taken[calibrate.Answer]
+    camera: EarlierAnswer[calibrate.Answer]
     effort: Mapping[str, Any]
     neighbours: Mapping[str, Sequence[str]]  # by viewpoint, as planned
     asked: set[str] = field(default_factory=set[str])
 
     @classmethod
     def begin(cls, context: StepContext, plan: Sequence[Viewpoint]) -> EarlyFeatures | None:
-        """None where no registration of the protocol will match these images, or the camera is not calibrated yet."""
+        """None if no registration of the protocol will match these images, or if the camera is not calibrated yet."""
         registration = _registration_of(context.protocol, context.step.id)
         if registration is None:
             return None
         params = registration.params.model_dump(mode="json")
         try:
-            camera = taken(context, params["calibration"], calibrate.KIND)
+            camera = earlier_answer(context, params["calibration"], calibrate.KIND)
         except ConfigurationError:
             return None
         effort = params["structure_from_motion"]
@@ -88,7 +88,7 @@ class EarlyFeatures:
 
 
 def _registration_of(protocol: Protocol, capture: str) -> Step | None:
-    """The step that will register the images of a capture by what is seen in them."""
+    """The step that will register the images of a capture by their features."""
     for step in protocol.steps:
         if step.kind == "registration":
             params = step.params.model_dump(mode="json")
@@ -99,7 +99,7 @@ def _registration_of(protocol: Protocol, capture: str) -> Step | None:
 
 
 def _taken(context: StepContext, registration: Step, station: str, nominal: Transform) -> dict[str, Transform]:
-    """T_base_camera, about, of the images of earlier steps at a station."""
+    """Approximate T_base_camera of the images of earlier steps at a station, by viewpoint."""
     params = registration.params.model_dump(mode="json")
     earlier = [s for s in (*params["images_of"], *params["control_images_of"]) if s != context.step.id]
     captures = [c for step in earlier for c in context.evidence.captures(step) if isinstance(c, ViewpointCaptured)]
@@ -107,7 +107,7 @@ def _taken(context: StepContext, registration: Step, station: str, nominal: Tran
 
 
 def early_matches(protocol: Protocol, state: RunState) -> list[NewJob]:
-    """The matches that can be made now: of every image whose features are there with its planned neighbours."""
+    """The matching jobs that are due: of each image with its planned neighbours, if both have features."""
     found: dict[str, tuple[str, JobState]] = {}
     pairs_done: set[tuple[str, str]] = set()
     matched: set[str] = set()
@@ -137,24 +137,24 @@ def early_matches(protocol: Protocol, state: RunState) -> list[NewJob]:
     return jobs
 
 
-# --- what a registration finds there -------------------------------------------------------------------------------
+# --- use by the registration ---------------------------------------------------------------------------------------
 
 
 @dataclass
-class Early:
-    """Jobs of one camera and effort; some may still be computed."""
+class EarlyJobs:
+    """Early jobs of one camera and effort; some may not have finished."""
 
     features: dict[str, JobState] = field(default_factory=dict[str, JobState])  # by the image's hash
     matches: list[JobState] = field(default_factory=list[JobState])
 
     def matching(self, features: Mapping[str, str]) -> list[JobState]:
-        """The jobs that matched exactly these features (by viewpoint)."""
+        """The jobs that matched exactly these features; `features` maps viewpoints to hashes of files."""
         return [job for job in self.matches if job.arguments["features"].items() <= features.items()]
 
 
-def found_early(state: RunState, jobs: Jobs, camera: Mapping[str, Any], effort: Mapping[str, Any]) -> Early:
-    """The features and matches that were made with this camera and this effort while the images arrived."""
-    early = Early()
+def found_early(state: RunState, jobs: Jobs, camera: Mapping[str, Any], effort: Mapping[str, Any]) -> EarlyJobs:
+    """The jobs that computed features and matches with this camera and effort while the images arrived."""
+    early = EarlyJobs()
     for step in state.steps.values():
         for job in step.jobs.values():
             if job.priority != EARLY or job.kind not in ("features", "match"):
@@ -171,6 +171,6 @@ def found_early(state: RunState, jobs: Jobs, camera: Mapping[str, Any], effort: 
 
 
 def chunks(items: Iterable[Any], size: int) -> list[list[Any]]:
-    """In order, `size` at a time."""
+    """The items in order, in lists of at most `size`."""
     listed = list(items)
     return [listed[i : i + size] for i in range(0, len(listed), size)]

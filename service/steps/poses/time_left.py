@@ -1,7 +1,7 @@
-"""How long what is being computed for a registration will still take, from what such work took in this run.
+"""Estimates how long the missing results of a registration will take, from how long such jobs took in this run.
 
-What the run has not done yet is guessed from other runs: seconds an image of 1920 × 1280 px on one core, in
-proportion to the pixels where the pixels are what is looked at.
+Kinds of jobs that the run has not computed yet are estimated from other runs: seconds per image of 1920 × 1280 px on
+one core, in proportion to the number of pixels for jobs that search the image.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from service.core.jobs.priorities import WAITED
 from service.core.jobs.references import Jobs, jobs_of, resolve
 from service.core.protocol.models import Protocol, Step
 from service.core.run.state import JobState, RunState
-from service.steps.poses.sources import Task, Wanted, Ways, evaluation_tasks, registration_ways
+from service.steps.poses.due_jobs import evaluation_tasks
+from service.steps.poses.registration_jobs import RegistrationJobs, Task, recorded_registration_jobs
+from service.steps.poses.sources import WantedRegistrations
 
 _NAMES = {
     "robot": "robot poses as reported",
@@ -26,7 +28,7 @@ _NAMES = {
     "glomap": "GLOMAP from nothing",
     "hybrid": "images, robot and spheres together",
 }
-_GUESS_S = {  # an image
+_GUESS_S = {  # per image
     "detect_spheres": 0.3,
     "register": 0.15,
     "features": 1.5,
@@ -41,14 +43,14 @@ _SEVERAL_CORES = frozenset({"detect_spheres"})
 
 
 @dataclass(frozen=True, slots=True)
-class Left:
-    """A result that is still to come. `seconds` until then, by estimate; the failed ones say why and never come."""
+class PendingResult:
+    """A result that has not arrived: the estimated `seconds` until it does, or why it has `failed`."""
 
     name: str
     what: str
     seconds: float
     failed: str = ""
-    waits: bool = False  # nothing of the run is being computed now: no worker runs, or it is busy with other runs
+    waits: bool = False  # no job of the run is being computed: no worker runs, or it computes for other runs
 
     @property
     def text(self) -> str:
@@ -62,7 +64,7 @@ class Left:
 
 
 def duration_words(seconds: float) -> str:
-    """Rounded as such an estimate deserves: `20 s`, `4 min`."""
+    """A duration rounded to the precision of an estimate: `20 s`, `4 min`."""
     if seconds < 90:
         return f"{max(10, 10 * round(seconds / 10))} s"
     return f"{round(seconds / 60)} min"
@@ -70,22 +72,22 @@ def duration_words(seconds: float) -> str:
 
 def missing_results(
     protocol: Protocol, state: RunState, started_utc: Mapping[str, str], now_utc: str, cores: int
-) -> list[Left]:
-    """What was planned and has not arrived, in the order in which it is expected; empty when all has.
+) -> list[PendingResult]:
+    """The planned results that have not arrived, in the order in which they are expected.
 
     Args:
         protocol: of the run.
         state: of the run.
-        started_utc: when each job that is being computed was begun.
-        now_utc: the time.
-        cores: how many jobs are computed side by side.
+        started_utc: when each job that is being computed now was started, by job id.
+        now_utc: the present time.
+        cores: number of jobs computed in parallel.
     """
-    left: list[Left] = []
+    left: list[PendingResult] = []
     for step in protocol.steps if state.status != "aborted" else ():  # nothing follows in an aborted run
-        found = registration_ways(protocol, state, step)
+        found = recorded_registration_jobs(protocol, state, step)
         if found is not None:
             evaluation = next((s for s in protocol.steps if _evaluates(s, step)), None)
-            left += _left_of(protocol, state, step, evaluation, found, _Clock(state, started_utc, now_utc, cores))
+            left += _left_of(protocol, state, step, evaluation, found, _JobTimes(state, started_utc, now_utc, cores))
     return sorted(left, key=lambda one: one.seconds)
 
 
@@ -94,14 +96,16 @@ def _evaluates(step: Step, registration: Step) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class _Clock:
+class _JobTimes:
+    """How long the jobs of a run take."""
+
     state: RunState
     started_utc: Mapping[str, str]
     now_utc: str
     cores: int
 
     def seconds(self, task: Task) -> float:
-        """Until a task is done once it has begun; none where it is done."""
+        """Seconds until a task is done, counted from its start; 0 if it is done."""
         job = task.job
         if job is not None and job.status != "enqueued":
             return 0.0
@@ -113,7 +117,7 @@ class _Clock:
         return max(expected_s - gone_s, 0.1 * expected_s)
 
     def expected_s(self, kind: str, arguments: Mapping[str, Any]) -> float:
-        """Of a job, by the jobs of its kind that this run has done, or by a guess."""
+        """Expected duration of a job, from the jobs of its kind in this run if there are any."""
         done = [
             job for step in self.state.steps.values() for job in step.jobs.values() if _tells_of(job, kind, arguments)
         ]
@@ -130,7 +134,7 @@ def _tells_of(job: JobState, kind: str, arguments: Mapping[str, Any]) -> bool:
 
 
 def _size(kind: str, arguments: Mapping[str, Any], jobs: Jobs) -> float:
-    """Images (or pairs of them), weighed by their pixels where these are what takes the time."""
+    """Number of images or pairs, weighted by their pixels for jobs whose duration depends on them."""
     camera = resolve(arguments.get("camera"), jobs) if kind in _BY_PIXELS else None
     if camera is None:
         return _count(kind, arguments)
@@ -143,23 +147,28 @@ def _count(kind: str, arguments: Mapping[str, Any]) -> int:
 
 
 def _left_of(
-    protocol: Protocol, state: RunState, step: Step, evaluation: Step | None, found: Ways, clock: _Clock
-) -> list[Left]:
-    """The tasks known by now, and what follows from them, laid out over the cores in the order of their priority."""
-    wanted = Wanted.of(step.params)
+    protocol: Protocol,
+    state: RunState,
+    step: Step,
+    evaluation: Step | None,
+    found: RegistrationJobs,
+    clock: _JobTimes,
+) -> list[PendingResult]:
+    """The missing results of a step, with its jobs scheduled on the cores in the order of their priority."""
+    wanted = WantedRegistrations.of(step.params)
     evaluations = {} if evaluation is None else evaluation_tasks(protocol, state, evaluation)
     free_s = [0.0] * clock.cores
     ready_s: dict[tuple[str, str], float] = {}
-    left: list[Left] = []
+    left: list[PendingResult] = []
     for name, (source, size) in wanted.registrations.items():
         what = _NAMES.get(source, source) + (f" at {size.replace('x', ' × ')}" if size else "")
         if name in found.failed:
-            left.append(Left(name, what, 0.0, found.failed[name]))
+            left.append(PendingResult(name, what, 0.0, found.failed[name]))
             continue
         evaluating = evaluations.get(name)
         if name in found.arrived and (evaluating is None or (evaluating.job and evaluating.job.status != "enqueued")):
             continue
-        steps = found.ways_to.get(name, ())
+        steps = found.tasks_for.get(name, ())
         at_s = 0.0
         for task in steps:
             key = (task.request.kind, task.name)
@@ -178,15 +187,15 @@ def _left_of(
             )
         if evaluation is not None and any(task.request.priority != WAITED for task in steps):
             at_s += clock.expected_s("evaluate", found.tasks[0].request.arguments)
-        left.append(Left(name, what, at_s))
+        left.append(PendingResult(name, what, at_s))
     return left
 
 
 _MODELLED = ("features", "match", "structure_from_motion")
-_WAYS = {"triangulated": _MODELLED, "colmap": _MODELLED, "glomap": _MODELLED, "hybrid": (*_MODELLED, "hybrid")}
+_CHAINS = {"triangulated": _MODELLED, "colmap": _MODELLED, "glomap": _MODELLED, "hybrid": (*_MODELLED, "hybrid")}
 
 
 def _rest(source: str, last: str) -> tuple[str, ...]:
-    """The kinds of jobs that follow on the last one that can be named."""
-    way = ("detect_spheres", *_WAYS.get(source, ()), "register")
-    return way[way.index(last) + 1 :] if last in way else ()
+    """The kinds of jobs that follow the last one that is planned."""
+    chain = ("detect_spheres", *_CHAINS.get(source, ()), "register")
+    return chain[chain.index(last) + 1 :] if last in chain else ()

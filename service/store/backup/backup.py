@@ -96,7 +96,7 @@ def _silent(_what: str, _done: int, _total: int) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Holds:
+class _ReferencedFiles:
     """What the copied database refers to."""
 
     sizes: dict[str, int]  # sizes of files, by hash
@@ -200,7 +200,7 @@ class _Backup:
         finally:
             source.close()
 
-    def _require_same_site(self, holds: _Holds) -> None:
+    def _require_same_site(self, holds: _ReferencedFiles) -> None:
         names = self.folder.states()
         if names and self.folder.read(names[-1]).root_sha256 not in ("", holds.root_sha256):
             raise StoreError(
@@ -293,10 +293,10 @@ def _fault_of(source: Path, sha256: str) -> str:
         return f"{shown}: the file cannot be read ({error.strerror}); it is not in the backup"
 
 
-def _holds(connection: Connection) -> _Holds:
+def _holds(connection: Connection) -> _ReferencedFiles:
     named = select(artefacts.c.sha256, artefacts.c.size_bytes).distinct().order_by(artefacts.c.sha256)
     first = select(event_index.c.run_id).order_by(event_index.c.position).limit(1).scalar_subquery()
-    return _Holds(
+    return _ReferencedFiles(
         sizes={row.sha256: row.size_bytes for row in connection.execute(named)},
         heads={row.run_id: (row.seq, row.sha256) for row in connection.execute(select(heads))},
         root_sha256=connection.execute(select(runs.c.root_sha256).where(runs.c.run_id == first)).scalar() or "",

@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import Record
-from service.store.durable_effects import Files, Ids
+from service.store.durable_effects import Files, IdSource
 from service.store.files.artefacts import TEMPORARY, ArtefactFiles
 
 MARKER = "orthocapture-backup.json"
@@ -65,7 +65,7 @@ def folder_errors(what: str) -> Generator[None]:
 class BackupFolder:
     """The backups of one data folder."""
 
-    def __init__(self, folder: Path, files: Files, ids: Ids) -> None:
+    def __init__(self, folder: Path, files: Files, ids: IdSource) -> None:
         self.folder = folder
         self.files = files
         self.artefacts = ArtefactFiles(folder / "artefacts", files, ids)

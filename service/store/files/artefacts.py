@@ -17,7 +17,7 @@ from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import ArtefactRef, Event
 from service.store.database.engine import RESTORE
 from service.store.database.tables import artefacts
-from service.store.durable_effects import Files, Ids
+from service.store.durable_effects import Files, IdSource
 from service.store.events import canonical_parsed, references, sha256_text
 from service.store.records import Artefact, NewArtefact
 
@@ -72,7 +72,7 @@ class _Meter:
 class ArtefactFiles:
     """The folder of content-addressed files, each written once and read-only."""
 
-    def __init__(self, folder: Path, files: Files, ids: Ids) -> None:
+    def __init__(self, folder: Path, files: Files, ids: IdSource) -> None:
         self._folder = folder
         self._files = files
         self._ids = ids

@@ -10,7 +10,7 @@ from sqlalchemy import ColumnElement, Connection, Row, func, insert, select, tru
 from service.core.jobs.priorities import EARLY, Lane
 from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished, StepNote
 from service.store.database.tables import jobs
-from service.store.durable_effects import Clock, Ids, utc_text
+from service.store.durable_effects import Clock, IdSource, utc_text
 from service.store.errors import LeaseLostError
 from service.store.events import append, canonical, parse_canonical
 from service.store.queue.leases import ProcessIdentity, identity_of, identity_values
@@ -20,7 +20,7 @@ ACTOR = "store"  # actor of events about a worker that is gone
 
 
 def enqueue(
-    connection: Connection, clock: Clock, ids: Ids, run_id: str, new: Sequence[NewJob], *, actor: str
+    connection: Connection, clock: Clock, ids: IdSource, run_id: str, new: Sequence[NewJob], *, actor: str
 ) -> list[Event]:
     """Append JobEnqueued and insert a row for every job whose key the run does not have yet. Returns the events."""
     appended: list[Event] = []
@@ -92,7 +92,7 @@ def started(connection: Connection, run_id: str) -> dict[str, str]:
 def claim(
     connection: Connection,
     clock: Clock,
-    ids: Ids,
+    ids: IdSource,
     *,
     worker: str,
     lease_s: float,

@@ -20,7 +20,7 @@ from sqlalchemy import Connection, Row, delete, insert, select, update
 from service.core.errors import StoreError
 from service.store.database.engine import Database
 from service.store.database.tables import leases
-from service.store.durable_effects import Clock, Ids
+from service.store.durable_effects import Clock, IdSource
 from service.store.errors import LeaseHeldError, LeaseLostError
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -151,7 +151,7 @@ def is_live(row: Row[Any], now_utc_s: float) -> bool:
     return life == "lives" or (life == "unknown" and now_utc_s < row.until_utc_s)
 
 
-def acquire(database: Database, clock: Clock, ids: Ids, *, run_id: str, holder: str, seconds: float) -> RunLease:
+def acquire(database: Database, clock: Clock, ids: IdSource, *, run_id: str, holder: str, seconds: float) -> RunLease:
     """Take the lease of a run. Raises LeaseHeldError, naming the holder, while another process has it."""
     token = ids.new_token()
     with database.writing() as connection:

@@ -42,7 +42,7 @@ class _Link:
 
 
 @dataclass
-class _Told:
+class _RecordedAccounts:
     """The state of accounts, links and sessions according to the site's chain."""
 
     accounts: dict[str, _Account] = field(default_factory=dict[str, _Account])
@@ -100,7 +100,7 @@ def people_faults(
         links: rows of the table invitations.
         sessions: rows of the table sessions.
     """
-    told = _Told()
+    told = _RecordedAccounts()
     for payload, at_utc in events:
         if payload["kind"] == "account_changed":
             told.changed(payload, at_utc)
@@ -119,7 +119,7 @@ def people_faults(
             yield _fault(f"{where} is {'' if row['locked'] else 'not '}locked; the events say otherwise")
 
 
-def _link_faults(told: _Told, rows: Rows) -> Iterator[Fault]:
+def _link_faults(told: _RecordedAccounts, rows: Rows) -> Iterator[Fault]:
     for row in rows:
         sha256, account = sha256_text(str(row["token_sha256"])), str(row["account"])
         known, of = told.links.get(sha256), f"for the account {account}" if account else "for the first administrator"
@@ -132,7 +132,7 @@ def _link_faults(told: _Told, rows: Rows) -> Iterator[Fault]:
             yield _fault(f"table invitations: a link {of} is {state}; the events say otherwise")
 
 
-def _account_faults(told: _Told, rows: Rows) -> Iterator[Fault]:
+def _account_faults(told: _RecordedAccounts, rows: Rows) -> Iterator[Fault]:
     seen: set[str] = set()
     for row in rows:
         name = str(row["account"])

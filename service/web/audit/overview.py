@@ -17,7 +17,7 @@ from service.audit.overview.shots import failed_exposures_of, shots_of, together
 from service.audit.overview.signatures import signatures as signatures_of
 from service.audit.record import queries
 from service.run_record import results_to_come
-from service.steps.poses.time_left import Left
+from service.steps.poses.time_left import PendingResult
 from service.web.audit.frame import AuditState, CurrentAudit, audit_frame, close_audit, link
 from service.web.audit.gates import accuracy_of
 from service.web.audit.protocol_identity import protocol_identity

@@ -28,7 +28,7 @@ class ProtocolIdentity:
 
     sha256: str
     approval: Approval | None
-    others: tuple[OtherContent, ...]
+    others: tuple[DifferingContent, ...]
 
 
 _CONTENTS = text(
@@ -50,7 +50,7 @@ def protocol_identity(store: Store, run_id: str, protocol: str, version: str) ->
     hashes = dict.fromkeys(sha256 for sha256 in (*by_run.values(), *approved) if sha256 not in ("", mine))
     source = _source(store, approved, mine)
     others = [
-        OtherContent(
+        DifferingContent(
             sha256,
             tuple(run for run, its in by_run.items() if its == sha256),
             approved[sha256].by if sha256 in approved else "",

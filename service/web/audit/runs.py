@@ -11,7 +11,7 @@ from service.audit.background.incremental import Progress
 from service.audit.overview import first_page
 from service.audit.overview.first_page import ListedRun
 from service.audit.record import queries
-from service.audit.runs.search import RunWanted, find_runs
+from service.audit.runs.search import RunSearch, find_runs
 from service.web.audit.frame import AuditState, CurrentAudit, link
 from service.web.audit.queries import RunQuery
 from service.web.page.rendering import render
@@ -28,7 +28,7 @@ def runs_page(request: Request, audit: CurrentAudit, query: Annotated[RunQuery, 
     wanted = query.wanted()
     with audit.site.store.database.reading() as connection:
         every = queries.runs(connection)
-    said = {run.run_id for run in find_runs(audit.site.store, RunWanted(q=wanted.q))}
+    said = {run.run_id for run in find_runs(audit.site.store, RunSearch(q=wanted.q))}
     listed = [_listed(audit, basics) for basics in every]
     found = [run for run in listed if run.basics.run_id in said and first_page.matches(run, wanted)]
     pages = max(1, -(-len(found) // _RUNS_A_PAGE))

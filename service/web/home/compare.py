@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 
 from service.audit.runs.comparison import ComparedRun, compare_runs, root_of
-from service.audit.runs.search import RunWanted, find_runs
+from service.audit.runs.search import RunSearch, find_runs
 from service.web.page.rendering import render
 from service.web.security.guards import requires
 from service.web.site import CurrentSite, Site
@@ -24,7 +24,7 @@ def compare_page(
     """Two runs, or the choice of two. Raises UnknownRunError."""
     chosen = list(dict.fromkeys(run or []))
     comparison = compare_runs(*(_run(site, run_id) for run_id in chosen)) if len(chosen) == 2 else None
-    offered = find_runs(site.store, RunWanted())[:_OFFERED]
+    offered = find_runs(site.store, RunSearch())[:_OFFERED]
     missing = [run_id for run_id in chosen if run_id not in {each.run_id for each in offered}]
     return render(request, "home/compare.html.j2", c=comparison, chosen=chosen, offered=offered, missing=missing)
 

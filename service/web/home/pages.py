@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 from pydantic import BaseModel, Field
 
-from service.audit.runs.search import RESULT_WORDS, RESULTS, RunWanted, find_runs
+from service.audit.runs.search import RESULT_WORDS, RESULTS, RunSearch, find_runs
 from service.core.errors import OrthocaptureError
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
 from service.core.records.entered import RunAbout
@@ -54,7 +54,7 @@ class RunLine:
 
 
 @dataclass(frozen=True, slots=True)
-class Startable:
+class StartableProtocol:
     """A protocol file."""
 
     file: str
@@ -200,7 +200,7 @@ def _standing(protocol: Protocol, state: RunState, *, driven: bool) -> tuple[tup
     return ("Waits for a signature" if question.for_ == "sign" else "Waits for a confirmation", "attention"), ""
 
 
-def startable_of(name: str, site: Site) -> Startable:
+def startable_of(name: str, site: Site) -> StartableProtocol:
     """A protocol file, and how it stands on the site."""
     try:
         loaded = load_protocol(site.protocols / name, params_models())
@@ -208,6 +208,6 @@ def startable_of(name: str, site: Site) -> Startable:
         standing = standing_of(site.store, loaded)
         changes = difference(standing.other.payload.source, loaded.source) if standing.other is not None else []
         words = "" if space.verdict == "enough" else space.words
-        return Startable(name, loaded, "", words, standing, tuple(changes))
+        return StartableProtocol(name, loaded, "", words, standing, tuple(changes))
     except OrthocaptureError as error:
-        return Startable(name, None, str(error))
+        return StartableProtocol(name, None, str(error))

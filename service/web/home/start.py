@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 
-from service.audit.runs.search import RunWanted, find_runs
+from service.audit.runs.search import RunSearch, find_runs
 from service.core.errors import ConfigurationError
 from service.core.records.entered import LINE_CHARACTERS, TEXT_CHARACTERS, RunAbout
 from service.web.home.pages import startable_of
@@ -30,7 +30,7 @@ def start_form(
             where=str(site.protocols),
             remedy="Choose one of the first page",
         )
-    earlier = [run.about for run in find_runs(site.store, RunWanted())]
+    earlier = [run.about for run in find_runs(site.store, RunSearch())]
     return render(
         request,
         "home/start.html.j2",

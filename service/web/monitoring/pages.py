@@ -88,7 +88,7 @@ def health(site: CurrentSite) -> JSONResponse:
     return JSONResponse(content, status_code=200 if found.ok else 503)
 
 
-@router.get("/metrics", name="metrics", dependencies=[Depends(ReaderOrThisMachine("read", while_locked=False))])
+@router.get("/metrics", name="metrics", dependencies=[Depends(ReaderOrLocalRequest("read", while_locked=False))])
 def metrics(request: Request) -> Response:
     """The figures for Prometheus."""
     content = generate_latest(cast(CollectorRegistry, request.app.state.metrics))

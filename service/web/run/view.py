@@ -44,8 +44,8 @@ from service.web.run.view_records import (
     RunView,
     Signature,
     StepLine,
+    StepTrouble,
     StepView,
-    Trouble,
     Viewer,
 )
 
@@ -231,7 +231,7 @@ def _options(decision: object, state: RunState) -> tuple[OperatorVerb, ...]:
     return (*others, "redo", "abort")
 
 
-def _trouble(protocol: Protocol, state: RunState, decision: object) -> Trouble | None:
+def _trouble(protocol: Protocol, state: RunState, decision: object) -> StepTrouble | None:
     if not isinstance(decision, AskOperator) or decision.for_ != "recovery":
         return None
     step, now = protocol.step(state.current), state.step
@@ -240,13 +240,13 @@ def _trouble(protocol: Protocol, state: RunState, decision: object) -> Trouble |
     advice = mending(now).advice
     short = stopped_words(protocol, state, decision)
     if now.failure is not None:
-        return Trouble(f"{step.title} did not work", short, sentence(now.failure.message), safe, advice)
+        return StepTrouble(f"{step.title} did not work", short, sentence(now.failure.message), safe, advice)
     failed = [figure_line(verdict) for verdict in now.verdicts if not verdict.passed]
     if failed:
         undecided = all(verdict.passed or verdict.undecided for verdict in now.verdicts)
         found = "not decided yet" if undecided else "outside its limits"
-        return Trouble(f"{step.title}: {found}", short, "; ".join(failed), safe, advice)
-    return Trouble(f"{step.title} cannot begin yet", short, decision.text, safe, advice)
+        return StepTrouble(f"{step.title}: {found}", short, "; ".join(failed), safe, advice)
+    return StepTrouble(f"{step.title} cannot begin yet", short, decision.text, safe, advice)
 
 
 _BUTTONS: Mapping[OperatorVerb, str] = {

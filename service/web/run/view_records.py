@@ -145,7 +145,7 @@ class Acceptance:
 
 
 @dataclass(frozen=True, slots=True)
-class Trouble:
+class StepTrouble:
     """A step that needs a decision."""
 
     title: str

@@ -15,7 +15,7 @@ from fastapi import FastAPI
 from service.core.errors import ConfigurationError
 from service.web.server.connections import ConnectionLimits, Connections, plain_address
 from service.web.server.listener import ACCEPTED_AT_ONCE, Listener
-from service.web.server.reception import Forwarded, Reception
+from service.web.server.reception import ForwardedClient, Reception
 from service.web.server.sparing_log import EVERY_S, SparingHandler
 
 
@@ -56,7 +56,7 @@ def server(
 ) -> Server:
     """The server of an application on a socket."""
     config = uvicorn.Config(
-        Reception(Forwarded(app, proxies), listener.connections),
+        Reception(ForwardedClient(app, proxies), listener.connections),
         loop="asyncio",  # its servers accept through the listener
         ws="none",
         backlog=ACCEPTED_AT_ONCE,

@@ -44,7 +44,7 @@ class Listener(socket.socket):
                 self._exhausted = True
                 self.connections.make_room()
             raise
-        accepted = _Accepted(plain, self.connections.limits.wait_s)
+        accepted = _AcceptedSocket(plain, self.connections.limits.wait_s)
         connection = self.connections.admit(accepted, (address[0], address[1]))
         if connection is None:
             accepted.close()
@@ -53,7 +53,7 @@ class Listener(socket.socket):
         return accepted, address
 
 
-class _Accepted(socket.socket):
+class _AcceptedSocket(socket.socket):
     """An accepted socket that tells when it is closed."""
 
     def __init__(self, plain: socket.socket, wait_s: float) -> None:

@@ -61,7 +61,7 @@ class Reception:
         return send_in_time
 
 
-class Forwarded:
+class ForwardedClient:
     """The client's address and scheme as a proxy forwards them, believed from known proxies alone."""
 
     def __init__(self, app: ASGIApp, proxies: frozenset[str]) -> None:

@@ -19,7 +19,7 @@ Kind = tuple[str | int, ...]
 
 
 @dataclass(slots=True)
-class _Told:
+class _Repeats:
     """What was said of one kind since `since_s`."""
 
     since_s: float
@@ -38,7 +38,7 @@ class SparingHandler(logging.StreamHandler[TextIO]):
         words.converter = time.gmtime
         self.setFormatter(words)
         self._every_s = every_s
-        self._told: dict[Kind, _Told] = {}
+        self._told: dict[Kind, _Repeats] = {}
 
     def emit(self, record: logging.LogRecord) -> None:
         """See logging.Handler, which holds the lock meanwhile."""
@@ -47,7 +47,7 @@ class SparingHandler(logging.StreamHandler[TextIO]):
         kind = _kind(record)
         if kind not in self._told and len(self._told) >= _KINDS:
             kind = ("others",)
-        told = self._told.setdefault(kind, _Told(now_s, record.name, record.getMessage().partition("\n")[0][:200]))
+        told = self._told.setdefault(kind, _Repeats(now_s, record.name, record.getMessage().partition("\n")[0][:200]))
         if told.written < (_FAULTS if record.exc_info and record.name.startswith("orthocapture") else 1):
             told.written += 1
             super().emit(record)

@@ -52,7 +52,7 @@ _TYPICAL_PX = 0.08  # of an outline's place and size, where a view is only plann
 
 
 @dataclass(frozen=True, slots=True)
-class _Earlier:
+class _EarlierImage:
     """An image that was looked at before."""
 
     viewpoint: str
@@ -67,7 +67,7 @@ class _Earlier:
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
+class _NewImage:
     """What the new image itself says."""
 
     T_scene_camera: Transform | None
@@ -115,7 +115,7 @@ def hand_view(context: JobContext[view_job.Arguments]) -> JobAnswer:
             measures["spheres_sigma_mm"] = mm(bundle.sigma_m)
     eye = np.zeros(3) if pose is None else pose[:3, 3]
     information = np.zeros((6, 6)) if view.information is None else view.information.information
-    found = _Seen(
+    found = _NewImage(
         pose, view.why, measures, information, away_from_plane(spheres, eye), spheres.mean(axis=0),
         np.zeros((0, 0), dtype=np.int64), spheres, reading,
     )  # fmt: skip
@@ -124,11 +124,11 @@ def hand_view(context: JobContext[view_job.Arguments]) -> JobAnswer:
 
 def _all_earlier(
     context: JobContext[_H], surface: CoverageSurface | None, camera: CameraModel | None = None
-) -> list[_Earlier]:
+) -> list[_EarlierImage]:
     return [_read(context, sha256, surface, camera) for sha256 in context.arguments.earlier]
 
 
-def _readings(earlier: Sequence[_Earlier]) -> list[Reading]:
+def _readings(earlier: Sequence[_EarlierImage]) -> list[Reading]:
     return [
         Reading.read(e.viewpoint, e.T_scene_camera, e.reading)
         for e in earlier
@@ -156,16 +156,16 @@ def hand_board(context: JobContext[board_job.Arguments]) -> JobAnswer:
         pose, cells = inverse(T_camera_board), coverage_map_of([corners.corners], size)
         measures = {"corners": float(len(corners.indices)), "nominal_rms_px": rms_px}
     up = np.array([0.0, 0.0, -1.0])  # the board's z points into the table
-    found = _Seen(pose, why, measures, np.zeros((6, 6)), up, middle, cells)
+    found = _NewImage(pose, why, measures, np.zeros((6, 6)), up, middle, cells)
     return _answer(context, found, camera, None, _all_earlier(context, None))
 
 
 def _answer(
     context: JobContext[_H],
-    found: _Seen,
+    found: _NewImage,
     camera: CameraModel,
     surface: CoverageSurface | None,
-    earlier: Sequence[_Earlier],
+    earlier: Sequence[_EarlierImage],
 ) -> JobAnswer:
     """The verdict on the image among those before it, what all of them come to, and where to go next."""
     arguments = context.arguments
@@ -178,7 +178,7 @@ def _answer(
         level = level_frame(found.middle_m, found.up, -T[:3, 1])
     visible = _visible(limits_of(arguments.limits), surface, T, camera)
     reading = None if found.reading is None else found.reading.record()
-    mine = _Earlier(
+    mine = _EarlierImage(
         image.viewpoint, not why, T, level, found.information, visible, found.cells, reading, found.spheres_m
     )
     good = [*used, mine] if mine.used and T is not None else used
@@ -223,7 +223,7 @@ def _listed(place: Place) -> dict[str, Any]:
     return {"name": place.name, "T_level_camera": place.T_level_camera.tolist()}
 
 
-def _repeats(T: Transform | None, used: Sequence[_Earlier]) -> str:
+def _repeats(T: Transform | None, used: Sequence[_EarlierImage]) -> str:
     if T is None:
         return ""
     same = [e.viewpoint for e in used if e.T_scene_camera is not None and _same(e.T_scene_camera, T)]
@@ -235,7 +235,7 @@ def _same(a: Transform, b: Transform) -> bool:
 
 
 def _totals(
-    arguments: HeldArguments, good: Sequence[_Earlier], spheres: Array, surface: CoverageSurface | None
+    arguments: HeldArguments, good: Sequence[_EarlierImage], spheres: Array, surface: CoverageSurface | None
 ) -> dict[str, float]:
     """What the used images come to."""
     if not isinstance(arguments, view_job.Arguments) or not len(spheres):
@@ -252,7 +252,7 @@ def _totals(
 
 
 def _present(
-    arguments: view_job.Arguments, good: Sequence[_Earlier], spheres: Array, surface: CoverageSurface | None
+    arguments: view_job.Arguments, good: Sequence[_EarlierImage], spheres: Array, surface: CoverageSurface | None
 ) -> CurrentInformation:
     """The images as measurements of the scan's pose, whose cameras structure from motion will place."""
     sigma_m, sigma_rad = arguments.pose_sigma_m, arguments.pose_sigma_rad
@@ -270,9 +270,9 @@ def _present(
 
 def _way_on(
     arguments: HeldArguments,
-    mine: _Earlier,
-    earlier: Sequence[_Earlier],
-    good: Sequence[_Earlier],
+    mine: _EarlierImage,
+    earlier: Sequence[_EarlierImage],
+    good: Sequence[_EarlierImage],
     places: Sequence[Place],
     done: set[str],
     surface: CoverageSurface | None,
@@ -300,7 +300,7 @@ def _way_on(
 def _informative(
     arguments: view_job.Arguments,
     T_scene_level: Transform,
-    good: Sequence[_Earlier],
+    good: Sequence[_EarlierImage],
     spheres: Array,
     surface: CoverageSurface | None,
     camera: CameraModel,
@@ -365,7 +365,7 @@ def _visible(
 
 def _read(
     context: JobContext[_H], sha256: str, surface: CoverageSurface | None, camera: CameraModel | None
-) -> _Earlier:
+) -> _EarlierImage:
     data = context.input_json(sha256)
     points = 0 if surface is None else len(surface.points_m)
     bits = np.unpackbits(np.frombuffer(base64.b64decode(data["seen"]), np.uint8))
@@ -375,7 +375,7 @@ def _read(
         visible = _visible(limits_of(context.arguments.limits), surface, T, camera)
     cells = np.array(data["cells"], dtype=np.int64)
     spheres = None if data.get("spheres_m") is None else np.array(data["spheres_m"])
-    return _Earlier(
+    return _EarlierImage(
         data["viewpoint"], bool(data["used"]), T, level, np.array(data["information"]), visible, cells,
         data.get("reading"), spheres,
     )  # fmt: skip

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.capture.live import (
     LiveView,
-    Provisional,
+    ProvisionalRegistration,
     clipped_fraction,
     expected_spheres,
     register_station,
@@ -71,7 +71,7 @@ class _Record:
 class _Station:
     """One station's registration so far, and what its images say."""
 
-    solved: Provisional
+    solved: ProvisionalRegistration
     informations: tuple[ViewInformation, ...]
     P: Array
     mounting: Array  # (6, 6) of the scan's pose, from the hand-eye's covariance

@@ -79,14 +79,14 @@ def read_matches(
     return [by_pair[pair] for pair in sorted(wanted & by_pair.keys())]
 
 
-class _Kept(threading.local):
+class _ColmapChildren(threading.local):
     """COLMAP's child of each thread that does jobs, by seed: starting one takes as long as an image's features."""
 
     def __init__(self) -> None:
         self.children: dict[int, ColmapProcess] = {}
 
 
-_KEPT = _Kept()
+_KEPT = _ColmapChildren()
 
 
 def _front_end(arguments: FrontEndArguments) -> FrontEnd:

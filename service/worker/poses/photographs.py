@@ -15,11 +15,11 @@ import cv2
 from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_image
 from service.compute.images.resolution import resample
-from service.jobs.records import ImageFile, Photographed
+from service.jobs.records import ImageFile, ImagesCamera
 from service.worker.camera import camera_reduced, camera_used
 from service.worker.job import JobContext
 
-_A = TypeVar("_A", bound=Photographed)
+_A = TypeVar("_A", bound=ImagesCamera)
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 

@@ -47,7 +47,7 @@ _COMMON = ("common", "intrinsics")  # components that move all spheres alike
 
 
 @dataclass(frozen=True, slots=True)
-class _Measured:
+class _MeasuredSpheres:
     """What scanner and CT say of the spheres, in the frame of the registered scan."""
 
     scan: MeasuredSpheres
@@ -130,7 +130,7 @@ class _Errors:
     control_outlines: int
 
 
-def _errors(registered: _Registered, measured: _Measured, radius_m: float) -> _Errors:
+def _errors(registered: _Registered, measured: _MeasuredSpheres, radius_m: float) -> _Errors:
     """The paper's two errors, on control spheres where there are any, else on each sphere predicted by the others."""
     if not len(measured.control.centres_m):
         left_out = registered.record.leave_one_out
@@ -151,18 +151,18 @@ def _errors(registered: _Registered, measured: _Measured, radius_m: float) -> _E
     )
 
 
-def _measured(arguments: job.Arguments) -> _Measured:
+def _measured(arguments: job.Arguments) -> _MeasuredSpheres:
     """Scan, control scan and CT brought together by their spheres."""
     scan = _spheres(arguments.scan)
     control = _control(scan, arguments.control_scan)
     if arguments.ct is None:
-        return _Measured(scan, control, None)
+        return _MeasuredSpheres(scan, control, None)
     ct = _spheres(arguments.ct)
     shared = match_constellations(scan.centres_m, ct.centres_m).pairs
     centres, covariance = np.full_like(scan.centres_m, np.nan), np.zeros((len(scan.centres_m), 3, 3))
     for a, b in shared:
         centres[a], covariance[a] = ct.centres_m[b], ct.covariance_m2[b]
-    return _Measured(scan, control, MeasuredSpheres(centres, covariance, ct.surface_rms_m))
+    return _MeasuredSpheres(scan, control, MeasuredSpheres(centres, covariance, ct.surface_rms_m))
 
 
 def _control(scan: MeasuredSpheres, control_scan: SpheresFound | None) -> MeasuredSpheres:
@@ -201,7 +201,7 @@ def _registered(
     context: JobContext[job.Arguments],
     name: str,
     record: Registration,
-    measured: _Measured,
+    measured: _MeasuredSpheres,
     radius_m: float,
     found: dict[Hash, Any],
 ) -> _Registered:
@@ -226,7 +226,7 @@ def _registered(
     return _Registered(name, record, camera, images, outlines, T_scan_camera, markers, controls)
 
 
-def _budget(registered: _Registered, measured: _Measured, radius_m: float) -> ErrorBudget:
+def _budget(registered: _Registered, measured: _MeasuredSpheres, radius_m: float) -> ErrorBudget:
     """Contributions where the control spheres are: in the middle of the anatomy."""
     record = registered.record
     T_world_scan = np.array(record.T_world_scan)
@@ -266,7 +266,7 @@ def _budget(registered: _Registered, measured: _Measured, radius_m: float) -> Er
 
 
 def _overlays(
-    context: JobContext[job.Arguments], registered: _Registered, measured: _Measured, radius_m: float
+    context: JobContext[job.Arguments], registered: _Registered, measured: _MeasuredSpheres, radius_m: float
 ) -> list[ArtefactRef]:
     """Pictures of one image a station, with detected and predicted outlines drawn over it."""
     first: dict[str, int] = {}

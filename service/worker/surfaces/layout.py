@@ -22,7 +22,7 @@ from service.compute.layout.ambiguity import (
 from service.compute.layout.photo_adjustment import LensPrior, Photograph
 from service.compute.layout.photographs import PhotoLayout, layout_from_photographs
 from service.compute.layout.sphere_moves import innermost, suggest_moves
-from service.compute.layout.words import ShownMove, show_move
+from service.compute.layout.words import PhotographedMove, show_move
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import SphereOutline
 from service.core.errors import ComputeError, DataError
@@ -116,7 +116,7 @@ def nominal_camera(width: int, height: int, focal_mm: float, sensor_width_mm: fl
 
 def _moves(
     found: PhotoLayout, report: LayoutReport, camera: CameraModel, radius_m: float, control: int
-) -> list[ShownMove]:
+) -> list[PhotographedMove]:
     """What to move, as the last photograph shows it; nothing where the layout is good, or no move would help."""
     T = found.T_photo_first[-1]
     if T is None or all(bounded.lower_m >= limit for bounded, limit in layout_bounds(report).values()):
@@ -127,7 +127,7 @@ def _moves(
         moves = suggest_moves(placed, up=up, radius_m=radius_m, fixed=innermost(placed, control))
     except ComputeError:
         return []
-    shown: list[ShownMove] = []
+    shown: list[PhotographedMove] = []
     for move in moves:
         shown.append(show_move(move, placed, up, T, camera, REQUIRED_MARGIN_M))
         placed = placed.copy()
@@ -146,7 +146,7 @@ def _photograph_record(ids: NDArray[np.int64], outlines: Sequence[SphereOutline]
     return {"used": bool(len(ids)), "spheres": {str(i): list(o.centre_px) for i, o in shown if i >= 0}}
 
 
-def _move_record(move: ShownMove, camera: CameraModel) -> dict[str, Any]:
+def _move_record(move: PhotographedMove, camera: CameraModel) -> dict[str, Any]:
     """The places as parts of the image's width and height: as one would point at them in the picture."""
     size = np.array([camera.width, camera.height])
     return {
@@ -162,7 +162,7 @@ def _picture(
     camera: CameraModel,
     outlines: Sequence[SphereOutline],
     ids: NDArray[np.int64],
-    moves: Sequence[ShownMove],
+    moves: Sequence[PhotographedMove],
 ) -> bytes:
     """JPEG of the photograph with numbered spheres, and arrows where spheres are to go."""
     picture = pixels.copy()
@@ -180,7 +180,7 @@ def _picture(
     return encoded.tobytes()
 
 
-def _draw_move(picture: NDArray[np.uint8], move: ShownMove, outline: Array, thick: int) -> None:
+def _draw_move(picture: NDArray[np.uint8], move: PhotographedMove, outline: Array, thick: int) -> None:
     """Where the sphere is to go as a circle, and an arrow from rim to rim, so that its number stays to be read.
 
     Args:

@@ -13,7 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.design import Aims
+from service.compute.calibration.board_poses.design import CalibrationTargets
 from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, align_points, apply, inverse, look_at, transform
@@ -86,7 +86,7 @@ def planned_board_shots(scene: Scene, wanted: BoardPoses, solve: Sequence[str]) 
     def joints(T_base_camera: Array) -> Array | None:
         return joints_for(ARM_MODEL, flange_target(T_base_camera, mount), _NEAR)
 
-    aims = Aims("intrinsics" in solve, "hand_eye" in solve, wanted.coverage)
+    aims = CalibrationTargets("intrinsics" in solve, "hand_eye" in solve, wanted.coverage)
     planner = Planner(wanted, board, aims, np.array(layout.approach), mount, lambda T: joints(T) is not None)
     found = [joints(T) for T in preview_board(planner, known).T_base_camera]
     return [Shot(wanted.station, q) for q in found if q is not None]

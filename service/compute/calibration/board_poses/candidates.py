@@ -21,7 +21,7 @@ _MOST = 800
 
 
 @dataclass(frozen=True, slots=True)
-class PoseWishes:
+class ViewRange:
     """The wanted range of views of the board."""
 
     tilts_deg: tuple[float, ...] = (4.0, 14.0, 24.0, 32.0, 38.0)  # of the optical axis from the board's normal
@@ -43,7 +43,7 @@ class Candidates:
 
 
 def board_candidates(
-    known: BoardKnowledge, board: Board, wishes: PoseWishes, approach: Array, *, most: int = _MOST, seed: int = 0
+    known: BoardKnowledge, board: Board, wishes: ViewRange, approach: Array, *, most: int = _MOST, seed: int = 0
 ) -> Candidates:
     """Poses that keep the whole printed board in the frame for every truth within the tolerances.
 
@@ -65,10 +65,10 @@ def board_candidates(
     poses = np.array([grid[k // len(_ANCHORS)] for k in pick]).reshape(-1, 4, 4)
     anchors = np.array([_ANCHORS[k % len(_ANCHORS)] for k in pick], dtype=np.float64).reshape(-1, 2)
     outline = _outline(board)
-    truth = _Possible(known, outline, _DRAWS)
+    truth = _ToleranceDraws(known, outline, _DRAWS)
     poses = _pushed(poses, anchors, known.camera, truth)
     poses = poses[_inside(poses, known.camera, truth)]
-    poses = poses[_inside(poses, known.camera, _Possible(known, outline, _CHECKED, seed=1))]
+    poses = poses[_inside(poses, known.camera, _ToleranceDraws(known, outline, _CHECKED, seed=1))]
     return Candidates(poses, expected_pixels(known, board, poses))
 
 
@@ -87,7 +87,7 @@ def _outline(board: Board) -> Array:
     return np.column_stack([low + np.array(share) * (high - low), np.zeros(len(share))])
 
 
-class _Possible:
+class _ToleranceDraws:
     """Draws within the tolerances: the true pose of a camera sent to a pose, and the true place of the board."""
 
     def __init__(self, known: BoardKnowledge, outline: Array, count: int, seed: int = 0) -> None:
@@ -110,7 +110,7 @@ class _Possible:
         return (pixels - middle) * self.zoom[:, None, None] + middle + self.shift_px[:, None], turned[..., 2]
 
 
-def _grid(known: BoardKnowledge, board: Board, wishes: PoseWishes, approach: Array) -> list[Transform]:
+def _grid(known: BoardKnowledge, board: Board, wishes: ViewRange, approach: Array) -> list[Transform]:
     middle = apply(known.T_base_board, board.points().mean(axis=0))
     normal = -known.T_base_board[:3, 2]
     towards = approach - (approach @ normal) * normal
@@ -127,7 +127,7 @@ def _grid(known: BoardKnowledge, board: Board, wishes: PoseWishes, approach: Arr
     return poses
 
 
-def _pushed(poses: Array, anchors: Array, camera: CameraModel, truth: _Possible) -> Array:
+def _pushed(poses: Array, anchors: Array, camera: CameraModel, truth: _ToleranceDraws) -> Array:
     """Each pose shifted in its image plane until the board touches the wanted side of the frame, or is centred."""
     size, margin = np.array([camera.width, camera.height]), _MARGIN * camera.width
     poses = poses.copy()
@@ -142,7 +142,7 @@ def _pushed(poses: Array, anchors: Array, camera: CameraModel, truth: _Possible)
     return poses
 
 
-def _inside(poses: Array, camera: CameraModel, truth: _Possible) -> NDArray[np.bool_]:
+def _inside(poses: Array, camera: CameraModel, truth: _ToleranceDraws) -> NDArray[np.bool_]:
     pixels, depth = truth.pixels(poses)
     margin = 0.5 * _MARGIN * camera.width
     within = (pixels >= margin) & (pixels <= np.array([camera.width, camera.height]) - 1 - margin)

@@ -37,7 +37,7 @@ _TRIED = 40  # of the best ones, until the arm can take one
 
 
 @dataclass(frozen=True, slots=True)
-class Aims:
+class CalibrationTargets:
     """Which calibrations the images are for, and their targets."""
 
     intrinsics: bool = True
@@ -72,18 +72,18 @@ class Prediction:
 
 
 @dataclass(frozen=True, slots=True)
-class Taken:
+class ChosenViews:
     """Images taken or already chosen: T_base_camera (N, 4, 4) and the pixels of their corners, N arrays (M, 2)."""
 
     T_base_camera: Array
     pixels: tuple[Array, ...] = ()
 
-    def plus(self, poses: Array, pixels: Sequence[Array]) -> Taken:
+    def plus(self, poses: Array, pixels: Sequence[Array]) -> ChosenViews:
         """These with further ones."""
-        return Taken(np.concatenate([self.T_base_camera, poses.reshape(-1, 4, 4)]), (*self.pixels, *pixels))
+        return ChosenViews(np.concatenate([self.T_base_camera, poses.reshape(-1, 4, 4)]), (*self.pixels, *pixels))
 
 
-NOTHING = Taken(np.zeros((0, 4, 4)))
+NOTHING = ChosenViews(np.zeros((0, 4, 4)))
 
 
 def choose_poses(
@@ -91,9 +91,9 @@ def choose_poses(
     count: int,
     known: BoardKnowledge,
     board: Board,
-    aims: Aims,
+    aims: CalibrationTargets,
     *,
-    taken: Taken = NOTHING,
+    taken: ChosenViews = NOTHING,
     feasible: Callable[[Transform], bool] = lambda _T: True,
     enough: Callable[[Prediction], bool] | None = None,
     seed: int = 0,
@@ -112,7 +112,7 @@ def choose_poses(
         seed: of the random samples of later picks.
     """
     rng = np.random.default_rng([seed, 0x9A5E])
-    worth = _Worth(known, board, aims)
+    worth = _InformationGain(known, board, aims)
     cells = _cells(candidates.pixels, known, _CELL_SHARE)
     covered = _covered(taken.pixels, known)
     gains = worth.gains(candidates.T_base_camera)
@@ -145,19 +145,24 @@ def choose_poses(
 
 
 def _of_chosen(
-    candidates: Candidates, chosen: list[int], known: BoardKnowledge, board: Board, aims: Aims, taken: Taken
+    candidates: Candidates,
+    chosen: list[int],
+    known: BoardKnowledge,
+    board: Board,
+    aims: CalibrationTargets,
+    taken: ChosenViews,
 ) -> Prediction:
     more = candidates.take(np.array(chosen, dtype=np.int64))
     return predict(taken.plus(more.T_base_camera, list(more.pixels)), known, board, aims)
 
 
-def as_taken(known: BoardKnowledge, board: Board, T_base_camera: Array) -> Taken:
+def as_taken(known: BoardKnowledge, board: Board, T_base_camera: Array) -> ChosenViews:
     """Poses as if their images were taken, with the board's points at their expected pixels."""
     poses = T_base_camera.reshape(-1, 4, 4)
-    return Taken(poses, tuple(expected_pixels(known, board, poses)))
+    return ChosenViews(poses, tuple(expected_pixels(known, board, poses)))
 
 
-def predict(taken: Taken, known: BoardKnowledge, board: Board, aims: Aims) -> Prediction:
+def predict(taken: ChosenViews, known: BoardKnowledge, board: Board, aims: CalibrationTargets) -> Prediction:
     """Predict what calibrations from images at these poses will achieve."""
     counts = _counts(taken.pixels, known)
     boards = np.array([inverse(T) @ known.T_base_board for T in taken.T_base_camera]).reshape(-1, 4, 4)
@@ -181,10 +186,10 @@ def predict(taken: Taken, known: BoardKnowledge, board: Board, aims: Aims) -> Pr
     )
 
 
-class _Worth:
+class _InformationGain:
     """Information gained by poses, and the variance left by a set of them."""
 
-    def __init__(self, known: BoardKnowledge, board: Board, aims: Aims) -> None:
+    def __init__(self, known: BoardKnowledge, board: Board, aims: CalibrationTargets) -> None:
         self.known, self.board, self.aims = known, board, aims
         self.prior = lens_prior(known.camera)
         self.field = lens_field(known.camera)

@@ -10,7 +10,7 @@ from service.compute.calibration.board_poses.knowledge import BoardKnowledge
 from service.compute.calibration.hand_eye.reprojection import projection_jacobian
 from service.compute.calibration.hand_eye.weighted import linearise
 from service.compute.calibration.intrinsics.adjustment import Adjustment, linearised, project_with_jacobian
-from service.compute.calibration.intrinsics.uncertainty import Determined, uncertainty_of
+from service.compute.calibration.intrinsics.uncertainty import EstimatedCamera, uncertainty_of
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, inverse
 
@@ -86,7 +86,7 @@ def uncertainty_mm(boards: Array, camera: CameraModel, board: Board, corner_sigm
         return float("nan")
     views = tuple(BoardView(everything, np.zeros((len(everything), 2))) for _ in boards)
     covariance = inverse_of(normal[None])[0] * variance
-    known = Determined(camera, board, views, solution, covariance, variance)
+    known = EstimatedCamera(camera, board, views, solution, covariance, variance)
     middle = np.append(board.points().mean(axis=0), 1.0)
     return uncertainty_of(known, float(np.median((boards @ middle)[:, 2]))).worst_mm
 

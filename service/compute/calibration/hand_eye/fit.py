@@ -91,7 +91,7 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class HandEyeMeasurements:
     """All measurements of N views; `corners` and `joints_rad` (N, 6) if known."""
 
     hands: Array
@@ -101,9 +101,9 @@ class Measured:
     joints_rad: Array | None
     arm: ArmModel | None
 
-    def take(self, which: NDArray[np.bool_]) -> Measured:
+    def take(self, which: NDArray[np.bool_]) -> HandEyeMeasurements:
         """Only these views."""
-        return Measured(
+        return HandEyeMeasurements(
             self.hands[which],
             self.boards[which],
             self.covariance[which],
@@ -133,7 +133,7 @@ class Measured:
         return hands @ answer.T_flange_camera @ self.boards
 
 
-def find_outliers(data: Measured, rng: np.random.Generator) -> dict[int, str]:
+def find_outliers(data: HandEyeMeasurements, rng: np.random.Generator) -> dict[int, str]:
     """Views whose robot pose and board pose disagree beyond the others' noise, with reasons by index.
 
     Raises:
@@ -176,17 +176,17 @@ def _median_noise(e: Array) -> Noise:
     return Noise(robot_m, robot_rad)
 
 
-def turned_back(data: Measured, answer: Answer, T_board_turned: Transform) -> NDArray[np.bool_]:
+def turned_back(data: HandEyeMeasurements, answer: Answer, T_board_turned: Transform) -> NDArray[np.bool_]:
     """(N,) views that fit the answer better with the board turned by half a turn."""
     apart = [
-        Measured(data.hands, boards, data.covariance, None, data.joints_rad, data.arm).placed(answer)
+        HandEyeMeasurements(data.hands, boards, data.covariance, None, data.joints_rad, data.arm).placed(answer)
         for boards in (data.boards, data.boards @ T_board_turned)
     ]
     as_is, turned = (deviation(placed, answer.T_base_board)[0] for placed in apart)
     return turned < as_is
 
 
-def fit_method(data: Measured, method: Method, start: Answer | None = None) -> Answer:
+def fit_method(data: HandEyeMeasurements, method: Method, start: Answer | None = None) -> Answer:
     """One method's answer from these views, without a model of the arm's error.
 
     Args:
@@ -215,13 +215,13 @@ def fit_method(data: Measured, method: Method, start: Answer | None = None) -> A
     return Answer(fit.T_flange_camera, fit.T_base_board, views, noise, fit)
 
 
-def fit_closed_form(data: Measured, method: ClosedForm) -> Answer:
+def fit_closed_form(data: HandEyeMeasurements, method: ClosedForm) -> Answer:
     """A closed form's answer, with the board at its mean pose."""
     X = solve_closed_form(data.hands, data.boards, method)
     return Answer(X, mean_pose(data.hands @ X @ data.boards))
 
 
-def arm_noise(data: Measured, plain: Answer, terms: ArmTerms) -> Noise:
+def arm_noise(data: HandEyeMeasurements, plain: Answer, terms: ArmTerms) -> Noise:
     """Noise of the model with these arm parameters, before any selection among them.
 
     Raises:
@@ -234,7 +234,7 @@ def arm_noise(data: Measured, plain: Answer, terms: ArmTerms) -> Noise:
     return estimate_noise(views, plain.T_flange_camera, plain.T_base_board, first, floor_m=_ARM_FLOOR_M)
 
 
-def fit_with_arm(data: Measured, plain: Answer, terms: ArmTerms, start: Noise) -> Answer:
+def fit_with_arm(data: HandEyeMeasurements, plain: Answer, terms: ArmTerms, start: Noise) -> Answer:
     """The weighted answer with the arm's systematic error estimated.
 
     Args:
@@ -277,13 +277,13 @@ def arm_outliers(answer: Answer) -> NDArray[np.bool_]:
     return square > _LIMIT * max(1.0, float(np.median(square)) / _CHI2_MEDIAN)
 
 
-def arm_is_possible(data: Measured) -> bool:
+def arm_is_possible(data: HandEyeMeasurements) -> bool:
     """Whether joints are known and there are enough views to estimate the arm's errors."""
     return data.arm is not None and data.joints_rad is not None and len(data.hands) >= _MIN_ARM_VIEWS
 
 
 def held_out(
-    data: Measured,
+    data: HandEyeMeasurements,
     keep: NDArray[np.bool_],
     method: Method,
     terms: ArmTerms,

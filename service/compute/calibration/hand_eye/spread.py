@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.board.board import BoardView
 from service.compute.calibration.hand_eye.closed_form import CLOSED_FORMS, solve_closed_form
-from service.compute.calibration.hand_eye.fit import Answer, Measured, Method, fit_closed_form
+from service.compute.calibration.hand_eye.fit import Answer, HandEyeMeasurements, Method, fit_closed_form
 from service.compute.calibration.hand_eye.reprojection import BoardCorners, resample_reprojection
 from service.compute.calibration.hand_eye.weighted import resample
 from service.compute.calibration.intrinsics.adjustment import fit_pose, pose_matrix
@@ -21,7 +21,7 @@ _MIN_DISTINCT = 4  # distinct views in a bootstrap replicate
 
 
 def bootstrap_covariance(
-    data: Measured, method: Method, answer: Answer, count: int, rng: np.random.Generator
+    data: HandEyeMeasurements, method: Method, answer: Answer, count: int, rng: np.random.Generator
 ) -> Array:
     """(6, 6) covariance of T_flange_camera from resampling whole images.
 
@@ -47,7 +47,7 @@ def bootstrap_covariance(
     return np.cov(steps[:, :6].T)
 
 
-def camera_share(data: Measured, known: CameraCovariance) -> Array:
+def camera_share(data: HandEyeMeasurements, known: CameraCovariance) -> Array:
     """(6, 6) covariance of T_flange_camera due to the camera calibration's uncertainty, common to all images.
 
     Board poses and then the mount are found again with cameras displaced by one standard deviation; by Park's closed
@@ -94,5 +94,5 @@ def not_below_held_out(covariance: Array, held_out_mm: Array, held_out_deg: Arra
     return covariance * np.outer(factor, factor)
 
 
-def _repeat(data: Measured, pick: NDArray[np.int64]) -> Measured:
-    return Measured(data.hands[pick], data.boards[pick], data.covariance[pick], None, None, None)
+def _repeat(data: HandEyeMeasurements, pick: NDArray[np.int64]) -> HandEyeMeasurements:
+    return HandEyeMeasurements(data.hands[pick], data.boards[pick], data.covariance[pick], None, None, None)

@@ -46,7 +46,7 @@ class ProjectionUncertainty:
 
 
 @dataclass(frozen=True, slots=True)
-class Determined:
+class EstimatedCamera:
     """A camera as determined by board images: the input of its projection uncertainty.
 
     Attributes:
@@ -99,12 +99,14 @@ def projection_uncertainty(
         DataError: the distance is not positive.
     """
     variance = result.sigma_corner_px**2 * result.inflation
-    known = Determined(result.camera, result.board, result.corners, result.adjustment, result.covariance, variance)
+    known = EstimatedCamera(
+        result.camera, result.board, result.corners, result.adjustment, result.covariance, variance
+    )
     return uncertainty_of(known, distance_m, columns=columns, rows=rows)
 
 
 def uncertainty_of(
-    result: Determined, distance_m: float, *, columns: int = 24, rows: int = 16
+    result: EstimatedCamera, distance_m: float, *, columns: int = 24, rows: int = 16
 ) -> ProjectionUncertainty:
     """`projection_uncertainty` for a camera determined by any images, including planned ones."""
     if not 0 < distance_m < np.inf:
@@ -144,7 +146,7 @@ def uncertainty_of(
     )
 
 
-def _implied_motion(result: Determined) -> tuple[Array, Array]:
+def _implied_motion(result: EstimatedCamera) -> tuple[Array, Array]:
     """K (6, P), and the covariance (6, 6) that the poses' own noise adds; motion (d, w) in metres and radians.
 
     A point p in the camera frame before a change of parameters and poses is at p + d + w x p after it.

@@ -42,7 +42,7 @@ _FOCUS = 1.3  # ratio of blur to expected blur above which the profiles were too
 
 
 @dataclass(frozen=True, slots=True)
-class Approached:
+class AveragedCone:
     """A cone measured on averaged pixels, and the expected blurs (px)."""
 
     cone: Cone
@@ -94,27 +94,27 @@ def refine_outlines(
 
 def approach_outlines(
     image_bgr: NDArray[np.uint8], camera: CameraModel, roughs: Sequence[Cone], options: DetectionOptions = DEFAULTS
-) -> list[Approached | None]:
+) -> list[AveragedCone | None]:
     """Cones refined on pixels averaged across the outline; `roughs` must be good to 4 % of their radii."""
     if not roughs:
         return []
     radius_px = float(np.median([c.half_angle_rad for c in roughs])) * camera.fx
     unit = max(1, round(radius_px / _UNIT_RADIUS_PX))
     count = _FIRST_PROFILES if unit == 1 else _FIRST_OF_LARGE
-    out: list[Approached | None] = [None] * len(roughs)
-    todo = [(i, Approached(rough)) for i, rough in enumerate(roughs)]
+    out: list[AveragedCone | None] = [None] * len(roughs)
+    todo = [(i, AveragedCone(rough)) for i, rough in enumerate(roughs)]
     for _ in range(3):
         if not todo:
             break
         measured = _measure(image_bgr, camera, [a for _, a in todo], count, 1.0, 2.5, 4, unit, options)
-        again: list[tuple[int, Approached]] = []
+        again: list[tuple[int, AveragedCone]] = []
         for (i, before), found in zip(todo, measured, strict=True):
             if found is None:
                 continue
             if unit > 1:
-                out[i] = Approached(found.cone)  # the blur is finer than these samples and still unknown
+                out[i] = AveragedCone(found.cone)  # the blur is finer than these samples and still unknown
                 continue
-            out[i] = Approached(found.cone, found.blur_px, found.chroma_blur_px)
+            out[i] = AveragedCone(found.cone, found.blur_px, found.chroma_blur_px)
             if found.blur_px >= _FOCUS * max(1.0, before.blur_px):
                 again.append((i, out[i] or before))  # out of focus
         todo = again
@@ -124,7 +124,7 @@ def approach_outlines(
 def measure_outlines(
     image_bgr: NDArray[np.uint8],
     camera: CameraModel,
-    starts: Sequence[Approached],
+    starts: Sequence[AveragedCone],
     options: DetectionOptions = DEFAULTS,
     *,
     scores: Sequence[float] = (),
@@ -144,7 +144,7 @@ def measure_outlines(
     found = _measure(image_bgr, camera, starts, count, step, 1.6 if fine else 2.5, iterations, 1, options)
     for i, best in enumerate(found):
         if best is not None and not fine and best.blur_px > _FOCUS * max(1.0, starts[i].blur_px):
-            longer = Approached(best.cone, best.blur_px, best.chroma_blur_px)
+            longer = AveragedCone(best.cone, best.blur_px, best.chroma_blur_px)
             found[i] = _measure(image_bgr, camera, [longer], count, step, 2.5, iterations, 1, options)[0]
     return [
         None if best is None else _outline(image_bgr, camera, best, options, score)
@@ -153,7 +153,7 @@ def measure_outlines(
 
 
 def _outline(
-    image: NDArray[np.uint8], camera: CameraModel, best: _Measured, options: DetectionOptions, score: float
+    image: NDArray[np.uint8], camera: CameraModel, best: _SubpixelCone, options: DetectionOptions, score: float
 ) -> SphereOutline | None:
     if (
         best.coverage < options.min_coverage
@@ -191,7 +191,7 @@ def _by_envelope(
 
 
 @dataclass(frozen=True, slots=True)
-class _Measured:
+class _SubpixelCone:
     """A cone measured by sub-pixel edges."""
 
     cone: Cone
@@ -209,14 +209,14 @@ class _Measured:
 def _measure(
     image: NDArray[np.uint8],
     camera: CameraModel,
-    starts: Sequence[Approached],
+    starts: Sequence[AveragedCone],
     n_profiles: int,
     step: float,
     reach: float,
     iterations: int,
     unit: int,
     options: DetectionOptions,
-) -> list[_Measured | None]:
+) -> list[_SubpixelCone | None]:
     """Cones near `starts` from `n_profiles` each; lengths are in units of `unit` averaged pixels."""
     cones = [s.cone for s in starts]
     radius = np.array([c.half_angle_rad for c in cones]) * camera.fx / unit
@@ -247,7 +247,7 @@ def _measure(
     fit = _robust_cones(azimuth, limb.offset * per_pixel / angle[:, None], limb.sigma, limb.ok)
     covariance = _covariances(azimuth, fit)
     contrast = masked_median(limb.contrast, fit.used)
-    out: list[_Measured | None] = []
+    out: list[_SubpixelCone | None] = []
     for i, cone in enumerate(cones):
         blur_px = float(limb.blur[i]) * unit
         if not fit.good[i] or fit.scale[i] > max(MOST_SIGMA_PX, 0.3 * float(limb.blur[i])):
@@ -260,7 +260,7 @@ def _measure(
         axis = cone.axis + cone.frame()[:, :2] @ fit.step[i, :2] * angle[i]
         systematic = SYSTEMATIC_PER_BLUR * blur_px
         out.append(
-            _Measured(
+            _SubpixelCone(
                 cone=Cone(axis / float(np.linalg.norm(axis)), half),
                 blur_px=blur_px,
                 chroma_blur_px=float(limb.chroma_blur[i]) * unit,

@@ -15,7 +15,7 @@ from service.compute.descent import gauss_newton
 from service.compute.markers.cones import Cone, cone_of_sphere, ransac_cone
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.outlines.edges import envelope_edges, profiles, sample
-from service.compute.markers.outlines.refine import Approached, approach_outlines, measure_outlines, refine_outline
+from service.compute.markers.outlines.refine import AveragedCone, approach_outlines, measure_outlines, refine_outline
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 from service.core.geometry import Array, Transform, apply, increment, skew
 
@@ -71,7 +71,7 @@ class Prediction:
 
 
 @dataclass(frozen=True, slots=True)
-class Located:
+class PredictedOutlines:
     """Outlines by sphere; reasons for spheres expected but not found; the image's own pose."""
 
     outlines: dict[int, SphereOutline]
@@ -90,7 +90,7 @@ class Located:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class ImageOutlines:
     """Outlines of one image; where they were predicted, the sphere of each, and the reason for each missing one."""
 
     outlines: tuple[SphereOutline, ...] = field(repr=False)
@@ -103,7 +103,7 @@ def find_spheres(
     camera: CameraModel,
     expected: Prediction | None,
     options: DetectionOptions = DEFAULTS,
-) -> Found:
+) -> ImageOutlines:
     """Outlines in an image (H, W, 3) of the camera's size: where they are predicted, or by a search of all of it.
 
     The search of a capture under way and that of a registration are this one.
@@ -114,13 +114,13 @@ def find_spheres(
     if expected is not None:
         located = locate_predicted(image_bgr, camera, expected, options)
         if located.convincing:
-            return Found(tuple(located.outlines.values()), tuple(located.outlines), located.missing)
-    return Found(detect_spheres(image_bgr, camera, options), None, {})
+            return ImageOutlines(tuple(located.outlines.values()), tuple(located.outlines), located.missing)
+    return ImageOutlines(detect_spheres(image_bgr, camera, options), None, {})
 
 
 def locate_predicted(
     image_bgr: NDArray[np.uint8], camera: CameraModel, expected: Prediction, options: DetectionOptions = DEFAULTS
-) -> Located:
+) -> PredictedOutlines:
     """The outlines of the predicted spheres in an image (H, W, 3) of the camera's size.
 
     Each region is searched as far as the prediction may be off. The outlines found must agree with one camera pose
@@ -137,7 +137,7 @@ def locate_predicted(
 
 def _attempt(
     image: NDArray[np.uint8], camera: CameraModel, expected: Prediction, options: DetectionOptions
-) -> Located:
+) -> PredictedOutlines:
     centres, radius_m = expected.centres_m, expected.radius_m
     pose = expected.T_camera_scan
     starts = None
@@ -170,12 +170,12 @@ def _attempt(
         if place > _PLACE_GATE / part or size > _SIZE_GATE / part:
             del outlines[m]
             missing[m] = "not where the image's other spheres predict it"
-    return Located(outlines, missing, pose)
+    return PredictedOutlines(outlines, missing, pose)
 
 
 def _starts(
     image: NDArray[np.uint8], camera: CameraModel, expected: Prediction, pose: Transform, options: DetectionOptions
-) -> dict[int, Approached] | None:
+) -> dict[int, AveragedCone] | None:
     """Cones good to about a pixel for measurement: approached ones, and predictions from these for the others.
 
     None if the approached spheres do not agree on a pose.
@@ -188,11 +188,11 @@ def _starts(
     agreed = _agreed_pose(cones, expected, pose, _APPROACH_GATE, max(0.5 * len(shown), _POSE_SPHERES))
     if agreed is None:
         return None
-    out: dict[int, Approached] = {}
+    out: dict[int, AveragedCone] = {}
     for m, cone in visible_cones(agreed, centres, radius_m, camera).items():
         own = approached.get(m)
         place, size = (np.inf, np.inf) if own is None else deviation(own.cone, cone)
-        out[m] = own if own is not None and place < _PLACE_GATE and size < _SIZE_GATE else Approached(cone)
+        out[m] = own if own is not None and place < _PLACE_GATE and size < _SIZE_GATE else AveragedCone(cone)
     return out
 
 

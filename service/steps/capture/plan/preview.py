@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.design import Aims
+from service.compute.calibration.board_poses.design import CalibrationTargets
 from service.compute.planning.motion_plan import able_postures
 from service.core.geometry import Array, Transform, apply
 from service.core.protocol.models import Protocol, Step
@@ -62,7 +62,7 @@ def preview_board_poses(
             mount, there, model, collision, rig.section.optics, protocol.motion, start, sharp_at_m=points
         )
         feasible = lambda T: bool(able_postures(T, situation))  # noqa: E731
-    aims = Aims("intrinsics" in solve, "hand_eye" in solve, wanted.coverage)
+    aims = CalibrationTargets("intrinsics" in solve, "hand_eye" in solve, wanted.coverage)
     planned = preview_board(Planner(wanted, board, aims, np.array(there.approach), mount, feasible), known)
     record = prediction_record(planned.prediction)
     text = (

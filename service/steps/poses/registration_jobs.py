@@ -1,0 +1,254 @@
+"""The jobs that lead from the images to each registration of a step, planned from the record.
+
+Nothing is enqueued here. The step enqueues the jobs that are due; once it has ended, the worker does so after each
+job, so that results still arrive when no process drives the run any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from service.compute.poses.sfm.front_end import pairs_of
+from service.compute.poses.sfm.options import SfmOptions
+from service.core.jobs.keys import arguments_name, newest_job
+from service.core.jobs.priorities import LATER, REDUCED, WAITED
+from service.core.jobs.references import Reference, jobs_of, resolve
+from service.core.protocol.models import Protocol, Step
+from service.core.run.state import JobState, RunState
+from service.jobs import job_kinds
+from service.jobs.records import Photograph
+from service.steps.context import JobRequest
+from service.steps.poses.front_end import IMAGES_A_JOB, PAIRS_A_JOB, EarlyJobs, chunks, found_early
+from service.steps.poses.sources import PLANNED, QUICK, WantedRegistrations, decisive, posed
+
+_REDUCED = ("reduced_to", "full_camera")  # arguments of jobs on reduced images; the second one in old runs only
+_MAPPERS = {"colmap": "incremental", "glomap": "global", "triangulated": "triangulated"}
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A job that a registration needs; `job` is None until it is enqueued."""
+
+    name: str  # of the job's key
+    request: JobRequest
+    job: JobState | None
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationJobs:
+    """The jobs of all registrations of a step, and their state."""
+
+    tasks: tuple[Task, ...]
+    tasks_for: Mapping[str, tuple[Task, ...]]  # the tasks of each registration, in the order of the computation
+    arrived: Mapping[str, JobState]  # the finished job `register` of each registration that has one
+    failed: Mapping[str, str]  # registration → why it cannot be computed
+
+    @property
+    def due(self) -> list[Task]:
+        """The tasks that can be enqueued now."""
+        return [task for task in self.tasks if task.job is None]
+
+
+def registration_jobs(
+    state: RunState, step: Step, waited: Iterable[str], outlines: JobRequest, root: str
+) -> RegistrationJobs:
+    """Every job of every registration of a step, as far as the results so far allow to plan them.
+
+    Args:
+        state: of the run.
+        step: the registration step.
+        waited: names of the registrations that the step waits for.
+        outlines: the job that detects the spheres; the arguments of all other jobs derive from its arguments.
+        root: the name of that job; jobs that use other images have another root in their names.
+    """
+    wanted = WantedRegistrations.of(step.params)
+    plan = _Plan(state, step.id, wanted, outlines, root)
+    urgent = set(waited)
+    arrived: dict[str, JobState] = {}
+    for name, (source, size) in sorted(wanted.registrations.items(), key=lambda item: item[0] not in urgent):
+        priority = WAITED if name in urgent else REDUCED if size else LATER
+        job = plan.registration(name, source, size, priority)
+        if job is not None:
+            arrived[name] = job
+    tasks_for = {name: tuple(plan.tasks[key] for key in keys) for name, keys in plan.tasks_for.items()}
+    return RegistrationJobs(tuple(plan.tasks.values()), tasks_for, arrived, plan.failed)
+
+
+@dataclass
+class _Plan:
+    """Plans the jobs from the images to each registration, as far as the results they need are there."""
+
+    state: RunState
+    step: str
+    wanted: WantedRegistrations
+    outlines: JobRequest
+    root: str
+    tasks: dict[tuple[str, str], Task] = field(default_factory=dict[tuple[str, str], Task])
+    tasks_for: dict[str, list[tuple[str, str]]] = field(default_factory=dict[str, list[tuple[str, str]]])
+    failed: dict[str, str] = field(default_factory=dict[str, str])
+    jobs: Mapping[str, JobState] = field(default_factory=dict[str, JobState])
+    _for: str = ""
+    _priority: int = WAITED
+
+    def __post_init__(self) -> None:
+        self.jobs = jobs_of(self.state)
+
+    def registration(self, name: str, source: str, size: str, priority: int) -> JobState | None:
+        """The finished job `register` of a registration, or None; the jobs that it needs become tasks."""
+        self._for, self._priority = name, priority
+        if size and (reason := self._no_reduction(size)):
+            self.failed[name] = reason
+            return None
+        return self._registered(source, size)
+
+    def _no_reduction(self, size: str) -> str:
+        """Why a size does not reduce the photographs, or "": a protocol serves cameras of any resolution."""
+        width, height = _pixels(size)
+        camera = resolve(self.outlines.arguments["camera"], self.jobs)
+        # Otherwise one side at least would be cropped at full scale.
+        if width < camera["width"] and height < camera["height"]:
+            return ""
+        return f"{width} × {height} does not reduce photographs of {camera['width']:g} × {camera['height']:g} px"
+
+    def _registered(self, source: str, size: str) -> JobState | None:
+        search = self._arguments(size)
+        shared = {key: value for key, value in search.items() if key not in ("detector", "colour")}
+        if not posed(map(Photograph.model_validate, search["images"])):
+            first = self._model(self._mapper(""), size, shared)  # spheres are searched where poses predict them
+            if first is None:
+                return None
+            search["model"] = first["model"]
+        detected = self._need("detect_spheres", "", size, search)
+        if detected is None:
+            return None
+        markers = {**shared, "outlines": detected.artefacts[0].sha256, "poses": source}
+        if source in QUICK:
+            reported: dict[str, Any] = {"arm_correction": None} if source == "robot" else {}
+            return self._need("register", source, size, {**markers, **reported})
+        model = self._model(self._mapper(source), size, shared)
+        if model is not None and source == "hybrid":
+            # It starts from one reconstruction and adds the robot and the spheres.
+            adjusted = self._need("hybrid", source, size, {**markers, **model})
+            model = None if adjusted is None else {"model": adjusted.artefacts[0].sha256}
+        return None if model is None else self._need("register", source, size, {**markers, **model})
+
+    def _mapper(self, source: str) -> str:
+        """The mapper of a source; a source without its own uses a mapper that another wanted source needs anyway."""
+        wanted = [mapper for other, mapper in _MAPPERS.items() if other in self.wanted.poses]
+        return _MAPPERS.get(source) or next(iter(wanted), "incremental")
+
+    def _model(self, mapper: str, size: str, shared: Mapping[str, Any]) -> dict[str, str] | None:
+        """Poses and tracks of structure from motion, as arguments of the next jobs; None until they are computed."""
+        known = next((source for source in reversed(QUICK) if source in self.wanted.poses), None)
+        prior = None
+        if known is not None:
+            # Registered robot poses share one frame over both stations: they say which images overlap.
+            registered = self._registered(known, "")
+            if registered is None:
+                return None
+            prior = Reference(registered.job, "result/T_scan_camera")
+        pieces = self._pieces(size, shared, prior)
+        if pieces is None:
+            return None
+        arguments = {**shared, **pieces, "mappers": [mapper], "effort": dict(self.wanted.effort)}
+        arguments["prior"] = None if prior is None else prior.record()
+        made = self._need("structure_from_motion", mapper, size, arguments)
+        if made is None:
+            return None
+        refs = {ref.original_name: ref.sha256 for ref in made.artefacts}
+        return {"model": refs[f"{mapper}.json"], "tracks": refs[f"{mapper}_tracks.npz"]}
+
+    def _pieces(self, size: str, shared: Mapping[str, Any], prior: Reference | None) -> dict[str, Any] | None:
+        """Features and matches as arguments, with those computed while the images arrived; None until all exist."""
+        effort = dict(self.wanted.effort)
+        common = {"camera": shared["camera"], "effort": effort}
+        common |= {name: shared[name] for name in _REDUCED if name in shared}
+        images = [{"viewpoint": image["viewpoint"], "sha256": image["sha256"]} for image in shared["images"]]
+        early = (
+            EarlyJobs() if size else found_early(self.state, self.jobs, resolve(shared["camera"], self.jobs), effort)
+        )
+        jobs: list[JobState | None] = [
+            early.features[image["sha256"]] for image in images if image["sha256"] in early.features
+        ]
+        rest = [image for image in images if image["sha256"] not in early.features]
+        for some in chunks(rest, IMAGES_A_JOB):
+            what = arguments_name({"images": [image["sha256"] for image in some]})
+            jobs.append(self._need("features", what, size, {**common, "images": some}))
+        made = [job for job in jobs if job is not None and job.status == "finished"]
+        if len(made) < len(jobs):
+            return None
+        by_image: dict[str, str] = {}
+        for job in made:
+            these = zip(job.arguments["images"], job.artefacts, strict=True)
+            by_image |= {image["sha256"]: ref.sha256 for image, ref in these}
+        features = {image["viewpoint"]: by_image[image["sha256"]] for image in images}
+        matched: list[JobState | None] = [*early.matching(features)]
+        done = {(a, b) for job in early.matching(features) for a, b in job.arguments["pairs"]}
+        known = {} if prior is None else {name: np.array(T) for name, T in resolve(prior.record(), self.jobs).items()}
+        left = [pair for pair in pairs_of(features, known or None, SfmOptions(**effort)) if pair not in done]
+        for pairs in chunks(left, PAIRS_A_JOB):
+            mine = {name: features[name] for pair in pairs for name in pair}
+            listed = [list(pair) for pair in pairs]
+            what = arguments_name({"pairs": listed})
+            matched.append(self._need("match", what, size, {**common, "features": mine, "pairs": listed}))
+        finished = [job for job in matched if job is not None and job.status == "finished"]
+        if len(finished) < len(matched):
+            return None
+        return {"features": features, "matches": [job.artefacts[0].sha256 for job in finished]}
+
+    def _arguments(self, size: str) -> dict[str, Any]:
+        """Arguments of the search for outlines at a size; the other jobs share most of them."""
+        arguments = dict(self.outlines.arguments)
+        arguments.pop("model", None)  # present where the search itself needed poses from structure from motion
+        if not size:
+            return arguments
+        width, height = _pixels(size)
+        arguments.pop("intrinsics_covariance", None)  # it belongs to the full size
+        return arguments | {"reduced_to": [width, height]}
+
+    def _need(self, kind: str, what: str, size: str, arguments: Mapping[str, Any]) -> JobState | None:
+        """The finished job for this work; None until it has finished, and where it has failed."""
+        name = "-".join(part for part in (what, size, self.root) if part)
+        job = newest_job(self.state, self.step, kind, name)
+        if job is not None and job.status == "failed":
+            if job.attempt == self.state.steps[self.step].attempt:
+                self.failed.setdefault(self._for, f"{kind.replace('_', ' ')}: {job.message}")
+            else:
+                job = None  # a repeated step computes it again
+        mine = self.tasks_for.setdefault(self._for, [])
+        if (kind, name) not in mine:
+            mine.append((kind, name))
+        request = JobRequest(kind, arguments, self._priority, job_kinds()[kind].version)
+        self.tasks.setdefault((kind, name), Task(name, request, job))
+        return job if job is not None and job.status == "finished" else None
+
+
+def _pixels(size: str) -> tuple[int, int]:
+    """Width and height of 1920x1080."""
+    width, _, height = size.partition("x")
+    return int(width), int(height)
+
+
+def recorded_registration_jobs(protocol: Protocol, state: RunState, step: Step) -> RegistrationJobs | None:
+    """The jobs of a step's registrations according to the record; None for a step that has not begun them.
+
+    Also None in runs of old versions, in which a registration waited for all of its sources.
+    """
+    now = state.steps[step.id]
+    if step.kind != "registration" or now.skipped or all(note.note != PLANNED for note in now.notes):
+        return None
+    begun = [j for j in now.jobs.values() if j.kind == "detect_spheres" and not set(_REDUCED) & set(j.arguments)]
+    if not begun:
+        return None
+    newest = max(begun, key=lambda job: job.enqueued_seq)
+    outlines = JobRequest(newest.kind, newest.arguments, newest.priority, 2)
+    return registration_jobs(state, step, decisive(protocol, step), outlines, name_of(newest))
+
+
+def name_of(job: JobState) -> str:
+    """The part of a job's key that tells it from other jobs of its kind."""
+    return job.idempotency_key.split("/")[3]
