@@ -35,7 +35,7 @@ from service.core.geometry import Array, Transform, apply, inverse
 from service.core.protocol.models import Motion
 from service.rig import CollisionSection, LensSection
 from service.steps.board.plan import START, BoardPoses, PlannedBoard, Planner, Why, nominal_board, nominal_camera
-from service.steps.capture.plan.planning import known_arm, situation_of, usual_posture
+from service.steps.capture.plan.planning import ArmAtStation, known_arm, usual_posture
 from service.steps.context import StationLayout
 from simulators.scene.world import SCENE_CENTRE_M, Scene, nominal_hand_eye
 
@@ -72,10 +72,8 @@ class Room:
         self.mount = nominal_hand_eye()
         arm = known_arm("UR10e")
         assert arm is not None
-        self.situation = situation_of(
-            self.mount, self.layout, arm, CollisionSection(arm="UR10e"), None, Motion(),
-            usual_posture(arm, self.layout, self.mount),
-        )  # fmt: skip
+        station = ArmAtStation(self.layout, arm, self.mount, CollisionSection(arm="UR10e"), None, Motion())
+        self.situation = station.situation(usual_posture(arm, self.layout, self.mount))
         # The simulator's board has its 23 corners along x; ours has them along y.
         there = self.scene.board_placement(0)
         turn = np.array([[0, 1, 0, 0], [-1, 0, 0, 15 * 0.015], [0, 0, 1, 0], [0, 0, 0, 1.0]])

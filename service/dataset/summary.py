@@ -64,7 +64,7 @@ class RunSummary:
         return budgets(self.protocol, self.state)
 
     def best(self) -> str | None:
-        """Name of the run's own registration: the best that the evaluation step judged (core/registered.py)."""
+        """Name of the run's own registration: the best that the evaluation step judged (registrations.py)."""
         return own_registration(self.protocol, self.state)
 
     def better_later(self) -> Row | None:

@@ -278,7 +278,7 @@ def measured_run(
         work(bench.store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _total: None)
 
     monkeypatch.setitem(HANDLERS, "live_view", look)
-    monkeypatch.setattr("service.worker.capture.live.find_spheres", exactly)
+    monkeypatch.setattr("service.worker.capture.live_view.find_spheres", exactly)
     bench.operator.on_show = serve
     return bench
 

@@ -35,7 +35,7 @@ from service.core.protocol.models import Motion, load_protocol
 from service.rig import CollisionSection, load_rig
 from service.station import layout_of
 from service.steps import params_models
-from service.steps.capture.plan.planning import situation_of, usual_posture
+from service.steps.capture.plan.planning import ArmAtStation, usual_posture
 from service.steps.capture.plan.preview import preview_board_poses, preview_plans
 from service.steps.capture.plan.viewpoints import denser_viewpoints, plan_viewpoints
 from service.steps.context import StationLayout
@@ -51,7 +51,7 @@ vectors = arrays(np.float64, 3, elements=st.floats(-1, 1, width=32))
 @pytest.fixture(scope="module")
 def situation() -> Situation:
     start = usual_posture(ARM, LAYOUT, T_FLANGE_CAMERA)
-    return situation_of(T_FLANGE_CAMERA, LAYOUT, ARM, CollisionSection(), None, Motion(), start)
+    return ArmAtStation(LAYOUT, ARM, T_FLANGE_CAMERA, CollisionSection(), None, Motion()).situation(start)
 
 
 def camera_at(eye: tuple[float, float, float]) -> Transform:
@@ -201,7 +201,7 @@ def test_depth_of_field_is_bounded_by_equal_circles_of_confusion() -> None:
 def test_the_shortest_order_is_a_permutation_and_never_longer_than_the_list(joints: Array) -> None:
     start = usual_posture(ARM, LAYOUT, T_FLANGE_CAMERA)
     times = travel_times_s(
-        joints, situation_of(T_FLANGE_CAMERA, LAYOUT, ARM, CollisionSection(), None, Motion(), start)
+        joints, ArmAtStation(LAYOUT, ARM, T_FLANGE_CAMERA, CollisionSection(), None, Motion()).situation(start)
     )
     order = shortest_order(times)
 

@@ -27,10 +27,10 @@ from service.steps.board.plan import (
     nominal_camera,
     prediction_record,
 )
-from service.steps.capture.plan.planning import known_arm, plan_step, situation_of, usual_posture
+from service.steps.capture.plan.planning import arm_at_station, plan_step, usual_posture
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.capture.retakes import to_take_again
-from service.steps.capture.views import capture_viewpoints
+from service.steps.capture.views import CaptureTask, capture_viewpoints
 from service.steps.context import StepContext
 from service.steps.notes import BOARD_POSES
 
@@ -204,17 +204,12 @@ class BoardCapture:
         )
 
     def _feasible(self, known: BoardKnowledge) -> Callable[[Transform], bool]:
-        collision, optics = self.context.devices.surroundings()
-        robot = self.context.devices.robot(self.wanted.station)
-        model = known_arm(collision.arm or robot.report().identity.model)
-        if model is None:
+        """Whether the arm can reach T_base_camera; always, for an arm of unknown kinematics."""
+        arm = arm_at_station(self.context, self.wanted.station, self._mount)
+        if arm is None:
             return lambda _T: True
-        layout = self.context.devices.layout(self.wanted.station)
-        start = usual_posture(model, layout, self._mount)
-        situation = situation_of(
-            self._mount, layout, model, collision, optics, self.context.protocol.motion, start,
-            sharp_at_m=apply(known.T_base_board, self.board.points()),
-        )  # fmt: skip
+        start = usual_posture(arm.model, arm.layout, self._mount)
+        situation = arm.situation(start, sharp_at_m=apply(known.T_base_board, self.board.points()))
         return lambda T: bool(able_postures(T, situation))
 
     def _taken(self, looks: Sequence[SearchedBoardImage], known: BoardKnowledge, planner: Planner) -> ChosenViews:
@@ -274,16 +269,16 @@ class BoardCapture:
                 self.context, todo, self._mount, "shortest", sharp_at_m=apply(board, self.board.points())
             )
             todo, refused = list(planned.viewpoints), planned.refused
-        capture_viewpoints(
-            self.context,
+        task = CaptureTask(
             [*todo, *(v for v in poses if v.name in there)],
             self._mount,
             image_kind="board_image",
             refused=refused,
             on_captured=self._looks.begin,
-            until=lambda: bool(self._looks.spoilt_in_a_row()),
+            stop=lambda: bool(self._looks.spoilt_in_a_row()),
             again=to_take_again(self.context),
         )
+        capture_viewpoints(self.context, task)
 
     def looks(self, *, wait: bool = True) -> list[SearchedBoardImage]:
         """Every valid image with what was found in it."""

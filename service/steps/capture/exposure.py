@@ -1,4 +1,4 @@
-"""One exposure with a robot: the picture, the arm's pose during it, the verdicts, and all of it into the evidence."""
+"""One exposure with a robot: takes the image, judges it and the arm's pose during it, and records both."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import StepContext
 from service.store.records import NewArtefact
 
-#: How long a busy camera is left alone before the next try: nearly a minute in all.
+#: Pauses between tries while the camera is busy; nearly a minute in all.
 _BUSY_PAUSES_S = (0.5, 1.0, 2.0, 4.0, *(8.0,) * 6)
-_BUSY_AGAIN_PAUSES_S = _BUSY_PAUSES_S[:3]  # of a camera that was opened again because it stayed busy
+_BUSY_AGAIN_PAUSES_S = _BUSY_PAUSES_S[:3]  # after the camera was reopened because it stayed busy
 
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """An image that has arrived from the camera, with all that belongs to it, before it is recorded."""
+    """An image that has arrived from the camera, with everything to be recorded with it."""
 
     viewpoint: Viewpoint
     image: CapturedImage
-    folder: tempfile.TemporaryDirectory[str]  # holds the image's files until they are in the store
-    window: tuple[RobotSample, ...]  # of the pose stream, over the exposure
+    folder: tempfile.TemporaryDirectory[str]  # holds the files until they are in the store
+    window: tuple[RobotSample, ...]  # the pose stream during the exposure
     pose: ExposurePose
     environment: dict[str, float]
     verdicts: dict[str, bool]
@@ -42,26 +42,40 @@ class Shot:
     ringing_s: float
 
 
-def expose(
-    context: StepContext,
-    camera: Camera,
-    robot: RobotArm,
-    viewpoint: Viewpoint,
-    settled: SettleReport,
-    environment: dict[str, float],
-    wanted: CameraSettings,
-    image_kind: str,
-    *,
-    was_busy: bool = False,
-) -> Shot:
-    """Take the picture and judge it. Nothing is recorded yet: `record_shot` does that while the arm moves on.
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """What an exposure at a viewpoint needs.
 
-    Raises DeviceError, DeviceUnavailableError when no pose of the arm is known for the exposure.
+    Attributes:
+        camera: takes the image.
+        robot: holds the camera, and streams its pose.
+        viewpoint: at which the arm stands.
+        settled: how it came to rest.
+        environment: light and temperature before the exposure.
+        wanted: settings of the protocol.
+        image_kind: artefact kind of the photograph.
     """
+
+    camera: Camera
+    robot: RobotArm
+    viewpoint: Viewpoint
+    settled: SettleReport
+    environment: dict[str, float]
+    wanted: CameraSettings
+    image_kind: str
+
+
+def expose(context: StepContext, exposure: Exposure, *, was_busy: bool = False) -> Shot:
+    """Take the image and judge it. `record_shot` records it, while the arm moves on.
+
+    Raises DeviceError, DeviceUnavailableError if no pose of the arm is known for the exposure.
+    """
+    wanted = exposure.wanted
     folder = tempfile.TemporaryDirectory(prefix="orthocapture-")
     try:
-        image = expose_when_free(context, camera, Path(folder.name), was_busy=was_busy)
-        window = robot.samples(image.trigger_monotonic_s, image.trigger_monotonic_s + wanted.exposure_s + 0.3)
+        image = expose_when_free(context, exposure.camera, Path(folder.name), was_busy=was_busy)
+        began_s = image.trigger_monotonic_s
+        window = exposure.robot.samples(began_s, began_s + wanted.exposure_s + 0.3)
         pose = exposure_pose(window)
     except BaseException:
         folder.cleanup()
@@ -70,12 +84,22 @@ def expose(
         "still": pose.spread.within(settle_criteria(context)),
         "settings": settings_agree(image.exif, wanted),
     }
-    return Shot(viewpoint, image, folder, window, pose, environment, verdicts, image_kind, settled.ringing_s)
+    return Shot(
+        viewpoint=exposure.viewpoint,
+        image=image,
+        folder=folder,
+        window=window,
+        pose=pose,
+        environment=exposure.environment,
+        verdicts=verdicts,
+        image_kind=exposure.image_kind,
+        ringing_s=exposure.settled.ringing_s,
+    )
 
 
 def record_shot(context: StepContext, shot: Shot) -> None:
-    """Write a shot down: files first, then one transaction with rows and event."""
-    viewpoint, image, pose = shot.viewpoint, shot.image, shot.pose
+    """Record an image: first its files, then its rows and its event in one transaction."""
+    viewpoint, image = shot.viewpoint, shot.image
     with shot.folder:
         refs = [
             context.evidence.put_file(
@@ -99,36 +123,41 @@ def record_shot(context: StepContext, shot: Shot) -> None:
         )
         for ref in refs
     )
-    context.evidence.record(
-        ViewpointCaptured(
-            step=context.step.id,
-            attempt=context.attempt,
-            viewpoint=viewpoint.name,
-            station=viewpoint.station,
-            artefacts=tuple(refs),
-            T_base_flange=_rows(pose.spread.T_base_flange),
-            pose_sigma_m=pose.spread.position_sigma_m,
-            pose_sigma_rad=pose.spread.rotation_sigma_rad,
-            joints_rad=tuple(float(q) for q in pose.joints_rad),
-            pose_samples=pose.spread.samples,
-            trigger_monotonic_s=image.trigger_monotonic_s,
-            arrival_monotonic_s=image.arrival_monotonic_s,
-            controller_time_s=pose.controller_time_s,
-            clock_offset_s=pose.clock_offset_s,
-            ringing_s=shot.ringing_s,
-            camera=camera_record(image),
-            environment=shot.environment,
-            verdicts=shot.verdicts,
-        ),
-        artefacts=rows,
+    context.evidence.record(_captured(context, shot, refs), artefacts=rows)
+
+
+def _captured(context: StepContext, shot: Shot, refs: Sequence[ArtefactRef]) -> ViewpointCaptured:
+    image, pose = shot.image, shot.pose
+    return ViewpointCaptured(
+        step=context.step.id,
+        attempt=context.attempt,
+        viewpoint=shot.viewpoint.name,
+        station=shot.viewpoint.station,
+        artefacts=tuple(refs),
+        T_base_flange=_rows(pose.spread.T_base_flange),
+        pose_sigma_m=pose.spread.position_sigma_m,
+        pose_sigma_rad=pose.spread.rotation_sigma_rad,
+        joints_rad=tuple(float(q) for q in pose.joints_rad),
+        pose_samples=pose.spread.samples,
+        trigger_monotonic_s=image.trigger_monotonic_s,
+        arrival_monotonic_s=image.arrival_monotonic_s,
+        controller_time_s=pose.controller_time_s,
+        clock_offset_s=pose.clock_offset_s,
+        ringing_s=shot.ringing_s,
+        camera=camera_record(image),
+        environment=shot.environment,
+        verdicts=shot.verdicts,
     )
 
 
 def expose_when_free(context: StepContext, camera: Camera, folder: Path, *, was_busy: bool = False) -> CapturedImage:
-    """Release the shutter, and wait up to a minute for a camera that is still busy with what came before.
+    """Release the shutter. While the camera is busy with an earlier image, try again for up to a minute.
 
     Args:
-        was_busy: that minute has passed before; it is waited for a few seconds only.
+        context: of the step.
+        camera: that takes the image.
+        folder: for its files.
+        was_busy: it was busy for a minute already: try for a few seconds only.
     """
     for pause_s in _BUSY_AGAIN_PAUSES_S if was_busy else _BUSY_PAUSES_S:
         try:
@@ -142,7 +171,7 @@ def expose_when_free(context: StepContext, camera: Camera, folder: Path, *, was_
 
 @dataclass(frozen=True, slots=True)
 class ExposurePose:
-    """The mean pose of the flange over an exposure, how far it strayed, and the clocks in the middle of it."""
+    """The mean pose of the flange during an exposure, its spread, and the clocks in the middle of the exposure."""
 
     spread: PoseSpread
     joints_rad: Array  # (6,) or (7,), mean
@@ -151,15 +180,15 @@ class ExposurePose:
 
 
 def exposure_pose(window: Sequence[RobotSample]) -> ExposurePose:
-    """The pose of the flange over the samples of an exposure, oldest first.
+    """The pose of the flange during an exposure, from its samples, oldest first.
 
-    Raises DeviceUnavailableError when there is none.
+    Raises DeviceUnavailableError if there are none.
     """
     if not window:
         raise DeviceUnavailableError(
             "the robot's pose stream has no sample during the exposure",
             where="robot",
-            remedy="The image cannot be used without its pose; the viewpoint is taken again",
+            remedy="The image cannot be used without a pose; the viewpoint is captured again",
         )
     middle = window[len(window) // 2]
     return ExposurePose(
@@ -180,13 +209,13 @@ def settings_agree(actual: CameraSettings, wanted: CameraSettings) -> bool:
 
 
 def wanted_settings(context: StepContext) -> CameraSettings:
-    """The camera settings of the protocol. Raises ConfigurationError when it has none."""
+    """The camera settings of the protocol. Raises ConfigurationError if it has none."""
     camera = context.protocol.camera
     if camera is None:
         raise ConfigurationError(
             "the protocol has no section `camera`",
             where=context.protocol.id,
-            remedy="Say there which aperture, exposure time and ISO the camera is set to",
+            remedy="Add it, with aperture, exposure time and ISO",
         )
     return CameraSettings(
         aperture_f=camera.aperture_f,
@@ -198,7 +227,7 @@ def wanted_settings(context: StepContext) -> CameraSettings:
 
 
 def environment_now(context: StepContext) -> dict[str, float]:
-    """Light and temperature, where a light box measures them."""
+    """Light and temperature from the light box; empty without one."""
     lightbox = context.devices.lightbox()
     if lightbox is None:
         return {}
@@ -211,7 +240,7 @@ def environment_now(context: StepContext) -> dict[str, float]:
 
 
 def _pose_log(context: StepContext, viewpoint: Viewpoint, window: Sequence[RobotSample]) -> ArtefactRef:
-    """The pose stream over the exposure, as it was received."""
+    """Store the pose stream during the exposure as it was received."""
     lines = [
         json.dumps(
             {
@@ -234,7 +263,7 @@ def _pose_log(context: StepContext, viewpoint: Viewpoint, window: Sequence[Robot
 
 
 def camera_record(image: CapturedImage) -> dict[str, object]:
-    """What the event of an exposure says of the camera."""
+    """The camera's part of the event of an exposure."""
     return {
         **dataclasses.asdict(image.exif),
         "counter": image.counter,
@@ -253,6 +282,6 @@ def camera_record(image: CapturedImage) -> dict[str, object]:
 def _rows(T: Transform) -> Matrix4:
     if T.shape != (4, 4):
         raise DataError(
-            f"a pose is a 4×4 matrix, not {T.shape}", where="robot", remedy="Report this: the driver is at fault"
+            f"a pose is a 4×4 matrix, not {T.shape}", where="robot", remedy="Report this error of the driver"
         )
     return tuple((float(r[0]), float(r[1]), float(r[2]), float(r[3])) for r in T)

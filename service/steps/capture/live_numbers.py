@@ -22,8 +22,8 @@ from service.jobs.calibration import calibrate
 from service.jobs.capture import live_summary, live_view
 from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Photograph, Point
 from service.jobs.surfaces import coverage_points, locate_spheres
-from service.steps.capture.spoilt import SPOILT, ImageSharpness, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.capture.plan.viewpoints import Viewpoint
+from service.steps.capture.spoilt import SPOILT, ImageSharpness, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import artefact_of, earlier_answer, mounting_of, robot_pose_of
 from service.steps.notes import SUGGESTION, suggested_views

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +22,7 @@ from service.core.records.events import ViewpointFailed
 from service.core.units import megapixels
 from service.logs.where import at
 from service.steps.capture.exposure import (
+    Exposure,
     Shot,
     environment_now,
     expose,
@@ -33,7 +34,7 @@ from service.steps.capture.motion import MotionLimits, move_and_settle, settle_c
 from service.steps.capture.plan.viewpoints import Viewpoint, flange_target
 from service.steps.context import StepContext
 
-#: Errors after which the same viewpoint may be tried again on a reopened device.
+#: Errors after which a viewpoint is tried again with the device reopened.
 WORTH_ANOTHER_TRY = (
     DeviceUnavailableError,
     DeviceTimeoutError,
@@ -41,12 +42,11 @@ WORTH_ANOTHER_TRY = (
     StaleImageError,
     UnreadableFileError,
 )
-NONE_REFUSED: Mapping[str, str] = {}
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureTotals:
-    """What a capture loop came to, the earlier part of a resumed one included."""
+    """The totals of a capture, including what was captured before the run was resumed."""
 
     planned: int
     captured: int
@@ -55,7 +55,7 @@ class CaptureTotals:
     moved: int
 
     def measures(self) -> dict[str, float]:
-        """As numbers for gates."""
+        """The totals under the names of measures."""
         return {
             "viewpoints_planned": float(self.planned),
             "viewpoints_captured": float(self.captured),
@@ -65,44 +65,48 @@ class CaptureTotals:
         }
 
 
-def capture_viewpoints(
-    context: StepContext,
-    viewpoints: Sequence[Viewpoint],
-    T_flange_camera: Transform,
-    *,
-    image_kind: str,
-    refused: Mapping[str, str] = NONE_REFUSED,
-    on_captured: Callable[[], None] = lambda: None,
-    until: Callable[[], bool] = lambda: False,
-    again: Collection[str] = (),
-) -> CaptureTotals:
-    """Capture every viewpoint that this attempt has not captured yet, in order.
+@dataclass(frozen=True, slots=True)
+class CaptureTask:
+    """What a capture loop is to do.
 
-    Args:
-        T_flange_camera: the best known mounting; decides only where the camera goes, not where it was.
+    Attributes:
+        viewpoints: to capture, in order; those that this attempt has captured already are skipped.
+        T_flange_camera: (4, 4) the best known mounting. It decides where the camera goes; what is recorded is the
+            measured pose of the flange.
         image_kind: artefact kind of the photographs (`image`, `board_image`, `control_image`).
-        refused: viewpoints that the plan has given up, with the reason; recorded as such, not tried.
-        on_captured: called after each image that is in the record; must return at once.
-        until: asked before each viewpoint; where it says so, the rest is not taken.
-        again: SHA-256 of images that are to be taken again.
+        refused: viewpoints that the plan left out, with the reason; they are recorded as given up.
+        on_captured: called after each image is recorded; must return at once.
+        stop: called before each viewpoint; if it returns True, the rest is not captured.
+        again: SHA-256 of images to take again.
+    """
 
-    Raises DeviceError when a viewpoint fails for good, StepInterruptedError on pause.
+    viewpoints: Sequence[Viewpoint]
+    T_flange_camera: Transform
+    image_kind: str
+    refused: Mapping[str, str] = field(default_factory=dict[str, str])
+    on_captured: Callable[[], None] = lambda: None
+    stop: Callable[[], bool] = lambda: False
+    again: Collection[str] = ()
+
+
+def capture_viewpoints(context: StepContext, task: CaptureTask) -> CaptureTotals:
+    """Capture every viewpoint of a task that this attempt has not captured yet.
+
+    Raises DeviceError if a viewpoint fails for good, StepInterruptedError on pause.
     """
     camera = context.devices.camera()
     wanted = wanted_settings(context)
     _apply(context, camera, wanted)
-    loop = _CaptureLoop(
-        context, camera, viewpoints, T_flange_camera, wanted, image_kind, on_captured, until, set(again)
-    )
+    loop = _CaptureLoop(context, camera, wanted, task)
     try:
-        loop.run(refused)
+        loop.run()
     finally:
-        loop.keep()  # whatever ends the loop, an image that has arrived is recorded
+        loop.keep()  # however the loop ends, an image that has arrived is recorded
         at(viewpoint="")
-    context.progress("viewpoints", len(viewpoints), len(viewpoints))
+    context.progress("viewpoints", len(task.viewpoints), len(task.viewpoints))
     captures = context.evidence.captures(context.step.id)
     return CaptureTotals(
-        planned=len(viewpoints),
+        planned=len(task.viewpoints),
         captured=len(captures),
         given_up=len(loop.given_up),
         settings_departures=sum(not capture.verdicts["settings"] for capture in captures),
@@ -114,37 +118,33 @@ def capture_viewpoints(
 class _CaptureLoop:
     """One pass over the viewpoints.
 
-    Storing an image takes as long as moving a joint by a degree, so an image is held until the arm is on its way to
-    the next viewpoint and is recorded then.
+    Storing an image takes as long as moving a joint by a degree. An image is therefore held, and recorded while the
+    arm moves to the next viewpoint.
     """
 
     context: StepContext
     camera: Camera
-    viewpoints: Sequence[Viewpoint]
-    T_flange_camera: Transform
     wanted: CameraSettings
-    image_kind: str
-    on_captured: Callable[[], None]
-    until: Callable[[], bool]
-    again: Set[str]
+    task: CaptureTask
     given_up: set[str] = field(init=False)
-    _taken: set[str] = field(init=False, default_factory=set[str])  # in this execution, successful or not
+    _tried: set[str] = field(init=False, default_factory=set[str])  # in this execution, successful or not
     _held: Shot | None = field(init=False, default=None)
-    _size: str = field(init=False, default="")  # of an image, in words, once one is there
-    _targets: dict[str, Array] = field(init=False, default_factory=dict[str, Array])  # joints (6,) asked ahead
+    _size: str = field(init=False, default="")  # of an image, in words, once there is one
+    _targets: dict[str, Array] = field(init=False, default_factory=dict[str, Array])  # joints (6,) solved ahead
 
     def __post_init__(self) -> None:
         self.given_up = set(self.context.state.skipped_viewpoints)
 
-    def run(self, refused: Mapping[str, str]) -> None:
-        """Take what is still to be taken. The last image may be left to `keep`."""
-        # Looked up anew each time: an operator may send a viewpoint back while the arm moves.
+    def run(self) -> None:
+        """Capture what is missing. `keep` must be called afterwards, as the last image may still be held."""
+        refused = self.task.refused
+        # Determined anew each time, because an operator may have a viewpoint repeated while the arm moves.
         while todo := self._next():
             self.context.checkpoint()
-            if self.until():
+            if self.task.stop():
                 return
             self.context.evidence.require_space()
-            self.context.progress("viewpoints", len(self.viewpoints) - len(todo), len(self.viewpoints))
+            self.context.progress("viewpoints", len(self.task.viewpoints) - len(todo), len(self.task.viewpoints))
             viewpoint = todo[0]
             if viewpoint.name in refused:
                 self._give_up(viewpoint, _left_out(viewpoint, refused[viewpoint.name]))
@@ -156,30 +156,30 @@ class _CaptureLoop:
             else:
                 self._held = shot
                 if not all(shot.verdicts.values()):
-                    self.keep()  # it is taken again from where the arm stands
-            self._taken.add(viewpoint.name)
+                    self.keep()  # it is taken again before the arm moves on
+            self._tried.add(viewpoint.name)
 
     def keep(self) -> None:
-        """Record the image that is held, if there is one."""
+        """Record the held image, if there is one."""
         shot, self._held = self._held, None
         if shot is not None:
             self._size = f", {megapixels(shot.image.width, shot.image.height):.0f} MP"
             self.context.busy(f"storing {shot.viewpoint.name}{self._size}")
             record_shot(self.context, shot)
-            self.on_captured()
+            self.task.on_captured()
 
     def _next(self) -> list[Viewpoint]:
-        """What is still to be captured, in order.
+        """The viewpoints still to capture, in order.
 
-        An image whose verdicts failed is taken again, once an execution.
+        An image whose verdicts failed is taken again, once per execution.
         """
         captures = {capture.viewpoint: capture for capture in self.context.evidence.captures(self.context.step.id)}
-        old = {name for name, capture in captures.items() if capture.artefacts[0].sha256 in self.again}
+        old = {name for name, capture in captures.items() if capture.artefacts[0].sha256 in self.task.again}
         good = {name for name, c in captures.items() if all(c.verdicts.values())} - old
-        done = good | (self._taken & captures.keys())
+        done = good | (self._tried & captures.keys())
         if self._held is not None:
             done.add(self._held.viewpoint.name)
-        left = [v for v in self.viewpoints if v.name not in done and v.name not in self.given_up]
+        left = [v for v in self.task.viewpoints if v.name not in done and v.name not in self.given_up]
         if left or self._held is None:
             return left
         self.keep()
@@ -202,10 +202,10 @@ class _CaptureLoop:
                 arrived = True
                 environment = self._dwell(robot, later)
                 context.busy(f"taking {viewpoint.name} and fetching it from the camera{self._size}")
-                return expose(
-                    context, self.camera, robot, viewpoint, settled, environment, self.wanted, self.image_kind,
-                    was_busy=was_busy,
-                )  # fmt: skip
+                exposure = Exposure(
+                    self.camera, robot, viewpoint, settled, environment, self.wanted, self.task.image_kind
+                )
+                return expose(context, exposure, was_busy=was_busy)
             except WORTH_ANOTHER_TRY as error:
                 was_busy = isinstance(error, DeviceBusyError)
                 self.keep()
@@ -231,7 +231,7 @@ class _CaptureLoop:
         return move_and_settle(context, robot, target, limits, settle_criteria(context), meanwhile=self.keep)
 
     def _dwell(self, robot: RobotArm, later: Sequence[Viewpoint]) -> dict[str, float]:
-        """Let the arm rest before the exposure, and use the time; returns the environment."""
+        """Let the arm rest before the exposure, and use that time; returns the environment."""
         dwell_s = self.context.protocol.motion.dwell_s
         ends_s = self.context.monotonic_s() + dwell_s
         if dwell_s > 0:
@@ -241,16 +241,16 @@ class _CaptureLoop:
         return environment
 
     def _solve(self, robot: RobotArm, viewpoint: Viewpoint) -> Array:
-        """Joints (6,) for a viewpoint, of the controller. Raises UnreachablePoseError."""
+        """Joints (6,) for a viewpoint, solved by the controller. Raises UnreachablePoseError."""
         near = robot.state().sample.joints_rad if viewpoint.joints_rad is None else viewpoint.joints_rad
-        return robot.solve_ik(flange_target(viewpoint.T_base_camera, self.T_flange_camera), near)
+        return robot.solve_ik(flange_target(viewpoint.T_base_camera, self.task.T_flange_camera), near)
 
     def _solve_ahead(self, robot: RobotArm, later: Sequence[Viewpoint]) -> None:
-        """Ask for the next viewpoint's joints while the arm rests before the exposure: the answer takes 0.1 s."""
+        """Solve for the next viewpoint's joints while the arm rests before the exposure, which takes 0.1 s."""
         following = next(iter(later), None)
         if following is None or self.context.devices.robot(following.station) is not robot:
             return
-        with suppress(DeviceError):  # it comes again when the viewpoint's turn has come, and counts then
+        with suppress(DeviceError):  # an error is handled when the viewpoint's turn comes and it is raised again
             self._targets[following.name] = self._solve(robot, following)
 
     def _record_failure(self, viewpoint: Viewpoint, error: DeviceError, *, skipped: bool) -> None:
@@ -270,18 +270,18 @@ def _left_out(viewpoint: Viewpoint, why: str) -> UnreachablePoseError:
     return UnreachablePoseError(
         f"the plan leaves it out: {why}",
         where=viewpoint.name,
-        remedy="Move what stands in the way, or choose another viewpoint",
+        remedy="Remove the obstacle, or choose another viewpoint",
     )
 
 
 def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, folder: Path) -> CapturedImage:
-    """One exposure without a robot; repeated, on a reopened camera, as often as the step's recovery allows.
+    """One exposure without a robot, repeated with the camera reopened as often as the step's recovery allows.
 
-    Raises DeviceError when it fails for good, StepInterruptedError on pause.
+    Raises DeviceError if it fails for good, StepInterruptedError on pause.
     """
     was_busy = False
     for tries_left in range(context.step.recovery.retries, -1, -1):
-        inside = folder / str(tries_left)  # what an earlier try has left behind is not in the way
+        inside = folder / str(tries_left)  # of its own, because an earlier try may have left files
         inside.mkdir()
         try:
             _apply(context, camera, wanted)
@@ -298,7 +298,7 @@ def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, fol
 
 
 def _apply(context: StepContext, camera: Camera, wanted: CameraSettings) -> None:
-    """Set the camera, which may have dropped its link since it was last used."""
+    """Apply the settings; the camera is reopened if its connection was lost since its last use."""
     context.busy("setting the camera")
     try:
         camera.apply(wanted)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Literal
 
@@ -14,19 +14,19 @@ from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.capture.plan.planning import feasible_extra, plan_step
 from service.steps.capture.plan.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.capture.retakes import advise_retakes, to_take_again
-from service.steps.capture.views import CaptureTotals, capture_viewpoints
+from service.steps.capture.views import CaptureTask, CaptureTotals, capture_viewpoints
 from service.steps.context import ROBOT_MOVES, Announcement, StepContext, StepKind, StepOutcome
 from service.steps.measures import CaptureMeasures, Count, ErrorMm, PredictedMeasures
 from service.steps.poses.front_end import EarlyFeatures
 
 
 class Params(MovingParams):
-    """Which viewpoints, what the images are for, and what is to be known of them while they are taken."""
+    """Which viewpoints, what the images are for, and what is computed from them during the capture."""
 
     purpose: Literal["dataset", "control"]  # what the images are for
-    viewpoints: tuple[ViewpointSet, ...]  # from where
-    order: Order = "as_listed"  # as listed, or the shortest way
-    live: Live | None = None  # what is computed of each image while the capture goes on; without it nothing
+    viewpoints: tuple[ViewpointSet, ...]  # where the images are taken from
+    order: Order = "as_listed"  # of the viewpoints: as listed, or along the shortest way
+    live: Live | None = None  # what is computed from each image during the capture; nothing if left out
 
 
 class Measures(PredictedMeasures, CaptureMeasures):
@@ -49,59 +49,13 @@ class Result(Record):
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Capture every viewpoint set of this step, and the viewpoints that an earlier attempt found wanting."""
-    plan = [
-        viewpoint
-        for viewpoint_set in params.viewpoints
-        for viewpoint in plan_viewpoints(viewpoint_set, context.devices.layout(viewpoint_set.station))
-    ]
-    live = LiveAnalysis.begin(context, params.live)
-    last = params.viewpoints[-1]
-    extra = denser_viewpoints(last, context.devices.layout(last.station))
-    if live is not None:
-        wanted = live.suggested()
-        plan += [viewpoint for viewpoint in extra if viewpoint.name in wanted]
-    context.devices.camera()  # no plan for an arm whose camera does not answer
-    nominal = context.devices.nominal_T_flange_camera()
-    there = {capture.viewpoint for capture in context.evidence.captures(context.step.id)}
-    planned = plan_step(context, [v for v in plan if v.name not in there], nominal, params.order)
-    features = EarlyFeatures.begin(context, plan)
-
-    def look() -> None:
-        for begun in (live, features):
-            if begun is not None:
-                begun.look()
-
-    def take(viewpoints: Sequence[Viewpoint], again: Collection[str]) -> CaptureTotals:
-        return capture_viewpoints(
-            context,
-            viewpoints,
-            nominal,
-            image_kind="image" if params.purpose == "dataset" else "control_image",
-            refused=planned.refused,
-            on_captured=look,
-            until=lambda: live is not None and bool(live.spoilt_in_a_row()),
-            again=again,
-        )
-
-    everything = [*planned.viewpoints, *(v for v in plan if v.name in there)]
-    totals = take(everything, to_take_again(context))
+    """Capture every viewpoint set of this step, and the viewpoints that an earlier attempt asked for."""
+    capture = _Capture(context, params)
+    totals = capture.take(capture.viewpoints, to_take_again(context))
     measures: dict[str, float] = {}
-    spoilt: dict[str, str] = {}
-    if live is not None:
-        spoilt = live.spoilt()
-        if spoilt:
-            for capture in context.evidence.captures(context.step.id):
-                why = spoilt.get(capture.artefacts[0].sha256)
-                if why is not None:
-                    context.tell(f"{capture.viewpoint}: {why}; it is taken again")
-            totals = replace(
-                take(_of_images(context, everything, spoilt), spoilt),
-                planned=totals.planned,
-                given_up=totals.given_up,
-            )
-            spoilt = live.spoilt()
-        live.note_spoilt(spoilt)
+    spoilt: Mapping[str, str] = {}
+    if capture.live is not None:
+        totals, spoilt = capture.repeat_spoilt(capture.live, totals)
         measures["images_spoilt"] = float(len(spoilt))
     measures |= totals.measures()
     departures = optics_departures(context)
@@ -109,21 +63,82 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         measures["optics_departures"] = float(departing_images(departures))
     departing = {departure.image for departure in departures or ()}
     refused = {c.viewpoint for c in context.evidence.captures(context.step.id) if not all(c.verdicts.values())}
-    bad = departing | refused | {v.name for v in _of_images(context, everything, spoilt)}
+    bad = departing | refused | {v.name for v in capture.of_images(spoilt)}
     again = len(bad) + totals.given_up
     retakes = advise_retakes(context, measures, again)
-    if live is not None:
-        taken = {viewpoint.name for viewpoint in plan}
-        candidates = feasible_extra(context, [v for v in extra if v.name not in taken], nominal)
-        measures |= live.summary(last.station, candidates, retakes, again if retakes else 0)
+    if capture.live is not None:
+        candidates = capture.candidates()
+        measures |= capture.live.summary(capture.last.station, candidates, retakes, again if retakes else 0)
     result = Result(purpose=params.purpose, captured=totals.captured)
     return StepOutcome(Measures.read(measures), result=result.model_dump())
 
 
-def _of_images(context: StepContext, viewpoints: Sequence[Viewpoint], images: Collection[str]) -> list[Viewpoint]:
-    """The viewpoints at which these images (SHA-256) were taken."""
-    taken = {c.viewpoint for c in context.evidence.captures(context.step.id) if c.artefacts[0].sha256 in images}
-    return [viewpoint for viewpoint in viewpoints if viewpoint.name in taken]
+class _Capture:
+    """The viewpoints of one execution of the step, and what is computed while they are captured."""
+
+    def __init__(self, context: StepContext, params: Params) -> None:
+        self._context, self._purpose = context, params.purpose
+        plan = [
+            viewpoint
+            for viewpoint_set in params.viewpoints
+            for viewpoint in plan_viewpoints(viewpoint_set, context.devices.layout(viewpoint_set.station))
+        ]
+        self.live = LiveAnalysis.begin(context, params.live)
+        self.last = params.viewpoints[-1]
+        self._extra = denser_viewpoints(self.last, context.devices.layout(self.last.station))
+        if self.live is not None:
+            wanted = self.live.suggested()
+            plan += [viewpoint for viewpoint in self._extra if viewpoint.name in wanted]
+        context.devices.camera()  # before planning: without a camera no plan is needed
+        self._nominal = context.devices.nominal_T_flange_camera()
+        there = {capture.viewpoint for capture in context.evidence.captures(context.step.id)}
+        planned = plan_step(context, [v for v in plan if v.name not in there], self._nominal, params.order)
+        self._refused = planned.refused
+        self._features = EarlyFeatures.begin(context, plan)
+        self.viewpoints = [*planned.viewpoints, *(v for v in plan if v.name in there)]
+
+    def take(self, viewpoints: Sequence[Viewpoint], again: Collection[str]) -> CaptureTotals:
+        """Capture those viewpoints that have no image, and those whose image (SHA-256) is to be taken again."""
+        task = CaptureTask(
+            viewpoints,
+            self._nominal,
+            image_kind="image" if self._purpose == "dataset" else "control_image",
+            refused=self._refused,
+            on_captured=self._look,
+            stop=lambda: self.live is not None and bool(self.live.spoilt_in_a_row()),
+            again=again,
+        )
+        return capture_viewpoints(self._context, task)
+
+    def repeat_spoilt(self, live: LiveAnalysis, totals: CaptureTotals) -> tuple[CaptureTotals, Mapping[str, str]]:
+        """Take spoilt images again, once; the new totals, and the reason of each image that is spoilt again."""
+        spoilt = live.spoilt()
+        if spoilt:
+            for capture in self._context.evidence.captures(self._context.step.id):
+                why = spoilt.get(capture.artefacts[0].sha256)
+                if why is not None:
+                    self._context.tell(f"{capture.viewpoint}: {why}; it is taken again")
+            repeated = self.take(self.of_images(spoilt), spoilt)
+            totals = replace(repeated, planned=totals.planned, given_up=totals.given_up)
+            spoilt = live.spoilt()
+        live.note_spoilt(spoilt)
+        return totals, spoilt
+
+    def of_images(self, images: Collection[str]) -> list[Viewpoint]:
+        """The viewpoints at which these images (SHA-256) were taken."""
+        captures = self._context.evidence.captures(self._context.step.id)
+        taken = {capture.viewpoint for capture in captures if capture.artefacts[0].sha256 in images}
+        return [viewpoint for viewpoint in self.viewpoints if viewpoint.name in taken]
+
+    def candidates(self) -> list[tuple[Viewpoint, float]]:
+        """Further viewpoints of the last station that the arm can reach, with the travel time (s)."""
+        taken = {viewpoint.name for viewpoint in self.viewpoints}
+        return feasible_extra(self._context, [v for v in self._extra if v.name not in taken], self._nominal)
+
+    def _look(self) -> None:
+        for analysis in (self.live, self._features):
+            if analysis is not None:
+                analysis.look()
 
 
 KIND = StepKind(

@@ -1,4 +1,4 @@
-"""The motion of a capture step before it begins: which viewpoints the arm can take, in which order, and how long."""
+"""Plans the motion of a capture step: which viewpoints the arm can reach, in which order, and how long it takes."""
 
 from __future__ import annotations
 
@@ -30,18 +30,86 @@ from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import StationLayout, StepContext
 from service.steps.notes import MOTION_PLAN
 
-_EXPOSURE_S = 3.0  # settling, exposure and download at each viewpoint, roughly
+_EXPOSURE_S = 3.0  # estimate of settling, exposure and download at each viewpoint
 _ELBOW_UP_RAD = np.array([0.0, -1.6, 1.9, -1.9, -1.57, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
 class StepPlan:
-    """The viewpoints of a step as they will be taken, and those that will not, with the reason."""
+    """The viewpoints of a step in the order in which they will be visited, and why some cannot be."""
 
     viewpoints: tuple[Viewpoint, ...]  # in order; refused ones last
     refused: Mapping[str, str]
     text: str
     record: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class ArmAtStation:
+    """An arm of known kinematics at a station, with everything that a motion plan there depends on.
+
+    Attributes:
+        layout: of the station.
+        model: kinematics of the arm.
+        T_flange_camera: (4, 4) the best known mounting of the camera.
+        collision: obstacles, and the size of the camera.
+        optics: of the lens, if the rig file describes it.
+        motion: speed, acceleration and pauses of the protocol.
+    """
+
+    layout: StationLayout
+    model: ArmModel
+    T_flange_camera: Transform
+    collision: CollisionSection
+    optics: OpticsSection | None
+    motion: Motion
+
+    def situation(self, start_rad: Array, *, sharp_at_m: Array | None = None) -> Situation:
+        """The planner's problem for a motion that starts with the joints (6,) at `start_rad`.
+
+        `sharp_at_m`: (N, 3) points that must be sharp, base frame; None: the specimen.
+        """
+        centre = np.array(self.layout.scene_centre_m)
+        T_base_specimen, half = self._specimen()
+        c = self.collision
+        camera = Capsule(np.array(c.camera_from_m), np.array(c.camera_to_m), c.camera_radius_m)
+        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
+        sharp = None
+        if self.optics is not None:
+            o = self.optics
+            focal_m, blur_m = metres(o.focal_length_mm), metres_of_um(o.blur_um)
+            sharp = depth_of_field(focal_m, o.aperture_f, o.focus_distance_m, blur_m)
+        return Situation(
+            body=universal_robot_body(self.model, self.T_flange_camera, camera),
+            obstacles=Obstacles(float(centre[2]) - c.table_below_scene_m, T_base_specimen, half),
+            centre_m=centre,
+            margin_m=c.margin_m,
+            start_rad=np.asarray(start_rad, dtype=np.float64),
+            speed_rad_s=self.motion.speed_rad_s,
+            acceleration_rad_s2=self.motion.acceleration_rad_s2,
+            sharp=sharp,
+            must_be_sharp_m=apply(T_base_specimen, corners) if sharp_at_m is None else sharp_at_m,
+            pause_s=self.motion.dwell_s + _EXPOSURE_S,
+        )
+
+    def _specimen(self) -> tuple[Transform, Array]:
+        """T_base_specimen, origin in the middle of its bounding box, and the box's half sizes (3,)."""
+        approach, up = np.array(self.layout.approach), np.array([0.0, 0.0, 1.0])
+        axes = np.column_stack([approach, np.cross(up, approach), up])
+        half = 0.5 * np.array(self.collision.specimen_size_m)
+        T_base_specimen = transform(axes, np.array(self.layout.scene_centre_m))
+        T_base_specimen[2, 3] += half[2] - self.collision.table_below_scene_m
+        return T_base_specimen, half
+
+
+def arm_at_station(context: StepContext, station: str, T_flange_camera: Transform) -> ArmAtStation | None:
+    """The arm at a station; None if its kinematics are not known."""
+    collision, optics = context.devices.surroundings()
+    model = known_arm(collision.arm or context.devices.robot(station).report().identity.model)
+    if model is None:
+        return None
+    layout = context.devices.layout(station)
+    return ArmAtStation(layout, model, T_flange_camera, collision, optics, context.protocol.motion)
 
 
 def plan_step(
@@ -52,30 +120,43 @@ def plan_step(
     *,
     sharp_at_m: Array | None = None,
 ) -> StepPlan:
-    """Plan from where the arm stands now, and record the plan. An arm without known kinematics is not checked.
+    """Plan from where the arm stands now, and record the plan. An arm of unknown kinematics is not checked.
 
     Args:
+        context: of the step.
+        viewpoints: to visit.
+        T_flange_camera: (4, 4) the best known mounting of the camera.
+        order: as listed, or the shortest way.
         sharp_at_m: (N, 3) points that must be sharp, base frame; None: the specimen.
     """
-    collision, optics = context.devices.surroundings()
     plans: list[StepPlan] = []
     for station in dict.fromkeys(v.station for v in viewpoints):
         mine = [v for v in viewpoints if v.station == station]
-        robot = context.devices.robot(station)
-        model = known_arm(collision.arm or robot.report().identity.model)
-        if model is None:
-            why = "the arm's kinematics are not known: reach is asked of its controller at each viewpoint, no more"
+        arm = arm_at_station(context, station, T_flange_camera)
+        if arm is None:
+            why = "the kinematics of the arm are not known; its controller checks the reach at each viewpoint"
             plans.append(StepPlan(tuple(mine), {}, f"{station}: {why}", {}))
             continue
-        start = robot.state().sample.joints_rad
-        layout = context.devices.layout(station)
         context.busy("planning the motions of the arm")
-        plans.append(
-            plan_station(
-                mine, T_flange_camera, layout, model, collision, optics, context.protocol.motion, start, order,
-                sharp_at_m=sharp_at_m,
-            )
-        )  # fmt: skip
+        start_rad = context.devices.robot(station).state().sample.joints_rad
+        plans.append(plan_station(mine, arm, arm.situation(start_rad, sharp_at_m=sharp_at_m), order))
+    return _recorded(context, plans)
+
+
+def plan_station(viewpoints: Sequence[Viewpoint], arm: ArmAtStation, situation: Situation, order: Order) -> StepPlan:
+    """Plan the viewpoints of one station for an arm of known kinematics, without a device."""
+    answer = plan_motion([(v.name, v.T_base_camera) for v in viewpoints], situation, order)
+    stations = {v.name: v.station for v in viewpoints}
+    planned = tuple(
+        Viewpoint(v.name, stations[v.name], v.T_base_camera, None if v.outcome == "refused" else v.joints_rad)
+        for v in answer.views
+    )
+    refused = {v.name: v.reason for v in answer.refused}
+    return StepPlan(planned, refused, _text(answer), _record(answer, arm.layout.name))
+
+
+def _recorded(context: StepContext, plans: Sequence[StepPlan]) -> StepPlan:
+    """The plans of all stations as one, which is told and recorded."""
     whole = StepPlan(
         tuple(v for plan in plans for v in plan.viewpoints),
         {name: reason for plan in plans for name, reason in plan.refused.items()},
@@ -89,99 +170,31 @@ def plan_step(
     return whole
 
 
-def plan_station(
-    viewpoints: Sequence[Viewpoint],
-    T_flange_camera: Transform,
-    layout: StationLayout,
-    model: ArmModel,
-    collision: CollisionSection,
-    optics: OpticsSection | None,
-    motion: Motion,
-    start_rad: Array,
-    order: Order,
-    *,
-    sharp_at_m: Array | None = None,
-) -> StepPlan:
-    """The same for one station and a known arm, without a device."""
-    situation = situation_of(
-        T_flange_camera, layout, model, collision, optics, motion, start_rad, sharp_at_m=sharp_at_m
-    )
-    answer = plan_motion([(v.name, v.T_base_camera) for v in viewpoints], situation, order)
-    stations = {v.name: v.station for v in viewpoints}
-    planned = tuple(
-        Viewpoint(v.name, stations[v.name], v.T_base_camera, None if v.outcome == "refused" else v.joints_rad)
-        for v in answer.views
-    )
-    return StepPlan(planned, {v.name: v.reason for v in answer.refused}, _text(answer), _record(answer, layout.name))
-
-
 def feasible_extra(
     context: StepContext, viewpoints: Sequence[Viewpoint], T_flange_camera: Transform
 ) -> list[tuple[Viewpoint, float]]:
-    """Those of further viewpoints of one station that the arm can take, with the time to get there from where it is.
+    """The further viewpoints of one station that the arm can reach, with the travel time (s) from where it stands.
 
-    All of them, with no time, for an arm without known kinematics.
+    All of them, with a time of 0, for an arm of unknown kinematics.
     """
     if not viewpoints:
         return []
-    collision, optics = context.devices.surroundings()
-    robot = context.devices.robot(viewpoints[0].station)
-    model = known_arm(collision.arm or robot.report().identity.model)
-    if model is None:
+    station = viewpoints[0].station
+    arm = arm_at_station(context, station, T_flange_camera)
+    if arm is None:
         return [(v, 0.0) for v in viewpoints]
-    layout, motion = context.devices.layout(viewpoints[0].station), context.protocol.motion
-    start = robot.state().sample.joints_rad
-    situation = situation_of(T_flange_camera, layout, model, collision, optics, motion, start)
+    start = context.devices.robot(station).state().sample.joints_rad
+    situation = arm.situation(start)
     out: list[tuple[Viewpoint, float]] = []
     for viewpoint in viewpoints:
-        joints = nearest_posture(model, viewpoint.T_base_camera @ inverse(T_flange_camera), start)
+        joints = nearest_posture(arm.model, viewpoint.T_base_camera @ inverse(T_flange_camera), start)
         if joints is not None and not infeasible_reason(viewpoint.T_base_camera, joints, situation):
             out.append((viewpoint, float(travel_times_s(np.array([start, joints]), situation)[0, 1])))
     return out
 
 
-def situation_of(
-    T_flange_camera: Transform,
-    layout: StationLayout,
-    model: ArmModel,
-    collision: CollisionSection,
-    optics: OpticsSection | None,
-    motion: Motion,
-    start_rad: Array,
-    *,
-    sharp_at_m: Array | None = None,
-) -> Situation:
-    """Arm, surroundings and optics of a station as the planner takes them."""
-    centre = np.array(layout.scene_centre_m)
-    approach = np.array(layout.approach)
-    up = np.array([0.0, 0.0, 1.0])
-    T_base_scene = transform(np.column_stack([approach, np.cross(up, approach), up]), centre)
-    half = 0.5 * np.array(collision.specimen_size_m)
-    T_base_specimen = T_base_scene.copy()
-    T_base_specimen[2, 3] += half[2] - collision.table_below_scene_m
-    camera = Capsule(np.array(collision.camera_from_m), np.array(collision.camera_to_m), collision.camera_radius_m)
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
-    sharp = None
-    if optics is not None:
-        sharp = depth_of_field(
-            metres(optics.focal_length_mm), optics.aperture_f, optics.focus_distance_m, metres_of_um(optics.blur_um)
-        )
-    return Situation(
-        body=universal_robot_body(model, T_flange_camera, camera),
-        obstacles=Obstacles(float(centre[2]) - collision.table_below_scene_m, T_base_specimen, half),
-        centre_m=centre,
-        margin_m=collision.margin_m,
-        start_rad=np.asarray(start_rad, dtype=np.float64),
-        speed_rad_s=motion.speed_rad_s,
-        acceleration_rad_s2=motion.acceleration_rad_s2,
-        sharp=sharp,
-        must_be_sharp_m=apply(T_base_specimen, corners) if sharp_at_m is None else sharp_at_m,
-        pause_s=motion.dwell_s + _EXPOSURE_S,
-    )
-
-
 def usual_posture(model: ArmModel, layout: StationLayout, T_flange_camera: Transform) -> Array:
-    """Joints (6,) with the elbow up and the camera above the scene: where a plan without a robot begins.
+    """Joints (6,) with the elbow up and the camera above the scene, from which a plan without a robot starts.
 
     Raises:
         ConfigurationError: the arm does not reach the scene of this station.
@@ -201,7 +214,7 @@ def usual_posture(model: ArmModel, layout: StationLayout, T_flange_camera: Trans
 
 
 def known_arm(name: str) -> ArmModel | None:
-    """The kinematics of an arm by its controller's name for it; None for one that is not in the table."""
+    """The kinematics of an arm, by the model name that its controller reports; None for an unknown model."""
     try:
         return arm_model(name)
     except ConfigurationError:

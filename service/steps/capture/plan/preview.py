@@ -1,4 +1,4 @@
-"""The plan of a capture step as it can be told before any device is opened: at the question that releases it."""
+"""The plan of a capture step before any device is opened, for the question that confirms the step."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from service.steps.board.plan import (
     prediction_record,
     preview_board,
 )
-from service.steps.capture.plan.planning import StepPlan, known_arm, plan_station, situation_of, usual_posture
+from service.steps.capture.plan.planning import ArmAtStation, StepPlan, known_arm, plan_station, usual_posture
 from service.steps.capture.plan.viewpoints import plan_viewpoints
 from service.steps.context import StationLayout
 from service.steps.kinds import calibration
@@ -32,7 +32,7 @@ from service.steps.notes import BoardPrediction
 
 @dataclass(frozen=True, slots=True)
 class BoardPreview:
-    """The board images of a calibration as they will be planned if everything lies as stated."""
+    """The board images of a calibration as they will be planned if board, mount and lens are as stated."""
 
     T_base_camera: Array  # (K, 4, 4)
     prediction: BoardPrediction
@@ -44,7 +44,7 @@ def preview_board_poses(
 ) -> BoardPreview | None:
     """None for steps whose board poses the software does not plan.
 
-    Raises ConfigurationError where protocol or rig file lack what a plan needs, or the scene is out of reach.
+    Raises ConfigurationError if protocol or rig file lack what a plan needs, or the scene is out of reach.
     """
     if not isinstance(step.params, calibration.Params) or step.params.board_poses is None or protocol.board is None:
         return None
@@ -52,16 +52,7 @@ def preview_board_poses(
     board = Board(protocol.board.columns, protocol.board.rows, metres(protocol.board.square_mm))
     mount, there = rig.nominal_T_flange_camera(), layout(wanted.station)
     known = nominal_board(wanted, board, there, mount, *nominal_camera(rig.section.lens))
-    collision = rig.section.collision
-    model = None if collision.arm is None else known_arm(collision.arm)
-    feasible: Callable[[Transform], bool] = lambda _T: True  # noqa: E731 - replaced below for a known arm
-    if model is not None:
-        start = usual_posture(model, there, mount)
-        points = apply(known.T_base_board, board.points())
-        situation = situation_of(
-            mount, there, model, collision, rig.section.optics, protocol.motion, start, sharp_at_m=points
-        )
-        feasible = lambda T: bool(able_postures(T, situation))  # noqa: E731
+    feasible = _feasible(_arm(protocol, rig, there), apply(known.T_base_board, board.points()))
     aims = CalibrationTargets("intrinsics" in solve, "hand_eye" in solve, wanted.coverage)
     planned = preview_board(Planner(wanted, board, aims, np.array(there.approach), mount, feasible), known)
     record = prediction_record(planned.prediction)
@@ -74,25 +65,39 @@ def preview_board_poses(
 def preview_plans(
     protocol: Protocol, step: Step, rig: Rig, layout: Callable[[str], StationLayout]
 ) -> tuple[StepPlan, ...]:
-    """One plan a station, from the arm's usual posture over the scene.
+    """One plan for each station, from the arm's usual posture above the scene.
 
-    None for other step kinds, and where the rig file does not name an arm whose kinematics are known.
+    Empty for steps of other kinds, and if the rig file names no arm of known kinematics.
 
-    Raises ConfigurationError for a station that the rig has not, or a scene out of reach.
+    Raises ConfigurationError for a station that the rig does not have, and for a scene out of reach.
     """
-    collision = rig.section.collision
-    model = None if collision.arm is None else known_arm(collision.arm)
-    if model is None or not isinstance(step.params, Params):
+    if not isinstance(step.params, Params):
         return ()
     plans: list[StepPlan] = []
-    nominal = rig.nominal_T_flange_camera()
     for station in dict.fromkeys(one.station for one in step.params.viewpoints):
         there = layout(station)
+        arm = _arm(protocol, rig, there)
+        if arm is None:
+            return ()
         views = [v for one in step.params.viewpoints if one.station == station for v in plan_viewpoints(one, there)]
-        start = usual_posture(model, there, nominal)
-        plans.append(
-            plan_station(
-                views, nominal, there, model, collision, rig.section.optics, protocol.motion, start, step.params.order
-            )
-        )
+        situation = arm.situation(usual_posture(arm.model, there, arm.T_flange_camera))
+        plans.append(plan_station(views, arm, situation, step.params.order))
     return tuple(plans)
+
+
+def _arm(protocol: Protocol, rig: Rig, layout: StationLayout) -> ArmAtStation | None:
+    """The arm that the rig file names; None if it names none, or one of unknown kinematics."""
+    collision = rig.section.collision
+    model = None if collision.arm is None else known_arm(collision.arm)
+    if model is None:
+        return None
+    nominal = rig.nominal_T_flange_camera()
+    return ArmAtStation(layout, model, nominal, collision, rig.section.optics, protocol.motion)
+
+
+def _feasible(arm: ArmAtStation | None, sharp_at_m: Array) -> Callable[[Transform], bool]:
+    """Whether the arm can reach T_base_camera; always, for an unknown arm."""
+    if arm is None:
+        return lambda _T: True
+    situation = arm.situation(usual_posture(arm.model, arm.layout, arm.T_flange_camera), sharp_at_m=sharp_at_m)
+    return lambda T: bool(able_postures(T, situation))

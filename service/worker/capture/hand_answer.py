@@ -1,0 +1,125 @@
+"""The answer to a job on a hand-held image: whether it counts, what all images give, and where to go next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.capture.hand_bundle import Reading
+from service.compute.planning.hand_guidance import Place, level_frame, same_view
+from service.core.geometry import Array, Transform, inverse
+from service.jobs.capture import hand_view as job
+from service.jobs.capture.hand_view import HeldArguments
+from service.worker.capture.hand_guide import Guide
+from service.worker.capture.held_images import HandheldImage
+from service.worker.capture.scene import CaptureScene
+from service.worker.job import JobAnswer, JobContext
+
+_SAME_M, _SAME_RAD = 0.02, np.deg2rad(3.0)  # an image nearer than this to another one repeats it
+_H = TypeVar("_H", bound=HeldArguments)
+
+
+@dataclass(frozen=True, slots=True)
+class NewImage:
+    """What the new image alone shows.
+
+    Attributes:
+        T_scene_camera: None where it does not show where the camera was.
+        why: why it cannot be used; "" if it can.
+        measures: numbers of this image.
+        information: (6, 6) about the scan's pose.
+        up: (3,) direction away from the table, frame of the scene.
+        middle_m: (3,) of the scene.
+        cells: board corners in each cell of the frame.
+        reading: outlines and spheres, where the spheres have not been measured.
+    """
+
+    T_scene_camera: Transform | None
+    why: str
+    measures: Mapping[str, float]
+    information: Array = field(repr=False)
+    up: Array
+    middle_m: Array
+    cells: NDArray[np.int64] = field(repr=False)
+    reading: Reading | None = field(default=None, repr=False)
+
+
+def answer_to(
+    context: JobContext[_H], found: NewImage, scene: CaptureScene, earlier: Sequence[HandheldImage]
+) -> JobAnswer:
+    """Judge the new image by those before it, and write its file."""
+    arguments = context.arguments
+    used = [view for view in earlier if view.used and view.T_scene_camera is not None]
+    T = found.T_scene_camera
+    why = arguments.image.settings or found.why or _repeats(T, used)
+    new = HandheldImage(
+        viewpoint=arguments.image.viewpoint,
+        used=not why,
+        T_scene_camera=T,
+        T_scene_level=_level(found, earlier),
+        information=found.information,
+        seen=scene.seen_from(T),
+        cells=found.cells,
+        reading=None if found.reading is None else found.reading.record(),
+        spheres_m=scene.spheres_m,
+    )
+    good = [*used, new] if new.used and T is not None else used
+    guide = Guide(arguments, scene, new, earlier, good)
+    measures = {**found.measures, **guide.totals()}
+    ref = context.keep_json(new.plain(rough=arguments.rough), kind="hand_view", name=f"{new.viewpoint}.hand.json")
+    answer = job.Answer.model_validate({**_result(guide, why), **_refined(guide, used)})
+    return JobAnswer({k: v for k, v in measures.items() if np.isfinite(v)}, (ref,), answer)
+
+
+def _level(found: NewImage, earlier: Sequence[HandheldImage]) -> Transform | None:
+    """T_scene_level of the first image that had one, else of this image if its pose is known."""
+    level = next((view.T_scene_level for view in earlier if view.T_scene_level is not None), None)
+    if level is None and found.T_scene_camera is not None:
+        level = level_frame(found.middle_m, found.up, -found.T_scene_camera[:3, 1])
+    return level
+
+
+def _result(guide: Guide, why: str) -> dict[str, Any]:
+    new, done = guide.new, guide.done()
+    next_words, target = guide.next_place()
+    T, level = new.T_scene_camera, new.T_scene_level
+    cells = [view.cells for view in guide.good if view.cells.size]
+    return {
+        "viewpoint": new.viewpoint,
+        "used": new.used,
+        "why": why,
+        "words": next_words,
+        "target": None if target is None else _listed(target),
+        "T_scene_camera": None if T is None else T.tolist(),
+        "T_level_camera": None if T is None or level is None else (inverse(level) @ T).tolist(),
+        "places": [{**_listed(place), "done": place.name in done} for place in guide.places()],
+        "cells": np.sum(cells, axis=0).tolist() if new.cells.size else [],
+    }
+
+
+def _refined(guide: Guide, used: Sequence[HandheldImage]) -> dict[str, Any]:
+    """The spheres and all camera poses, where the images themselves determine the spheres."""
+    if not guide.arguments.rough:
+        return {}
+    poses = {v.viewpoint: v.T_scene_camera.tolist() for v in [*used, guide.new] if v.T_scene_camera is not None}
+    return {"spheres_m": guide.scene.spheres_m.tolist(), "T_scene_cameras": poses}
+
+
+def _listed(place: Place) -> dict[str, Any]:
+    return {"name": place.name, "T_level_camera": place.T_level_camera.tolist()}
+
+
+def _repeats(T: Transform | None, used: Sequence[HandheldImage]) -> str:
+    """Why an image adds nothing to the earlier ones, or ""."""
+    if T is None:
+        return ""
+    same = [
+        view.viewpoint
+        for view in used
+        if view.T_scene_camera is not None and same_view(view.T_scene_camera, T, _SAME_M, _SAME_RAD)
+    ]
+    return f"it repeats {same[0]}" if same else ""
