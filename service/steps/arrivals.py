@@ -1,4 +1,4 @@
-"""Files that arrive from elsewhere (scanner, CT): wait for them, keep the originals, hand arrays to the worker."""
+"""Files from other devices (scanner, CT): waits for them, stores the originals, and decodes them for the worker."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 def wait_for(context: StepContext, find: Callable[[], Sequence[T]], wait_s: float, what: str) -> T:
-    """The newest of what `find` returns, as soon as there is one; DeviceTimeoutError after `wait_s`."""
+    """Wait until `find` returns something, and return the newest. Raises DeviceTimeoutError after `wait_s`."""
     deadline_s = context.monotonic_s() + wait_s
     while not (found := find()):
         context.checkpoint()
@@ -36,9 +36,9 @@ def wait_for(context: StepContext, find: Callable[[], Sequence[T]], wait_s: floa
 
 
 def keep(context: StepContext, path: Path, *, device: str, kind: str, media_type: str) -> ArtefactRef:
-    """Copy one original file into the evidence; nothing is repaired, nothing removed at the source.
+    """Copy one original file into the evidence, unchanged; the source is not touched.
 
-    Raises DataError in a run that imports, when the file is not as it was listed.
+    Raises DataError in a run that imports, if the file has changed since it was listed.
     """
     ref = context.evidence.put_file(path, kind=kind, media_type=media_type, original_name=path.name)
     note = f"kept {path.name}"
@@ -50,9 +50,9 @@ def keep(context: StepContext, path: Path, *, device: str, kind: str, media_type
 
 
 def keep_array(context: StepContext, array: Any, *, device: str, kind: str, name: str) -> ArtefactRef:
-    """Keep a decoded array (.npy) beside the originals, for the worker."""
+    """Store a decoded array (.npy) for the worker, in addition to the originals."""
     with tempfile.TemporaryDirectory(prefix="orthocapture-") as folder:
-        path = Path(folder) / name  # a CT volume of 0.4 mm voxels has a gigabyte: not through memory
+        path = Path(folder) / name  # written to disk first: a CT volume of 0.4 mm voxels has a gigabyte
         np.save(path, array, allow_pickle=False)
         ref = context.evidence.put_file(path, kind=kind, media_type="application/x-npy", original_name=name)
     _record(context, ref, device, f"decoded {name}")
@@ -62,7 +62,11 @@ def keep_array(context: StepContext, array: Any, *, device: str, kind: str, name
 def keep_mesh(
     context: StepContext, scan: ScannedMesh, *, device: str, kind: str
 ) -> tuple[ArtefactRef, tuple[ArtefactRef, ...]]:
-    """Keep a scan's original files and its decoded mesh (.npz: vertices_m, faces); (mesh, all)."""
+    """Store a scan's original files and its decoded mesh (.npz: vertices_m, faces).
+
+    Returns:
+        the mesh, and all files with the mesh last.
+    """
     originals = tuple(
         keep(context, path, device=device, kind=f"{kind}_original", media_type="application/octet-stream")
         for path in scan.source.files

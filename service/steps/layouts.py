@@ -1,4 +1,4 @@
-"""The numbers of a layout of spheres as gates take them: the same in every step that measures spheres."""
+"""The uncertainties of the measures of a layout, for all steps that measure spheres."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from service.core.records.events import Uncertainty
 
 
 def layout_uncertainties(layout: Mapping[str, Any]) -> dict[str, Uncertainty]:
-    """Of the measures of a layout's record (service.compute.layout.ambiguity.layout_record)."""
+    """The uncertainty of each measure in a layout's record (service.compute.layout.ambiguity.layout_record)."""
     return {name: Uncertainty.model_validate(bounds) for name, bounds in layout.get("bounds", {}).items()}

@@ -1,7 +1,7 @@
-"""Whether the gates of a protocol judge numbers that its steps yield, in their units and within credible limits.
+"""Checks the gates of a protocol: their measures exist, and their units and limits are credible.
 
-A gate on a number that no step of its kind measures fails when the step is done, hours into a run; a limit in another
-unit passes everything. `orthocapture protocol check` holds a protocol's gates against what each step kind declares.
+A gate on a measure that the step does not yield would fail only when the step is done, hours into a run; a limit in a
+wrong unit might pass everything. `orthocapture protocol check` compares gates with the Measures of each step kind.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from service.steps import step_kinds
 from service.steps.measures import Measure, RegistrationMeasures
 from service.steps.poses.sources import WantedRegistrations
 
-# Sections of the file: field → between what it is plausible, in the field's unit.
+# Section and field of the file → its credible range, and its unit.
 _SECTIONS: Mapping[tuple[str, str], tuple[float, float, str]] = {
     ("spheres", "radius_mm"): (1.0, 100.0, "mm"),
     ("board", "square_mm"): (0.5, 1000.0, "mm"),
@@ -27,7 +27,7 @@ _ALIAS = {"deg": "°", "1": "", "degrees": "°"}
 
 
 def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, Measure] | None:
-    """All that a step of this kind and with these parameters measures; None where that cannot be known."""
+    """The measures that a step with its parameters can yield; None if that cannot be determined."""
     kind = step_kinds().get(step.kind)
     if kind is None:
         return None
@@ -42,7 +42,7 @@ def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, 
 
 
 def implausible(loaded: LoadedProtocol, rig: RigSection | None = None) -> tuple[Problem, ...]:
-    """What cannot be meant of measures, units, limits and, with the rig, stations; in the order of the lines."""
+    """Unknown measures, wrong units, limits that are not credible and, with a rig, unknown stations; by line."""
     tree = parse_yaml(loaded.source, name="the protocol")
     found: list[tuple[FieldPath, str]] = []
     data = tree.data if isinstance(tree.data, dict) else {}
@@ -82,7 +82,7 @@ def _gate(gate: Gate, step: Step, known: Mapping[str, Measure]) -> Iterator[tupl
 
 
 def _stations(data: Mapping[str, Plain], rig: RigSection) -> Iterator[tuple[FieldPath, str]]:
-    """Stations that the protocol names and the rig file does not have."""
+    """Stations that the protocol names but the rig file does not have."""
 
     def walk(value: Plain, at: FieldPath) -> Iterator[tuple[FieldPath, str]]:
         if isinstance(value, dict):

@@ -152,8 +152,8 @@ def test_an_image_that_could_not_be_looked_at_says_why_and_what_to_do(
     bench, _ = held_run(begin, monkeypatch, tmp_path, {1: "fails", 3: "fails"}, STEP)
     assert bench.run().status == "completed"
     told = bench.operator.told
-    first, third = (i for i, line in enumerate(told) if "could not be looked at" in line)
-    assert told[first].startswith("h_001 could not be looked at: the image cannot be decoded")
+    first, third = (i for i, line in enumerate(told) if "could not be analysed" in line)
+    assert told[first].startswith("h_001 could not be analysed: the image cannot be decoded")
     assert "take it again from the same place" in told[third]
     assert "cm above the middle of the specimen" in told[first + 1], "where to begin, once more"
     assert told[third + 1].startswith("next: ")

@@ -109,7 +109,7 @@ def test_an_image_that_could_not_be_looked_at_says_why_and_what_to_do(
     with web_site(tmp_path) as site:
         bench = left_held_run(site.begin_run, monkeypatch, tmp_path, {4: "fails"})
         page = words(site.browser("technician").get(f"/runs/{bench.run_id}/held").text)
-        assert "H_004 could not be looked at: the image cannot be decoded" in page
+        assert "H_004 could not be analysed: the image cannot be decoded" in page
         assert "take it again from the same place" in page
 
 

@@ -1,4 +1,4 @@
-"""Board images while they are taken: each is looked at as it arrives; later poses are planned from the first ones."""
+"""The capture of board images: each is searched as it arrives, and later poses are planned from the first images."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ from service.steps.capture.views import CaptureTask, capture_viewpoints
 from service.steps.context import StepContext
 from service.steps.notes import BOARD_POSES
 
-_MOST_FIRST = 4  # tries for a first image that shows the board
-_MOVED_M = 0.01  # a board found further from where an earlier step had it has been moved
-_MOST_FOR_LENS = 40  # images that the estimate between captures uses
+_MOST_FIRST = 4  # tries to get a first image that shows the board
+_MOVED_M = 0.01  # a board found farther than this from its earlier place has been moved
+_MOST_FOR_LENS = 40  # most images used for the estimate during the capture
 
 
 @dataclass
 class BoardCapture:
     """The board images of one execution of one calibration step.
 
-    Poses come from the protocol (`given`) or are planned; every one that was planned is in a note of the step, so
-    that a restart goes on with the same ones. A pose is recorded as where the nominal mount puts the camera.
+    Poses come from the protocol (`given`) or are planned. Planned poses are recorded in notes of the step, so that
+    they are the same after a restart. A pose is recorded as T_base_camera for the nominal mount.
     """
 
     context: StepContext
     wanted: BoardPoses
     board: Board
     solve: tuple[str, ...]
-    given: tuple[Viewpoint, ...] = ()  # the protocol's own poses; then nothing is planned but replacements
+    given: tuple[Viewpoint, ...] = ()  # poses of the protocol; only replacements are planned then
     camera: Mapping[str, float] | None = None  # calibrated by an earlier step
-    earlier: str | None = None  # step whose board images tell where board and mount are
+    earlier: str | None = None  # step whose board images show where board and mount are
     _known: BoardKnowledge | None = None
     _notes: list[Mapping[str, Any]] = field(default_factory=list[Mapping[str, Any]])
     _replaced: int = 0  # in this attempt
@@ -69,7 +69,7 @@ class BoardCapture:
     # --- the loop ---
 
     def take(self) -> dict[str, float]:
-        """Capture, look, plan what comes next, until nothing is missing; the measures of the capture."""
+        """Capture, search and plan until nothing is missing; the measures of the capture."""
         begun = False
         while True:
             fresh = self.poses() if not begun else self._new
@@ -95,7 +95,7 @@ class BoardCapture:
         )
 
     def _more(self, looks: Sequence[SearchedBoardImage]) -> tuple[Viewpoint, ...]:
-        """Which poses to add now; none when all that is wanted is there, or no more may be replaced."""
+        """Plan the poses to add now; none if no image is missing, or no more may be replaced."""
         seen = [look for look in looks if look.seen]
         planned = sum(len(n["poses"]) for n in self._notes if n["why"] != "replacement")
         if self.given or planned >= self.wanted.count:
@@ -113,7 +113,7 @@ class BoardCapture:
                 raise ComputeError(
                     f"the first images show no board ({'; '.join(unseen)})",
                     where=f"step {self.context.step.id}",
-                    remedy="Lay the whole board where the protocol says, uncovered and lit, and take the cap off",
+                    remedy="Lay the board where the protocol says, uncovered and lit, and take the lens cap off",
                 )
             return self._plan("replacement", 1, looks)
         if planned < START < self.wanted.count:
@@ -129,15 +129,15 @@ class BoardCapture:
     def mend(
         self, count: int, enough: Callable[[Prediction, Prediction], bool], advise: Callable[[int, str, str], str]
     ) -> bool:
-        """Plan up to `count` further poses that would mend what falls short, for the next attempt.
+        """Plan up to `count` further poses for the next attempt, so that the calibration passes its gates.
 
         Args:
-            count: at most.
-            enough: judges the prediction with further poses, given also that of the images so far.
-            advise: words for the operator from the number of poses, their names and what they are predicted to reach.
+            count: the most poses to add.
+            enough: from the predictions without and with further poses, whether these are enough.
+            advise: the advice to the operator, from the number of poses, their names and their prediction in words.
 
         Returns:
-            whether any were found.
+            whether any pose was found.
         """
         looks = self.looks()
         return bool(self._plan("mend", count, looks, enough=enough, advise=advise))
@@ -151,7 +151,7 @@ class BoardCapture:
         enough: Callable[[Prediction, Prediction], bool] | None = None,
         advise: Callable[[int, str, str], str] | None = None,
     ) -> tuple[Viewpoint, ...]:
-        """Plan, record and tell; none where the arm can take no further pose that holds the board."""
+        """Plan poses, record and tell them; none if the arm can reach no further pose that shows the board."""
         self.context.progress("planning board poses", 0, 1)
         self.context.busy("planning board poses")
         known = self._knowledge(looks)
@@ -192,7 +192,7 @@ class BoardCapture:
         return poses
 
     def planner(self, known: BoardKnowledge, *, coverage: float) -> Planner:
-        """For this station, from where the arm stands."""
+        """The planner for this station."""
         layout = self.context.devices.layout(self.wanted.station)
         return Planner(
             self.wanted,
@@ -213,7 +213,7 @@ class BoardCapture:
         return lambda T: bool(able_postures(T, situation))
 
     def _taken(self, looks: Sequence[SearchedBoardImage], known: BoardKnowledge, planner: Planner) -> ChosenViews:
-        """The images with a board, and poses that are decided and not taken yet."""
+        """The images that show the board, and the planned poses without an image."""
         seen = [look for look in looks if look.seen and look.view is not None]
         poses = np.array([np.array(look.capture.T_base_flange) @ known.T_flange_camera for look in seen])
         pixels = tuple(look.view.corners for look in seen if look.view is not None)
@@ -227,11 +227,11 @@ class BoardCapture:
     # --- what is known ---
 
     def knowledge(self) -> BoardKnowledge:
-        """Where camera, mount and board are, by all images of the board so far, of earlier attempts too."""
+        """The estimate of camera, mount and board from all images so far, including those of earlier attempts."""
         return self._knowledge(self.looks())
 
     def _knowledge(self, looks: Sequence[SearchedBoardImage]) -> BoardKnowledge:
-        """From the images so far; before them from an earlier step's, or as rig file and protocol state it."""
+        """Estimate from the images so far; without any from an earlier step's, or from rig file and protocol."""
         seen = [look for look in looks if look.seen]
         if self._known is not None and self._known.measured == len(seen) > 0:
             return self._known
@@ -281,7 +281,7 @@ class BoardCapture:
         capture_viewpoints(self.context, task)
 
     def looks(self, *, wait: bool = True) -> list[SearchedBoardImage]:
-        """Every valid image with what was found in it."""
+        """Every valid image with what was found in it; with `wait`, once all have been searched."""
         if wait:
             self._looks.wait()
         return self._looks.of(self.context.step.id)
@@ -299,11 +299,11 @@ class BoardCapture:
 
 
 _WORDS: Mapping[Why, str] = {
-    "first": "the first, to see where the board lies",
-    "start": "to find lens, mount and board",
+    "first": "the first, to locate the board",
+    "start": "to estimate lens, mount and board",
     "rest": "the rest",
     "replacement": "instead of images without a board",
-    "mend": "to mend what falls short",
+    "mend": "to pass the gates",
 }
 
 

@@ -1,4 +1,4 @@
-"""Board images as they arrive: a job looks at each, and tells whether it shows the whole board, and sharp."""
+"""Board images as they arrive: a job searches each for the board and checks that it is complete and sharp."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.steps.context import JobRequest, StepContext
 
 @dataclass(frozen=True, slots=True)
 class SearchedBoardImage:
-    """One board image and what was found in it."""
+    """A board image that was searched, and what was found."""
 
     capture: ViewpointCaptured
     seen: bool
@@ -27,12 +27,12 @@ class SearchedBoardImage:
     corners_sha256: str | None = None
     view: BoardView | None = None
     size: tuple[int, int] = (0, 0)
-    spoilt: bool = False  # blurred or black: not to be calibrated from, whatever is seen in it
+    spoilt: bool = False  # blurred or black: not used, even if the board was found
 
 
 @dataclass
 class BoardLooks:
-    """The looks at the board images of a step, and of the earlier step whose board they show again."""
+    """The searched images of a step, and those of an earlier step that show the same board."""
 
     context: StepContext
     board: Board
@@ -41,7 +41,7 @@ class BoardLooks:
     _told: set[str] = field(default_factory=set[str])
 
     def begin(self) -> None:
-        """Have every new image looked at. Returns at once."""
+        """Enqueue the search of every new image. Returns at once."""
         begun = {job.arguments["image"]["sha256"] for job in self._jobs(self.context.step.id)}
         for capture in self.context.evidence.captures(self.context.step.id):
             sha256 = capture.artefacts[0].sha256
@@ -52,7 +52,7 @@ class BoardLooks:
                 self.context.evidence.enqueue(JobRequest.of(board_view.KIND, arguments), sha256)
 
     def wait(self) -> None:
-        """Until every image has been looked at."""
+        """Wait until every image has been searched."""
         self.begin()
         while True:
             self.context.checkpoint()
@@ -64,7 +64,7 @@ class BoardLooks:
             self.context.wait(0.05)
 
     def of(self, step: str) -> list[SearchedBoardImage]:
-        """Every valid image of a step that has been looked at, with what was found in it."""
+        """Every valid image of a step that has been searched, with what was found."""
         jobs = self._by_image(step)
         spoilt = why_spoilt(self._looked_at(step))
         out: list[SearchedBoardImage] = []
@@ -76,7 +76,7 @@ class BoardLooks:
             look = self._look(capture, job)
             if not all(capture.verdicts.values()):
                 departs = [name for name, passed in capture.verdicts.items() if not passed]
-                look = SearchedBoardImage(capture, False, f"not as wanted: {', '.join(departs)}")
+                look = SearchedBoardImage(capture, False, f"not as required: {', '.join(departs)}")
             elif sha256 in spoilt:
                 look = SearchedBoardImage(capture, False, spoilt[sha256], spoilt=True)
             if not look.seen:
@@ -85,9 +85,9 @@ class BoardLooks:
         return out
 
     def spoilt_in_a_row(self) -> list[ImageSharpness]:
-        """Blurred or black images with which this step's images end, where they are to stop it.
+        """The blurred or black images at the end of this step, if there are so many that the capture must stop.
 
-        Where all so far are black, whoever looks for the first board says so.
+        Empty if all images so far are black: then the search for the first board reports it.
         """
         mine = self._looked_at(self.context.step.id)
         others = self._looked_at(self.earlier) if self.earlier is not None else []
@@ -96,7 +96,7 @@ class BoardLooks:
         return [] if from_the_start else row
 
     def stop_where_spoilt(self) -> None:
-        """Raises ImagesSpoiltError after several spoilt images in a row."""
+        """Raise ImagesSpoiltError after several spoilt images in a row."""
         row = self.spoilt_in_a_row()
         if row:
             stop_for_lens(self.context, row)
@@ -108,7 +108,7 @@ class BoardLooks:
         return {str(j.arguments["image"]["sha256"]): j for j in self._jobs(step) if j.status != "enqueued"}
 
     def _looked_at(self, step: str) -> list[ImageSharpness]:
-        """In the order of capture."""
+        """The sharpness of the searched images, in the order of capture."""
         jobs = self._by_image(step)
         ordered = [jobs.get(capture.artefacts[0].sha256) for capture in self.context.evidence.captures(step)]
         return [
@@ -123,7 +123,7 @@ class BoardLooks:
 
     def _as_read(self, capture: ViewpointCaptured, job: JobState) -> SearchedBoardImage:
         if job.status == "failed" or not job.result.get("seen"):
-            why = job.message if job.status == "failed" else str(job.result.get("reason", "not looked at"))
+            why = job.message if job.status == "failed" else str(job.result.get("reason", "not searched"))
             return SearchedBoardImage(capture, False, why)
         ref = job.artefacts[0]
         record = json.loads(self.context.evidence.path(ref).read_bytes())
@@ -140,7 +140,7 @@ class BoardLooks:
 
 
 class BoardFields(TypedDict):
-    """A board as fields of a job's arguments."""
+    """The fields of a job's arguments that describe a board."""
 
     columns: int
     rows: int
@@ -148,5 +148,5 @@ class BoardFields(TypedDict):
 
 
 def board_arguments(board: Board) -> BoardFields:
-    """A board as job arguments."""
+    """The fields of a job's arguments for a board."""
     return {"columns": board.columns, "rows": board.rows, "square_m": board.square_m}

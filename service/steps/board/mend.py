@@ -1,4 +1,4 @@
-"""A calibration that falls short of a gate: exactly the board poses that would mend it, for the next attempt."""
+"""After a calibration that fails a gate: plans the further board poses that would make it pass."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from service.steps.board.capture import BoardCapture
 from service.steps.capture.retakes import TAKEN_AGAIN
 from service.steps.context import StepContext
 
-_MOST = 30  # further poses in one attempt
-_AGAIN = 10  # further poses where nothing predicts how many it takes
-_AIM = 0.9  # of a limit, so that a prediction that is a little too good still suffices
-_SPARE = 0.03  # of the coverage: a corner expected in a cell may fall beside it
+_MOST = 30  # most further poses in one attempt
+_AGAIN = 10  # further poses if their number cannot be predicted
+_AIM = 0.9  # share of a limit to reach, because predictions may be slightly optimistic
+_SPARE = 0.03  # added to a required coverage, because a corner may miss its predicted cell
 
 Enough = Callable[[Prediction, Prediction], bool]
 
 
 def mend_calibration(context: StepContext, capture: BoardCapture, measures: Mapping[str, float]) -> None:
-    """Where a gate fails, note what would mend it: the retry takes those poses and keeps all that was good."""
+    """If a gate fails, plan and note further poses; the retry takes them and keeps the good images."""
     verdicts = evaluate_gates(context.step, context.attempt, measures, context.run.skipped).verdicts
     failed = [verdict for verdict in verdicts if not verdict.passed]
     if not failed:
@@ -36,24 +36,24 @@ def mend_calibration(context: StepContext, capture: BoardCapture, measures: Mapp
             first = f"First {' and '.join(again)}. " if again else ""
             return (
                 f"{short}. {first}Confirm to take {counted(found, 'more image', 'more images')} of the board "
-                f"({names}), all others are kept: predicted then are {words}"
+                f"({names}); all others are kept. Prediction with them: {words}"
             )
 
         if capture.mend(count, lambda before, after: all(rule(before, after) for rule in rules), advise):
             return
     if again:
-        advice = f"{short}. First {' and '.join(again)}; confirm, and the images that departed are taken again"
+        advice = f"{short}. First {' and '.join(again)}; then confirm, and the affected images are taken again"
     else:
         advice = (
-            f"{short}. The arm can take no further pose that holds the whole board: lay the board where the arm "
-            "reaches more around it, and redo the step"
+            f"{short}. The arm can reach no further pose that shows the whole board: lay the board where the arm can "
+            "reach more poses around it, and redo the step"
         )
     context.note("advice", advice=advice)
     context.tell(advice)
 
 
 def _wanted(failed: Sequence[GateVerdict], measures: Mapping[str, float]) -> tuple[int, list[Enough]]:
-    """How many poses at most, and when they are enough."""
+    """The most poses to add, and the rules that say when they are enough."""
     least, most, rules = 1, _MOST, list[Enough]()
     for verdict in failed:
         name, value = verdict.measure, verdict.value
@@ -62,15 +62,15 @@ def _wanted(failed: Sequence[GateVerdict], measures: Mapping[str, float]) -> tup
             least = max(least, round(low - value))
         elif name in _PREDICTED and (low is not None or (high is not None and value)):
             rules.append(_rule(name, value, low, high))
-        else:  # an error that further images average down, or whose worst images they replace
+        else:  # an error that decreases with more images
             least = max(least, _AGAIN)
     return max(most, least), [lambda before, after: after.images - before.images >= least, *rules]
 
 
 def _rule(name: str, value: float | None, low: float | None, high: float | None) -> Enough:
-    """Whether a predicted number reaches the gate.
+    """A rule: whether a predicted number reaches the gate.
 
-    Of uncertainties only the ratio counts: how much further images lower what was measured.
+    For uncertainties, the measured value is scaled by the predicted ratio of after to before.
     """
     of = _PREDICTED[name]
     if low is not None:

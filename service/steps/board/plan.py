@@ -1,4 +1,4 @@
-"""Board poses as a protocol asks for them, and their planning from what is known of camera, mount and board."""
+"""Board poses as the protocol specifies them, and their planning from estimates of camera, mount and board."""
 
 from __future__ import annotations
 
@@ -30,40 +30,40 @@ from service.steps.context import StationLayout
 from service.steps.notes import BoardPrediction
 
 Why = Literal["first", "start", "rest", "replacement", "mend"]
-#: The first image is taken from further away and steeply: nobody knows yet where exactly the board lies.
+#: The first image is taken from farther away and nearly from above, because the board's place is only roughly known.
 FIRST = ViewRange(tilts_deg=(8.0, 14.0, 24.0), distances_m=(0.78, 0.82, 0.86))
 START = 6  # images after which camera, mount and board are known well enough to plan the rest
-_USUAL_FOCAL = 1.2  # focal length over the image's longer side, where the rig file does not tell
-_UNKNOWN_FOCAL = 0.25
+_USUAL_FOCAL = 1.2  # focal length over the image's longer side, if the rig file describes no lens
+_UNKNOWN_FOCAL = 0.25  # relative standard deviation of that focal length
 
 
 class BoardPoses(Record):
-    """Board images that the software plans: how many, from where, and what they shall reach."""
+    """Board images that the software plans: how many, from where, and what they must reach."""
 
     station: str  # where the images are taken
     prefix: str  # of the names of the views
     count: Annotated[int, Field(ge=4, le=300)]  # how many images
-    # Of the camera from the vertical.
+    # Tilt of the camera from the vertical.
     tilts_deg: tuple[Annotated[float, Field(ge=0, le=60)], ...] = ViewRange().tilts_deg
     rolls_deg: tuple[float, ...] = ViewRange().rolls_deg  # of the camera about its axis
-    # From the camera to the board.
+    # Distance from the camera to the board.
     distances_m: tuple[Annotated[float, Field(ge=0.2, le=2)], ...] = ViewRange().distances_m
-    above_scene_m: float = 0.09  # height of the board over the scene's centre, roughly
+    above_scene_m: float = 0.09  # approximate height of the board above the scene's centre
     long_side: Literal["across", "along"] = "across"  # how the board lies, seen from the robot
-    place_tolerance_mm: Annotated[float, Field(gt=0, le=100)] = 30.0  # of the board's middle
+    place_tolerance_mm: Annotated[float, Field(gt=0, le=100)] = 30.0  # of the position of the board's centre
     turn_tolerance_deg: Annotated[float, Field(gt=0, le=30)] = 10.0  # of the board's turn about the vertical
-    coverage: Annotated[float, Field(gt=0, le=1)] = 0.97  # of the image, as planned
-    replacements: Annotated[int, Field(ge=0, le=100)] = 12  # in one attempt, for images without a board
+    coverage: Annotated[float, Field(gt=0, le=1)] = 0.97  # share of the image area that the planned images must cover
+    replacements: Annotated[int, Field(ge=0, le=100)] = 12  # most per attempt, for images without a board
 
     @property
     def wishes(self) -> ViewRange:
-        """As the planner takes them."""
+        """The range of views for the planner."""
         return ViewRange(self.tilts_deg, self.rolls_deg, self.distances_m)
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedBoard:
-    """Camera poses T_base_camera (K, 4, 4) at the estimated mount, and what they will come to with the others."""
+    """Camera poses T_base_camera (K, 4, 4) with the estimated mount, and the prediction with all images."""
 
     T_base_camera: Array
     prediction: Prediction
@@ -74,8 +74,12 @@ class Planner:
     """Plans board poses at one station.
 
     Attributes:
-        feasible: whether the arm can take T_base_camera as the nominal mount puts it.
-        nominal_mount: T_flange_camera of the drawing.
+        wanted: by the protocol.
+        board: to be photographed.
+        aims: calibrations that the images are for.
+        approach: (3,) horizontal unit vector from the scene towards the arm's base.
+        nominal_mount: T_flange_camera according to the drawing.
+        feasible: whether the arm can reach a T_base_camera given for the nominal mount.
     """
 
     wanted: BoardPoses
@@ -95,7 +99,7 @@ class Planner:
         enough: Callable[[Prediction], bool] | None = None,
         seed: int = 0,
     ) -> PlannedBoard:
-        """Up to `count` further poses; fewer where the arm can take no others that hold the board."""
+        """Up to `count` further poses; fewer if the arm can reach no others that show the board."""
         wishes = FIRST if why == "first" else self.wanted.wishes
         candidates = board_candidates(known, self.board, wishes, self.approach, seed=seed)
         poses = choose_poses(
@@ -107,23 +111,23 @@ class Planner:
         return PlannedBoard(poses, predict(everything, known, self.board, self.aims))
 
     def prediction(self, taken: ChosenViews, known: BoardKnowledge) -> Prediction:
-        """What images will come to without further ones."""
+        """The prediction without further images."""
         return predict(taken, known, self.board, self.aims)
 
     def with_planned(self, taken: ChosenViews, T_base_camera: Array, known: BoardKnowledge) -> ChosenViews:
-        """With poses that are decided and not taken yet."""
+        """The images with those added that are planned but not taken yet."""
         future = as_taken(known, self.board, T_base_camera)
         return taken.plus(future.T_base_camera, future.pixels)
 
     def sent(self, T_base_camera: Transform, known: BoardKnowledge) -> Transform:
-        """Where the nominal mount would have the camera when the estimated one has it at T_base_camera."""
+        """T_base_camera for the nominal mount, if the camera is to be at T_base_camera with the estimated mount."""
         return T_base_camera @ inverse(known.T_flange_camera) @ self.nominal_mount
 
 
 def preview_board(planner: Planner, known: BoardKnowledge) -> PlannedBoard:
-    """All poses as they would be if camera, mount and board were as stated: before anything has moved.
+    """All poses as they would be planned if camera, mount and board were as stated, before anything has moved.
 
-    The later ones as they will be planned once the first images have told where the board lies.
+    After the first pose, the place of the board counts as measured.
     """
     first = planner.next("first", 1, known)
     sure = _as_if_measured(known)
@@ -141,7 +145,7 @@ def _as_if_measured(known: BoardKnowledge) -> BoardKnowledge:
 def nominal_board(
     wanted: BoardPoses, board: Board, layout: StationLayout, mount: Transform, camera: CameraModel, focal: float
 ) -> BoardKnowledge:
-    """What protocol and rig file say of the board, the mount and the lens."""
+    """Board, mount and lens as protocol and rig file state them."""
     tolerances = Tolerances(
         place_m=metres(wanted.place_tolerance_mm), turn_rad=float(np.radians(wanted.turn_tolerance_deg)), focal=focal
     )
@@ -153,11 +157,11 @@ def nominal_board(
 
 
 def nominal_camera(lens: LensSection | None, size: tuple[int, int] | None = None) -> tuple[CameraModel, float]:
-    """The lens as engraved, without distortion, and by what share its focal length may be off.
+    """Nominal intrinsics without distortion, and the relative uncertainty of the focal length.
 
     Args:
-        lens: of the rig file; None: a usual one, hardly known.
-        size: of the images, px; None: as the rig file has it.
+        lens: of the rig file; None: a common focal length with a large uncertainty.
+        size: of the images, px; None: as the rig file states it.
     """
     width, height = size or (lens.image_px if lens is not None else (1800, 1200))
     if lens is None:

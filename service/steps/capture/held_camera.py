@@ -1,4 +1,4 @@
-"""Images of a camera that a person holds: at a cable, released by anybody; or without one, found as files."""
+"""Images of a hand-held camera: released over a cable or on the camera, or found as files without a cable."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from service.steps.capture.views import WORTH_ANOTHER_TRY, photograph
 from service.steps.context import StepContext
 from service.store.records import NewArtefact
 
-_PATIENCE_S = 0.3  # of one look at the camera
-_CLOCKS_S = 300.0  # by so much a camera's clock may be slow: what was taken earlier than the step began is of no use
+_PATIENCE_S = 0.3  # how long to wait for an image in one call
+_CLOCKS_S = 300.0  # tolerated delay of the camera's clock; images from before the step are ignored
 
 By = Literal["camera", "screen", "pedal"]
 
 
 @dataclass
 class HeldCamera:
-    """The camera of one execution of a step, and everything that may release it."""
+    """The camera in one execution of a step, and the ways to release it."""
 
     context: StepContext
     prefix: str
     image_kind: str
-    finished: bool = False  # somebody has asked to end with what there is
+    finished: bool = False  # somebody has asked to end the capture with the images so far
     _asked: int = field(init=False)
     _pedal: int | None = field(init=False)
 
@@ -48,7 +48,7 @@ class HeldCamera:
             self.context.tell(problem)
 
     def new_views(self) -> list[ViewHeld]:
-        """Waits a moment for images, which are evidence at once. An image that cannot be read is noted, not kept."""
+        """Wait a moment for images, and record them. Of an image that cannot be read, only the failure is recorded."""
         context = self.context
         context.evidence.require_space()
         camera = context.devices.camera()
@@ -56,7 +56,7 @@ class HeldCamera:
             by, images = self._images(camera, Path(folder))
             views = [self._record(image, by) for image in images]
         if any(not view.verdicts["settings"] for view in views):
-            self._set(camera)  # a dial was turned: the next image shall be right
+            self._set(camera)  # somebody turned a dial: correct it for the next image
         return views
 
     def _images(self, camera: Camera, folder: Path) -> tuple[By, tuple[CapturedImage, ...]]:
@@ -77,7 +77,7 @@ class HeldCamera:
         return "camera", ()
 
     def _requests(self) -> list[By]:
-        """At most one request for a release, from a screen or the pedal."""
+        """At most one request for a release, from a page or the pedal."""
         asked = self.context.evidence.asked()
         for what in asked[self._asked :]:
             self._asked += 1
@@ -96,7 +96,7 @@ class HeldCamera:
         try:
             return lightbox.pedal_presses()
         except DeviceError:
-            return None  # the other ways of releasing remain
+            return None  # the camera can still be released in other ways
 
     def _set(self, camera: Camera) -> None:
         try:
@@ -106,7 +106,7 @@ class HeldCamera:
             camera.apply(wanted_settings(self.context))
 
     def _record(self, image: CapturedImage, by: By) -> ViewHeld:
-        """Write an image down: files first, then one transaction with rows and event."""
+        """Record an image: first its files, then its rows and its event in one transaction."""
         context = self.context
         number = len(context.evidence.captures(context.step.id)) + 1
         name = f"{self.prefix}{number:03d}"
@@ -160,20 +160,20 @@ class HeldCamera:
         self.context.tell(f"{name}: {error}")
 
     def waiting(self, done: int, total: int) -> None:
-        """For the screens: the live view runs while nothing else happens."""
+        """Report that the step waits for an image, so that pages show the live view."""
         self.context.progress(WAITING_FOR_HAND, done, total)
 
 
 def new_images(context: StepContext, camera: Camera, folder: Path) -> tuple[CapturedImage, ...]:
-    """Waits a moment for what the camera's button has released in this step and is not in the evidence yet."""
+    """Wait a moment for images that were released on the camera during this step and are not recorded yet."""
     began = datetime.fromisoformat(context.evidence.state().steps[context.step.id].started_utc)
     images = camera.released_images(folder, _PATIENCE_S, began.timestamp() - _CLOCKS_S)
-    # Of a folder all photographs come again after a restart. Bytes that a camera itself sends twice are an error.
+    # After a restart, a watched folder delivers all photographs again. From a camera, a repeated file is an error.
     return tuple(image for image in images if not (image.found_at and context.evidence.holds(image.jpeg.sha256)))
 
 
 def awaited_images(context: StepContext, camera: Camera, folder: Path, wait_s: float) -> tuple[CapturedImage, ...]:
-    """Those that come next from a camera without a cable, at least one; DeviceTimeoutError after `wait_s`."""
+    """Wait for at least one image of a camera without a cable. Raises DeviceTimeoutError after `wait_s`."""
     context.tell("take the photograph now, with the camera's own button; it is read as soon as its file is there")
     for problem in camera.report().problems:
         context.tell(problem)

@@ -1,4 +1,4 @@
-"""What the images say while they are being taken: one job an image, none of which the capture waits for."""
+"""Live numbers of a capture by the robot, from one job per image; the capture does not wait for these jobs."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ ERROR, COVERAGE = "predicted_target_error_mm", "specimen_coverage"
 class CoverageRule(Record):
     """When a view counts for a point of the specimen's surface."""
 
-    min_views: Annotated[int, Field(ge=1)] = 2  # that must see the point
-    # Between the viewing ray and the normal of the surface.
+    min_views: Annotated[int, Field(ge=1)] = 2  # views that must see the point
+    # Angle between the viewing ray and the normal of the surface.
     max_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 65.0
     max_distance_m: Annotated[float, Field(gt=0)] = 1.0  # from the camera
 
 
 class Live(Record):
-    """What the numbers after each image are computed from."""
+    """What the numbers after each image are computed from, and how."""
 
     calibration: str  # step with the intrinsics
     hand_eye: str  # step with T_flange_camera
-    spheres_of: str  # step with the spheres and, for the coverage, the surface: the CT
-    images_of: tuple[str, ...] = ()  # earlier capture steps that count too
-    aim_mm: Annotated[float, Field(gt=0)] = 0.35  # of the suggestions, where no gate says it
-    # Scatter of the camera's poses before any image tells; without them what the hand-eye calibration's held-out
-    # views show.
+    spheres_of: str  # CT import: the spheres and, for the coverage, the surface
+    images_of: tuple[str, ...] = ()  # earlier capture steps whose images count too
+    aim_mm: Annotated[float, Field(gt=0)] = 0.35  # error that suggested views should reach, if no gate sets a limit
+    # Scatter of the camera's positions before any image is taken; without it, as the held-out views of the
+    # hand-eye calibration show it.
     arm_sigma_mm: Annotated[float, Field(gt=0)] | None = None
-    arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None  # of the camera's rotation
+    arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None  # the same of the camera's rotations
     coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
-    wait_s: Annotated[float, Field(ge=0)] = 60.0  # at the end of the step, for images still being looked at
+    wait_s: Annotated[float, Field(ge=0)] = 60.0  # at the end of the step, for jobs that have not finished
 
 
 @dataclass
@@ -67,7 +67,7 @@ class LiveAnalysis:
 
     @classmethod
     def begin(cls, context: StepContext, params: Live | None) -> LiveAnalysis | None:
-        """Gather what earlier steps found; None, with a note, where one of them was skipped."""
+        """Read the results of earlier steps; None, with a note, if one of them was skipped."""
         if params is None:
             return None
         try:
@@ -89,7 +89,7 @@ class LiveAnalysis:
         return analysis
 
     def look(self) -> None:
-        """Have every new image looked at, and tell what is known of the earlier ones. Returns at once."""
+        """Enqueue the job on every new image, and tell the numbers of earlier ones. Returns at once."""
         begun = {job.arguments["image"]["sha256"] for job in self._jobs("live_view")}
         for capture in self.context.evidence.captures(self.context.step.id):
             sha256 = capture.artefacts[0].sha256
@@ -116,13 +116,13 @@ class LiveAnalysis:
     def summary(
         self, station: str, candidates: Sequence[tuple[Viewpoint, float]], retakes: str = "", again: int = 0
     ) -> dict[str, float]:
-        """Wait, up to a limit, for the last images; the measures of the gate. A shortfall becomes a suggestion.
+        """Wait for the last images, at most `wait_s`; the measures. If a gate fails, suggest further views.
 
         Args:
-            station: where the robot stands.
-            candidates: viewpoints that could be taken there in addition, with the time to get there.
-            retakes: what the same confirmation takes again, in words; the suggestion is added to it.
-            again: how many images that are.
+            station: of the robot.
+            candidates: further viewpoints at this station, with the travel time (s).
+            retakes: advice on images to take again, to which the suggestion is added.
+            again: number of images to take again.
         """
         self._wait()
         error_gate, coverage_gate = self._gate(ERROR), self._gate(COVERAGE)
@@ -156,12 +156,12 @@ class LiveAnalysis:
         return dict(answer.measures)
 
     def spoilt_in_a_row(self) -> list[ImageSharpness]:
-        """Blurred or black images with which this step's images end, where they are to stop it."""
+        """The blurred or black images at the end of this step, if there are so many that the capture must stop."""
         mine = self._looked_at(self.context.step.id)
         return row_to_stop_for(self.context, mine, self._looked_at(*self.params.images_of))
 
     def spoilt(self) -> dict[str, str]:
-        """Wait, up to a limit, for the last images: the reason of each spoilt one, by its SHA-256.
+        """Wait for the last images, but not longer than `wait_s`; the reason of each spoilt image, by its SHA-256.
 
         Raises ImagesSpoiltError after several in a row.
         """
@@ -172,14 +172,14 @@ class LiveAnalysis:
         return why_spoilt(self._looked_at(self.context.step.id), self._looked_at(*self.params.images_of))
 
     def note_spoilt(self, reasons: Mapping[str, str]) -> None:
-        """Images that are spoilt although they were taken again: a retry of the step takes them once more."""
+        """Note images that are spoilt even after they were taken again, so that a retry of the step repeats them."""
         captures = self.context.evidence.captures(self.context.step.id)
         names = [capture.viewpoint for capture in captures if capture.artefacts[0].sha256 in reasons]
         if names:
             self.context.note(SPOILT, viewpoints=names, attempt=self.context.attempt)
 
     def suggested(self) -> set[str]:
-        """Names of the viewpoints that earlier attempts of this step found wanting."""
+        """Names of the viewpoints that earlier attempts of this step suggested."""
         return {view.viewpoint for note in suggested_views(self.context.state) for view in note.viewpoints}
 
     def _suggest(
@@ -202,10 +202,10 @@ class LiveAnalysis:
             f"{short}. {confirm} {len(suggestions)} more views ({names}): the error is then predicted to be "
             f"{last.predicted_error_mm:.3f} mm and the coverage {100 * last.coverage:.0f} %"
         )
-        self.context.tell(advice)  # of what is taken again it was told before
-        # The newest note with advice is what a person is shown: it holds all that the confirmation does.
+        self.context.tell(advice)  # the advice on retakes was told before
+        # Pages show the newest note with advice, so it must hold everything that the confirmation does.
         both = f"{retakes}. {advice}" if retakes else advice
-        # What is to be done for the retakes is to be done for this newer note, which takes their place.
+        # This note replaces that of the retakes, so it repeats what has to be done for them.
         mend = self.context.evidence.state().steps[self.context.step.id].mend if retakes else {}
         views = [view.plain() for view in suggestions]
         self.context.note(SUGGESTION, advice=both, viewpoints=views, images=again, hands=list(mend.get("hands", ())))
@@ -218,7 +218,7 @@ class LiveAnalysis:
         return [job for step in steps for job in self.context.evidence.jobs(step) if job.kind == kind]
 
     def _earlier(self) -> tuple[tuple[Hash, ...], Each | None]:
-        """The files of the looks at images that still count, in the order of capture, and the reference to them."""
+        """The files of the jobs on images that still count, in the order of capture, and the reference to them."""
         steps = dict.fromkeys((*self.params.images_of, self.context.step.id))
         state = self.context.evidence.state()
         captures: list[View] = []
@@ -238,7 +238,7 @@ class LiveAnalysis:
         return files, each if resolve(each.record(), jobs) == list(files) else None
 
     def _looked_at(self, *steps: str) -> list[ImageSharpness]:
-        """The images of these steps that have been looked at, in the order of capture."""
+        """The sharpness of the images of these steps whose job has finished, in the order of capture."""
         by_image = {j.arguments["image"]["sha256"]: j for j in self._jobs("live_view") if j.status == "finished"}
         captures = [capture for step in steps for capture in self.context.evidence.captures(step)]
         hashes = [capture.artefacts[0].sha256 for capture in captures]
@@ -261,7 +261,7 @@ class LiveAnalysis:
             if self.context.monotonic_s() > deadline_s:
                 self.context.note("live_numbers_late", images=left)
                 return
-            self.context.progress("looking at the last images", len(waiting) - left, len(waiting))
+            self.context.progress("analysing the last images", len(waiting) - left, len(waiting))
             self.context.wait(0.1)
 
     def _tell(self) -> None:
@@ -272,7 +272,7 @@ class LiveAnalysis:
 
 
 def seen_words(seen: float, expected: float | None) -> str:
-    """`9/10 spheres`; of more than are expected here, `13 spheres (10 expected in this image)`."""
+    """`9/10 spheres`, or `13 spheres (10 expected in this image)` if there are more than expected."""
     if expected is None:
         return f"{seen:.0f} spheres"
     if seen > expected:
@@ -281,9 +281,9 @@ def seen_words(seen: float, expected: float | None) -> str:
 
 
 def describe_view(job: JobState) -> str:
-    """`v1_005: 9/10 spheres, 0.18 px, predicted error 0.210 mm, coverage 74 %`: one line on one image."""
+    """One line on one image: `v1_005: 9/10 spheres, 0.18 px, predicted error 0.210 mm, coverage 74 %`."""
     if job.status == "failed":
-        return f"{job.arguments['image']['viewpoint']}: could not be looked at: {job.message}"
+        return f"{job.arguments['image']['viewpoint']}: could not be analysed: {job.message}"
     m = job.measures
     parts = [seen_words(m["spheres_seen"], m.get("spheres_expected"))]
     if "outline_rms_px" in m:
@@ -299,10 +299,10 @@ def describe_view(job: JobState) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Shared:
-    """What all jobs of a capture have in common, and what of it is recorded as a reference.
+    """The arguments that all jobs of a capture share, and the references that are recorded in their place.
 
-    The covariance of T_flange_camera and the scatter of the camera's poses are as the hand-eye calibration states
-    them: with the arm's correction, where there is one, because the images get corrected poses.
+    The covariance of T_flange_camera and the scatter of the camera's poses are those of the hand-eye calibration with
+    the arm's correction, if there is one, because the poses of the images are corrected too.
     """
 
     camera: Camera
@@ -317,14 +317,14 @@ class Shared:
 
     @classmethod
     def of(cls, context: StepContext, params: Live) -> Shared:
-        """From what earlier steps found. Raises ConfigurationError where one of them did not."""
+        """From the results of earlier steps. Raises ConfigurationError if one is missing."""
         scan = earlier_answer(context, params.spheres_of, locate_spheres.KIND)
         calibration = earlier_answer(context, params.calibration, calibrate.KIND)
         hand_eye = earlier_answer(context, params.hand_eye, calibrate.KIND)
         record = hand_eye.answer.hand_eye
         if record is None:
             raise ConfigurationError(
-                f"step {params.hand_eye!r} gives no hand_eye",
+                f"step {params.hand_eye!r} has no hand-eye calibration",
                 where=f"step {context.step.id}, live",
                 remedy="Do that step first",
             )
@@ -350,7 +350,7 @@ class Shared:
         )
 
     def fields(self, mounting: Mounting) -> dict[str, Any]:
-        """Of the arguments of a job, with the mounting at a station."""
+        """Fields of the arguments of a job, with the mounting at a station."""
         return {
             "camera": self.camera,
             **mounting.set_fields(),

@@ -1,4 +1,4 @@
-"""Moving an arm and waiting until it stands still, stopping at once when the operator says so."""
+"""Moves an arm and waits until it stands still; stops at once if the operator pauses the run."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from service.core.geometry import Array
 from service.steps.context import StepContext, StepInterruptedError
 
 _POLL_S = 0.02
-_POLL_AT_THE_END_S = 0.004  # once the window may be complete: each millisecond from there on is the viewpoint's
+_POLL_AT_THE_END_S = 0.004  # when the arm may have settled: waiting longer delays the viewpoint
 
 
 @dataclass(frozen=True, slots=True)
 class MotionLimits:
-    """How an arm may move in a run."""
+    """Limits on the motion of an arm in a run."""
 
     speed_rad_s: float
     acceleration_rad_s2: float
@@ -46,9 +46,9 @@ def move_and_settle(
     *,
     meanwhile: Callable[[], None] = lambda: None,
 ) -> SettleReport:
-    """Move to joints (6,) and return once the pose stream is quiet. `meanwhile` is called once the motion has begun.
+    """Move to joints (6,) and return when the pose stream is quiet. `meanwhile` is called after the motion has begun.
 
-    Raises SafetyStopError, DeviceTimeoutError (after stopping the arm), StepInterruptedError (arm stands still).
+    Raises SafetyStopError, DeviceTimeoutError (the arm is stopped), StepInterruptedError (the arm stands still).
     """
     try:
         robot.move_joints(target_rad, speed_rad_s=limits.speed_rad_s, acceleration_rad_s2=limits.acceleration_rad_s2)
@@ -57,7 +57,7 @@ def move_and_settle(
     except StepInterruptedError:
         _stand_still(context, robot, criteria)
         raise
-    except BaseException:  # a defect and Ctrl-C too: nobody watches the arm any more
+    except BaseException:  # also for defects and Ctrl-C, because the arm would move on unsupervised
         with suppress(DeviceError):
             robot.stop()
         raise
@@ -88,15 +88,15 @@ def _wait_settled(
             raise DeviceTimeoutError(
                 "the robot did not arrive and settle in time",
                 where=context.step.id,
-                remedy="Look for vibration of the mount or a joint that drifts",
+                remedy="Check for a vibrating mount or a drifting joint",
             )
-        # The stop is seen up to three polls after it happened.
+        # The stop is noticed up to three polls after it happened.
         near_the_end = stopped_s is not None and now_s > stopped_s + criteria.window_s - 3 * _POLL_S
         context.wait(_POLL_AT_THE_END_S if near_the_end else _POLL_S)
 
 
 def _stand_still(context: StepContext, robot: RobotArm, criteria: SettleCriteria) -> None:
-    """Stop and wait for the stand-still: 'paused' may be shown only then."""
+    """Stop the arm and wait until it stands still, because only then may pages show 'paused'."""
     robot.stop()
     deadline_s = context.monotonic_s() + 10.0
     while not robot.settle(criteria).settled and context.monotonic_s() < deadline_s:

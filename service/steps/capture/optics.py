@@ -1,4 +1,4 @@
-"""Images held against those of the calibration: focus, zoom, aperture, lens and body must not have changed."""
+"""Compares images with those of the calibration: focus, zoom, aperture, lens and body must not have changed."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ def optics_departures(
     quiet: bool = False,
     against_itself: bool = False,
 ) -> tuple[OpticsDeparture, ...] | None:
-    """How the images of this step depart from those that the intrinsics were calibrated from, by viewpoint.
+    """How images of this step differ from those from which the intrinsics were calibrated, by viewpoint.
 
-    The calibration is the last one before this step that has images; a calibration is held against itself. None if
-    there is none: nothing can be said then. What departs is noted in the record and told to the operator.
+    The reference is the last calibration up to this step that has images; None without one. Departures are noted and
+    told to the operator.
 
     Args:
-        captures: images of this step to look at; None: all.
-        quiet: neither note nor tell.
-        against_itself: hold the images against one another: they are those that a later step calibrates from.
+        context: of the step.
+        captures: images of this step to compare; None: all.
+        quiet: do not note and tell departures.
+        against_itself: compare the images with one another, because a later step calibrates from them.
     """
     mine = context.evidence.captures(context.step.id) if captures is None else captures
     reference = mine if against_itself else _calibration_images(context)
@@ -49,7 +50,7 @@ def optics_departures(
 
 
 def departing_images(departures: Sequence[OpticsDeparture]) -> int:
-    """How many images depart."""
+    """The number of images that differ."""
     return len({departure.image for departure in departures})
 
 
@@ -71,6 +72,6 @@ def _optics(capture: View) -> Optics:
 
 
 def _stated(name: str, record: Mapping[str, Any]) -> bool:
-    """Whether the image says it: 0 is a position of the focus motor, and nothing anywhere else."""
+    """Whether the image states a value: 0 is a valid position of the focus motor, but means "unknown" elsewhere."""
     value = record.get(name)
     return value is not None if name == "focus_position" else bool(value)

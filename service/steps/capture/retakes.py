@@ -1,4 +1,4 @@
-"""Images that a gate refuses although they are there: on a retry only those are taken again, all others are kept."""
+"""Images that make a gate fail: a retry takes only those again and keeps the others."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from service.steps.capture.spoilt import CLEAN, spoilt_before
 from service.steps.context import StepContext
 
 DEPARTING = "images depart from the calibration"  # name of the note
-#: Gates that are about how images were taken, and what a person looks at before they are taken again.
+#: Measure of how images were taken → what a person should do before images are taken again.
 TAKEN_AGAIN: Mapping[str, str] = {
-    "viewpoints_captured": "look at why the arm could not take the viewpoints that are missing",
+    "viewpoints_captured": "find out why the arm could not reach the missing viewpoints",
     "settings_departures": "set the camera as the protocol has it",
-    "moved_during_exposure": "look for what shook the arm or its mount",
-    "images_spoilt": "clean the lens, and look whether something stands before it or in the light",
+    "moved_during_exposure": "find out what shook the arm or its mount",
+    "images_spoilt": "clean the lens, and check that nothing blocks its view or the light",
     "optics_departures": "set zoom, focus and lens as they were for the calibration, or redo the calibration",
 }
 
@@ -31,13 +31,15 @@ def to_take_again(context: StepContext) -> set[str]:
 
 
 def advise_retakes(context: StepContext, measures: Mapping[str, float], images: int) -> str:
-    """Where such a gate fails, note what a retry will do: the failed images only.
-
-    Returns the advice; "" where none is needed.
+    """If a gate on how images were taken fails, note which images a retry takes again.
 
     Args:
+        context: of the step.
         measures: of the capture.
         images: how many will be taken again.
+
+    Returns:
+        the advice; "" if none is needed.
     """
     verdicts = evaluate_gates(context.step, context.attempt, measures, context.run.skipped).verdicts
     failed = [verdict for verdict in verdicts if not verdict.passed and verdict.measure in TAKEN_AGAIN]
@@ -45,7 +47,7 @@ def advise_retakes(context: StepContext, measures: Mapping[str, float], images: 
         return ""
     short = "; ".join(describe(verdict) for verdict in failed)
     words = "; ".join(TAKEN_AGAIN[verdict.measure] for verdict in failed)
-    confirm = "No image has to be taken again: confirm to judge the step anew"
+    confirm = "No image has to be taken again: confirm to judge the step again"
     if images:
         confirm = f"Confirm to take {images} image{'s'[: images > 1]} again; all others are kept"
     advice = f"{short}. First {words}. {confirm}"

@@ -1,4 +1,4 @@
-"""Images that show nothing sharp: one is taken again at once; after several in a row a person cleans the lens."""
+"""Blurred and black images: a single one is taken again at once; after several in a row, the capture stops."""
 
 from __future__ import annotations
 
@@ -10,21 +10,24 @@ from service.core.errors import ImagesSpoiltError
 from service.core.run.state import JobState
 from service.steps.context import StepContext
 
-SPOILT = "spoilt images"  # name of the note that a retry of the step reads
-CLEAN: list[dict[str, Any]] = [{"action": "clean_lens"}]  # what a simulated technician does
-IN_A_ROW = 3  # spoilt images that are no accident any more
-_MOST_STOPS = 2  # of one step: after that a person has seen them, and the step's gates judge
-_FACTOR = 1.6  # of the edges in the sharpest image of the step
-_WIDEST_PX, _WIDEST_SHARE = 7.0, 0.002  # of an edge, and of the image's width, where there is nothing to compare
+SPOILT = "spoilt images"  # name of the note from which a retry takes the images to repeat
+CLEAN: list[dict[str, Any]] = [{"action": "clean_lens"}]  # for the simulated technician
+IN_A_ROW = 3  # so many spoilt images have a common cause
+_MOST_STOPS = 2  # of one step; after that, only the gates judge the images
+_FACTOR = 1.6  # of the edge width in the sharpest image of the step
+_WIDEST_PX, _WIDEST_SHARE = 7.0, 0.002  # the largest limit on an edge width, in px and as a share of the image width
 _MOST_NAMES = 6
 
 
 @dataclass(frozen=True, slots=True)
 class ImageSharpness:
-    """What a job found of one image, as far as sharpness goes.
+    """The sharpness of one image, as a job measured it.
 
     Attributes:
-        edge_px: width of its clearest edges; None where it has none.
+        viewpoint: its name.
+        sha256: of the photograph.
+        edge_px: width of its clearest edges; None if it has none.
+        black: whether it is black.
         width: of the image, px.
     """
 
@@ -36,7 +39,7 @@ class ImageSharpness:
 
     @classmethod
     def of(cls, job: JobState, width: int) -> ImageSharpness:
-        """From the answer of a finished job that looked at one image."""
+        """From the answer of a finished job on one image."""
         image = job.arguments["image"]
         edge_px = job.measures.get("image_edge_px")
         return cls(image["viewpoint"], image["sha256"], edge_px, bool(job.result.get("black")), width)
@@ -46,8 +49,8 @@ def why_spoilt(images: Sequence[ImageSharpness], others: Sequence[ImageSharpness
     """The reason of each spoilt image by its SHA-256.
 
     Args:
-        images: all of one step.
-        others: of earlier steps, which show the same things and tell how sharp images can be.
+        images: all images of one step.
+        others: images of earlier steps that show the same scene, to compare the sharpness with.
     """
     edges = [image.edge_px for image in (*images, *others) if image.edge_px is not None]
     sharpest_px = min(edges, default=0.0)
@@ -62,7 +65,7 @@ def why_spoilt(images: Sequence[ImageSharpness], others: Sequence[ImageSharpness
 
 
 def last_in_a_row(images: Sequence[ImageSharpness], reasons: Mapping[str, str]) -> list[ImageSharpness]:
-    """The spoilt images with which a sequence ends, in order of capture; none where they are too few to mean more."""
+    """The spoilt images at the end of a sequence, in the order of capture; empty if there are fewer than IN_A_ROW."""
     row: list[ImageSharpness] = []
     for image in reversed(images):
         if image.sha256 not in reasons:
@@ -105,16 +108,16 @@ def may_stop(context: StepContext) -> bool:
 
 
 def stop_for_lens(context: StepContext, row: Sequence[ImageSharpness]) -> None:
-    """Note what a person is to do and which images are then taken again.
+    """Stop the capture: note what a person should do, and which images are taken again afterwards.
 
     Raises:
-        ImagesSpoiltError: always, with the same words.
+        ImagesSpoiltError: always, with the same advice.
     """
     names = [image.viewpoint for image in row]
     shown = ", ".join(names) if len(names) <= _MOST_NAMES else f"{names[0]} … {names[-1]}"
     dark = all(image.black for image in row)
     what = f"the last {len(row)} images are {'black' if dark else 'blurred'}: {shown}"
-    first = "Look whether the lens cap is off and the light is on" if dark else "Clean the lens"
+    first = "Check that the lens cap is off and the light is on" if dark else "Clean the lens"
     advice = f"{first}, then confirm: these {len(row)} images are taken again, all others are kept"
     context.note(SPOILT, advice=advice, hands=[] if dark else CLEAN, viewpoints=names, attempt=context.attempt)
     raise ImagesSpoiltError(what, where=f"step {context.step.id}", remedy=advice)

@@ -1,4 +1,4 @@
-"""Step kind `manual_capture`: a person holds the camera; after each image the software says where to go next."""
+"""Step kind `manual_capture`: a person holds the camera; after each image, the software says where to go next."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ _KINDS = {"dataset": "image", "control": "control_image", "calibration": "board_
 
 
 class Ring(Record):
-    """Places of a hemisphere at one tilt from the vertical, evenly spread over an azimuth range.
+    """Camera places on a hemisphere at one tilt from the vertical, evenly spread over an azimuth range.
 
-    Azimuth 0 is the person's side at the first image, positive to the right; a range of 360° is a whole ring.
+    Azimuth 0 is the person's side at the first image, positive to the right. A range of 360° is a whole ring.
     """
 
     tilt_deg: Annotated[float, Field(ge=0, le=60)]  # from the vertical
@@ -43,10 +43,12 @@ class Ring(Record):
     azimuth_to_deg: float = 180.0  # end of the range
     count: Annotated[int, Field(ge=1, le=60)]  # places on the ring
     distance_m: Annotated[float, Field(ge=0.2, le=2)]  # from the middle of the scene
-    aim_spread_m: Annotated[float, Field(ge=0, le=0.2)] = 0.0  # to all sides of the middle, for images of the board
+    aim_spread_m: Annotated[float, Field(ge=0, le=0.2)] = (
+        0.0  # spread of the aim point around the middle, for images of the board
+    )
 
     def azimuths_deg(self) -> list[float]:
-        """Of its places."""
+        """The azimuths of its places."""
         span = self.azimuth_to_deg - self.azimuth_from_deg
         whole = span >= 360.0
         if self.count == 1:
@@ -57,32 +59,34 @@ class Ring(Record):
 
 
 class Params(Record):
-    """What the images are for, and from where they should be taken."""
+    """What the images are for, and where they should be taken from."""
 
     purpose: Literal["dataset", "control", "calibration"]  # what the images are for
-    hemisphere: Annotated[tuple[Ring, ...], Field(min_length=1)]  # from where images are to be taken
-    prefix: str = "h_"  # of the names of the views
-    min_images: Annotated[int, Field(ge=3)] = 12  # that must be usable
-    max_images: Annotated[int, Field(ge=3)] = 200  # those that cannot be used included
-    calibration: str | None = None  # step with the intrinsics; none for images of the board
-    spheres_of: tuple[str, ...] = ()  # steps that may know the spheres, the best first: ct_import, layout_check
-    sensor_width_mm: float = 35.7  # for images of the board, with the focal length of the file
+    hemisphere: Annotated[tuple[Ring, ...], Field(min_length=1)]  # where images are to be taken from
+    prefix: str = "h_"  # of the views' names
+    min_images: Annotated[int, Field(ge=3)] = 12  # usable images that are needed at least
+    max_images: Annotated[int, Field(ge=3)] = 200  # including unusable ones
+    calibration: str | None = None  # step with the intrinsics; not for images of the board
+    spheres_of: tuple[
+        str, ...
+    ] = ()  # steps that may have located the spheres, the best first: ct_import, layout_check
+    sensor_width_mm: float = 35.7  # for images of the board, together with the focal length in the file
     coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
-    pose_sigma_mm: Annotated[float, Field(gt=0)] = 0.05  # what structure from motion will leave of a camera's pose
-    pose_sigma_mrad: Annotated[float, Field(gt=0)] = 0.1  # of the camera's rotation
-    wait_s: Annotated[float, Field(gt=0)] = 600.0  # for the next image, before the step asks what is wrong
+    pose_sigma_mm: Annotated[float, Field(gt=0)] = 0.05  # expected position error of structure from motion
+    pose_sigma_mrad: Annotated[float, Field(gt=0)] = 0.1  # expected rotation error of structure from motion
+    wait_s: Annotated[float, Field(gt=0)] = 600.0  # longest wait for the next image before the step stops
 
 
 def failure_words(job: JobState) -> str:
-    """For a person: which work on the images has failed, what that means and what to do."""
+    """Explains a failed job on the images: what it means, and what to do."""
     why = job.message.rstrip(".")
     if job.kind == "coverage_points":
         return (
-            f"what of the specimen the images show cannot be told: {why}. Images are judged without it; a limit on "
-            "it is not met: end with what there is (finish), and the step lists the ways on"
+            f"the coverage of the specimen cannot be computed: {why}. Images are judged without it. A gate on the "
+            "coverage cannot pass: finish with the images so far, and the step offers what can be done"
         )
     return (
-        f"{job.arguments['image']['viewpoint']} could not be looked at: {why}. It stays in the evidence and is not "
+        f"{job.arguments['image']['viewpoint']} could not be analysed: {why}. It stays in the evidence but is not "
         "used: take it again from the same place"
     )
 
@@ -99,7 +103,7 @@ class Measures(PredictedMeasures):
 
 
 class Result(Record):
-    """Which images count."""
+    """Which images are used."""
 
     purpose: str
     used: tuple[str, ...]
@@ -107,7 +111,7 @@ class Result(Record):
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Take images until the step's limits are met, or somebody says that it is enough."""
+    """Take images until the step's gates pass or somebody ends the capture."""
     guide = _Guide(context, params, _shared(context, params))
     held = HeldCamera(context, params.prefix, _KINDS[params.purpose])
     guide.begin()
@@ -122,7 +126,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
             raise DeviceTimeoutError(
                 f"no image came within {params.wait_s:.0f} s",
                 where=f"step {context.step.id}",
-                remedy="Check camera and cable; what was taken is safe. Confirm to go on",
+                remedy="Check camera and cable; the images so far are safe. Confirm to continue",
             )
     return guide.outcome()
 
@@ -130,37 +134,46 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 def _shared(context: StepContext, params: Params) -> _CommonArguments:
     """The arguments that all jobs of the step have in common."""
     board = params.purpose == "calibration"
-    places = [
+    height_cm, what = 100 * params.hemisphere[0].distance_m, "calibration board" if board else "specimen"
+    shared: dict[str, Any] = {
+        "places": _places(params),
+        "within_deg": 9.0 if board else 14.0,
+        "first_words": f"hold the camera {height_cm:.0f} cm above the middle of the {what}, "
+        "looking straight down, and release the shutter",
+        "limits": params.coverage.model_dump(),
+    }
+    return _of_board(context, params, shared) if board else _of_specimen(context, params, shared)
+
+
+def _places(params: Params) -> list[dict[str, Any]]:
+    """The places of the hemisphere, as job arguments."""
+    return [
         {
             "name": f"{ring.tilt_deg:02.0f}/{k + 1}",
             "tilt_deg": ring.tilt_deg,
             "azimuth_deg": azimuth,
             "distance_m": ring.distance_m,
-            "walk_round": not board,
+            "walk_round": params.purpose != "calibration",
             "aim_m": [ring.aim_spread_m * float(np.cos(2.4 * k)), ring.aim_spread_m * float(np.sin(2.4 * k)), 0.0],
         }
         for ring in params.hemisphere
         for k, azimuth in enumerate(ring.azimuths_deg())
     ]
-    first = params.hemisphere[0]
-    what = "calibration board" if board else "specimen"
-    shared: dict[str, Any] = {
-        "places": places,
-        "within_deg": 9.0 if board else 14.0,
-        "first_words": f"hold the camera {100 * first.distance_m:.0f} cm above the middle of the {what}, "
-        "looking straight down, and release the shutter",
-        "limits": params.coverage.model_dump(),
-    }
-    if board:
-        described = context.protocol.board
-        if described is None:
-            raise ConfigurationError(
-                "the protocol describes no calibration board",
-                where=f"step {context.step.id}",
-                remedy="Add a section `board`",
-            )
-        size = {"columns": described.columns, "rows": described.rows, "square_m": metres(described.square_mm)}
-        return _CommonArguments({**shared, **size, "sensor_width_mm": params.sensor_width_mm}, {})
+
+
+def _of_board(context: StepContext, params: Params, shared: Mapping[str, Any]) -> _CommonArguments:
+    board = context.protocol.board
+    if board is None:
+        raise ConfigurationError(
+            "the protocol describes no calibration board",
+            where=f"step {context.step.id}",
+            remedy="Add a section `board`",
+        )
+    size = {"columns": board.columns, "rows": board.rows, "square_m": metres(board.square_mm)}
+    return _CommonArguments({**shared, **size, "sensor_width_mm": params.sensor_width_mm}, {})
+
+
+def _of_specimen(context: StepContext, params: Params, shared: Mapping[str, Any]) -> _CommonArguments:
     if params.calibration is None:
         raise ConfigurationError(
             "images of the specimen need the calibrated camera",
@@ -168,8 +181,6 @@ def _shared(context: StepContext, params: Params) -> _CommonArguments:
             remedy="Name the calibration step in `calibration`",
         )
     error, covers = (next((g for g in context.step.gates if g.measure == m), None) for m in (ERROR, COVERAGE))
-    if context.protocol.spheres.colour is not None:
-        shared["colour"] = context.protocol.spheres.colour
     calibration = earlier_answer(context, params.calibration, calibrate.KIND)
     spheres, rough, spheres_from = _spheres(context, params)
     fields = {
@@ -183,13 +194,15 @@ def _shared(context: StepContext, params: Params) -> _CommonArguments:
         "limit_m": metres(error.max if error and error.max is not None else 0.35),
         "min_coverage": covers.min if covers and covers.min is not None else 0.0,
     }
+    if context.protocol.spheres.colour is not None:
+        fields["colour"] = context.protocol.spheres.colour
     return _CommonArguments(fields, {"camera": calibration.reference("camera"), "spheres_m": spheres_from})
 
 
 def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], bool, Reference | None]:
-    """The spheres of the first of the steps named that has them, whether they are rough, and the reference to them.
+    """The spheres of the first step in `spheres_of` that has them, whether they are rough, and the reference to them.
 
-    Those that photographs alone tell of are rough.
+    Spheres that were located in photographs alone are rough.
     """
     for name in params.spheres_of:
         state = context.run.steps.get(name)
@@ -198,7 +211,7 @@ def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], b
             rough = context.protocol.step(name).kind == "layout_check"
             return found.answer.spheres_m, rough, found.reference("spheres_m")
     raise ConfigurationError(
-        f"none of {', '.join(params.spheres_of) or 'no step'} knows where the spheres are",
+        f"the spheres have not been located by {' or '.join(params.spheres_of) or 'any step'}",
         where=f"step {context.step.id}, spheres_of",
         remedy="Name the CT import, or the layout check from photographs",
     )
@@ -206,15 +219,15 @@ def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], b
 
 @dataclass(frozen=True, slots=True)
 class _CommonArguments:
-    """Fields of the arguments of all jobs of the step, and what of them is recorded as a reference."""
+    """The arguments that all jobs of the step share, and the references that are recorded in their place."""
 
     fields: Mapping[str, Any]
-    taken: Mapping[str, Reference | None]
+    references: Mapping[str, Reference | None]
 
 
 @dataclass
 class _Guide:
-    """Has the images looked at, one after the other, and tells the person what came of it."""
+    """Enqueues a job for one image after the other, and tells the person the result."""
 
     context: StepContext
     params: Params
@@ -223,23 +236,23 @@ class _Guide:
 
     @property
     def kind(self) -> str:
-        """Of the jobs."""
+        """Kind of the jobs."""
         return (hand_board if self.params.purpose == "calibration" else hand_view).KIND.name
 
     def begin(self) -> None:
-        """Have the specimen's surface prepared where a CT shows it, and say where to begin."""
+        """Enqueue the specimen's surface if there is a CT, and say where to begin."""
         mesh = self._mesh()
         if mesh is not None:
             kept = {k: self.shared.fields[k] for k in ("spheres_m", "radius_m", "limits")}
             arguments = coverage_points.Arguments.model_validate({"mesh": mesh, **kept})
-            references = {"spheres_m": self.shared.taken["spheres_m"]}
+            references = {"spheres_m": self.shared.references["spheres_m"]}
             request = JobRequest.of(coverage_points.KIND, arguments, references)
             self.context.evidence.enqueue(request, "specimen")
         done = self._answers()
         self._say(str(done[-1].result["words"]) if done else str(self.shared.fields["first_words"]))
 
     def look(self) -> None:
-        """Tell what is known of the last image; have the next one looked at. Returns at once."""
+        """Tell the result of the last image, and enqueue the job for the next one. Returns at once."""
         jobs = {str(job.arguments["image"]["sha256"]): job for job in self._jobs()}
         for view in self._views():
             job = jobs.get(view.artefacts[0].sha256)
@@ -257,15 +270,15 @@ class _Guide:
                 self.context.tell(failure_words(job))
 
     def __post_init__(self) -> None:
-        # What ended before a restart was told then.
+        # The results of jobs that ended before a restart were told then.
         self._reported = {job.job for job in self._jobs() if job.status != "enqueued"}
 
     def images_used(self) -> int:
-        """So far."""
+        """Number of usable images so far."""
         return int(self._measures().get("images_used", 0))
 
     def enough(self) -> bool:
-        """Whether every image was looked at and the step's limits are met, or there are too many images."""
+        """Whether every image was analysed and the step's gates pass, or there are too many images."""
         views = self._views()
         if len(self._answers()) + sum(job.status == "failed" for job in self._jobs()) < len(views):
             return False
@@ -277,7 +290,7 @@ class _Guide:
         return evaluate_gates(self.context.step, self.context.attempt, measures, self.context.run.skipped).passed
 
     def outcome(self) -> StepOutcome:
-        """The step's numbers."""
+        """The outcome of the step."""
         found = held_views(self.context, self.context.step.id)
         failed = {j.arguments["image"]["sha256"]: j.message for j in self._jobs() if j.status == "failed"}
         used: list[str] = []
@@ -288,7 +301,7 @@ class _Guide:
             if look is not None and look.used:
                 used.append(view.viewpoint)
             else:
-                not_used[view.viewpoint] = failed.get(sha256, "not looked at") if look is None else look.why
+                not_used[view.viewpoint] = failed.get(sha256, "not analysed") if look is None else look.why
         result = Result(purpose=self.params.purpose, used=tuple(used), not_used=not_used)
         return StepOutcome(Measures.read(self._measures()), (), result.model_dump(mode="json"))
 
@@ -341,7 +354,7 @@ class _Guide:
             settings = (
                 f"the camera was set to f/{camera['aperture_f']:g}, {camera['exposure_s']:.3g} s, "
                 f"ISO {camera['iso']}; "
-                f"wanted are f/{wanted.aperture_f:g}, {wanted.exposure_s:.3g} s, ISO {wanted.iso}"
+                f"required are f/{wanted.aperture_f:g}, {wanted.exposure_s:.3g} s, ISO {wanted.iso}"
             )
         image = {
             "viewpoint": view.viewpoint,
@@ -356,7 +369,7 @@ class _Guide:
         each = Each((key_stem(state, step, self.kind),), state.seq, "artefacts/0/sha256")
         looks = each if resolve(each.record(), jobs_of(state)) == earlier else None
         arguments = {**self.shared.fields, "image": image, "earlier": earlier, "surface": self._surface()}
-        references = {**self.shared.taken, "earlier": looks}
+        references = {**self.shared.references, "earlier": looks}
         request = (
             JobRequest.of(hand_board.KIND, hand_board.Arguments.model_validate(arguments), references)
             if self.params.purpose == "calibration"
@@ -374,7 +387,7 @@ class _Guide:
         parts = [f"{m['images_used']:.0f} used", f"hemisphere {100 * m['hemisphere_coverage']:.0f} %"]
         if "spheres_seen" in m:
             parts.insert(0, seen_words(m["spheres_seen"], m["spheres_expected"]))
-        if "spheres_sigma_mm" in m:  # nobody has measured them: the images tell where they are
+        if "spheres_sigma_mm" in m:  # they have not been measured: the images locate them
             parts.append(f"spheres known to {m['spheres_sigma_mm']:.2f} mm")
         if ERROR in m:
             parts.append(f"predicted error {m[ERROR]:.3f} mm")
@@ -386,7 +399,7 @@ class _Guide:
         self._say_next(str(result["words"]))
 
     def _say_next(self, words: str) -> None:
-        """Unless that is enough, or another image waits to be looked at, as of a card: its words will count."""
+        """Say where to go, unless the images suffice or another image (as from a memory card) waits for its job."""
         ended = sum(job.status != "enqueued" for job in self._jobs())
         if ended == len(self._views()) and not self.enough():
             self._say(words)

@@ -150,7 +150,7 @@ def _state(
 ) -> tuple[ViewState, str]:
     if capture is not None:
         departs = [key for key, passed in capture.payload.verdicts.items() if not passed]
-        return ("departs", f"not as wanted: {', '.join(departs)}") if departs else ("done", "")
+        return ("departs", f"not as required: {', '.join(departs)}") if departs else ("done", "")
     if name in refused:
         return "left_out", refused[name]
     if name in state.skipped_viewpoints:

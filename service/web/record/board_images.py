@@ -55,9 +55,9 @@ def board_use(state: StepState, view: View) -> BoardUse:
     departs = [key for key, passed in view.verdicts.items() if not passed]
     reason = why.get(name) or (_plain(str(look.result.get("reason", ""))) if unseen and look is not None else "")
     if not reason and departs:
-        reason = f"{' and '.join(departs)} not as wanted"
+        reason = f"{' and '.join(departs)} not as required"
     if not reason and look is not None and look.status == "failed":
-        reason = f"it could not be examined: {look.message}"
+        reason = f"it could not be analysed: {look.message}"
     if reason or unseen:
         return BoardUse(False, "Not used", reason or "no board was found in it")
     if solved:

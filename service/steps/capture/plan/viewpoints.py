@@ -1,4 +1,4 @@
-"""Where the camera should stand: viewpoints on arcs around the scene centre, from the protocol's parameters."""
+"""Viewpoints on arcs around the centre of the scene, from the protocol's parameters."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Arc(Record):
     """
 
     tilt_deg: float  # from the vertical, 0 to 80
-    azimuth_from_deg: float  # from the side of the robot
+    azimuth_from_deg: float  # start of the range, from the robot's side
     azimuth_to_deg: float  # end of the range
     count: int  # viewpoints on the arc
-    distance_m: float  # from the point that is aimed at, 0.2 to 2
+    distance_m: float  # to the point aimed at, 0.2 to 2
 
     @model_validator(mode="after")
     def _plausible(self) -> Self:
@@ -38,18 +38,18 @@ class Arc(Record):
 
 
 class ViewpointSet(Record):
-    """Arcs seen from one station, and how the camera is turned and aimed."""
+    """Arcs at one station, and how the camera is rolled and aimed."""
 
     station: str  # name in the rig file
-    prefix: str  # of the names of the viewpoints
+    prefix: str  # of the viewpoints' names
     arcs: tuple[Arc, ...]  # where the viewpoints lie
-    rolls_deg: tuple[float, ...] = (0.0,)  # cycled over the viewpoints
+    rolls_deg: tuple[float, ...] = (0.0,)  # rolls of the camera, cycled over the viewpoints
     aim_spread_m: float = 0.0  # spread of the aim point around the scene centre (for board images)
     aim_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the aim point, in the base frame
 
     @property
     def count(self) -> int:
-        """How many viewpoints the set has."""
+        """Number of viewpoints of the set."""
         return sum(arc.count for arc in self.arcs)
 
 
@@ -60,19 +60,19 @@ class Viewpoint:
     name: str
     station: str
     T_base_camera: Transform
-    joints_rad: Array | None = None  # (6,) as planned; None: nearest to where the arm stands
+    joints_rad: Array | None = None  # (6,) as planned; None: the solution nearest to the present posture
 
 
 _UP = np.array([0.0, 0.0, 1.0])
 _DENSER_TILTS_DEG = (5.0, 15.0, 25.0, 35.0, 42.0)
 _DENSER_AZIMUTHS_DEG = (-80.0, -60.0, -40.0, -20.0, 0.0, 20.0, 40.0, 60.0, 80.0)
-_APART_M = 0.03  # a view nearer to a planned one adds little
+_APART_M = 0.03  # views nearer than this to a planned one add little
 
 
 def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple[Viewpoint, ...]:
     """All viewpoints of a set in the base frame of its station, in the order of capture.
 
-    Raises NoViewpointError when the set is empty.
+    Raises NoViewpointError if the set is empty.
     """
     centre = np.array(layout.scene_centre_m) + np.array(viewpoint_set.aim_offset_m)
     approach = np.array(layout.approach)
@@ -89,7 +89,7 @@ def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple
             eye = centre + arc.distance_m * (np.cos(tilt) * _UP + np.sin(tilt) * horizontal)
             aim = centre + viewpoint_set.aim_spread_m * _spread(i, approach, side)
             roll = np.deg2rad(viewpoint_set.rolls_deg[i % len(viewpoint_set.rolls_deg)])
-            # The image's top points away from the base: the wrist then keeps its natural posture.
+            # The top of the image points away from the base, which keeps the wrist in its natural posture.
             T_base_camera = look_at(eye, aim, -approach) @ _rotation_about_axis(roll)
             viewpoints.append(Viewpoint(f"{viewpoint_set.prefix}{i + 1:03d}", layout.name, T_base_camera))
     if not viewpoints:
@@ -100,10 +100,10 @@ def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple
 
 
 def denser_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple[Viewpoint, ...]:
-    """Further viewpoints of the same kind that a step may suggest: a grid of tilts and azimuths at its distance.
+    """Further viewpoints that a step may suggest: a grid of tilts and azimuths at the same distance.
 
-    A viewpoint is named by its place, `v2_t25-40` for a tilt of 25° and an azimuth of −40°, so that the name says
-    the same in every attempt.
+    A viewpoint is named after its place, such as `v2_t25-40` for a tilt of 25° and an azimuth of −40°, so that names
+    mean the same in every attempt.
     """
     distance_m = float(np.median([arc.distance_m for arc in viewpoint_set.arcs]))
     planned = [v.T_base_camera[:3, 3] for v in plan_viewpoints(viewpoint_set, layout)]
