@@ -1,4 +1,4 @@
-"""What crosses between steps, worker, audit and web: one declaration per job kind, and the list of all kinds."""
+"""Kinds of jobs, declared once for steps, worker, audit and web; and the list of all kinds."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ GROUP = "orthocapture.jobs"  # entry points of plug-ins; each names a JobKind
 
 @cache
 def job_kinds() -> dict[str, JobKind[Any, Any]]:
-    """All job kinds by name, as they follow one another in a run: those below this package, and those of plug-ins.
+    """All job kinds by name, in the order in which a run uses them: those of this package, and those of plug-ins.
 
     Raises:
-        ConfigurationError: two declare the same name, or an entry point names something else than a JobKind.
+        ConfigurationError: two declare the same name, or an entry point names something that is not a JobKind.
     """
     kinds: dict[str, JobKind[Any, Any]] = declared_kinds(__name__, GROUP, JobKind)
     return dict(sorted(kinds.items(), key=lambda item: (item[1].order, item[0])))

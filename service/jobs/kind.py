@@ -1,4 +1,4 @@
-"""JobKind: the one declaration of a kind of computation; and the base of the records that it takes and gives."""
+"""JobKind, the declaration of a kind of computation, and the base class of its arguments and answers."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from service.core.jobs.references import Jobs, resolve
 
 
 class JobRecord(BaseModel):
-    """Base of arguments and answers: frozen, and what an older or newer version had beside the fields is kept.
+    """Base of arguments and answers: frozen; fields of older or newer versions are kept.
 
-    Only fields that were set are written, so that a recorded answer and the same answer computed again are equal.
+    Only fields that were set are written, so that a recorded answer and its recomputation are equal.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
     def plain(self) -> dict[str, Any]:
-        """As it is written into an event."""
+        """The record as it is written into an event."""
         return self.model_dump(mode="json", exclude_unset=True)
 
     def set_fields(self) -> dict[str, Any]:
-        """The fields that were set, as they are: to be added to another record."""
+        """The fields that were set, unconverted, for use in another record."""
         return {name: getattr(self, name) for name in self.model_fields_set}
 
 
 class NoAnswer(JobRecord):
-    """Of a job that gives measures and files alone."""
+    """The answer of a job that yields only measures and files."""
 
 
 _NO_JOBS: Jobs = {}
@@ -44,16 +44,16 @@ class JobKind(Generic[A, R]):
     """One kind of computation, declared once.
 
     Attributes:
-        name: in the record.
-        arguments: what a job is given, with references resolved.
-        answer: the plain data that it gives beside measures and files.
+        name: of the kind, as it is recorded.
+        arguments: of a job, with references resolved.
+        answer: plain data that it yields in addition to measures and files.
         compute: `module:function`, imported at the first such job. The function takes a JobContext[arguments] and
-            gives a JobAnswer[answer] (service/worker/job.py).
-        words: what people read.
-        version: of the arguments' form. 1 holds copies of earlier results, 2 references to them; both are read.
-        order: its place among the kinds in lists and texts, as they follow one another in a run.
-        replayed: whether a replay computes it unless it is asked for others. What only helps during a capture is not.
-        aside: whether it is left out of the provenance drawing, because it leads to no result.
+            returns a JobAnswer (service/worker/job.py).
+        words: its name for people.
+        version: of the arguments. 1 holds copies of earlier results, 2 references to them; both are read.
+        order: position among the kinds in lists and texts, as a run uses them.
+        replayed: whether a replay recomputes it by default; not for kinds that only help during a capture.
+        aside: whether the provenance drawing omits it, because no result depends on it.
     """
 
     name: str

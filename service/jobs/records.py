@@ -1,4 +1,4 @@
-"""Records that several kinds of jobs share: photographs with their poses, cameras, spheres, the arm's correction."""
+"""Records that several kinds of jobs share: photographs with poses, cameras, spheres, corrections of an arm."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ Hash = str  # SHA-256 of an artefact
 
 
 class Camera(JobRecord):
-    """Intrinsics as CameraModel writes them: pixels, OpenCV's distortion; k3 … k6 only where they are not zero.
+    """Intrinsics as CameraModel writes them: in pixels, OpenCV's distortion model; k3 … k6 only if not zero.
 
-    Not CameraModel itself, which computes and does not know which of its fields were set: a record is written out
-    again with exactly the fields that were read, so that the JSON of an event, and with it its hash, stays the same.
+    Not CameraModel itself, which does not know which of its fields were set: a record is written again with exactly
+    the fields that were read, so that the JSON of an event, and with it its hash, stays the same.
     """
 
     width: int
@@ -39,8 +39,8 @@ class ImagesCamera(JobRecord):
 
     Attributes:
         camera: at the size of the photographs, or, with `full_camera`, at that of the reduced images.
-        reduced_to: width and height to which the photographs are reduced first; None: they are used as they are.
-        full_camera: at the size of the photographs, in arguments of version 1 for reduced images.
+        reduced_to: width and height to which the photographs are reduced first; None: used at full size.
+        full_camera: camera at the size of the photographs, in arguments of version 1 for reduced images.
     """
 
     camera: Camera
@@ -54,22 +54,22 @@ class ImagesCamera(JobRecord):
 
 
 class ImageFile(JobRecord):
-    """A photograph by its viewpoint and its file."""
+    """A photograph: its viewpoint and its file."""
 
     viewpoint: str
     sha256: Hash
 
 
 class Photograph(ImageFile):
-    """A photograph and where the camera was.
+    """A photograph and the pose of its camera.
 
     Attributes:
         name: of the image in a data set.
-        step: that took it.
-        station: where the robot stood; "" without one.
-        T_base_flange: as the arm reported it; None where a person held the camera.
-        joints_rad: with it.
-        T_scene_camera: of a hand-held camera, by the spheres that the image shows.
+        step: in which it was taken.
+        station: of the robot; "" without one.
+        T_base_flange: as the arm reported it; None if a person held the camera.
+        joints_rad: reported with it.
+        T_scene_camera: of a hand-held camera, from the spheres in the image.
     """
 
     name: str = ""
@@ -81,20 +81,20 @@ class Photograph(ImageFile):
 
 
 class ArmCorrection(JobRecord):
-    """What the hand-eye calibration found of an arm's errors, with the T_flange_camera that goes with it."""
+    """The errors of an arm as the hand-eye calibration estimated them, with the corresponding T_flange_camera."""
 
     T_flange_camera: Matrix
     arm: str
-    stations: tuple[str, ...] | None = None  # where that arm stood; in arguments of version 1
+    stations: tuple[str, ...] | None = None  # stations of that arm, in arguments of version 1
 
 
 class Mounting(JobRecord):
-    """How the camera sat on the arm.
+    """How the camera was mounted on the arm.
 
     Attributes:
-        T_flange_camera: with poses as the arm reports them; None where a person held the camera.
-        arm_correction: of the reported poses; None where they are taken as they are.
-        arm_stations: stations at which the corrected arm stood.
+        T_flange_camera: for uncorrected poses of the arm; None if a person held the camera.
+        arm_correction: of the reported poses; None if they are used uncorrected.
+        arm_stations: stations of the corrected arm.
     """
 
     T_flange_camera: Matrix | None = None
@@ -128,10 +128,10 @@ class MeasuredSphere(JobRecord):
 
 
 class SphereDetails(JobRecord):
-    """All that is known of the spheres of a mesh."""
+    """Details on the spheres of a mesh."""
 
     spheres: tuple[MeasuredSphere, ...] = ()
-    layout: dict[str, Any] | None = None  # near-symmetries (compute/registration/layout.py)
+    layout: dict[str, Any] | None = None  # near-symmetries (service/compute/layout/ambiguity.py)
 
 
 class SpheresFound(JobRecord):
@@ -142,7 +142,7 @@ class SpheresFound(JobRecord):
 
 
 class ParameterCovariance(JobRecord):
-    """A covariance with the names of its rows."""
+    """A covariance matrix with the parameters of its rows."""
 
     parameters: tuple[str, ...]
     matrix: Matrix

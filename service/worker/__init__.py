@@ -1,1 +1,1 @@
-"""The registration worker: claims jobs, computes, appends results. One file a stage of the computation."""
+"""The registration worker: claims jobs, computes, appends results. One folder for each stage of the computation."""

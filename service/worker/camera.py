@@ -1,4 +1,4 @@
-"""The camera of a job's record as a model that computes."""
+"""Camera models from the records of jobs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def camera_used(arguments: ImagesCamera) -> CameraModel:
 
 
 def camera_reduced(arguments: ImagesCamera) -> CameraModel | None:
-    """The camera at the size of the photographs, where the job uses reduced copies of them; else None."""
+    """The camera at the size of the photographs if the job uses reduced copies of them; else None."""
     if arguments.reduced_to is not None:
         return camera_of(arguments.camera)
     return None if arguments.full_camera is None else camera_of(arguments.full_camera)

@@ -1,4 +1,4 @@
-"""What follows from a finished job: the jobs that it made possible, and a signature where the run has ended."""
+"""What follows a finished job: the jobs that it makes possible, and a signature if the run has ended."""
 
 from __future__ import annotations
 
@@ -24,29 +24,31 @@ _log = logging.getLogger(__name__)
 
 
 class FollowedRuns:
-    """The runs that a worker has jobs of, each read as far as it went when the last of them ended."""
+    """The records of the runs whose jobs a worker computes, read up to the end of the last job."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._logs: dict[str, RunFollower | None] = {}
 
     def resolved(self, job: Job) -> Mapping[str, Any]:
-        """A job's arguments with what it takes from earlier jobs in the place of the references to it.
+        """A job's arguments with the references to earlier answers resolved.
 
         Raises:
-            IntegrityError: there is no such answer, or none that still counts.
+            IntegrityError: a reference has no answer that still counts.
         """
         if next(references_in(job.arguments), None) is None:
             return job.arguments
         log = self._log_of(job.run_id)
         if log is None:
-            raise IntegrityError("what the job refers to cannot be read without the run's protocol", where=job.job_id)
+            raise IntegrityError(
+                "the references of the job cannot be resolved without the run's protocol", where=job.job_id
+            )
         return resolve(job.arguments, jobs_of(log.refresh()))
 
     def finish(self, job: Job, answer: JobAnswer, duration_s: float) -> None:
-        """Record an answer, and in the same transaction enqueue what it makes possible. Raises LeaseLostError.
+        """Record an answer and, in one transaction, enqueue the jobs that it makes possible. Raises LeaseLostError.
 
-        An answer that arrives when the run has ended is signed at once: nobody else would.
+        If the run has ended, the answer is signed at once, because no runner will do it.
         """
         log = self._log_of(job.run_id)
         late: float | None = None
@@ -67,7 +69,7 @@ class FollowedRuns:
         self.seal(job.run_id)
 
     def seal(self, run_id: str) -> None:
-        """Sign the end of a run that is over and that nobody drives. A key that cannot be used is told, no more."""
+        """Sign the end of a run that is over and has no runner. An unusable key is only logged."""
         log = self._log_of(run_id)
         if log is None or not log.refresh().terminal or self._store.driven(run_id):
             return
@@ -77,12 +79,12 @@ class FollowedRuns:
             _log.warning("the record of %s could not be signed: %s", run_id, error)
 
     def _log_of(self, run_id: str) -> RunFollower | None:
-        """None for a run whose protocol this version cannot read: its jobs are done, and nothing follows."""
+        """None for a run whose protocol this version cannot read: its jobs are computed, but none are added."""
         if run_id not in self._logs:
             try:
                 protocol = recorded_protocol(self._store, recorded_root(self._store, run_id))
                 self._logs = {run_id: RunFollower(self._store, run_id, protocol)}
             except OrthocaptureError as error:
-                _log.warning("what follows from the jobs of %s cannot be told: %s", run_id, error)
+                _log.warning("no jobs can follow those of %s: %s", run_id, error)
                 self._logs = {run_id: None}
         return self._logs[run_id]

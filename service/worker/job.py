@@ -1,4 +1,4 @@
-"""What a job handler is given and gives back."""
+"""The interface of the functions that compute jobs: their context and their answer."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ A = TypeVar("A")
 
 
 class ArtefactStore(Protocol):
-    """What a job needs of the store; a replay gives it one that reads the evidence and writes elsewhere."""
+    """The part of the store that a job needs; in a replay it reads the evidence but writes elsewhere."""
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """The read-only file of an artefact. Raises IntegrityError when missing or, with `verify`, altered."""
+        """The read-only file of an artefact. Raises IntegrityError if it is missing or, with `verify`, altered."""
         ...
 
     def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
-        """Keep bytes; the reference to them."""
+        """Store bytes; returns the reference to them."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class JobAnswer:
-    """Numbers, files (already in the store) and the kind's answer."""
+    """Measures, files (already in the store) and the kind's answer."""
 
     measures: Mapping[str, float]
     artefacts: tuple[ArtefactRef, ...] = ()
@@ -43,7 +43,7 @@ class JobAnswer:
 
 @dataclass(frozen=True, slots=True)
 class JobContext(Generic[A]):
-    """What a handler may touch: its arguments, verified inputs, a scratch folder and the store for its outputs."""
+    """What a job may use: its arguments, verified inputs, a scratch folder and the store for its outputs."""
 
     arguments: A
     store: ArtefactStore
@@ -59,12 +59,12 @@ class JobContext(Generic[A]):
         return json.loads(self.input(sha256).read_bytes())
 
     def keep_json(self, data: Any, *, kind: str, name: str) -> ArtefactRef:
-        """Write a JSON artefact."""
+        """Store a JSON artefact."""
         text = json.dumps(data, indent=1, sort_keys=True).encode()
         return self.store.put_bytes(text, kind=kind, media_type="application/json", original_name=name)
 
     def keep_bytes(self, data: bytes, *, kind: str, media_type: str, name: str) -> ArtefactRef:
-        """Write any artefact."""
+        """Store an artefact."""
         return self.store.put_bytes(data, kind=kind, media_type=media_type, original_name=name)
 
 
@@ -73,9 +73,9 @@ Handler = Callable[[RecordedContext], JobAnswer]
 
 
 def handler_of(kind: JobKind[Any, Any]) -> Handler:
-    """The function that computes a kind from arguments without references.
+    """The function that computes a kind, from arguments with references resolved.
 
-    It is imported at the first such job: a worker is ready at once.
+    Its module is imported at the first such job, so that a worker starts at once.
     """
 
     def handle(context: RecordedContext) -> JobAnswer:

@@ -1,4 +1,4 @@
-"""Claim a job, compute, append the result; again, until told to stop."""
+"""The worker's loop: claims a job, computes it, and records the answer."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 _LEASE_S = 30.0
 _POLL_S = 0.2
 
-# What computes each kind, from arguments without references: tests put others in their place.
+# Kind → function that computes it, from arguments with references resolved. Tests replace some.
 HANDLERS: dict[str, Handler] = {name: handler_of(kind) for name, kind in job_kinds().items()}
 
 
@@ -45,28 +45,28 @@ def work(
     lane: Lane | None = None,
     finished: Callable[[], None] = lambda: None,
 ) -> int:
-    """Serve jobs one by one until `stop()`, or with `until_idle` until none is left; the number of jobs done.
+    """Compute one job after the other until `stop()`.
 
     Args:
         store: of the data folder.
-        until_idle: see above.
-        stop: asked between jobs.
-        progress: told what a job does, how much of it is done, and all of it.
-        lane: only jobs that are waited for, or only those that are not; None: all.
-        finished: told after each job.
+        until_idle: end when no job is left.
+        stop: called between jobs.
+        progress: called with what a job does, how much is done, and the total.
+        lane: only jobs that a step waits for, or only the others; None: all.
+        finished: called after each job.
+
+    Returns:
+        the number of jobs computed.
     """
     name = f"worker {socket.gethostname()}:{os.getpid()}"
     following: FollowedRuns | None = None
     done = 0
     waiting = False
     while not stop():
-        if store.free_bytes() < LEAST_FREE_BYTES:
-            if not waiting:
-                _log.warning("the disk of the data folder is nearly full: no job is begun before there is more room")
-            waiting = True
+        waiting = _disk_full(store, told=waiting)
+        if waiting:
             time.sleep(_POLL_S)
             continue
-        waiting = False
         job = store.claim_job(name, _LEASE_S, kinds=list(HANDLERS), lane=lane)
         if job is None:
             if until_idle:
@@ -80,9 +80,16 @@ def work(
     return done
 
 
+def _disk_full(store: Store, *, told: bool) -> bool:
+    full = store.free_bytes() < LEAST_FREE_BYTES
+    if full and not told:
+        _log.warning("the disk of the data folder is nearly full: no job is started until there is space")
+    return full
+
+
 def _following(store: Store) -> FollowedRuns:
-    """Imported at the first job, as the job's function is."""
-    from service.worker.following import FollowedRuns  # noqa: PLC0415 - all step kinds come with it, which takes a second
+    """Imported at the first job, like the job's function."""
+    from service.worker.following import FollowedRuns  # noqa: PLC0415 - it imports all step kinds, which takes a second
 
     return FollowedRuns(store)
 
@@ -107,14 +114,14 @@ def _do(store: Store, job: Job, progress: Callable[[str, int, int], None], follo
 
 
 def _worth_another_try(error: Exception) -> bool:
-    """The same input gives the same refusal: only trouble that passes is worth another try."""
+    """Whether an error may be temporary; a job that refuses its input would refuse it again."""
     if isinstance(error, OrthocaptureError):
         return not isinstance(error, (ComputeError, IntegrityError))
     return isinstance(error, BrokenProcessPool)  # a helper of the job was killed
 
 
 class _Attempt:
-    """Renews a job's lease while it is computed, and keeps the error that ends it, whatever it is."""
+    """Renews a job's lease while it is computed, and holds the error that ends it."""
 
     def __init__(self, store: Store, job: Job) -> None:
         self.error: Exception | None = None

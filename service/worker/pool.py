@@ -1,7 +1,7 @@
-"""A worker that does as many jobs at once as there are cores, each in a child process of its own.
+"""A worker that computes as many jobs in parallel as there are cores, each in a child process.
 
-A child that dies loses its job to the next one, as the death of a whole worker does, and is replaced. What a step
-waits for has children of its own, so that it never waits behind a computation of many minutes that nobody waits for.
+A child that dies is replaced, and its job is computed by another one. Jobs that a step waits for have their own
+children, so that they never queue behind long background computations.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from service.worker.loop import work
 
 _log = logging.getLogger(__name__)
 _POLL_S = 0.2
-_RESTART_S = 1.0  # before a child that died is replaced
-_MOST_WAITED = 4  # children for what is waited for: there are seldom more such jobs at once
-_NICE = 10  # of the children for what is not: the others, and the capture, come first
+_RESTART_S = 1.0  # delay before a dead child is replaced
+_MOST_WAITED = 4  # children for jobs that a step waits for; there are seldom more of them at a time
+_NICE = 10  # of background children, so that the others and the capture have priority
 
 Progress = Callable[[str, int, int], None]
 
@@ -44,11 +44,11 @@ class _Child:
     lane: Lane
     scratch: Path
     died_s: float | None = None
-    busy: bool = False  # it has begun a job and has not said that it ended
+    busy: bool = False  # it has started a job and not reported its end
 
 
 class Pool:
-    """The children of one worker. Use it in a `with`: at its end they stop and their jobs are queued again."""
+    """The children of one worker, as a context manager: at its end they are stopped and their jobs queued again."""
 
     def __init__(self, store: Store, data: Path, at_once: int) -> None:
         self.done = 0
@@ -56,18 +56,18 @@ class Pool:
         self._scratch = tempfile.TemporaryDirectory(prefix="orthocapture-worker-", ignore_cleanup_errors=True)
         self._context = multiprocessing.get_context("spawn")
         self._most: dict[Lane, int] = {"waited": min(at_once, _MOST_WAITED), "background": at_once}
-        self._children = [self._start("waited")]  # the others when there is work for them
+        self._children = [self._start("waited")]  # others are started when needed
 
     def tend(self, progress: Progress, timeout_s: float = _POLL_S) -> bool:
-        """Hear what the children say, up to `timeout_s`; replace those that have died, and start what is needed.
+        """Receive messages of the children for up to `timeout_s`; replace dead children, and start missing ones.
 
-        Whether any of them had something to say.
+        Returns whether there was a message.
         """
         by_pipe = {child.pipe: child for child in self._children if child.died_s is None}
         heard = wait(list(by_pipe), timeout_s)
         for ready in heard:
             assert isinstance(ready, Connection)
-            with contextlib.suppress(EOFError, OSError):  # it has died, which is seen below
+            with contextlib.suppress(EOFError, OSError):  # it has died, which is handled below
                 what, done, total = ready.recv()
                 by_pipe[ready].busy = total >= 0
                 if total < 0:
@@ -77,7 +77,7 @@ class Pool:
         for index, child in enumerate(self._children):
             if child.died_s is None and not child.process.is_alive():
                 child.died_s = time.monotonic()
-                _log.warning("process %s of the worker died; its job is done again", child.process.pid)
+                _log.warning("process %s of the worker died; its job is computed again", child.process.pid)
             if child.died_s is not None and time.monotonic() - child.died_s > _RESTART_S:
                 self._end(child)
                 self._children[index] = self._start(child.lane)
@@ -91,11 +91,11 @@ class Pool:
 
     @property
     def busy(self) -> bool:
-        """Whether a living child has begun a job and has not said that it ended."""
+        """Whether a living child has started a job and not reported its end."""
         return any(child.busy and child.died_s is None for child in self._children)
 
     def pids(self) -> list[int]:
-        """The children's processes, in the order in which they were started."""
+        """The children's process ids, in the order in which they were started."""
         return [child.process.pid or 0 for child in self._children]
 
     def __enter__(self) -> Pool:
@@ -127,7 +127,7 @@ class Pool:
 
 
 def _kill(group: int) -> None:
-    """End a child and all that it has started: a child leads a process group of its own."""
+    """Kill a child and all processes that it has started: each child leads its own process group."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(group, signal.SIGKILL)
 
@@ -135,14 +135,17 @@ def _kill(group: int) -> None:
 def work_side_by_side(
     data: Path, *, at_once: int, until_idle: bool, stop: Callable[[], bool], progress: Progress
 ) -> int:
-    """Serve the jobs of a data folder until `stop()`, or with `until_idle` until none is open; how many were done.
+    """Compute the jobs of a data folder in parallel until `stop()`.
 
     Args:
         data: the data folder.
-        at_once: jobs that nobody waits for, computed side by side; up to as many more that a step waits for.
-        until_idle: see above.
-        stop: asked several times a second.
-        progress: told what is computed, how much of it is done, and all of it.
+        at_once: number of background jobs in parallel; there may be as many again that a step waits for.
+        until_idle: end when no job is open.
+        stop: called several times a second.
+        progress: called with what a job does, how much is done, and the total.
+
+    Returns:
+        the number of jobs computed.
     """
     with Store.open(data) as store:
         if until_idle and not store.open_jobs():
@@ -152,7 +155,7 @@ def work_side_by_side(
                 pool.tend(progress)
                 sign.give(pool.done)
                 if until_idle and not store.open_jobs():
-                    while pool.tend(progress) or pool.busy:  # a job's end is in the store before its child says so
+                    while pool.tend(progress) or pool.busy:  # a job's end is recorded before its child reports it
                         pass
                     break
             return pool.done
@@ -163,7 +166,7 @@ def work_side_by_side(
 
 def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int) -> None:
     """Entry point of a child."""
-    os.setsid()  # Ctrl-C is for the worker, which ends its children and what they have started
+    os.setsid()  # Ctrl-C must reach only the worker, which ends its children and their processes
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     tempfile.tempdir = str(scratch)
     keep_freed_memory()
@@ -171,7 +174,7 @@ def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int)
         os.nice(_NICE)
 
     def tell(what: str, done: int, total: int) -> None:
-        with contextlib.suppress(OSError):  # the worker has gone, and this process goes too
+        with contextlib.suppress(OSError):  # the worker has ended, and this process will too
             pipe.send((what, done, total))
 
     with file_log(data, "worker"), Store.open(data) as store:
@@ -179,7 +182,7 @@ def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int)
 
 
 def _end_with(parent: int) -> None:
-    """A child whose worker was killed computes for nobody: it ends at once, with all that it has started."""
+    """End this child and all its processes as soon as the worker has died."""
     while os.getppid() == parent:
         time.sleep(_POLL_S)
     _kill(os.getpid())

@@ -1,4 +1,4 @@
-"""Job kind `board_view`: the calibration board in one image as soon as it has arrived."""
+"""Job kind `board_view`: searches one image for the calibration board as soon as it arrives."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Arguments(BoardSize):
 
 
 class Answer(JobRecord):
-    """Whether the whole board was seen; its corners are the job's file. `size` is width and height in pixels."""
+    """Whether the whole board was found; its corners are in the job's file. `size` is width and height in pixels."""
 
     viewpoint: str
     size: tuple[int, int]

@@ -9,14 +9,14 @@ from service.jobs.records import ArmCorrection, BoardSize, Camera, Hash, Matrix,
 
 
 class Arguments(BoardSize):
-    """Board images and what is solved from them.
+    """Board images and what to solve from them.
 
     Attributes:
-        solve: what is asked for.
+        solve: which calibrations.
         images: of the board.
-        camera: intrinsics that are known; None where they are solved.
-        corners: of each image, the file that a job `board_view` kept; None where the image is still to be searched.
-        known: what is known of camera, mount and board, so that a part of the board counts.
+        camera: known intrinsics; None if they are solved.
+        corners: for each image, the file of its job `board_view`; None if the image has not been searched.
+        known: estimate of camera, mount and board, with which images of a part of the board can be used.
     """
 
     solve: tuple[Literal["intrinsics", "hand_eye"], ...]
@@ -27,27 +27,27 @@ class Arguments(BoardSize):
 
 
 class Spread(JobRecord):
-    """How well T_flange_camera is known: (6, 6) translation in metres, then rotation in radians."""
+    """Uncertainty of T_flange_camera: (6, 6) covariance of translation (m), then rotation (rad)."""
 
     covariance: Matrix
 
 
 class Residuals(JobRecord):
-    """Of each board image by name, as predicted by the others."""
+    """Errors of each held-out board image, by name."""
 
     held_out_mm: dict[str, float]
     held_out_deg: dict[str, float]
 
 
 class ArmAnswer(ArmCorrection):
-    """The hand-eye answer with the arm's errors taken off."""
+    """The hand-eye calibration with the arm's errors corrected."""
 
     sigma: Spread
     residuals: Residuals
 
 
 class HandEye(JobRecord):
-    """Where the camera sits on the flange, and how it was found (compute/calibration/hand_eye_record.py)."""
+    """Where the camera is on the flange (service/compute/calibration/hand_eye/record.py)."""
 
     T_flange_camera: Matrix
     T_base_board: Matrix | None = None
@@ -57,26 +57,26 @@ class HandEye(JobRecord):
 
     @property
     def best(self) -> HandEye | ArmAnswer:
-        """What the registration uses: with the arm's correction, where there is one."""
+        """The calibration that the registration uses: with the arm's correction, if there is one."""
         return self.arm_correction or self
 
 
 class Intrinsics(JobRecord):
-    """What is known of the calibrated camera (compute/calibration/intrinsics_record.py)."""
+    """Uncertainty and warnings of the intrinsics (service/compute/calibration/intrinsics/record.py)."""
 
     covariance: ParameterCovariance | None = None
     warnings: tuple[str, ...] = ()
 
 
 class CalibrationDetails(JobRecord):
-    """Of the images and of the intrinsics, where they were solved."""
+    """Details on the images and, if they were solved, the intrinsics."""
 
     views_without_board: tuple[str, ...] = ()
     intrinsics: Intrinsics | None = None
 
 
 class Answer(JobRecord):
-    """The camera and, where solved, the hand-eye transform."""
+    """The camera and, if solved, the hand-eye transform."""
 
     camera: Camera
     details: CalibrationDetails = CalibrationDetails()

@@ -1,4 +1,4 @@
-"""Job kind `hand_board`: an image of the board of a hand-held camera: its pose by the nominal lens, the way on."""
+"""Job kind `hand_board`: locates a hand-held camera by the board, and says where it should go next."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from service.jobs.kind import JobKind
 
 
 class Arguments(HeldArguments):
-    """The image, the board, and the sensor's width, which with the focal length makes a nominal camera."""
+    """The image, the board, and the sensor's width, which gives nominal intrinsics with the focal length."""
 
     columns: int
     rows: int

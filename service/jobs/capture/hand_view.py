@@ -1,4 +1,4 @@
-"""Job kind `hand_view`: an image of a hand-held camera: its pose by the spheres, and where to go next."""
+"""Job kind `hand_view`: locates a hand-held camera by the spheres, and says where it should go next."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from service.jobs.records import Camera, Hash, Limits, Matrix, Point
 
 
 class HeldImage(JobRecord):
-    """A photograph of a hand-held camera; `settings` says what departs from those wanted, "" for nothing."""
+    """A photograph of a hand-held camera; `settings` says which settings are wrong, "" if none are."""
 
     viewpoint: str
     sha256: Hash
@@ -18,7 +18,7 @@ class HeldImage(JobRecord):
 
 
 class PlannedPlace(JobRecord):
-    """A place of the hemisphere to be covered."""
+    """A camera place on the hemisphere to be covered."""
 
     name: str
     tilt_deg: float
@@ -29,7 +29,7 @@ class PlannedPlace(JobRecord):
 
 
 class HeldArguments(JobRecord):
-    """What a look at a hand-held image is given, of the specimen or of the board."""
+    """Arguments of the jobs on hand-held images, of the specimen or of the board."""
 
     image: HeldImage
     earlier: tuple[Hash, ...] = ()
@@ -38,11 +38,11 @@ class HeldArguments(JobRecord):
     within_deg: float
     first_words: str
     limits: Limits
-    rough: bool = False  # nobody has measured the spheres: the images tell where they are
+    rough: bool = False  # the spheres have not been measured: the images locate them
 
 
 class Arguments(HeldArguments):
-    """Of an image of the specimen."""
+    """Arguments for an image of the specimen."""
 
     camera: Camera
     spheres_m: tuple[Point, ...]
@@ -55,7 +55,7 @@ class Arguments(HeldArguments):
 
 
 class ShownPlace(JobRecord):
-    """A place of the hemisphere."""
+    """A place of the hemisphere, and whether it has an image."""
 
     name: str
     T_level_camera: Matrix
@@ -63,7 +63,7 @@ class ShownPlace(JobRecord):
 
 
 class Answer(JobRecord):
-    """The verdict on the image, where the camera was, and the way on in words."""
+    """Whether the image is used, the camera's pose, and directions to the next place."""
 
     viewpoint: str
     used: bool
@@ -73,8 +73,8 @@ class Answer(JobRecord):
     T_scene_camera: Matrix | None = None
     T_level_camera: Matrix | None = None
     places: tuple[ShownPlace, ...] = ()
-    cells: tuple[tuple[int, ...], ...] = ()  # board corners by part of the frame
-    spheres_m: tuple[Point, ...] = ()  # as this image and those before it tell them
+    cells: tuple[tuple[int, ...], ...] = ()  # number of board corners in each cell of the frame
+    spheres_m: tuple[Point, ...] = ()  # as the images up to this one locate them
     T_scene_cameras: dict[str, Matrix] = Field(
         default_factory=dict[str, Matrix]
     )  # of all images, refined by this one

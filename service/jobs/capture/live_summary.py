@@ -1,4 +1,4 @@
-"""Job kind `live_summary`: whether the images so far are enough, and which further views would help most."""
+"""Job kind `live_summary`: whether the images so far suffice, and which further views would help most."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class CandidateView(JobRecord):
 
 
 class Arguments(LiveArguments):
-    """The files of all looks, and what could be taken at the station where the robot stands."""
+    """The files of all `live_view` jobs, and further views at the robot's present station."""
 
     views: tuple[Hash, ...]
     station: str
@@ -26,7 +26,7 @@ class Arguments(LiveArguments):
 
 
 class Suggestion(JobRecord):
-    """A view that helps, with the error and the coverage (0 … 1) once it and those before it are taken."""
+    """A view that would help; error and coverage (0 … 1) are predicted with it and the suggestions before it."""
 
     viewpoint: str
     predicted_error_mm: float
@@ -34,14 +34,14 @@ class Suggestion(JobRecord):
 
 
 class StationSoFar(JobRecord):
-    """What the images of a station come to."""
+    """The predicted error from the images of a station so far."""
 
     predicted_target_error_mm: float
     images: int
 
 
 class Answer(JobRecord):
-    """What to take next, and why a station's images do not determine its registration."""
+    """The views to take next, and why some stations cannot be registered yet."""
 
     next_best_views: tuple[Suggestion, ...]
     reasons: dict[str, str]

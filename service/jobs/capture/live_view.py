@@ -1,4 +1,4 @@
-"""Job kind `live_view`: one image, just taken: its spheres, the registration so far, the error to expect."""
+"""Job kind `live_view`: finds the spheres in an image just taken, and registers the images so far."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Photogr
 
 
 class LiveArguments(Mounting):
-    """What every look during a capture by the robot is given.
+    """Arguments of all jobs during a capture by the robot.
 
     Attributes:
         camera: calibrated.
         hand_eye_covariance: (6, 6) of T_flange_camera, m and rad.
-        arm_sigma_m: scatter of the camera's poses before any image tells.
-        arm_sigma_rad: likewise.
-        spheres_m: of the CT.
+        arm_sigma_m: prior scatter of the camera's positions.
+        arm_sigma_rad: prior scatter of the camera's rotations.
+        spheres_m: centres in the CT.
         radius_m: of the spheres.
         limits: when a view counts for the coverage.
-        surface: points of the specimen (`coverage_points`); None while there are none.
+        surface: file of the job `coverage_points`; None until it has finished.
     """
 
     camera: Camera
@@ -31,14 +31,14 @@ class LiveArguments(Mounting):
 
 
 class Arguments(LiveArguments):
-    """The new image, and the files of the looks at the earlier ones."""
+    """The new image, and the files of this job for the earlier ones."""
 
     image: Photograph
     earlier: tuple[Hash, ...] = ()
 
 
 class Answer(JobRecord):
-    """Where the image belongs; `reason` says why the images do not determine the registration yet."""
+    """The image and its station; `reason` says why the images do not determine the registration yet."""
 
     viewpoint: str
     station: str

@@ -1,1 +1,1 @@
-"""Kinds of jobs that find camera poses from images."""
+"""Kinds of jobs that estimate camera poses from images."""

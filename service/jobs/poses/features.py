@@ -1,4 +1,4 @@
-"""Job kind `features`: SIFT features of some images, a file for each."""
+"""Job kind `features`: SIFT features of some images, one file for each."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from service.jobs.records import ImageFile, ImagesCamera
 
 
 class FrontEndArguments(ImagesCamera):
-    """Of features and of matches; `effort` are SfmOptions."""
+    """Arguments that features and matches share; `effort` holds SfmOptions."""
 
     effort: dict[str, Any]
 
 
 class Arguments(FrontEndArguments):
-    """The images, and with which others they are to be matched as soon as these have features."""
+    """The images, and the viewpoints that they are to be matched with as soon as those have features."""
 
     images: tuple[ImageFile, ...]
     match_with: tuple[str, ...] = ()

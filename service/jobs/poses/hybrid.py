@@ -1,4 +1,4 @@
-"""Job kind `hybrid`: the tracks of a model, the robot's poses and the registration spheres adjusted together."""
+"""Job kind `hybrid`: bundle adjustment of a model's tracks, the robot's poses and the registration spheres."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from service.jobs.registration.detect_spheres import SceneArguments
 
 
 class Arguments(SceneArguments):
-    """Outlines, and the model with its tracks that the adjustment begins with."""
+    """Outlines, and the model with its tracks from which the adjustment starts."""
 
     outlines: Hash
     poses: str = "hybrid"

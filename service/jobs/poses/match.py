@@ -1,4 +1,4 @@
-"""Job kind `match`: verified matches of some pairs of images."""
+"""Job kind `match`: geometrically verified matches of some pairs of images."""
 
 from __future__ import annotations
 

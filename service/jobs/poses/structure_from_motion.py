@@ -9,14 +9,14 @@ from service.jobs.records import Hash, ImagesCamera, Matrix, Photograph
 
 
 class Arguments(ImagesCamera):
-    """What is mapped, and how.
+    """What is reconstructed, and how.
 
     Attributes:
         images: of the captures.
-        mappers: one model each.
+        mappers: each makes one model.
         effort: SfmOptions.
-        prior: T_scan_camera by viewpoint of a registration that is there already; it chooses which pairs are matched.
-        features: files by viewpoint; None in runs that were recorded when one job did everything.
+        prior: T_scan_camera by viewpoint, of an earlier registration; decides which pairs are matched.
+        features: files by viewpoint; None in old runs, in which one job did everything.
         matches: files.
     """
 

@@ -7,13 +7,13 @@ from service.jobs.records import Hash, ImagesCamera, Matrix, Mounting, Parameter
 
 
 class SceneArguments(ImagesCamera, Mounting):
-    """What all jobs of a registration have in common.
+    """Arguments that all jobs of a registration share.
 
     Attributes:
-        images: of the captures, control captures included.
+        images: of the captures, including control captures.
         intrinsics_covariance: (8, 8) of fx, fy, cx, cy, k1, k2, p1, p2, or a covariance with its parameters' names.
-        spheres_m: of the scan.
-        sphere_covariance_m2: of each of them, (3, 3).
+        spheres_m: centres in the scan.
+        sphere_covariance_m2: (3, 3) of each centre.
         radius_m: of the spheres.
     """
 
@@ -25,7 +25,7 @@ class SceneArguments(ImagesCamera, Mounting):
 
 
 class Arguments(SceneArguments):
-    """How the outlines are searched for; `model` has the poses where no robot and no sphere told them."""
+    """How outlines are searched; `model` holds the poses if neither a robot nor spheres provide them."""
 
     model: Hash | None = None
     colour: str | None = None

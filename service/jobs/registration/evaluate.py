@@ -10,7 +10,7 @@ from service.jobs.registration.register import Registration
 
 
 class Arguments(JobRecord):
-    """The control captures, the registrations by name, and the spheres as scanner and CT measured them."""
+    """Control captures, registrations by name, and the spheres as scanner and CT measured them."""
 
     images: tuple[Photograph, ...]
     registrations: dict[str, Registration]
@@ -27,15 +27,15 @@ class Row(JobRecord):
         poses: name of the registration.
         source: of its camera poses.
         resolution: of the images.
-        images: of the control captures that it has a pose for.
-        predicted_error_mm: by the error budget.
-        control_error_mm: of the control spheres located in the images; None without any.
-        control_normalised_chi2: of that.
-        mean_radial_error_mm: the paper's.
-        mean_reprojection_error_px: the paper's.
-        evaluated_on: control spheres, or each sphere left out.
-        control_outlines: that were compared.
-        late: when it came, in words, of a row that was not there when the evaluation was made.
+        images: number of control images with a pose.
+        predicted_error_mm: of the error budget.
+        control_error_mm: error of the control spheres as located in the images; None without any.
+        control_normalised_chi2: of that error against its predicted covariance.
+        mean_radial_error_mm: as the paper defines it.
+        mean_reprojection_error_px: as the paper defines it.
+        evaluated_on: `control spheres`, or `each sphere left out`.
+        control_outlines: number of outlines compared.
+        late: when the row arrived, in words, if that was after the evaluation.
     """
 
     poses: str
@@ -53,7 +53,7 @@ class Row(JobRecord):
 
 
 class Contribution(JobRecord):
-    """One source of error (1σ, 3D); `counted` ones are in the sum."""
+    """One source of error (1σ, 3D); the sum includes it if it is `counted`."""
 
     name: str
     sigma_mm: float
@@ -62,7 +62,7 @@ class Contribution(JobRecord):
 
 
 class Observation(JobRecord):
-    """An independent measurement of `n` spheres, and what the budget predicts for it."""
+    """An independent measurement of `n` spheres, with the error that the budget predicts for it."""
 
     name: str
     observed_mm: float
@@ -74,7 +74,7 @@ class Observation(JobRecord):
 
 
 class ErrorBudget(JobRecord):
-    """Where the error of a registration comes from, and what independent measurements say of it."""
+    """The sources of a registration's error, compared with independent measurements."""
 
     contributions: tuple[Contribution, ...] = ()
     total_mm: float | None = None

@@ -8,7 +8,7 @@ from service.jobs.registration.detect_spheres import SceneArguments
 
 
 class Arguments(SceneArguments):
-    """Outlines and the source of the poses, with its model where the images told them."""
+    """Outlines and the source of the poses, with its model if they come from the images."""
 
     outlines: Hash
     poses: str
@@ -17,7 +17,7 @@ class Arguments(SceneArguments):
 
 
 class LeaveOneOut(JobRecord):
-    """Every sphere as predicted by the others: means, and `[radial error (mm), reprojection error (px)]` of each."""
+    """`[radial error (mm), reprojection error (px)]` of each sphere predicted from the others, and the means."""
 
     mean_radial_error_mm: float
     mean_reprojection_error_px: float
@@ -29,18 +29,18 @@ class Registration(JobRecord):
 
     Attributes:
         poses: the source of the camera poses.
-        camera: that the outlines were read with.
-        outlines: their file.
-        full_camera: of the photographs, where the images were reduced.
+        camera: with which the outlines were detected.
+        outlines: file with the outlines.
+        full_camera: at the size of the photographs, if the images were reduced.
         T_world_scan: world is the base of the first station, or the reconstruction's own frame.
         scale: of the reconstruction; 1 for metric poses.
-        rms_px: of the outlines that took part.
+        rms_px: of the outlines that were used.
         T_world_station: by station.
         T_scan_camera: by viewpoint.
-        excluded: outlines left out, in words.
+        excluded: outlines left out as outliers, in words.
         covariance: (6, 6) of T_world_scan, m and rad.
-        components: what the covariance is the sum of.
-        leave_one_out: None where a station sees too few spheres to spare one.
+        components: terms whose sum is the covariance.
+        leave_one_out: None if a station sees too few spheres for it.
     """
 
     poses: str

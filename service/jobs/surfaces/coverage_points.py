@@ -1,4 +1,4 @@
-"""Job kind `coverage_points`: points of the specimen that the images should see, on the CT's surface."""
+"""Job kind `coverage_points`: points of the specimen's CT surface that the images should see."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Job kind `ct_surface`: the CT volume becomes a mesh, which is searched for its spheres."""
+"""Job kind `ct_surface`: computes the surface of a CT volume and finds its spheres."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from service.jobs.records import Hash, Matrix, SpheresFound
 
 
 class Arguments(JobRecord):
-    """The decoded volume: `hounsfield` is a NumPy array, `T_ct_voxel` takes its indices to metres."""
+    """The decoded volume: `hounsfield` is a NumPy array, `T_ct_voxel` maps its indices to metres."""
 
     radius_m: float
     expected: int

@@ -1,4 +1,4 @@
-"""Job kind `layout`: photographs of the placed spheres tell whether they can be told apart, and what to move."""
+"""Job kind `layout`: from photographs of the placed spheres, whether they are distinguishable, and what to move."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from service.jobs.records import Hash, Point
 
 
 class LayoutPhotograph(JobRecord):
-    """A photograph of a lens that is not calibrated yet."""
+    """A photograph taken with an uncalibrated lens."""
 
     sha256: Hash
     focal_mm: float
 
 
 class Arguments(JobRecord):
-    """The photographs, and how many spheres of which radius stand there."""
+    """The photographs, and the number and radius of the spheres."""
 
     images: tuple[LayoutPhotograph, ...]
     sensor_width_mm: float
@@ -26,14 +26,14 @@ class Arguments(JobRecord):
 
 
 class LayoutDetails(JobRecord):
-    """Near-symmetries (compute/registration/layout.py), and what to do about them."""
+    """Near-symmetries (service/compute/layout/ambiguity.py), and the moves that would resolve them."""
 
     problems: tuple[str, ...] = ()
     moves: tuple[dict[str, Any], ...] = ()
 
 
 class Answer(JobRecord):
-    """The spheres in the frame of the photograph with most of them, metres."""
+    """The spheres in the frame of the photograph that shows most of them, metres."""
 
     spheres_m: tuple[Point, ...]
     details: LayoutDetails

@@ -1,4 +1,4 @@
-"""Job kind `locate_spheres`: the spheres of a decoded mesh, and how they moved since an earlier measurement."""
+"""Job kind `locate_spheres`: finds the spheres of a mesh, and how they moved since an earlier measurement."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from service.jobs.records import Hash, Matrix, Point, SpheresFound
 
 
 class Arguments(JobRecord):
-    """The mesh and what to expect in it; `reference_m` are the spheres of an earlier mesh."""
+    """The mesh, and the number of spheres expected in it; `reference_m` are the spheres of an earlier mesh."""
 
     mesh: Hash
     radius_m: float

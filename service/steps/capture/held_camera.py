@@ -48,7 +48,7 @@ class HeldCamera:
             self.context.tell(problem)
 
     def new_views(self) -> list[ViewHeld]:
-        """Wait a moment for images, and record them. Of an image that cannot be read, only the failure is recorded."""
+        """Wait a moment for images, and record them. For an unreadable image, only the failure is recorded."""
         context = self.context
         context.evidence.require_space()
         camera = context.devices.camera()

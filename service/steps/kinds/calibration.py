@@ -26,21 +26,21 @@ from service.steps.context import ROBOT_MOVES, Announcement, JobRequest, JobResu
 from service.steps.inputs import captured_images, earlier_answer, result_of
 from service.steps.measures import CaptureMeasures, Count, FineMm, Measure, Mm, Px, Share
 
-_FEWEST_KNOWN = 3  # whole boards, before a part of one may count
+_FEWEST_KNOWN = 3  # images of the whole board needed before images of a part of it are used
 
 
 class Params(MovingParams):
-    """Which board images, and what is computed from them."""
+    """Which board images are taken, and what is computed from them."""
 
     solve: tuple[Literal["intrinsics", "hand_eye"], ...]  # what is computed
-    board_poses: BoardPoses | None = None  # planned by the software
-    viewpoints: tuple[ViewpointSet, ...] = ()  # or: as listed here
+    board_poses: BoardPoses | None = None  # images whose poses the software plans
+    viewpoints: tuple[ViewpointSet, ...] = ()  # or images from these viewpoints
     images_of: str | None = None  # use the images of this earlier calibration step instead of new ones
-    intrinsics_of: str | None = None  # hand-eye alone: the step that solved the intrinsics
+    intrinsics_of: str | None = None  # for hand-eye alone: the step that solved the intrinsics
 
     @property
     def moves_robot(self) -> bool:
-        """Not with images that are there."""
+        """Whether new images are taken."""
         return self.images_of is None
 
     @model_validator(mode="after")
@@ -106,18 +106,18 @@ class Measures(CaptureMeasures):
 
 
 class Result(Record):
-    """The camera and, where solved, where it sits on the flange (4×4, metres)."""
+    """The camera and, if solved, its pose on the flange (4×4, metres)."""
 
     camera: dict[str, float]
     T_flange_camera: tuple[tuple[float, ...], ...] | None = None
     T_base_board: tuple[tuple[float, ...], ...] | None = None
-    hand_eye: dict[str, Any] | None = None  # the whole record: covariance, residuals, methods, the arm's correction
-    robots: tuple[str, ...] = ()  # devices whose flange carried the camera
+    hand_eye: dict[str, Any] | None = None  # whole record: covariance, residuals, methods, the arm's correction
+    robots: tuple[str, ...] = ()  # robots that carried the camera
     details: dict[str, object]
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Capture the board and let the worker solve; what falls short is answered with the views that would mend it."""
+    """Capture the board and let the worker solve; if a gate fails, plan the views that would make it pass."""
     board = board_of_protocol(context)
     camera = _camera(context, params)
     measures: dict[str, float] = {}
@@ -149,7 +149,7 @@ def board_of_protocol(context: StepContext) -> Board:
 
 
 def _camera(context: StepContext, params: Params) -> Mapping[str, float] | None:
-    """Intrinsics of an earlier step, where this one does not solve them."""
+    """Intrinsics of an earlier step, if this one does not solve them."""
     if "intrinsics" in params.solve:
         return None
     if params.intrinsics_of is None:
@@ -172,7 +172,7 @@ def _board_capture(
 
 
 def _as_board_poses(sets: tuple[ViewpointSet, ...]) -> BoardPoses:
-    """What replacements of listed viewpoints are planned by."""
+    """The planning parameters for replacements of listed viewpoints."""
     arcs = [arc for one in sets for arc in one.arcs]
     offset = sets[-1].aim_offset_m[2]
     return BoardPoses(

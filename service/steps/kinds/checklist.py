@@ -1,4 +1,4 @@
-"""Step kind `checklist`: work of hands that the software can only ask about (fixation, hand-over, removal)."""
+"""Step kind `checklist`: manual work that the software can only ask about (fixation, hand-over, removal)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from service.steps.measures import Count, MeasureRecord
 
 
 class Params(Record):
-    """Nothing to set: the step's checklist says it all."""
+    """No parameters: the items are in the step's checklist."""
 
 
 class Measures(MeasureRecord):
@@ -28,7 +28,7 @@ class Result(Record):
 
 
 def execute(context: StepContext, _params: Params) -> StepOutcome:
-    """Count what the operator ticked when confirming; the confirmation itself is an event."""
+    """Count the items that the operator ticked; the confirmation itself is an event."""
     items = len(context.step.checklist)
     ticked = len(context.state.ticked)
     result = Result(items=items, ticked=ticked)

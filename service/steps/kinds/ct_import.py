@@ -1,7 +1,8 @@
-"""Step kind `ct_import`: the CT series arrives, is kept slice by slice, and becomes a surface with its spheres."""
+"""Step kind `ct_import`: stores the CT series slice by slice, computes its surface and finds the spheres."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from drivers.interfaces import CtSource
@@ -17,10 +18,10 @@ from service.steps.measures import Count, Measure, SphereMeasures
 class Params(Record):
     """What to expect from the CT suite."""
 
-    source: Literal["dicom", "mesh"] = "dicom"  # mesh: segmented elsewhere (Mimics STL)
-    threshold_hu: float = -450.0  # half way between air and soft tissue or plastic: neither grows nor shrinks
-    spheres: int  # registration and control spheres in the volume
-    wait_s: float = 600.0  # for the series to appear and be complete
+    source: Literal["dicom", "mesh"] = "dicom"  # mesh: segmented by other software (Mimics STL)
+    threshold_hu: float = -450.0  # half way between air and tissue or plastic: unbiased surfaces
+    spheres: int  # number of registration and control spheres in the volume
+    wait_s: float = 600.0  # longest wait until the series is complete
 
 
 class Measures(SphereMeasures):
@@ -40,50 +41,48 @@ class Result(Record):
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Wait for one sound series (or mesh), keep its files, let the worker make the surface."""
-    ct = context.devices.ct()
-    radius_m = metres(context.protocol.spheres.radius_mm)
-    measures: dict[str, float] = {}
-    kept: tuple[ArtefactRef, ...]
-    if params.source == "mesh":
-        scan = ct.read_mesh(wait_for(context, ct.segmented_meshes, params.wait_s, "a segmented CT mesh"))
-        mesh, kept = keep_mesh(context, scan, device="ct", kind="ct_mesh")
-        request = JobRequest.of(
-            locate_spheres.KIND,
-            locate_spheres.Arguments(mesh=mesh.sha256, radius_m=radius_m, expected=params.spheres),
-        )
-    else:
-        series = wait_for(context, lambda: _sound(ct), params.wait_s, "a CT series without faults")
-        volume = ct.read(series)
-        kept = tuple(
-            keep(context, path, device="ct", kind="ct_slice", media_type="application/dicom") for path in series.files
-        )
-        array = keep_array(context, volume.hounsfield, device="ct", kind="ct_volume", name="hounsfield.npy")
-        request = JobRequest.of(
-            ct_surface.KIND,
-            ct_surface.Arguments(
-                radius_m=radius_m,
-                expected=params.spheres,
-                slices=tuple(ref.sha256 for ref in kept),
-                hounsfield=array.sha256,
-                T_ct_voxel=volume.T_ct_voxel.tolist(),
-                threshold_hu=params.threshold_hu,
-            ),
-        )
-        measures = {
-            "slices": float(series.slices),
-            "slice_spacing_mm": round(mm(volume.spacing_m[2]), 6),  # positions are decimal text of six places
-            "voxel_mm": round(mm(max(volume.spacing_m)), 6),
-        }
+    """Wait for a series without faults (or a mesh), store its files, and let the worker find the spheres."""
+    request, kept, measures = (_mesh if params.source == "mesh" else _series)(context, params)
     (answer,) = context.evidence.run_jobs(request)
     result = Result.model_validate(answer.result)
     uncertainties = layout_uncertainties(result.details["layout"]) if "layout" in result.details else {}
-    return StepOutcome(
-        Measures.read({**measures, **answer.measures}),
-        kept + answer.artefacts,
-        result.model_dump(mode="json"),
-        uncertainties,
+    measured = Measures.read({**measures, **answer.measures})
+    return StepOutcome(measured, kept + answer.artefacts, result.model_dump(mode="json"), uncertainties)
+
+
+def _mesh(context: StepContext, params: Params) -> tuple[JobRequest, tuple[ArtefactRef, ...], Mapping[str, float]]:
+    """Store a mesh that was segmented elsewhere: the job on it, the stored files, and its measures."""
+    ct = context.devices.ct()
+    scan = ct.read_mesh(wait_for(context, ct.segmented_meshes, params.wait_s, "a segmented CT mesh"))
+    mesh, kept = keep_mesh(context, scan, device="ct", kind="ct_mesh")
+    radius_m = metres(context.protocol.spheres.radius_mm)
+    arguments = locate_spheres.Arguments(mesh=mesh.sha256, radius_m=radius_m, expected=params.spheres)
+    return JobRequest.of(locate_spheres.KIND, arguments), kept, {}
+
+
+def _series(context: StepContext, params: Params) -> tuple[JobRequest, tuple[ArtefactRef, ...], Mapping[str, float]]:
+    """Store a series: the job on it, the stored files, and its measures."""
+    ct = context.devices.ct()
+    series = wait_for(context, lambda: _sound(ct), params.wait_s, "a CT series without faults")
+    volume = ct.read(series)
+    kept = tuple(
+        keep(context, path, device="ct", kind="ct_slice", media_type="application/dicom") for path in series.files
     )
+    array = keep_array(context, volume.hounsfield, device="ct", kind="ct_volume", name="hounsfield.npy")
+    arguments = ct_surface.Arguments(
+        radius_m=metres(context.protocol.spheres.radius_mm),
+        expected=params.spheres,
+        slices=tuple(ref.sha256 for ref in kept),
+        hounsfield=array.sha256,
+        T_ct_voxel=volume.T_ct_voxel.tolist(),
+        threshold_hu=params.threshold_hu,
+    )
+    measures = {
+        "slices": float(series.slices),
+        "slice_spacing_mm": round(mm(volume.spacing_m[2]), 6),  # DICOM states positions with six decimal places
+        "voxel_mm": round(mm(max(volume.spacing_m)), 6),
+    }
+    return JobRequest.of(ct_surface.KIND, arguments), kept, measures
 
 
 def _sound(ct: CtSource) -> tuple[Any, ...]:

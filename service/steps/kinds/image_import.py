@@ -1,4 +1,4 @@
-"""Step kind `image_import`: photographs that were captured earlier come into the evidence, as imported."""
+"""Step kind `image_import`: stores photographs that were taken earlier, marked as imported."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _KINDS = {"calibration": "board_image", "image": "image", "control_image": "cont
 
 
 class Params(Record):
-    """Which of the photographs that were brought."""
+    """Which photographs of the import."""
 
-    photographs: PhotographRole  # of which part of the import
+    photographs: PhotographRole  # part of the import
 
 
 class Measures(MeasureRecord):
@@ -41,14 +41,14 @@ class Result(Record):
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Bring in every photograph that is not in the evidence yet; a restart goes on where it stopped."""
+    """Store every photograph that is not in the evidence yet; after a restart, the others are skipped."""
     listed = context.devices.imported()
     views = () if listed is None else listed.of(params.photographs)
     if listed is None or not views:
         raise ConfigurationError(
             f"there are no photographs to import ({params.photographs.replace('_', ' ')})",
             where=f"step {context.step.id}",
-            remedy="Begin the run with `orthocapture import`, with a folder that holds them",
+            remedy="Start the run with `orthocapture import` and a folder that contains them",
         )
     there = {view.viewpoint for view in context.evidence.captures(context.step.id)}
     for number, view in enumerate(views):
@@ -71,7 +71,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 
 def _bring_in(context: StepContext, params: Params, listed: ImportList, view: ImportedView) -> None:
-    """Files first, then one transaction with rows and event."""
+    """Store one photograph: first its files, then its rows and its event in one transaction."""
     photograph = _put(context, listed, view.photograph, _KINDS[params.photographs])
     refs = (photograph, *(_put(context, listed, raw, "raw") for raw in view.raws))
     settings = settings_agree(view.camera, context.protocol.camera)
@@ -116,9 +116,9 @@ def _put(context: StepContext, listed: ImportList, file: ImportedFile, kind: str
 
 
 def settings_agree(stated: dict[str, Any], wanted: CameraSection | None) -> bool | None:
-    """Whether what a photograph states of aperture, time and ISO is what the protocol wants (as of a capture).
+    """Whether aperture, exposure time and ISO of a photograph are those of the protocol, as in a capture.
 
-    None where the protocol wants nothing in particular, or the file states none of the three.
+    None if the protocol sets none, or the file states none of the three.
     """
     if wanted is None:
         return None

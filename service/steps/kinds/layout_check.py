@@ -1,4 +1,4 @@
-"""Step kind `layout_check`: photographs of the placed spheres, taken by hand, tell whether they are too symmetric."""
+"""Step kind `layout_check`: checks in hand-held photographs whether the layout of the spheres is too symmetric."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from service.steps.measures import Count, LayoutMeasures
 PHOTOGRAPH = "layout_photograph"
 PHOTOGRAPH_WANTED = "layout_photograph_wanted"
 MOVE_WANTED = "layout_move_wanted"
-# Where the camera is held for one photograph after the other; edges are those of the first photograph.
+# Where to hold the camera for each photograph; the edges are those of the first photograph.
 _SIDES: tuple[tuple[str, str], ...] = (
     ("above", "nearly above the scene"),
     ("left", "on the side of the left edge of the first photograph, about 30° lower than it was"),
@@ -36,13 +36,13 @@ _SIDES: tuple[tuple[str, str], ...] = (
 
 
 class Params(Record):
-    """What the photographs must show."""
+    """How many photographs are taken, and how."""
 
-    photographs: int = 1  # to begin with; the camera is moved in between
-    most_photographs: int = 5  # of one layout, as long as the number is not known well enough
-    between_s: float = 5.0  # for moving the camera
-    wait_s: Annotated[float, Field(gt=0)] = 600.0  # for a photograph that comes as a file
-    sensor_width_mm: float = 35.7  # with the focal length of the file, a camera that is not calibrated yet
+    photographs: int = 1  # in the first attempt; the camera is moved in between
+    most_photographs: int = 5  # most of one layout, while the measures are not certain enough for a decision
+    between_s: float = 5.0  # time for moving the camera
+    wait_s: Annotated[float, Field(gt=0)] = 600.0  # longest wait for a photograph that arrives as a file
+    sensor_width_mm: float = 35.7  # gives nominal intrinsics, with the focal length in the file
 
 
 class Measures(LayoutMeasures):
@@ -53,16 +53,16 @@ class Measures(LayoutMeasures):
 
 
 class Result(Record):
-    """The spheres as the photographs show them, in the frame of the photograph with most spheres, metres."""
+    """The spheres in the frame of the photograph that shows most of them, metres."""
 
     spheres_m: tuple[tuple[float, float, float], ...]
     details: dict[str, Any]
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Take a photograph, find the spheres in it and in the earlier ones, search for near-symmetries; nothing moves.
+    """Take photographs, locate the spheres in all of this layout, and search for near-symmetries; nothing moves.
 
-    The first attempt takes `photographs`, each further one another, until a sphere was moved: then it begins anew.
+    The first attempt takes `photographs`, each further one takes one more. After a sphere was moved, it starts over.
     """
     images = _earlier(context)
     kept: list[ArtefactRef] = []
@@ -93,7 +93,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 
 
 def _earlier(context: StepContext) -> list[dict[str, Any]]:
-    """The photographs of the layout as it stands: those taken since a sphere was last moved."""
+    """The photographs of the present layout: those taken since a sphere was last moved."""
     images: list[dict[str, Any]] = []
     for note in context.state.notes:
         if note.note == MOVE_WANTED:
@@ -104,7 +104,7 @@ def _earlier(context: StepContext) -> list[dict[str, Any]]:
 
 
 def _photographs(context: StepContext, images: list[dict[str, Any]], wait_s: float) -> list[ArtefactRef]:
-    """Take one, or wait for those of a camera without a cable; keep them, note them and add them to `images`."""
+    """Take one, or wait for those of a camera without a cable; store, note and add them to `images`."""
     camera = context.devices.camera()
     refs: list[ArtefactRef] = []
     with tempfile.TemporaryDirectory(prefix="orthocapture-") as name:
@@ -131,7 +131,7 @@ def _advise(
     images: Sequence[Mapping[str, Any]],
     params: Params,
 ) -> None:
-    """Where the layout has not passed, say what to do: one more photograph as long as that may decide, or a move."""
+    """If the layout fails its gates, advise one more photograph while that may decide, or a move."""
     short = [verdict for verdict in verdicts if not verdict.passed]
     if not short:
         return
@@ -142,7 +142,7 @@ def _advise(
         return
     moves = details["moves"]
     if not moves:
-        remedy = "; ".join(details["problems"]) or "what the photographs show does not decide it"
+        remedy = "; ".join(details["problems"]) or "the photographs do not decide it"
         advice = f"{remedy[0].upper()}{remedy[1:]}. Set the spheres up less regularly and photograph them anew"
         context.note(MOVE_WANTED, advice=advice)
     else:
@@ -168,7 +168,7 @@ def _ask_for_photograph(context: StepContext, taken: int, *, unseen: bool) -> No
 
 
 def _move_hand(move: Mapping[str, Any]) -> dict[str, Any]:
-    """For the simulated technician: he points at the sphere in the photograph, as a person does."""
+    """For the simulated technician, who is told the sphere's place in the photograph, as a person is."""
     return {
         "action": "move_sphere",
         "from": move["from"],

@@ -44,7 +44,7 @@ class Ring(Record):
     count: Annotated[int, Field(ge=1, le=60)]  # places on the ring
     distance_m: Annotated[float, Field(ge=0.2, le=2)]  # from the middle of the scene
     aim_spread_m: Annotated[float, Field(ge=0, le=0.2)] = (
-        0.0  # spread of the aim point around the middle, for images of the board
+        0.0  # of the aim point around the middle, for images of the board
     )
 
     def azimuths_deg(self) -> list[float]:
@@ -67,9 +67,7 @@ class Params(Record):
     min_images: Annotated[int, Field(ge=3)] = 12  # usable images that are needed at least
     max_images: Annotated[int, Field(ge=3)] = 200  # including unusable ones
     calibration: str | None = None  # step with the intrinsics; not for images of the board
-    spheres_of: tuple[
-        str, ...
-    ] = ()  # steps that may have located the spheres, the best first: ct_import, layout_check
+    spheres_of: tuple[str, ...] = ()  # steps that locate the spheres, the best first: ct_import, layout_check
     sensor_width_mm: float = 35.7  # for images of the board, together with the focal length in the file
     coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
     pose_sigma_mm: Annotated[float, Field(gt=0)] = 0.05  # expected position error of structure from motion

@@ -1,4 +1,4 @@
-"""Step kind `scan_import`: the hand scanner's export is kept, checked and searched for its spheres."""
+"""Step kind `scan_import`: stores and checks the export of the hand scanner, and finds the spheres."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from service.core.jobs.references import Reference
-from service.core.records.events import Record
+from service.core.records.events import ArtefactRef, Record
 from service.core.units import metres
 from service.jobs.surfaces import locate_spheres
 from service.steps.arrivals import keep_mesh, wait_for
@@ -17,13 +17,13 @@ from service.steps.measures import Count, Measure, SphereMeasures
 
 
 class Params(Record):
-    """What the scan must hold."""
+    """What the scan must contain."""
 
-    spheres: int  # that the scan must hold
-    wait_s: float = 1800.0  # for the export to appear and be complete
+    spheres: int  # number of spheres in the scan
+    wait_s: float = 1800.0  # longest wait until the export is complete
     device: str | None = None  # name of the scanner in rig.yaml; None: the only one
     application: str | None = None  # the step whose coat is still on the specimen
-    compare_with: str | None = None  # an earlier ct_import or scan_import: did the spheres move since?
+    compare_with: str | None = None  # an earlier ct_import or scan_import, to see whether spheres moved since
 
 
 class Measures(SphereMeasures):
@@ -54,10 +54,10 @@ class Result(Record):
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Wait for a complete export that is newer than the step before, keep it, let the worker find the spheres."""
+    """Wait for a complete export since the previous step, store it, and let the worker find the spheres."""
     scanner = context.devices.scanner(params.device)
-    # The technician exports, then confirms: what arrived since the step before this one ended belongs to it. What is
-    # imported was there before.
+    # The technician exports, then confirms: exports since the end of the previous step belong to this one. In an
+    # import, the files existed before.
     importing = context.devices.imported() is not None
     since = "" if importing else max((step.ended_utc for step in context.run.steps.values()), default="")
 
@@ -65,27 +65,14 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         return [e for e in scanner.exports() if not since or _time(e.modified_utc) >= _time(since)]
 
     scan = scanner.read(wait_for(context, fresh, params.wait_s, "a complete scan export"))
-    measures = {f"scan_{name}": float(value) for name, value in scan.findings.items()}
+    found = {f"scan_{name}": float(value) for name, value in scan.findings.items()}
+    measures = {name: value for name, value in found.items() if name in Measures.declared()}  # a driver may find more
     measures["faces"] = float(len(scan.mesh.faces))
     if params.application is not None:
         applied = float(result_of(context, params.application)["applied_monotonic_s"])
         measures["since_application_min"] = (context.monotonic_s() - applied) / 60
     mesh, kept = keep_mesh(context, scan, device="scanner", kind="scan_mesh")
-    arguments = locate_spheres.Arguments(
-        mesh=mesh.sha256, radius_m=metres(context.protocol.spheres.radius_mm), expected=params.spheres
-    )
-    references: dict[str, Reference | None] = {}
-    if params.compare_with is not None and params.compare_with not in context.run.skipped:
-        reference = earlier_answer(context, params.compare_with, locate_spheres.KIND)
-        compared = {
-            "reference_m": reference.answer.spheres_m,
-            "reference_covariances_m2": tuple(s.covariance_m2 for s in reference.answer.details.spheres),
-        }
-        arguments = arguments.model_copy(update=compared)
-        references = {
-            "reference_m": reference.reference("spheres_m"),
-            "reference_covariances_m2": reference.reference("details/spheres/*/covariance_m2"),
-        }
+    arguments, references = _arguments(context, params, mesh)
     (answer,) = context.evidence.run_jobs(JobRequest.of(locate_spheres.KIND, arguments, references))
     result = Result.model_validate(answer.result)
     uncertainties = layout_uncertainties(result.details["layout"]) if "layout" in result.details else {}
@@ -95,6 +82,27 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         result.model_dump(mode="json"),
         uncertainties,
     )
+
+
+def _arguments(
+    context: StepContext, params: Params, mesh: ArtefactRef
+) -> tuple[locate_spheres.Arguments, dict[str, Reference | None]]:
+    """The arguments of the search, with the spheres to compare with, and the references to these."""
+    arguments = locate_spheres.Arguments(
+        mesh=mesh.sha256, radius_m=metres(context.protocol.spheres.radius_mm), expected=params.spheres
+    )
+    if params.compare_with is None or params.compare_with in context.run.skipped:
+        return arguments, {}
+    earlier = earlier_answer(context, params.compare_with, locate_spheres.KIND)
+    compared = {
+        "reference_m": earlier.answer.spheres_m,
+        "reference_covariances_m2": tuple(sphere.covariance_m2 for sphere in earlier.answer.details.spheres),
+    }
+    references = {
+        "reference_m": earlier.reference("spheres_m"),
+        "reference_covariances_m2": earlier.reference("details/spheres/*/covariance_m2"),
+    }
+    return arguments.model_copy(update=compared), references
 
 
 def _time(text: str) -> datetime:

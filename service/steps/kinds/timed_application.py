@@ -1,4 +1,4 @@
-"""Step kind `timed_application`: a coat that is applied once and fades, such as scanning spray."""
+"""Step kind `timed_application`: a coating that is applied once and disappears, such as scanning spray."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ class Params(Record):
     """What is applied and how long it lasts."""
 
     product: str  # what is applied
-    sublimates_after_s: float  # when it is gone
-    scan_within_s: float  # latest time for the scan, counted from the application
-    settle_s: float = 0.0  # wait this long before the next step
+    sublimates_after_s: float  # time until it has disappeared
+    scan_within_s: float  # latest time of the scan after the application
+    settle_s: float = 0.0  # waiting time before the next step
 
 
 class Measures(MeasureRecord):
@@ -25,7 +25,7 @@ class Measures(MeasureRecord):
 
 
 class Result(Record):
-    """When the coat was applied, on the host's clock."""
+    """When the coating was applied (host's monotonic clock), and its times."""
 
     product: str
     applied_monotonic_s: float
@@ -34,10 +34,10 @@ class Result(Record):
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Start the timer at the operator's confirmation and let the coat settle."""
+    """Start the timer at the operator's confirmation, and wait for the coating to settle."""
     earlier = [note.data for note in context.state.notes if "applied_monotonic_s" in note.data]
     applied = float(earlier[0]["applied_monotonic_s"]) if earlier else context.monotonic_s()
-    if not earlier:  # a restart does not apply the coat again
+    if not earlier:  # after a restart, the timer goes on
         context.note(
             f"{params.product} applied: scan within {params.scan_within_s / 60:.0f} min, "
             f"gone after {params.sublimates_after_s / 3600:.1f} h",

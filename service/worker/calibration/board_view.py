@@ -1,4 +1,4 @@
-"""Job `board_view`: the calibration board in one image as soon as it has arrived; what a calibration takes of it."""
+"""Job `board_view`: finds the calibration board in an image; and how a calibration uses the result."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from service.jobs.calibration import calibrate as calibrate_job
 from service.jobs.records import BoardSize
 from service.worker.job import JobAnswer, JobContext
 
-_WHITE = 245.0  # grey level that nearly all pixels must lie beyond
+_WHITE = 245.0  # an image counts as white if nearly all grey levels exceed this
 
 
 def board_of(size: BoardSize) -> Board:
@@ -30,9 +30,9 @@ def board_of(size: BoardSize) -> Board:
 
 
 def board_view(context: JobContext[job.Arguments]) -> JobAnswer:
-    """Find the whole board in one image, without it the reason is the answer; and tell how sharp the image is."""
+    """Find the whole board in an image, or the reason why not; and measure the sharpness of the image."""
     image = context.arguments.image
-    cv2.setNumThreads(1)  # beside a capture
+    cv2.setNumThreads(1)  # the capture goes on in parallel
     grey = read_grey(context.input(image.sha256))
     size = (grey.shape[1], grey.shape[0])
     quality = image_quality(grey)
@@ -53,12 +53,12 @@ def board_view(context: JobContext[job.Arguments]) -> JobAnswer:
 
 
 def plain_reason(error: ComputeError) -> str:
-    """Why no board was found, without what only tells how it was searched."""
+    """Why no board was found, without the details of the search."""
     return error.what.partition(" (searched")[0]
 
 
 def read_corners(record: Mapping[str, Any]) -> BoardImage:
-    """What `board_view` kept of an image with a board."""
+    """The board in an image, from the file of `board_view`."""
     indices, corners = np.array(record["indices"], dtype=np.int64), np.array(record["corners"], dtype=np.float64)
     return BoardImage((record["size"][0], record["size"][1]), BoardView(indices, corners))
 
@@ -66,10 +66,10 @@ def read_corners(record: Mapping[str, Any]) -> BoardImage:
 def boards_of(
     context: JobContext[calibrate_job.Arguments], board: Board
 ) -> tuple[tuple[BoardImage, ...], dict[int, int]]:
-    """The board in every image of a `calibrate` job, and the corners of those that show it in part, by index.
+    """The board in every image of a `calibrate` job; and for images that show a part of it, the number of corners.
 
-    An image that has been looked at before is not searched again. Where camera, mount and board are known well enough
-    (`known`), a part of the board counts.
+    Images that `board_view` has searched are not searched again. Parts of the board are used if camera, mount and
+    board are known well enough (`known`).
     """
     arguments = context.arguments
     images = arguments.images

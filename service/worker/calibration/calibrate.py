@@ -10,7 +10,7 @@ import numpy as np
 from service.compute.arm.kinematics import matching_arm
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.board.images import UsableViews, usable_views
-from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.record import board_corners, hand_eye_record
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
 from service.compute.calibration.intrinsics.record import intrinsics_record
@@ -30,7 +30,7 @@ from service.worker.job import JobAnswer, JobContext
 
 
 def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
-    """Detect the board in every image, then solve what the step asks for."""
+    """Find the board in every image, then solve what is asked for."""
     arguments = context.arguments
     images = arguments.images
     names = [image.viewpoint for image in images]
@@ -64,7 +64,7 @@ def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
 def _hand_eye(
     images: Sequence[Photograph], usable: UsableViews, board: Board, camera: CameraModel
 ) -> tuple[dict[str, Any], dict[str, float]]:
-    """What later steps need and the whole record, and measures for gates."""
+    """The fields of the answer with the whole record, and measures."""
     used = [images[i] for i in usable.indices]
     T_base_flange = np.array([image.T_base_flange for image in used])
     T_camera_board = np.array([locate_view(view, board, camera)[0] for view in usable.views])
@@ -81,9 +81,18 @@ def _hand_eye(
         T_board_turned=board.half_turn(),
     )
     record = hand_eye_record(solved, [image.viewpoint for image in used])
+    answer = {
+        "T_flange_camera": record["T_flange_camera"],
+        "T_base_board": record["T_base_board"],
+        "hand_eye": record,
+    }
+    return answer, _hand_eye_measures(solved)
+
+
+def _hand_eye_measures(solved: HandEyeResult) -> dict[str, float]:
     best = solved if solved.corrected is None else solved.corrected
     measures = {
-        # Of the answer that the registration uses: with the arm's correction, where there is one.
+        # Of the result that the registration uses: with the arm's correction, if there is one.
         "hand_eye_sigma_mm": best.sigma_mm,
         "hand_eye_sigma_deg": best.sigma_deg,
         "hand_eye_held_out_mm": float(np.median(best.held_out_mm)),
@@ -99,18 +108,13 @@ def _hand_eye(
         measures |= {"robot_noise_mm": best.robot_noise_mm, "robot_noise_deg": best.robot_noise_deg}
     if solved.corner_sigma_px is not None:
         measures["corner_sigma_px"] = solved.corner_sigma_px
-    answer = {
-        "T_flange_camera": record["T_flange_camera"],
-        "T_base_board": record["T_base_board"],
-        "hand_eye": record,
-    }
-    return answer, measures
+    return measures
 
 
 def _intrinsics(
     usable: UsableViews, board: Board, names: Sequence[str]
 ) -> tuple[CameraModel, dict[str, float], dict[str, Any]]:
-    """The camera, measures for gates, and all that is known of the calibration (`intrinsics_record`)."""
+    """The camera, measures, and the whole record of the calibration (`intrinsics_record`)."""
     solved = calibrate_intrinsics(usable.views, board, usable.size)
     validation = cross_validate(solved) if len(solved.views) >= MIN_VIEWS_TO_VALIDATE else None
     uncertainty = projection_uncertainty(solved, board_distance_m(solved))

@@ -1,1 +1,1 @@
-"""Jobs that find camera poses from images, and the poses of the robot."""
+"""Jobs that estimate camera poses from images, and camera poses from those of the robot."""

@@ -1,4 +1,4 @@
-"""Jobs `features` and `match`: the pieces that structure from motion is made of, as images arrive or afterwards."""
+"""Jobs `features` and `match`: the input of structure from motion, computed as images arrive or afterwards."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from service.worker.poses.photographs import photographs
 
 
 def features(context: JobContext[features_job.Arguments]) -> JobAnswer:
-    """SIFT features of some images, an artefact each, in the order of the images."""
-    cv2.setNumThreads(1)  # jobs run side by side
+    """SIFT features of some images, one artefact for each, in the order of the images."""
+    cv2.setNumThreads(1)  # jobs run in parallel
     images = context.arguments.images
     files = photographs(context, images)
     refs = []
@@ -41,7 +41,7 @@ def features(context: JobContext[features_job.Arguments]) -> JobAnswer:
 
 
 def match(context: JobContext[match_job.Arguments]) -> JobAnswer:
-    """Verified matches of some pairs of images."""
+    """Geometrically verified matches of some pairs of images."""
     arguments = context.arguments
     with _front_end(arguments) as front:
         found = front.match_pairs(read_features(context, arguments.features), arguments.pairs, context.progress)
@@ -64,13 +64,13 @@ def read_matches(
     prior: Mapping[str, Transform],
     options: SfmOptions,
 ) -> list[PairMatches]:
-    """The matches that count for these images: of the pairs that their poses choose, whenever they were made.
+    """The matches of those pairs of images that their prior poses select, whenever they were computed.
 
     Args:
         context: of the job.
         files: of matches.
         names: of the images.
-        prior: T_world_camera by image, which choose the pairs; empty where none are known.
+        prior: T_world_camera by image, which select the pairs; empty if unknown.
         options: of structure from motion.
     """
     wanted = set(pairs_of(names, prior or None, options))
@@ -80,7 +80,7 @@ def read_matches(
 
 
 class _ColmapChildren(threading.local):
-    """COLMAP's child of each thread that does jobs, by seed: starting one takes as long as an image's features."""
+    """COLMAP's child process of each thread, by seed; kept, because starting one takes as long as an image."""
 
     def __init__(self) -> None:
         self.children: dict[int, ColmapProcess] = {}

@@ -1,4 +1,4 @@
-"""Jobs on camera poses: structure from motion, and hybrid poses of it with the robot and the spheres."""
+"""Jobs `structure_from_motion` and `hybrid`: camera poses from images, and combined with robot and spheres."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from service.worker.poses.robot_poses import robot_camera_poses
 
 
 def structure_from_motion(context: JobContext[sfm_job.Arguments]) -> JobAnswer:
-    """Run each wanted mapper on shared features; the robot's poses only choose which pairs are matched."""
+    """Run each mapper on the same features; the prior poses only select which pairs are matched."""
     arguments = context.arguments
     options = SfmOptions(**arguments.effort)
     reconstructed = (
@@ -89,7 +89,7 @@ def _from_pieces(
 
 
 def _from_images(context: JobContext[sfm_job.Arguments], options: SfmOptions) -> Callable[[Mapper], SfmModel]:
-    """All at once, as runs were recorded before features and matches were jobs of their own."""
+    """Compute everything in this job, as in old runs, which had no jobs for features and matches."""
     images = context.arguments.images
     files = dict(zip((image.viewpoint for image in images), photographs(context, images), strict=True))
     return partial(
@@ -117,7 +117,7 @@ def hybrid(context: JobContext[hybrid_job.Arguments]) -> JobAnswer:
     found = context.input_json(arguments.outlines)
     stations = sorted({image.station for image in images})
     context.progress("hybrid poses", 0, 1)
-    # The camera is held: overlays and control spheres are read with the calibrated one, which must fit the poses.
+    # Intrinsics stay fixed: overlays and control spheres use the calibrated ones, which must fit the poses.
     answer = hybrid_poses(
         PosedImages(
             np.array([model[name] for name in names]),
@@ -179,7 +179,7 @@ def _packed(model: SfmModel, joint_pose_covariance: Array) -> bytes:
 
 
 def joint_pose_covariance(data: bytes, names: Sequence[str]) -> Array:
-    """(6 N, 6 N) of a packed model, for the images named, in their order."""
+    """(6 N, 6 N) Covariance of the poses in a packed model, for the named images in their order."""
     with np.load(io.BytesIO(data)) as archive:
         order = json.loads(str(archive["names"]))
         rows = (6 * np.array([order.index(name) for name in names])[:, None] + np.arange(6)).ravel()
@@ -187,7 +187,7 @@ def joint_pose_covariance(data: bytes, names: Sequence[str]) -> Array:
 
 
 def _unpacked(data: bytes, names: list[str]) -> Tracks:
-    """The tracks again, images numbered as in `names`."""
+    """The tracks of a packed model, with images numbered as in `names`."""
     with np.load(io.BytesIO(data)) as archive:
         order = json.loads(str(archive["names"]))
         number = np.array([names.index(name) for name in order], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""The photographs of a job as files, at their own size or at the resolution that the job asks for."""
+"""The photographs of a job as files, at full size or reduced."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMW
 
 
 def photographs(context: JobContext[_A], images: Sequence[ImageFile]) -> list[Path]:
-    """One file an image. Where the job asks for a smaller size, reduced copies."""
+    """One file per image: the original, or a reduced copy if the job asks for it."""
     originals = [context.input(image.sha256) for image in images]
     full = camera_reduced(context.arguments)
     if full is None:

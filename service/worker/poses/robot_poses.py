@@ -1,4 +1,4 @@
-"""Camera poses from the robot's: through the hand-eye, and through the arm's correction where there is one."""
+"""Camera poses from robot poses, with the hand-eye transform and, if there is one, the arm's correction."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ def robot_camera_poses(mounting: Mounting, images: Sequence[Photograph]) -> Arra
     """(N, 4, 4) T_base_camera of a job's images, each in the base frame of its station.
 
     Args:
-        mounting: how the camera sat on the arm.
-        images: with `T_scene_camera` of a hand-held camera, or with `T_base_flange`, and for a correction `station`
-            and `joints_rad`.
+        mounting: of the camera on the arm.
+        images: with `T_scene_camera` of a hand-held camera, or with `T_base_flange`; for a correction also with
+            `station` and `joints_rad`.
 
     Raises:
-        DataError: joints of another arm than the correction's.
+        DataError: the joints are not of the corrected arm.
     """
-    if all(image.T_scene_camera is not None for image in images):  # hand-held: by the spheres of each image
+    if all(image.T_scene_camera is not None for image in images):  # hand-held, located by the spheres
         return np.array([image.T_scene_camera for image in images], dtype=np.float64)
     flange = np.array([image.T_base_flange for image in images], dtype=np.float64)
     poses = flange @ np.array(mounting.T_flange_camera, dtype=np.float64)

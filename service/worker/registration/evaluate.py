@@ -43,21 +43,21 @@ from service.jobs.registration.register import Registration
 from service.worker.camera import camera_of
 from service.worker.job import JobAnswer, JobContext
 
-_COMMON = ("common", "intrinsics")  # components that move all spheres alike
+_COMMON = ("common", "intrinsics")  # components that move all spheres equally
 
 
 @dataclass(frozen=True, slots=True)
 class _MeasuredSpheres:
-    """What scanner and CT say of the spheres, in the frame of the registered scan."""
+    """The spheres as scanner and CT measured them, in the frame of the registered scan."""
 
     scan: MeasuredSpheres
     control: MeasuredSpheres
-    ct: MeasuredSpheres | None  # in its own frame, one row for each sphere of the scan, NaN where it has none
+    ct: MeasuredSpheres | None  # in its own frame; one row for each sphere of the scan, NaN if it is missing
 
 
 @dataclass(frozen=True, slots=True)
 class _Registered:
-    """One registration and the images that it has a pose for."""
+    """One registration, with the images that have a pose in it."""
 
     name: str
     record: Registration
@@ -70,7 +70,7 @@ class _Registered:
 
 
 def evaluate(context: JobContext[job.Arguments]) -> JobAnswer:
-    """One row a registration: errors on the control spheres, which took no part in it, and its budget."""
+    """Evaluate each registration on the control spheres, which it did not use; one row of the table for each."""
     arguments = context.arguments
     measured = _measured(arguments)
     radius_m = arguments.radius_m
@@ -85,7 +85,7 @@ def evaluate(context: JobContext[job.Arguments]) -> JobAnswer:
         table.append(_row(registered, budget, _errors(registered, measured, radius_m)))
         pictures[name] = partial(_overlays, context, registered, measured, radius_m)
     best = best_row(table)
-    # The best source, and beside it the robot's own poses: the eye sees the difference.
+    # Overlays of the best source and of the reported robot poses, to show the difference.
     refs = [ref for name in dict.fromkeys((best.poses, "robot")) if name in pictures for ref in pictures[name]()]
     numbers: dict[str, float | None] = {
         f"{row.poses}_mean_radial_error_mm": row.mean_radial_error_mm for row in table
@@ -122,7 +122,7 @@ def _row(registered: _Registered, budget: ErrorBudget, errors: _Errors) -> job.R
 
 @dataclass(frozen=True, slots=True)
 class _Errors:
-    """The paper's two errors, and on what they were evaluated."""
+    """The paper's two errors, and what they were evaluated on."""
 
     mean_radial_mm: float
     mean_reprojection_px: float
@@ -131,7 +131,7 @@ class _Errors:
 
 
 def _errors(registered: _Registered, measured: _MeasuredSpheres, radius_m: float) -> _Errors:
-    """The paper's two errors, on control spheres where there are any, else on each sphere predicted by the others."""
+    """The paper's two errors: on the control spheres or, without any, on each sphere predicted from the others."""
     if not len(measured.control.centres_m):
         left_out = registered.record.leave_one_out
         if left_out is None:
@@ -152,7 +152,7 @@ def _errors(registered: _Registered, measured: _MeasuredSpheres, radius_m: float
 
 
 def _measured(arguments: job.Arguments) -> _MeasuredSpheres:
-    """Scan, control scan and CT brought together by their spheres."""
+    """Scan, control scan and CT, matched by their spheres."""
     scan = _spheres(arguments.scan)
     control = _control(scan, arguments.control_scan)
     if arguments.ct is None:
@@ -227,7 +227,7 @@ def _registered(
 
 
 def _budget(registered: _Registered, measured: _MeasuredSpheres, radius_m: float) -> ErrorBudget:
-    """Contributions where the control spheres are: in the middle of the anatomy."""
+    """The error budget at the centre of the control spheres, which is the middle of the anatomy."""
     record = registered.record
     T_world_scan = np.array(record.T_world_scan)
     target = (measured.control if len(measured.control.centres_m) else measured.scan).centres_m.mean(axis=0)
@@ -238,7 +238,7 @@ def _budget(registered: _Registered, measured: _MeasuredSpheres, radius_m: float
         name: float(np.sqrt(np.trace(component.covariance_at_m2(target[None])[0])))
         for name, component in components.items()
     }
-    # Each sphere alone needs three images; control captures are few, so two must do where there are no more.
+    # To locate a sphere takes three images; with fewer control images, two have to suffice.
     least = min(3, len(registered.images))
     controls = locate_in_images(
         registered.outlines,
@@ -268,7 +268,7 @@ def _budget(registered: _Registered, measured: _MeasuredSpheres, radius_m: float
 def _overlays(
     context: JobContext[job.Arguments], registered: _Registered, measured: _MeasuredSpheres, radius_m: float
 ) -> list[ArtefactRef]:
-    """Pictures of one image a station, with detected and predicted outlines drawn over it."""
+    """One image of each station with detected and predicted outlines drawn over it."""
     first: dict[str, int] = {}
     for i, image in enumerate(registered.images):
         first.setdefault(image.station, i)

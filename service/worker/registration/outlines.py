@@ -11,6 +11,7 @@ from service.compute.markers.archive import outline_record
 from service.compute.markers.detectors import options_for
 from service.compute.markers.search.image_files import LocatedOutlines, detect_all, locate_outlines, searched_whole
 from service.compute.markers.search.paper_files import detect_file_by_masks
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
 from service.jobs.records import Photograph
 from service.jobs.registration import detect_spheres as job
@@ -68,13 +69,14 @@ def _located(
         return searched_whole(detect_all(files, camera, options, workers, show, detect=detect_file_by_masks))
     return locate_outlines(
         files,
-        camera,
-        robot_camera_poses(arguments, images) if poses is None else poses,
-        np.array(arguments.spheres_m),
-        arguments.radius_m,
-        groups=_numbered(image.station for image in images),
+        PosedImages(
+            robot_camera_poses(arguments, images) if poses is None else poses,
+            camera,
+            groups=_numbered(image.station for image in images),
+            metric=poses is None,
+        ),
+        ScanSpheres(np.array(arguments.spheres_m), arguments.radius_m),
         scenes=_numbered(image.step for image in images),
-        metric=poses is None,
         options=options,
         workers=workers,
         progress=show,

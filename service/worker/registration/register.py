@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,8 @@ from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import register_images
 from service.compute.registration.joint_poses import with_joint_pose_covariance
 from service.compute.registration.result import RegistrationResult
+from service.compute.registration.settings import RegistrationSettings
+from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, inverse
 from service.core.units import mm
@@ -35,23 +36,16 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
     arguments, source = context.arguments, context.arguments.poses
     refined = source == "robot_corrected"
     images = _posed_images(context)
-    solve = partial(
-        register_images,
-        images.outlines,
-        images.poses,
-        images.camera,
-        np.array(arguments.spheres_m),
-        arguments.radius_m,
-        groups=images.groups,
-        estimate_scale=source not in ("robot", "robot_corrected", "spheres", "hybrid"),
-        names=images.names,
-        sphere_covariance_m2=np.array(arguments.sphere_covariance_m2),
-    )
-    solved = solve()
+    metric = source in ("robot", "robot_corrected", "spheres", "hybrid")
+    posed = PosedImages(images.poses, images.camera, groups=images.groups, metric=metric, names=images.names)
+    covariance_m2 = np.array(arguments.sphere_covariance_m2)
+    spheres = ScanSpheres(np.array(arguments.spheres_m), arguments.radius_m, covariance_m2=covariance_m2)
+    solved = register_images(images.outlines, posed, spheres)
     answer = solved.registration
     placed, components = _placed(context, images, answer)
     if (lens := _intrinsics_covariance(arguments)) is not None:
-        uncertain = solve(assignments=solved.assignments, intrinsics_covariance=lens)
+        settings = RegistrationSettings(intrinsics_covariance=lens)
+        uncertain = register_images(images.outlines, posed, spheres, settings, assignments=solved.assignments)
         components["intrinsics"] = _added(answer, uncertain.registration, refined=refined)
     covariance = np.sum(list(components.values()), axis=0)
     left_out = _leave_one_out(answer, refined=refined)

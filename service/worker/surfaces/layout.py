@@ -1,4 +1,4 @@
-"""Job `layout`: photographs of the placed spheres → their places → near-symmetries, and what to move."""
+"""Job `layout`: locates the spheres in photographs, searches for near-symmetries, and suggests moves."""
 
 from __future__ import annotations
 
@@ -31,14 +31,15 @@ from service.core.units import mm
 from service.jobs.surfaces import layout as job
 from service.worker.job import JobAnswer, JobContext
 
-# The lens is not calibrated yet, and its distortion bends outlines away from ellipses: in an image of 9504 px by more
-# than the edges scatter, so that ten of thirteen good ones were refused. Of a lens that bends more, a smaller copy.
+# The lens is not calibrated yet, and its distortion deforms the ellipses of the outlines. In an image of 9504 px this
+# exceeds the noise of the edges, so that ten of thirteen good outlines were rejected: copies of smaller width are
+# searched, and still smaller ones for a lens with more distortion.
 _WIDTHS_PX = (1920, 1440, 960)
 _GREEN, _YELLOW, _BLACK, _WHITE = (60, 220, 60), (0, 220, 255), (0, 0, 0), (255, 255, 255)  # BGR
 
 
 def layout(context: JobContext[job.Arguments]) -> JobAnswer:
-    """Spheres of all photographs in one frame, judged by `check_layout`; the last photograph shows them numbered."""
+    """Locate the spheres of all photographs, check their layout, and number them in the last photograph."""
     arguments = context.arguments
     radius_m, expected = arguments.radius_m, arguments.expected
     photographs: list[NDArray[np.uint8]] = []
@@ -70,10 +71,10 @@ def layout(context: JobContext[job.Arguments]) -> JobAnswer:
 def _look(
     photographs: Sequence[NDArray[np.uint8]], focal_mm: Sequence[float], sensor_width_mm: float, expected: int | None
 ) -> tuple[list[tuple[CameraModel, Sequence[SphereOutline]]], NDArray[np.uint8]]:
-    """Nominal camera and outlines of each photograph, and the last of the copies in which they were found.
+    """Nominal camera and outlines of each photograph, and the copy of the last photograph that was searched.
 
-    All copies are of one width, because the photographs are adjusted together: of the largest in which all spheres
-    are seen, or else most.
+    All copies have the same width, because the photographs are adjusted together: the largest at which all spheres
+    are found, or otherwise the one at which most are.
     """
     best: tuple[int, list[tuple[CameraModel, Sequence[SphereOutline]]], NDArray[np.uint8]] | None = None
     for width in _WIDTHS_PX:
@@ -88,7 +89,7 @@ def _look(
             best = found, seen, copy
         if expected is None or all(len(outlines) >= expected for _, outlines in seen):
             break
-    assert best is not None  # there is a width
+    assert best is not None  # there is at least one width
     return best[1:]
 
 
@@ -100,15 +101,15 @@ def _not_wider(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
 
 
 def nominal_camera(width: int, height: int, focal_mm: float, sensor_width_mm: float) -> CameraModel:
-    """A camera that was not calibrated: focal length by the file, principal point in the middle, no distortion.
+    """Nominal intrinsics: focal length from the file, principal point in the middle, no distortion.
 
     Raises:
-        DataError: the file does not tell its focal length.
+        DataError: the file does not state its focal length.
     """
     if not focal_mm > 0:
         raise DataError(
-            "the photograph does not tell its focal length",
-            remedy="use a lens that tells the camera, or check the layout with `orthocapture layout --photo`",
+            "the photograph does not state its focal length",
+            remedy="Use a lens that reports it to the camera, or check the layout with `orthocapture layout --photo`",
         )
     focal_px = focal_mm / sensor_width_mm * width
     return CameraModel(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0, 0.0, 0.0)
@@ -117,7 +118,7 @@ def nominal_camera(width: int, height: int, focal_mm: float, sensor_width_mm: fl
 def _moves(
     found: PhotoLayout, report: LayoutReport, camera: CameraModel, radius_m: float, control: int
 ) -> list[PhotographedMove]:
-    """What to move, as the last photograph shows it; nothing where the layout is good, or no move would help."""
+    """The spheres to move, in the last photograph; none if the layout is good or no move would help."""
     T = found.T_photo_first[-1]
     if T is None or all(bounded.lower_m >= limit for bounded, limit in layout_bounds(report).values()):
         return []
@@ -136,7 +137,7 @@ def _moves(
 
 
 def _up(centres: Array) -> Array:
-    """Away from the table: across the spheres' best plane, towards the camera, which looks along its z."""
+    """(3,) Normal of the spheres' best plane, pointing away from the table, towards the camera."""
     _, _, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
     return np.asarray(axes[2] if axes[2, 2] < 0 else -axes[2], dtype=np.float64)
 
@@ -147,7 +148,7 @@ def _photograph_record(ids: NDArray[np.int64], outlines: Sequence[SphereOutline]
 
 
 def _move_record(move: PhotographedMove, camera: CameraModel) -> dict[str, Any]:
-    """The places as parts of the image's width and height: as one would point at them in the picture."""
+    """The move as recorded; places are fractions of the image's width and height."""
     size = np.array([camera.width, camera.height])
     return {
         "words": move.words,
@@ -164,7 +165,7 @@ def _picture(
     ids: NDArray[np.int64],
     moves: Sequence[PhotographedMove],
 ) -> bytes:
-    """JPEG of the photograph with numbered spheres, and arrows where spheres are to go."""
+    """JPEG of the photograph with numbered spheres, and arrows for the moves."""
     picture = pixels.copy()
     thick = max(1, round(camera.width / 900))
     curves = [outline.captured_px(camera) for outline in outlines]
@@ -173,7 +174,7 @@ def _picture(
     for move in moves:
         moved = min(curves, key=lambda curve: float(np.linalg.norm(curve.mean(axis=0) - move.from_px)))
         _draw_move(picture, move, moved - moved.mean(axis=0), thick)
-    for sphere, curve in zip(ids.tolist(), curves, strict=False):  # above all else: the advice names them
+    for sphere, curve in zip(ids.tolist(), curves, strict=False):  # last: the advice refers to the numbers
         if sphere >= 0:
             _draw_number(picture, str(sphere), curve, thick)
     _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
@@ -181,13 +182,13 @@ def _picture(
 
 
 def _draw_move(picture: NDArray[np.uint8], move: PhotographedMove, outline: Array, thick: int) -> None:
-    """Where the sphere is to go as a circle, and an arrow from rim to rim, so that its number stays to be read.
+    """Draw the new place of a sphere, and an arrow from rim to rim, which leaves the number legible.
 
     Args:
         picture: drawn into.
         move: the move.
         outline: (n, 2) pixels of the sphere's outline about its middle.
-        thick: of a thin line, in pixels.
+        thick: width of a thin line, in pixels.
     """
     way = move.to_px - move.from_px
     length = float(np.linalg.norm(way))
@@ -200,7 +201,7 @@ def _draw_move(picture: NDArray[np.uint8], move: PhotographedMove, outline: Arra
 
 
 def _draw_number(picture: NDArray[np.uint8], text: str, curve: Array, thick: int) -> None:
-    """In the middle of its sphere, as large as fits there: a page shows the photograph at a fraction of its size."""
+    """Draw a number on its sphere as large as possible, because pages show the photograph at a reduced size."""
     x, y = curve.mean(axis=0)
     radius = float(np.linalg.norm(curve - (x, y), axis=1).mean())
     (width_1, height_1), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 2 * thick)
@@ -211,5 +212,5 @@ def _draw_number(picture: NDArray[np.uint8], text: str, curve: Array, thick: int
 
 
 def _sixteenths(curve: Array) -> NDArray[np.int32]:
-    """As OpenCV takes pixels with four binary places."""
+    """Pixels as OpenCV expects them with four fractional bits."""
     return np.rint(curve * 16).astype(np.int32)

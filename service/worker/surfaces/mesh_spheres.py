@@ -1,4 +1,4 @@
-"""Jobs on surfaces: the CT volume becomes a mesh, and every mesh is searched for its spheres."""
+"""Jobs `ct_surface` and `locate_spheres`: the surface of a CT volume, and the spheres of a mesh."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from service.worker.job import JobAnswer, JobContext
 
 
 def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
-    """Hounsfield volume → surface at the threshold → spheres in the CT frame."""
+    """Compute the surface of a volume (Hounsfield units) at the threshold, and find the spheres in the CT frame."""
     arguments = context.arguments
     hounsfield = np.load(context.input(arguments.hounsfield), allow_pickle=False, mmap_mode="r")
     vertices_m, faces = surface(hounsfield, np.array(arguments.T_ct_voxel), arguments.threshold_hu)
@@ -37,7 +37,7 @@ def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
 
 
 def locate_spheres(context: JobContext[locate_job.Arguments]) -> JobAnswer:
-    """Spheres of a decoded mesh; with `reference_m`, how they moved against an earlier measurement."""
+    """Find the spheres of a mesh; with `reference_m`, also how they moved since an earlier measurement."""
     with np.load(context.input(context.arguments.mesh), allow_pickle=False) as mesh:
         return _search(context.arguments, mesh["vertices_m"], mesh["faces"])
 
