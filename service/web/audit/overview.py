@@ -86,7 +86,7 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
     )
 
 
-def _to_come(audit: AuditState, run_id: str, digest: Digest | None) -> list[Left]:
+def _to_come(audit: AuditState, run_id: str, digest: Digest | None) -> list[PendingResult]:
     """Results that are still being computed, or that failed. The whole run is read only if there may be any."""
     failed = digest is not None and digest.facets.kinds.get("job_failed", 0) > 0
     if digest is None or digest.problem or not (failed or audit.site.store.open_jobs(run_id)):

@@ -13,7 +13,7 @@ from service.store.store import Store
 
 
 @dataclass(frozen=True, slots=True)
-class OtherContent:
+class DifferingContent:
     """Different content under the same id and version: its runs, who approved it, and the lines that differ."""
 
     sha256: str

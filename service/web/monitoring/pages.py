@@ -24,7 +24,7 @@ router = APIRouter(tags=["health"])
 _FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
 
 
-class ReaderOrThisMachine(Guard):
+class ReaderOrLocalRequest(Guard):
     """Lets requests from this machine pass if no proxy forwarded them; everybody else must be signed in to read.
 
     A scraping program cannot sign in, and whoever is on this machine could read the data folder anyway.

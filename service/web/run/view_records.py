@@ -191,7 +191,7 @@ class Question:
     can_pause: bool
     asked_anew: bool
     standing: bool
-    trouble: Trouble | None
+    trouble: StepTrouble | None
     ways: tuple[Choice, ...]
     signature: Signature | None
     acceptance: Acceptance | None
