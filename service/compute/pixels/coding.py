@@ -26,7 +26,7 @@ def coded_depth(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
         )
     coded = np.empty(depth_m.shape, dtype=np.uint16)
     for row in range(0, len(depth_m), 256):
-        coded[row : row + 256] = np.rint(depth_m[row : row + 256] * np.float64(1e3 / DEPTH_UNIT_MM))
+        coded[row : row + 256] = np.rint(depth_m[row : row + 256] * np.float64(mm(1.0) / DEPTH_UNIT_MM))
     return coded
 
 

@@ -24,7 +24,7 @@ from service.compute.calibration.hand_eye.closed_form import (
 from service.compute.calibration.hand_eye.fit import (
     Answer,
     ArmTerms,
-    Measured,
+    HandEyeMeasurements,
     Method,
     arm_is_possible,
     arm_noise,
@@ -149,7 +149,7 @@ def calibrate_hand_eye(
 class _Agreed:
     """The views with half-turned boards turned back, the outliers among them, and the answer without the arm."""
 
-    data: Measured
+    data: HandEyeMeasurements
     turned: NDArray[np.bool_]
     corner_sigma_px: float | None
     excluded: dict[int, str]
@@ -171,7 +171,7 @@ class _Outcome:
 
 
 def _agreed(
-    data: Measured,
+    data: HandEyeMeasurements,
     T_board_turned: Transform | None,
     method: Method,
     checked: tuple[Array, Setup],
@@ -216,7 +216,7 @@ def _outcomes(agreed: _Agreed, method: Method, folds: NDArray[np.int64], point: 
     return outcomes
 
 
-def _bootstrap(good: Measured, method: Method, count: int, seed: int, outcome: _Outcome) -> Array:
+def _bootstrap(good: HandEyeMeasurements, method: Method, count: int, seed: int, outcome: _Outcome) -> Array:
     """(6, 6) covariance of T_flange_camera by resampling the views."""
     covariance = bootstrap_covariance(good, method, outcome.answer, count, np.random.default_rng(seed))
     if method in CLOSED_FORMS:
@@ -225,7 +225,7 @@ def _bootstrap(good: Measured, method: Method, count: int, seed: int, outcome: _
 
 
 def _quality(
-    data: Measured, point_m: Array, share: Array, resampled: Callable[[_Outcome], Array], outcome: _Outcome
+    data: HandEyeMeasurements, point_m: Array, share: Array, resampled: Callable[[_Outcome], Array], outcome: _Outcome
 ) -> dict[str, Any]:
     """The fields of a HandEyeAnswer."""
     answer = outcome.answer
@@ -248,7 +248,7 @@ def _quality(
     }
 
 
-def _measured(views: HandEyeViews) -> Measured:
+def _measured(views: HandEyeViews) -> HandEyeMeasurements:
     """The views as arrays whose shapes agree."""
     corners = views.corners
     hands = np.asarray(views.T_base_flange, dtype=np.float64)
@@ -262,12 +262,12 @@ def _measured(views: HandEyeViews) -> Measured:
     joints = None if views.joints_rad is None else np.asarray(views.joints_rad, dtype=np.float64)
     if joints is not None and (joints.shape != (len(hands), 6) or not np.isfinite(joints).all()):
         raise DataError(f"joints {joints.shape} instead of ({len(hands)}, 6) finite numbers")
-    return Measured(hands, boards, np.zeros((len(hands), 6, 6)), corners, joints, views.arm)
+    return HandEyeMeasurements(hands, boards, np.zeros((len(hands), 6, 6)), corners, joints, views.arm)
 
 
 def _straightened(
-    data: Measured, turned: NDArray[np.bool_], T_board_turned: Transform | None
-) -> tuple[Measured, float | None]:
+    data: HandEyeMeasurements, turned: NDArray[np.bool_], T_board_turned: Transform | None
+) -> tuple[HandEyeMeasurements, float | None]:
     """The views with half-turned boards turned back, their corners renumbered, and the boards' covariance."""
     boards, corners = data.boards, data.corners
     if T_board_turned is not None:
@@ -281,7 +281,7 @@ def _straightened(
 
 
 def _arm_answer(
-    data: Measured, keep: NDArray[np.bool_], plain: Answer, terms: ArmTerms, noise: Noise
+    data: HandEyeMeasurements, keep: NDArray[np.bool_], plain: Answer, terms: ArmTerms, noise: Noise
 ) -> tuple[Answer, NDArray[np.bool_], Noise]:
     """The fit with the arm's errors (refitted without its own outliers), the views used, and the noise."""
     good = data.take(keep)
@@ -296,7 +296,7 @@ def _arm_answer(
     return fit_with_arm(good, plain, terms, noise), used, noise
 
 
-def _methods(data: Measured, method: Method, answer: Answer) -> dict[Method, Transform]:
+def _methods(data: HandEyeMeasurements, method: Method, answer: Answer) -> dict[Method, Transform]:
     """T_flange_camera by every method that has an answer."""
     answers: dict[Method, Transform] = {method: answer.T_flange_camera}
     for name, T in all_closed_forms(data.hands, data.boards).items():

@@ -45,7 +45,7 @@ class MapOver(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Provisional:
+class AnchorRegistration:
     """The provisional registration.
 
     Attributes:
@@ -72,7 +72,7 @@ def register_anchors(
     sets: Sequence[NDArray[np.int64]],
     options: DetectionOptions,
     map_over: MapOver,
-) -> Provisional | None:
+) -> AnchorRegistration | None:
     """The registration of a few images of each of the `sets`; None if no reliable one is found."""
     seen: dict[int, tuple[SphereOutline, ...]] = {}
     look = partial(_look_reduced, camera=images.camera, options=options)
@@ -102,7 +102,7 @@ def _provisional(
     solved: RegistrationResult,
     spheres: ScanSpheres,
     anchors: tuple[int, ...],
-) -> Provisional:
+) -> AnchorRegistration:
     listed = np.vstack([spheres.centres_m, spheres.control_m])
     used = sorted((r.image, r.outline) for r in solved.residuals if not r.excluded)
     T_scan_camera = solved.T_scan_camera
@@ -110,7 +110,7 @@ def _provisional(
         _pose_error(outlines[i], assignments[i], inverse(T_scan_camera[i]), listed, spheres.radius_m)
         for i in sorted({i for i, _ in used})
     ]
-    return Provisional(
+    return AnchorRegistration(
         T_scan_camera,
         solved.scale,
         # The anchors share part of their poses' error; the next image's may be several times as large.

@@ -19,9 +19,9 @@ from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_image_of
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
-from service.compute.markers.search.anchors import MapOver, Provisional, register_anchors
+from service.compute.markers.search.anchors import AnchorRegistration, MapOver, register_anchors
 from service.compute.markers.search.predicted import (
-    Found,
+    ImageOutlines,
     Prediction,
     find_spheres,
 )
@@ -170,7 +170,7 @@ def locate_outlines(
 
 
 def _located(
-    found: Sequence[Found], first: Provisional, camera: CameraModel, spheres: ScanSpheres
+    found: Sequence[ImageOutlines], first: AnchorRegistration, camera: CameraModel, spheres: ScanSpheres
 ) -> LocatedOutlines:
     """What was found at the predicted places, with the registration spheres identified."""
     centres = np.vstack([spheres.centres_m, spheres.control_m, first.unlisted_m])
@@ -200,7 +200,7 @@ def searched_whole(outlines: Sequence[tuple[SphereOutline, ...]]) -> LocatedOutl
     return LocatedOutlines(tuple(outlines), None, tuple(ImageSearch("searched") for _ in outlines))
 
 
-def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> Found:
+def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> ImageOutlines:
     return find_spheres(read_image_of(task.path, camera), camera, task.expected, options)
 
 
