@@ -74,9 +74,9 @@ class HomeQuery(BaseModel):
     until: str = Field("", max_length=200)
     result: str = Field("", max_length=200)
 
-    def wanted(self) -> RunWanted:
+    def wanted(self) -> RunSearch:
         """The search."""
-        return RunWanted(self.q, self.since, self.until, self.result if self.result in RESULTS else "")
+        return RunSearch(self.q, self.since, self.until, self.result if self.result in RESULTS else "")
 
 
 @router.get("/", name="home", dependencies=[Depends(requires("read"))])
