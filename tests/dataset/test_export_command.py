@@ -20,7 +20,7 @@ from service.compute.pixels.masks import Ball, marker_mask
 from service.core.geometry import apply, increment, inverse
 from service.core.records.events import EvidenceExported
 from service.core.units import metres
-from service.dataset.posed.of_run import data_set_of, pose_covariance, upwards
+from service.dataset.posed.of_run import control_spheres, data_set_of, pose_covariance, specimen_pixels, upwards
 from service.dataset.posed.records import Mesh
 from service.store.verification.verify import verify
 from tests.support.runs.bench_run import record_runs
@@ -87,6 +87,19 @@ def test_the_masks_cover_the_spheres_that_the_photographs_show(recorded: Path) -
                 contrast.append(abs(float(np.median(saturation[mine]) - np.median(saturation[around]))))
     assert len(contrast) > 10
     assert np.median(contrast) > 20
+
+
+def test_control_spheres_that_the_scan_no_longer_shows_are_masked(recorded: Path) -> None:
+    """They are yellow-green as the others, and stand on the specimen, whose colour differs."""
+    summary = read_run(recorded, "latest").summary()
+    dataset, centres = data_set_of(summary), control_spheres(summary)
+    assert len(centres) == summary.protocol.spheres.control
+    for view in dataset.views:
+        colours, markers = dataset.pixels.colours(view).astype(np.int64), dataset.pixels.markers(view)
+        between = specimen_pixels(summary, view)
+        sphere_like = (colours[..., 1] > 120) & (colours[..., 1] > 1.5 * colours[..., 0]) & between
+        assert np.count_nonzero(sphere_like) > 300
+        assert np.count_nonzero(sphere_like & ~markers) < 0.06 * np.count_nonzero(sphere_like)
 
 
 def test_crops_of_a_run_are_free_of_markers(recorded: Path, tmp_path: Path) -> None:

@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.masks import Ball, hull_mask, posts_below
+from service.compute.pixels.masks import Ball, Post, hull_mask, posts_below
 from service.compute.pixels.splits import splits
 from service.compute.pixels.surface import Surface
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse, skew
 from service.core.picture_files import PNG_BEGINS
 from service.core.units import metres
+from service.dataset.control_spheres import control_centres
 from service.dataset.export import described_run
 from service.dataset.posed.pixels import Photographs
 from service.dataset.posed.records import DataSet, Mesh, Pixels, View
@@ -32,9 +33,10 @@ _LEAST_LEVEL = 0.05  # share of the surface that must be level
 def data_set_of(summary: RunSummary, not_in_yet: Sequence[str] = (), *, personal: bool = True) -> DataSet:
     """Images, poses and mesh of a run in the frame of its scan, which is the data set's `world`.
 
-    The poses are those of the run's own registration, with the camera that it was made with. Images with control
-    spheres are left out: these were taken away before the scan. A pose's covariance is that of the registration,
-    which is common to all images.
+    The poses are those of the run's own registration, with the camera that it was made with. Images that were taken
+    for the evaluation alone are left out. Control spheres are masked in all images: they were taken away before the
+    scan. So are posts, if the scan shows the board on which they stand. A pose's covariance is that of the
+    registration, which is common to all images.
 
     Args:
         summary: the run.
@@ -112,22 +114,42 @@ def pose_covariance(T_world_scan: Transform, covariance: Array, T_scan_camera: T
 def _pixels(summary: RunSummary, views: Sequence[View], mesh: Mesh, files: dict[str, Path], personal: bool) -> Pixels:
     radius_m = metres(summary.protocol.spheres.radius_mm)
     balls = tuple(Ball(np.array(centre), radius_m) for centre in summary.result("scan_import")["spheres_m"])
-    up = upwards(mesh, np.mean([v.T_world_camera[:3, 3] for v in views], axis=0) - np.mean(mesh.vertices_m, axis=0))
-    height = mesh.vertices_m @ up
-    # A post is not recorded; it stands below its sphere, is thinner, and ends on the board.
-    posts = tuple(
+    extra = tuple(Ball(np.array(centre), radius_m) for centre in control_spheres(summary))
+    mark = "SIMULATED" if summary.root.simulated else ""
+    surface, posts = Surface(mesh.vertices_m, mesh.faces), _posts(balls, mesh, views)
+    return Photographs(files, surface, (*balls, *extra), posts, personal=personal, mark=mark)
+
+
+def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ...]:
+    """Centres of the control spheres, which the images show and the scan does not."""
+    evaluation = next((step for step in reversed(summary.protocol.steps) if step.kind == "evaluation"), None)
+    before = None if evaluation is None else evaluation.params.model_dump().get("control_scan")
+    if before is None:
+        return ()
+    scan, control = (
+        tuple((float(x), float(y), float(z)) for x, y, z in result["spheres_m"])
+        for result in (summary.result("scan_import"), summary.state.steps[before].result)
+    )
+    return control_centres(scan, control)
+
+
+def _posts(balls: Sequence[Ball], mesh: Mesh, views: Sequence[View]) -> tuple[Post, ...]:
+    """A post is not recorded: it stands below its sphere, is thinner, and ends on the board, if a scan shows one."""
+    eyes = np.mean([view.T_world_camera[:3, 3] for view in views], axis=0)
+    up = upwards(mesh, eyes - np.mean(mesh.vertices_m, axis=0))
+    lowest = float((mesh.vertices_m @ up).min()) if up.any() else 0.0
+    return tuple(
         post
         for ball in balls
-        for post in posts_below([ball], up, max(radius_m, float(ball.centre_m @ up - height.min())), radius_m)
+        if up.any()
+        for post in posts_below([ball], up, max(ball.radius_m, float(ball.centre_m @ up) - lowest), ball.radius_m)
     )
-    mark = "SIMULATED" if summary.root.simulated else ""
-    return Photographs(files, Surface(mesh.vertices_m, mesh.faces), balls, posts, personal=personal, mark=mark)
 
 
 def upwards(mesh: Mesh, about: Array) -> Array:
     """Unit normal (3,) of the board: the direction, within 45° of `about`, to which most of the surface is level.
 
-    Where no direction has a twentieth of the surface, `about` itself.
+    Zero where no direction has a twentieth of the surface: the mesh shows no board.
     """
     a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
     vector = np.cross(b - a, c - a)
@@ -138,11 +160,11 @@ def upwards(mesh: Mesh, about: Array) -> Array:
     candidates = normal[:: max(1, len(normal) // _CANDIDATES)]
     candidates = candidates[candidates @ up > _WITHIN]
     if not len(candidates):
-        return up
+        return np.zeros(3)
     level = np.array([area[normal @ candidate > _LEVEL].sum() for candidate in candidates])
     best = int(level.argmax())
     if level[best] < _LEAST_LEVEL * area.sum():
-        return up
+        return np.zeros(3)
     mean = (area[:, None] * normal)[normal @ candidates[best] > _LEVEL].sum(axis=0)
     return mean / np.linalg.norm(mean)
 

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
-import numpy as np
-
-from service.compute.surfaces.constellations import match_constellations
-from service.core.errors import ComputeError
-from service.core.geometry import Array, align_points, apply
+from service.dataset.control_spheres import control_centres
 from service.dataset.registrations import best_registration as best_registration_name
 from service.dataset.registrations import registrations
-from service.jobs.records import Point, SpheresFound
+from service.jobs.records import SpheresFound
 from service.jobs.registration.register import Registration
 from service.jobs.surfaces import locate_spheres
 from service.run_record import RunRecord
@@ -65,7 +60,7 @@ def scan_spheres(log: RunRecord, by: ShownRegistration) -> tuple[Sphere, ...]:
     judged = next((s for s in reversed(log.protocol.steps) if s.kind == evaluation.KIND.name), None)
     before = None if judged is None else judged.params_as(evaluation.Params).control_scan
     control = SpheresFound(spheres_m=()) if before is None else _found_in(log, before)
-    extra = _control_centres(scan.spheres_m, control.spheres_m)
+    extra = control_centres(scan.spheres_m, control.spheres_m)
     return (*_numbered(scan, "registration"), *(Sphere(f"C{i}", "control", c) for i, c in enumerate(extra)))
 
 
@@ -88,19 +83,3 @@ def _numbered(found: SpheresFound, kind: SphereKind) -> tuple[Sphere, ...]:
         else Sphere(str(i), kind, centre, sphere.rms_mm, sphere.radius_residual_mm)
         for i, (centre, sphere) in enumerate(zip(found.spheres_m, measured, strict=False))
     )
-
-
-@lru_cache(maxsize=16)
-def _control_centres(scan: tuple[Point, ...], control: tuple[Point, ...]) -> tuple[Point, ...]:
-    """Centres that only the control scan shows, in the frame of the scan."""
-    if not scan or not control:
-        return ()
-    a, b = np.array(scan), np.array(control)
-    try:
-        found = match_constellations(a, b)
-    except ComputeError:
-        return ()
-    pairs = np.array(found.pairs)
-    T_a_b, _ = align_points(a[pairs[:, 0]], b[pairs[:, 1]])
-    extra: Array = apply(T_a_b, b[list(found.missing_b)]) if found.missing_b else np.zeros((0, 3))
-    return tuple((float(x), float(y), float(z)) for x, y, z in extra)
