@@ -60,6 +60,7 @@ def test_a_run_is_exported_recorded_and_still_verifies(recorded: Path, tmp_path:
     described = json.loads((out / "dataset.json").read_text())
     assert described["simulated"] is True
     assert described["pose_source"] == run.summary().best()
+    assert described["masks"].startswith("13 spheres; posts are not masked")  # its scan was cut to the spheres
     # The spheres are in the images where pycolmap projects them: they differ from what surrounds them.
     model = pycolmap.Reconstruction(str(out / "sparse" / "0"))
     spheres = np.array(run.summary().result("scan_import")["spheres_m"])

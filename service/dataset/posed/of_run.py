@@ -20,7 +20,7 @@ from service.core.units import metres
 from service.dataset.control_spheres import control_centres
 from service.dataset.export import described_run
 from service.dataset.posed.pixels import Photographs
-from service.dataset.posed.records import DataSet, Mesh, Pixels, View
+from service.dataset.posed.records import DataSet, Mesh, View
 from service.dataset.summary import RunSummary
 from service.jobs.registration.register import Registration
 
@@ -59,13 +59,22 @@ def data_set_of(summary: RunSummary, not_in_yet: Sequence[str] = (), *, personal
     vertices_m, faces = summary.scan_mesh()
     mesh = Mesh(np.asarray(vertices_m, dtype=np.float64), np.asarray(faces, dtype=np.int64))
     views = tuple(_view(name, path, registered) for name, (path, _) in sorted(files.items()))
+    balls, posts = _markers(summary, views, mesh)
     simulated = summary.root.simulated
-    pixels = _pixels(summary, views, mesh, {name: path for name, (path, _) in files.items()}, personal)
+    pixels = Photographs(
+        {name: path for name, (path, _) in files.items()},
+        Surface(mesh.vertices_m, mesh.faces),
+        balls,
+        posts,
+        personal=personal,
+        mark="SIMULATED" if simulated else "",
+    )
+    masks = _masked(balls, posts)
     hashes = {view.file: files[view.name][1] for view in views}
     return DataSet(
         identity=_identity(summary, own, hashes),
         simulated=simulated,
-        statement={**described_run(summary, own, not_in_yet), "image_sha256": hashes},
+        statement={**described_run(summary, own, not_in_yet), "masks": masks, "image_sha256": hashes},
         views=views,
         pixels=pixels,
         mesh=mesh,
@@ -111,13 +120,21 @@ def pose_covariance(T_world_scan: Transform, covariance: Array, T_scan_camera: T
     return J @ covariance[:6, :6] @ J.T
 
 
-def _pixels(summary: RunSummary, views: Sequence[View], mesh: Mesh, files: dict[str, Path], personal: bool) -> Pixels:
+def _markers(summary: RunSummary, views: Sequence[View], mesh: Mesh) -> tuple[tuple[Ball, ...], tuple[Post, ...]]:
+    """All spheres that an image may show, and the posts of the registration spheres."""
     radius_m = metres(summary.protocol.spheres.radius_mm)
-    balls = tuple(Ball(np.array(centre), radius_m) for centre in summary.result("scan_import")["spheres_m"])
-    extra = tuple(Ball(np.array(centre), radius_m) for centre in control_spheres(summary))
-    mark = "SIMULATED" if summary.root.simulated else ""
-    surface, posts = Surface(mesh.vertices_m, mesh.faces), _posts(balls, mesh, views)
-    return Photographs(files, surface, (*balls, *extra), posts, personal=personal, mark=mark)
+    balls, extra = (
+        tuple(Ball(np.array(centre), radius_m) for centre in centres)
+        for centres in (summary.result("scan_import")["spheres_m"], control_spheres(summary))
+    )
+    return (*balls, *extra), _posts(balls, mesh, views)
+
+
+def _masked(balls: Sequence[Ball], posts: Sequence[Post]) -> str:
+    """What the masks hold, in words."""
+    if posts:
+        return f"{len(balls)} spheres, and the posts below {len(posts)} of them"
+    return f"{len(balls)} spheres; posts are not masked, because the scan shows no board on which they stand"
 
 
 def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ...]:
