@@ -301,6 +301,7 @@ def test_suggested_poses_keep_what_they_promise() -> None:
     assert np.count_nonzero(np.all(drawn == (20, 90, 230), axis=2)) > 200
 
 
+@pytest.mark.slow
 def test_the_command_calibrates_photographs(tmp_path: Path) -> None:
     scene = Scene.generate(4)
     session = board_session(scene, plan(scene, "demo", "camera_calibration"), width=900)

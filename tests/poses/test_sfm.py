@@ -105,6 +105,7 @@ def test_both_mappers_share_features_and_find_the_poses(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_pieces_in_any_order_make_the_same_model(
     camera: CameraModel, views: dict[str, tuple[Path, Transform]], tmp_path: Path
 ) -> None:

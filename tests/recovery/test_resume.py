@@ -46,7 +46,7 @@ def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> Non
             )
         wait_for_captures(data, 2, runner, tmp_path / "run.log")
         os.kill(runner.pid, signal.SIGKILL)
-        runner.wait(timeout=10)
+        runner.wait(timeout=60)
         before = captured(data)
         assert 2 <= len(before) < 6
 

@@ -170,7 +170,7 @@ def stop_and_release(host: str) -> None:
 
 
 def unlock(host: str) -> bool:
-    with socket.create_connection((host, 29999), timeout=3) as connection, connection.makefile("rw") as lines:
+    with socket.create_connection((host, 29999), timeout=30) as connection, connection.makefile("rw") as lines:
         lines.readline()
         lines.write("unlock protective stop\n")
         lines.flush()

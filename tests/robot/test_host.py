@@ -80,10 +80,8 @@ def test_segfault_names_the_signal_and_open_restarts(fake: Fake) -> None:
 def test_call_timeout_kills_the_child(tmp_path: Path) -> None:
     device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=0.5, name="slow")
     pid = int(device.open().serial)
-    start = time.monotonic()
     with pytest.raises(DeviceTimeoutError, match=r"hang did not return within 0\.5 s"):
-        device.hang(60)
-    assert time.monotonic() - start < 3
+        device.hang(600)
     assert not psutil.pid_exists(pid)
     with pytest.raises(DeviceUnavailableError, match="killed after hang"):
         device.double(np.ones(1))
@@ -92,7 +90,7 @@ def test_call_timeout_kills_the_child(tmp_path: Path) -> None:
 
 
 def test_heartbeat_finds_a_child_that_died_between_calls(caplog: pytest.LogCaptureFixture) -> None:
-    device = HostedDevice(SPEC, FakeConfig(), call_timeout_s=5, name="mortal", heartbeat_s=0.1)
+    device = HostedDevice(SPEC, FakeConfig(), call_timeout_s=30, name="mortal", heartbeat_s=0.1)
     device.open()
     device.call("crash_later", 0.1)
     until(lambda: device.pid is None, "the death is noticed", 10)
@@ -170,7 +168,7 @@ def test_output_of_the_child_goes_to_logging(
 
 def test_close_closes_the_device_and_ends_the_child(tmp_path: Path) -> None:
     trace = tmp_path / "trace"
-    device = hosted(Fake, SPEC, FakeConfig(trace=trace), call_timeout_s=5, name="tidy")
+    device = hosted(Fake, SPEC, FakeConfig(trace=trace), call_timeout_s=30, name="tidy")
     pid = int(device.open().serial)
     device.close()
     assert trace.read_text() == "closed"
@@ -181,20 +179,20 @@ def test_close_closes_the_device_and_ends_the_child(tmp_path: Path) -> None:
 
 
 def test_calls_before_open_are_refused() -> None:
-    device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=5, name="early")
+    device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=30, name="early")
     with pytest.raises(DeviceUnavailableError, match="not opened yet"):
         device.report()
 
 
 @pytest.mark.parametrize("spec", ["tests.support.nowhere:DRIVER", "tests.support.rig.host_fake_driver:NOT_A_DRIVER"])
 def test_wrong_spec_is_a_configuration_error(spec: str) -> None:
-    device = hosted(Fake, spec, FakeConfig(), call_timeout_s=5, name="wrong")
+    device = hosted(Fake, spec, FakeConfig(), call_timeout_s=30, name="wrong")
     with pytest.raises(ConfigurationError, match=spec):
         device.open()
 
 
 def test_child_that_dies_while_opening() -> None:
-    device = hosted(Fake, SPEC, FakeConfig(die_on_open=True), call_timeout_s=5, name="stillborn")
+    device = hosted(Fake, SPEC, FakeConfig(die_on_open=True), call_timeout_s=30, name="stillborn")
     with pytest.raises(DeviceUnavailableError, match="exited with status 3"):
         device.open()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import ssl
+from contextlib import suppress
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -29,12 +30,12 @@ def rig(tmp_path: Path) -> Path:
 def test_it_serves_this_machine_records_its_start_and_signs_at_its_end(rig: Path) -> None:
     with serving(rig) as server:
         assert server.url.startswith("http://127.0.0.1:")
-        with urlopen(server.url + "/sign-in", timeout=20) as page:
+        with urlopen(server.url + "/sign-in", timeout=60) as page:
             assert page.status == 200
             assert "default-src 'none'" in page.headers["Content-Security-Policy"]
         # A page whose foreign host name was made to resolve to this machine (DNS rebinding) gets nothing.
         with pytest.raises(HTTPError) as refused:
-            urlopen(Request(server.url + "/sign-in", headers={"Host": "evil.example"}), timeout=20)
+            urlopen(Request(server.url + "/sign-in", headers={"Host": "evil.example"}), timeout=60)
         assert refused.value.code in (400, 403, 421)
         again = orthocapture(
             "serve", "--rig", str(rig), "--data", str(rig.parent / "data"), "--port", server.url[-5:]
@@ -60,7 +61,7 @@ def test_other_machines_are_served_with_tls_or_on_an_explicit_word_only(rig: Pat
     assert not (rig.parent / "data").exists()
     with serving(rig, "--host", "0.0.0.0", "--insecure-lan") as server:
         port = server.url.rpartition(":")[2]
-        with urlopen(f"http://127.0.0.1:{port}/sign-in", timeout=20) as page:
+        with urlopen(f"http://127.0.0.1:{port}/sign-in", timeout=60) as page:
             assert page.status == 200
 
 
@@ -71,11 +72,14 @@ def test_tls(rig: Path) -> None:
         port = server.url.rpartition(":")[2]
         assert server.url.startswith("https://")
         trust = ssl.create_default_context(cafile=str(certificate))
-        with urlopen(f"https://127.0.0.1:{port}/sign-in", timeout=20, context=trust) as page:
+        with urlopen(f"https://127.0.0.1:{port}/sign-in", timeout=60, context=trust) as page:
             assert page.status == 200
-        with socket.create_connection(("127.0.0.1", int(port)), timeout=5) as plain:
+        with socket.create_connection(("127.0.0.1", int(port)), timeout=60) as plain:
             plain.sendall(b"GET /sign-in HTTP/1.0\r\n\r\n")
-            assert b"200" not in plain.recv(64)
+            answer = b""
+            with suppress(ConnectionResetError):  # the server may end the connection before it has read everything
+                answer = plain.recv(64)
+            assert b"200" not in answer
     half = orthocapture("serve", "--rig", str(rig), "--data", str(rig.parent / "data"), "--tls-key", str(key))
     assert half.returncode == 1
     assert "certificate and its key" in half.stderr

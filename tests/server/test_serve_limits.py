@@ -78,6 +78,7 @@ def dribbles_in_vain(client: socket.socket, *, within_s: float) -> bool:
 # --- connections ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_1100_half_open_requests_shut_nobody_out_and_are_told_in_a_few_lines(rig: Path) -> None:
     with serving(rig, most_files=1024) as server:
         person = server.signed_in()
@@ -103,6 +104,7 @@ def test_one_address_leaves_room_for_others(rig: Path) -> None:
         assert httpx.get(f"{server.url}/sign-in", timeout=WAIT_S).status_code == 200
 
 
+@pytest.mark.slow
 def test_a_client_that_is_slow_on_purpose_is_left(rig: Path) -> None:
     body = b"POST /sign-in HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/x-www-form-urlencoded\r\n"
     with serving(rig, "--client-wait-s", "1") as server, ExitStack() as stack:
@@ -139,6 +141,7 @@ def test_a_client_that_never_begins_tls_is_left(rig: Path) -> None:
         assert httpx.get(f"{server.url}/sign-in", timeout=WAIT_S, verify=trust).status_code == 200
 
 
+@pytest.mark.slow
 def test_when_no_more_files_can_be_opened_it_neither_spins_nor_floods_the_log(rig: Path) -> None:
     with serving(rig) as server:
         assert httpx.get(f"{server.url}/sign-in", timeout=WAIT_S).status_code == 200
@@ -168,6 +171,7 @@ def test_what_is_no_http_is_told_once_and_counted(rig: Path) -> None:
 # --- streams of news -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_sign_in_has_six_streams_the_newest_and_strangers_do_not_end_them(rig: Path) -> None:
     with Store.open(rig.parent / "data") as store:
         run_id = begin_run(store, PROTOCOL, rig.parent).run_id
@@ -219,6 +223,7 @@ def recorded_addresses(rig: Path) -> list[str]:
     return [each.address for each in payloads if isinstance(each, SignInRecorded) and each.outcome == "refused"]
 
 
+@pytest.mark.slow
 def test_a_forwarded_address_passes_no_limit_stands_in_no_record_and_a_restart_forgives_nothing(rig: Path) -> None:
     with serving(rig) as server:
         answers = [
@@ -233,6 +238,7 @@ def test_a_forwarded_address_passes_no_limit_stands_in_no_record_and_a_restart_f
         assert 0 < int(refused.headers["retry-after"]) <= 300
 
 
+@pytest.mark.slow
 def test_of_a_trusted_proxys_words_the_last_stranger_counts(rig: Path) -> None:
     with serving(rig, "--trusted-proxy", "127.0.0.1", "--trusted-proxy", "2001:db8::5") as server:
         for forwarded in (

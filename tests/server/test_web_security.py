@@ -383,7 +383,14 @@ def test_a_refused_form_does_not_repeat_what_was_typed(site: WebSite, caplog: py
 # --- anything that the interface's own description allows, and what it does not --------------------------------
 
 
-@pytest.mark.parametrize("role", [None, *ROLES])
+@pytest.mark.parametrize(
+    "role",
+    [
+        None,
+        "administrator",
+        *(pytest.param(role, marks=pytest.mark.slow) for role in ROLES if role != "administrator"),
+    ],
+)
 def test_generated_requests_never_break_the_server(
     tmp_path_factory: pytest.TempPathFactory, role: Role | None
 ) -> None:

@@ -50,6 +50,7 @@ def test_planned_poses_pass_at_the_first_attempt_without_a_cut_board(begin: Call
     bench.must_verify()
 
 
+@pytest.mark.slow
 def test_images_without_a_board_are_replaced_in_the_same_attempt(begin: Callable[[str], Bench]) -> None:
     bench = begin(PROTOCOL)
     room = board_room(bench)
@@ -158,6 +159,7 @@ def test_the_board_on_its_other_side_stops_after_a_few_images(begin: Callable[[s
     bench.must_verify()
 
 
+@pytest.mark.slow
 def test_a_single_blurred_image_is_replaced_and_not_calibrated_from(begin: Callable[[str], Bench]) -> None:
     bench = begin(PROTOCOL)
     room = board_room(bench)
@@ -174,6 +176,7 @@ def test_a_single_blurred_image_is_replaced_and_not_calibrated_from(begin: Calla
     assert name not in solved
 
 
+@pytest.mark.slow
 def test_a_smeared_lens_stops_the_capture_and_exactly_the_blurred_images_are_taken_again(
     begin: Callable[[str], Bench],
 ) -> None:

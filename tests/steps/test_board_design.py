@@ -46,7 +46,9 @@ def nominal(tolerances: Tolerances = USUAL) -> BoardKnowledge:
     return nominal_knowledge(CAMERA, MOUNT, MIDDLE, APPROACH, BOARD, tolerances=tolerances)
 
 
-@pytest.mark.parametrize(("wishes", "tolerances"), [(FIRST, Tolerances()), (ViewRange(), SMALL)])
+@pytest.mark.parametrize(
+    ("wishes", "tolerances"), [(FIRST, Tolerances()), pytest.param(ViewRange(), SMALL, marks=pytest.mark.slow)]
+)
 def test_every_planned_pose_holds_the_whole_board_within_the_tolerances(
     wishes: ViewRange, tolerances: Tolerances
 ) -> None:

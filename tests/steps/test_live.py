@@ -316,6 +316,7 @@ def test_confirming_takes_the_suggested_views_and_the_gate_is_judged_again(
     bench.must_verify()
 
 
+@pytest.mark.slow
 def test_images_to_take_again_and_views_to_add_are_told_together_and_taken_by_one_confirmation(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -61,7 +61,7 @@ def test_a_run_is_backed_up_in_its_capture_and_finished_where_it_was_restored(tm
             wait_for_captures(data, len(captured(data)) + 1, runner, tmp_path / "run.log")
         finally:
             runner.kill()
-            runner.wait(timeout=10)
+            runner.wait(timeout=60)
         lost = captured(data)
         back = orthocapture("store", "restore", str(tmp_path / "backup"), str(restored), "--json")
         assert back.returncode == 0, back.stdout + back.stderr

@@ -74,7 +74,7 @@ def test_an_image_that_claims_a_gigapixel_is_refused_before_memory_is_set_aside(
     ("name", "fault"),
     [
         ("_crash", r"crashes \(SIGSEGV\)"),
-        ("_hang", r"hangs beyond 2 s"),
+        pytest.param("_hang", r"hangs beyond 2 s", marks=pytest.mark.slow),
         ("_grow", r"memory: more than 32 MiB"),
         ("_leak", r"leaks (ValueError|UnicodeDecodeError)"),
         ("_mumble", r"words: the message names no place"),

@@ -49,7 +49,7 @@ def data(recorded: tuple[Path, str], tmp_path: Path) -> Path:
 
 
 def ask(authority: TimeStampAuthority) -> Authority:
-    return Authority(authority.url, authority.certificates, timeout_s=5)
+    return Authority(authority.url, authority.certificates, timeout_s=30)
 
 
 def test_a_checkpoint_is_stamped_once_and_verified_with_and_without_certificates(

@@ -103,7 +103,7 @@ def session(host: str, *, e_series: bool) -> dict[str, Any]:
     dashboard.closeSafetyPopup()
     dashboard.unlockProtectiveStop()
     control.reuploadScript()
-    deadline = time.monotonic() + 3
+    deadline = time.monotonic() + 30
     while (not control.isProgramRunning() or receive.isProtectiveStopped()) and time.monotonic() < deadline:
         time.sleep(0.02)
     said["again"] = [receive.isProtectiveStopped(), control.moveJ(goal, 2.0, 5.0)]
