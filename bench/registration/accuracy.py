@@ -25,7 +25,8 @@ from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import true_error_m
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, detect_all, register_images
-from service.compute.poses.files.pose_files import read_camera_json, read_poses_csv, read_spheres_json
+from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
+from service.compute.poses.files.pose_files import read_poses_csv
 from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.poses.sfm.estimate import SfmModel, reconstruct
 from service.compute.poses.sfm.options import Effort, Mapper, options_for

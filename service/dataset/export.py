@@ -12,7 +12,8 @@ import numpy as np
 import trimesh
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.files.pose_files import write_camera_json, write_poses_csv, write_transforms_json
+from service.compute.poses.files.camera_files import write_camera_json
+from service.compute.poses.files.pose_files import write_poses_csv, write_transforms_json
 from service.core.errors import DataError
 from service.core.gates.dependence import accepted_gates
 from service.core.gates.verdict import BOUNDS_HOLD, describe, standing

@@ -14,7 +14,8 @@ from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
 from service.compute.camera_model import CameraModel
 from service.compute.poses.files.pose_covariance import blocks, similarity_covariance
-from service.compute.poses.hybrid.bundle import Data, Sigmas, State, linearise, moved, normal_equations
+from service.compute.poses.hybrid.bundle import Data, Sigmas, State, moved, normal_equations
+from service.compute.poses.hybrid.rows import linearise
 from service.compute.poses.sfm.tracks import Tracks
 from service.core.errors import DataError
 from service.core.geometry import Array, align_points

@@ -16,11 +16,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
+from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json, write_camera_json
 from service.compute.poses.files.pose_files import (
-    read_camera_json,
     read_poses,
-    read_spheres_json,
-    write_camera_json,
     write_colmap_text,
     write_poses_csv,
     write_transforms_json,

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_covariance import CameraCovariance
 from service.compute.poses.files.pose_covariance import similarity_covariance
-from service.compute.poses.hybrid.bundle import Data, Sigmas, SphereSightings, State, linearise, moved, width
+from service.compute.poses.hybrid.bundle import Data, Sigmas, SphereSightings, State, moved, width
 from service.compute.poses.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses
+from service.compute.poses.hybrid.rows import linearise
 from service.compute.scene import PosedImages
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, align_points, inverse, transform

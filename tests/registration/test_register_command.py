@@ -17,12 +17,8 @@ from typer.testing import CliRunner, Result
 
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
-from service.compute.poses.files.pose_files import (
-    write_camera_json,
-    write_colmap_text,
-    write_poses_csv,
-    write_transforms_json,
-)
+from service.compute.poses.files.camera_files import write_camera_json
+from service.compute.poses.files.pose_files import write_colmap_text, write_poses_csv, write_transforms_json
 from service.core.geometry import apply, inverse, look_at
 from simulators.rendering.render import REFERENCE, Renderer
 from simulators.scan_station.formats import encode

@@ -22,7 +22,8 @@ import trimesh
 
 from docs.generate.pages import REFERENCE, pages
 from docs.generate.steps import measures_of_kind
-from service.compute.poses.files.pose_files import write_camera_json, write_poses_csv
+from service.compute.poses.files.camera_files import write_camera_json
+from service.compute.poses.files.pose_files import write_poses_csv
 from service.core.records.events import JobFailed
 from service.steps import step_kinds
 from service.store.records import NewJob

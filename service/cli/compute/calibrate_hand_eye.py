@@ -44,7 +44,8 @@ from service.compute.calibration.hand_eye.setup import Setup
 from service.compute.calibration.intrinsics.estimate import locate_view
 from service.compute.camera_covariance import read_camera_covariance
 from service.compute.images.folder import image_folder
-from service.compute.poses.files.pose_files import posed_images, read_camera_json
+from service.compute.poses.files.camera_files import read_camera_json
+from service.compute.poses.files.pose_files import posed_images
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform
 from service.core.text.counts import counted

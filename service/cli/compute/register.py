@@ -34,7 +34,8 @@ from service.compute.markers.search.image_files import (
 )
 from service.compute.markers.search.paper_files import detect_file_by_masks, read_boxes
 from service.compute.pipeline import register_images
-from service.compute.poses.files.pose_files import posed_images, read_camera_json, read_spheres_json
+from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
+from service.compute.poses.files.pose_files import posed_images
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array

@@ -30,14 +30,9 @@ from service.compute.camera_covariance import CameraCovariance, read_camera_cova
 from service.compute.camera_model import CameraModel
 from service.compute.images.folder import image_folder
 from service.compute.markers.search.image_files import detect_all
+from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json, write_camera_json
 from service.compute.poses.files.pose_covariance import write_pose_covariance
-from service.compute.poses.files.pose_files import (
-    read_camera_json,
-    read_poses_csv,
-    read_spheres_json,
-    write_camera_json,
-    write_poses_csv,
-)
+from service.compute.poses.files.pose_files import read_poses_csv, write_poses_csv
 from service.compute.poses.files.robot_files import read_hand_eye, read_stations
 from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.poses.sfm.estimate import SfmModel, reconstruct

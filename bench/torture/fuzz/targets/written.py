@@ -19,12 +19,10 @@ from service.compute.calibration.hand_eye.record import read_arm_correction
 from service.compute.camera_model import CameraModel
 from service.compute.markers.search.paper_files import read_boxes
 from service.compute.poses.colmap.model_files import write_model
+from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json, write_camera_json
 from service.compute.poses.files.pose_files import (
-    read_camera_json,
     read_colmap_model,
     read_poses,
-    read_spheres_json,
-    write_camera_json,
     write_poses_csv,
     write_transforms_json,
 )
@@ -238,14 +236,14 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target(
         "camera_json",
-        "service.compute.poses.files.pose_files:read_camera_json",
+        "service.compute.poses.files.camera_files:read_camera_json",
         lambda data, folder: read_camera_json(_put(folder, "camera.json", data)),
         _cameras,
         JSON,
     ),
     Target(
         "spheres_json",
-        "service.compute.poses.files.pose_files:read_spheres_json",
+        "service.compute.poses.files.camera_files:read_spheres_json",
         lambda data, folder: read_spheres_json(_put(folder, "spheres.json", data)),
         _spheres,
         JSON,

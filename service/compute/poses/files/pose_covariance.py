@@ -12,7 +12,8 @@ import numpy as np
 from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.poses.hybrid.adjustment import first_guess, robust_rows
-from service.compute.poses.hybrid.bundle import Data, Rows, Sigmas, State, linearise, normal_equations
+from service.compute.poses.hybrid.bundle import Data, Rows, Sigmas, State, normal_equations
+from service.compute.poses.hybrid.rows import linearise
 from service.compute.poses.hybrid.stated_covariance import clustered_information
 from service.compute.poses.sfm.tracks import Tracks
 from service.core.errors import ComputeError

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.compute.descent import Damping, levenberg_marquardt
-from service.compute.poses.hybrid.bundle import Data, Normal, Rows, Sigmas, State, linearise, moved, normal_equations
+from service.compute.poses.hybrid.bundle import Data, Normal, Rows, Sigmas, State, moved, normal_equations
+from service.compute.poses.hybrid.rows import linearise
 from service.compute.poses.hybrid.stated_covariance import (
     CAUCHY,
     EXPECTED,

@@ -10,7 +10,8 @@ from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone
 from service.compute.poses.hybrid.adjustment import Solution
-from service.compute.poses.hybrid.bundle import Data, SphereSightings, linearise, normal_equations
+from service.compute.poses.hybrid.bundle import Data, SphereSightings, normal_equations
+from service.compute.poses.hybrid.rows import linearise
 from service.core.geometry import Array
 
 _RIM = 12  # rays of an outline that are recomputed

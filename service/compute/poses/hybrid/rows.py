@@ -1,0 +1,220 @@
+"""Rows of each component of a bundle adjustment: whitened residuals and their derivatives."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.spatial.transform import Rotation
+
+from service.compute.camera_model import CameraModel
+from service.compute.poses.hybrid.bundle import (
+    COMMON,
+    LENS,
+    Data,
+    Index,
+    Rows,
+    Sigmas,
+    State,
+    common_column,
+    lens_column,
+    whitening_of,
+    width,
+)
+from service.compute.registration.cost import cone_residuals
+from service.core.geometry import Array, skew
+
+
+def linearise(state: State, data: Data, sigmas: Sigmas) -> dict[str, Rows]:
+    """Rows of every component in the data: tracks, spheres, centres, common, robot_position …, lens."""
+    out = {"tracks": _track_rows(state, data, sigmas)}
+    if data.sightings is not None:
+        out["spheres"] = _sphere_rows(state, data, sigmas)
+        out["centres"] = _centre_rows(state, data)
+        out["common"] = _common_rows(state, data)
+    if data.robot is not None and data.group is not None:
+        out["robot_position"], out["robot_rotation"] = _robot_rows(state, data, sigmas)
+    if data.lens_covariance is not None:
+        out["lens"] = _lens_rows(state, data)
+    return out
+
+
+def _seen(cameras: Array, points: Array) -> tuple[Array, Array, Array]:
+    """Points in their camera frames (O, 3), and derivatives (O, 3, 6) by the pose and (O, 3, 3) by the point."""
+    R, t = cameras[:, :3, :3], cameras[:, :3, 3]
+    v = points - t
+    Rt = np.swapaxes(R, 1, 2)
+    d_pose = np.concatenate([-Rt, Rt @ skew(v)], axis=2)
+    return np.einsum("oij,oj->oi", Rt, v), d_pose, Rt
+
+
+def _track_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
+    tracks = data.tracks
+    c, d_pose, d_point = _seen(state.cameras[tracks.image], state.points[tracks.point])
+    camera = state.camera
+    f = np.array([camera.fx, camera.fy]) / sigmas.track_px
+    measured = camera.normalise(tracks.pixels)
+    residual = (c[:, :2] / c[:, 2:] - measured) * f
+    d_image = np.zeros((len(c), 2, 3))
+    d_image[:, 0, 0] = d_image[:, 1, 1] = 1 / c[:, 2]
+    d_image[:, :, 2] = -c[:, :2] / c[:, 2:] ** 2
+    d_image *= f[:, None]
+    lens = None
+    if data.lens_covariance is not None:
+        lens = (lens_column(state, data), -_lens_derivative(camera, tracks.pixels, measured) * f[:, None])
+    observed = _Observed(tracks.image, tracks.point, residual, d_image @ d_pose, d_image @ d_point, lens)
+    return _rows(state, data, observed)
+
+
+def _sphere_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
+    s = data.sightings
+    assert s is not None
+    point = s.marker + len(data.tracks.points)
+    light = data.light_unit_m * state.common[3:]
+    c, d_pose, d_point = _seen(state.cameras[s.image], state.points[point] + light)
+    e = s.frames[:, :, :2]
+    axes, lens = s.axes, None
+    if data.lens_covariance is not None:
+        assert data.calibrated is not None
+        pixels = data.calibrated.project(s.axes)
+        plane = state.camera.normalise(pixels)
+        axes = np.column_stack([plane, np.ones(len(plane))])
+        axes /= np.linalg.norm(axes, axis=1)[:, None]
+        # The focal length also changes the half angle, but by far less than its sigma.
+        lift = np.zeros((len(c), 3, len(LENS)))
+        lift[:, :2] = _lens_derivative(state.camera, pixels, plane) * axes[:, 2, None, None]
+        lens = np.zeros((len(c), 3, len(LENS)))
+        lens[:, :2] = -np.swapaxes(e, 1, 2) @ lift
+    focal = 0.5 * (state.camera.fx + state.camera.fy)
+    shift = np.zeros((len(c), 3, len(COMMON)))  # the common errors of the detector
+    shift[:, :2, :2] = np.swapaxes(e[:, :2], 1, 2) * (axes[:, 2] / focal)[:, None, None]
+    shift[:, 2, 2] = axes[:, 2] ** 2 / focal
+    seen, d = cone_residuals(axes, e, s.half_angles, c, data.radius_m)
+    residual = seen + shift @ state.common
+    whitening = s.whitening / sigmas.sphere
+    d = whitening @ d
+    more = whitening @ shift
+    more[:, :, 3:] = data.light_unit_m * (d @ d_point)
+    if lens is not None:
+        more = np.concatenate([more, whitening @ lens], axis=2)
+    residual = np.einsum("sij,sj->si", whitening, residual)
+    first = common_column(state)
+    return _rows(state, data, _Observed(s.image, point, residual, d @ d_pose, d @ d_point, (first, more)))
+
+
+def _lens_derivative(camera: CameraModel, pixels: Array, plane: Array) -> Array:
+    """(O, 2, 4) derivative of the undistorted coordinates of fixed pixels by fx, fy, cx, cy."""
+    out = np.empty((len(pixels), 2, len(LENS)))
+    for k, name in enumerate(LENS):
+        nudged = dataclasses.replace(camera, **{name: getattr(camera, name) + 0.5})
+        out[:, :, k] = (nudged.normalise(pixels) - plane) / 0.5
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Observed:
+    """O observations of points, k numbers each, with their derivatives."""
+
+    image: Index  # (O,)
+    point: Index  # (O,)
+    residual: Array  # (O, k)
+    d_pose: Array  # (O, k, 6)
+    d_point: Array  # (O, k, 3)
+    more: tuple[int, Array] | None  # first column and derivatives (O, k, m) of further frame parameters
+
+
+def _rows(state: State, data: Data, seen: _Observed) -> Rows:
+    """Sparse rows from dense derivatives."""
+    n_obs, k = seen.residual.shape
+    row = np.arange(n_obs * k).reshape(n_obs, k, 1)
+    columns = [np.broadcast_to(6 * seen.image[:, None, None] + np.arange(6), seen.d_pose.shape)]
+    values = [seen.d_pose]
+    if seen.more is not None:
+        first, further = seen.more
+        columns.append(np.broadcast_to(first + np.arange(further.shape[2]), further.shape))
+        values.append(further)
+    frame = np.concatenate(values, axis=2)
+    return Rows(
+        seen.residual.ravel(),
+        _sparse(row, np.concatenate(columns, axis=2), frame, (n_obs * k, width(state, data))),
+        _sparse(row, 3 * seen.point[:, None, None] + np.arange(3), seen.d_point, (n_obs * k, 3 * len(state.points))),
+        k,
+    )
+
+
+def _sparse(row: NDArray[Any], column: NDArray[Any], values: NDArray[Any], shape: tuple[int, int]) -> csr_matrix:
+    rows, columns = np.broadcast_to(row, values.shape), np.broadcast_to(column, values.shape)
+    return coo_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape).tocsr()
+
+
+def _centre_rows(state: State, data: Data) -> Rows:
+    """Rows of the spheres' measured positions in the scan."""
+    assert data.centres is not None
+    assert data.centre_whitening is not None
+    m, first = len(data.centres), len(data.tracks.points)
+    residual = np.einsum("mij,mj->mi", data.centre_whitening, state.points[first:] - data.centres).ravel()
+    row = np.arange(3 * m).reshape(m, 3, 1)
+    column = 3 * (first + np.arange(m))[:, None, None] + np.arange(3)
+    point = _sparse(row, column, data.centre_whitening, (3 * m, state.points.size))
+    return Rows(residual, csr_matrix((3 * m, width(state, data))), point, 3)
+
+
+def _common_rows(state: State, data: Data) -> Rows:
+    """Rows of the prior of the errors that all outlines share."""
+    assert data.common_sigma_px is not None
+    count = len(COMMON)
+    row, column = np.arange(count)[:, None], common_column(state) + np.arange(count)[:, None]
+    frame = _sparse(row, column, 1 / data.common_sigma_px[:, None], (count, width(state, data)))
+    return Rows(state.common / data.common_sigma_px, frame, csr_matrix((count, state.points.size)), 1)
+
+
+def _robot_rows(state: State, data: Data, sigmas: Sigmas) -> tuple[Rows, Rows]:
+    assert data.robot is not None
+    assert data.group is not None
+    image = np.nonzero(np.isfinite(data.robot).all(axis=(1, 2)))[0]
+    base = data.group[image]
+    B, M, T = state.bases[base], data.robot[image], state.cameras[image]
+    arm = np.einsum("nij,nj->ni", B[:, :3, :3], M[:, :3, 3])
+    position = T[:, :3, 3] - arm - B[:, :3, 3]
+    turn = T[:, :3, :3] @ np.swapaxes(B[:, :3, :3] @ M[:, :3, :3], 1, 2)
+    rotation = Rotation.from_matrix(turn).as_rotvec()
+    one = np.broadcast_to(np.eye(3), (len(image), 3, 3))
+    zero = np.zeros_like(one)
+    out: list[Rows] = []
+    for residual, d_camera, d_base, sigma in (
+        (position, np.concatenate([one, zero], axis=2), np.concatenate([-one, skew(arm)], axis=2), sigmas.robot_m),
+        (rotation, np.concatenate([zero, one], axis=2), np.concatenate([zero, -one], axis=2), sigmas.robot_rad),
+    ):
+        row = np.arange(3 * len(image)).reshape(-1, 3, 1)
+        columns = np.concatenate(
+            [
+                np.broadcast_to(6 * image[:, None, None] + np.arange(6), d_camera.shape),
+                np.broadcast_to(6 * (len(state.cameras) + base)[:, None, None] + np.arange(6), d_base.shape),
+            ],
+            axis=2,
+        )
+        frame = _sparse(
+            row, columns, np.concatenate([d_camera, d_base], axis=2) / sigma, (3 * len(image), width(state, data))
+        )
+        out.append(Rows((residual / sigma).ravel(), frame, csr_matrix((3 * len(image), state.points.size)), 3))
+    return out[0], out[1]
+
+
+def _lens_rows(state: State, data: Data) -> Rows:
+    """Rows of the lens calibration, as an observation of the lens."""
+    assert data.calibrated is not None
+    assert data.lens_covariance is not None
+    whitening = whitening_of(data.lens_covariance)
+    change = np.array([getattr(state.camera, name) - getattr(data.calibrated, name) for name in LENS])
+    n, count = width(state, data), len(LENS)
+    row, column = np.arange(count)[:, None], n - count + np.arange(count)[None, :]
+    return Rows(
+        whitening @ change,
+        _sparse(row, column, whitening, (count, n)),
+        csr_matrix((count, state.points.size)),
+        count,
+    )
