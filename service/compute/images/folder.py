@@ -1,8 +1,7 @@
 """Reads a folder of images by one rule for all commands: odd files are left out, damaged ones are errors.
 
 Odd files are intact but do not belong: macOS's notes beside files (`._…`), second copies of an image, images of
-    another
-size. `strict` refuses these too.
+another size. `strict` refuses these too.
 """
 
 from __future__ import annotations

@@ -176,8 +176,7 @@ def _readings(a: Array, b: Array) -> list[tuple[Transform, list[tuple[int, int]]
     """T_a_b and pairs (index in a, index in b) for every way in which b (N, 3) matches a (M, 3), best first.
 
     Nearly symmetric layouts match in more than one way: the adjustment decides between them, and if it cannot, the
-        layout
-    is the same either way.
+    layout is the same either way.
     """
     if min(len(a), len(b)) < LEAST_SPHERES:
         return []

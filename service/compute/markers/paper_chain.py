@@ -52,9 +52,8 @@ def detect_by_masks(
     """Outlines in an image (H, W, 3) by the paper's chain (supplement, "Ellipse Detection"), the best first.
 
     Boxes and masks replace Grounding DINO and SAM 2: boxes come from circle votes unless given, masks from GrabCut on
-        each
-    channel, started at the middle. Kept for comparison with the default detector; its edge points lie on whole pixels
-    of one grey image.
+    each channel, started at the middle. Kept for comparison with the default detector; its edge points lie on whole
+    pixels of one grey image.
 
     Args:
         image_bgr: at the camera's size.

@@ -21,8 +21,7 @@ def camera_share(solution: Solution, data: Data, known: CameraCovariance) -> Arr
     """Covariance (n, n) of the frame parameters due to the camera's covariance, to be added to the solution's.
 
     For each deviation of the camera, this takes the step that the adjustment would make with that camera: robust
-        weights
-    fixed, points adjusted, cones recomputed from the outlines' pixels.
+    weights fixed, points adjusted, cones recomputed from the outlines' pixels.
     """
     plain = linearise(solution.state, data, solution.sigmas)
     weighted = {name: rows.weighted(solution.weights[name]) for name, rows in plain.items()}

@@ -25,8 +25,7 @@ class Samples:
     """Points on the surface near one candidate.
 
     Vertices are measured, not facets: a facet with edge e on a sphere lies up to e²/(8 R) inside it, which would move
-        a
-    cap's centre by as much, while its vertices lie on the sphere.
+    a cap's centre by as much, while its vertices lie on the sphere.
 
     Attributes:
         points: (N, 3).
