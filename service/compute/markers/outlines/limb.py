@@ -47,6 +47,48 @@ class LimbFit:
     chroma_blur: Array
 
 
+@dataclass(frozen=True, slots=True)
+class LimbProfiles:
+    """Values along K profiles across each of G outlines, lengths in the unit of the offsets.
+
+    Attributes:
+        coded_bgr: (G, K, J, 3).
+        offsets: (J,) positions across the outline, evenly spaced, positive outside.
+        inside: (G, K) whether a profile lies in the image.
+        radius: (G,) of the outlines.
+        srgb: whether values are sRGB coded.
+    """
+
+    coded_bgr: NDArray[np.uint8]
+    offsets: Array
+    inside: Mask
+    radius: Array
+    srgb: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Model:
+    """What the forward model is evaluated on.
+
+    Attributes:
+        data: (G, 3, K, J) Y, Cb, Cr of the profiles.
+        t: (J,) offsets.
+        wide: (J',) offsets with margins for the blur.
+        sharp: (J', J) interpolation from `wide` to `t`.
+        radius: (G,) of the outlines.
+        tone: (G, 3) the spheres' colour in linear light.
+        srgb: whether values are sRGB coded.
+    """
+
+    data: Array32
+    t: Array
+    wide: Array
+    sharp: Array32
+    radius: Array
+    tone: Array32
+    srgb: bool
+
+
 @lru_cache(maxsize=1)
 def _limb_table() -> tuple[Array32, Array32]:
     """E[sqrt(max(0, -(x + z)))] for z ~ N(0, 1), and its derivative, at _TABLE."""
@@ -107,50 +149,32 @@ def masked_median(values: Array | Array32, mask: Mask) -> Array:
 
 
 def fit_limb(
-    coded_bgr: NDArray[np.uint8],
-    offsets: Array,
-    inside: Mask,
-    radius: Array,
-    *,
-    srgb: bool,
-    blur: Array,
-    chroma_blur: Array,
-    iterations: int = 4,
-    reach: float = 2.0,
+    profiles: LimbProfiles, *, blur: Array, chroma_blur: Array, iterations: int = 4, reach: float = 2.0
 ) -> LimbFit:
     """Edges by Gauss–Newton on the forward model, with one blur for all profiles of an outline.
 
     Lengths are in one unit: the image's pixel, or the step over which samples were averaged.
 
     Args:
-        coded_bgr: (G, K, J, 3) values along the profiles.
-        offsets: (J,) positions across the outline, evenly spaced, positive outside.
-        inside: (G, K) whether a profile lies in the image.
-        radius: (G,) of the outlines.
-        srgb: whether values are sRGB coded.
+        profiles: the values.
         blur: (G,) initial standard deviation of lens and pixel.
         chroma_blur: (G,) initial extra standard deviation of the colour differences; about 1.1 for 4:2:0.
         iterations: number of Gauss–Newton steps.
         reach: largest offset.
     """
-    t = offsets
-    step = float(t[1] - t[0])
-    margin = int(np.ceil(3.6 / step)) if step < 0.8 else 3
-    wide = t[0] - margin * step + step * np.arange(len(t) + 2 * margin)
-    G, K, J = coded_bgr.shape[:3]
-    data = _mixed(np.moveaxis(coded_bgr, 3, 1).astype(np.float32) / np.float32(255))  # (G, 3, K, J)
+    inside = profiles.inside
     usable = np.where(inside.any(axis=1, keepdims=True), inside, True)
-    light = _light(srgb=srgb)
-    p = _start(coded_bgr, light, t)
-    tone = _albedo(coded_bgr, light, usable, t)
-    sharp = _interpolation(t, wide)
+    light = _light(srgb=profiles.srgb)
+    p = _start(profiles.coded_bgr, light, profiles.offsets)
+    model = _model(profiles, _albedo(profiles.coded_bgr, light, usable, profiles.offsets))
+    G, K, J = profiles.coded_bgr.shape[:3]
     blur, chroma_blur = blur.astype(np.float64), chroma_blur.astype(np.float64)
     limb, limb_sigma = np.zeros((G, K)), np.full((G, 1), 1.0)
     slope, slope_sigma = np.zeros((G, K)), np.full((G, 1), 5.0)
     sd_in, sd_out = np.full((G, 3), 0.01), np.full((G, 3), 0.03)
     variance, misfit, typical = np.ones((G, K)), np.ones((G, K)), np.ones((G, 1))
     for it in range(iterations):
-        rows, share = _evaluate(p, blur, chroma_blur, data, t, wide, sharp, radius, tone, srgb=srgb)
+        rows, share = _evaluate(p, blur, chroma_blur, model)
         r = rows[:, _N]  # (G, 3, K, J)
         if it > 0:
             sd_in, sd_out = _scales(r, share, usable)
@@ -166,11 +190,7 @@ def fit_limb(
         delta, change, variance = _gauss_newton(normal, p, priors, good)
         blur = np.clip(blur + change[:, 0], 0.3, 5.0)
         chroma_blur = np.clip(chroma_blur + change[:, 1], 0.3, 2.5)
-        delta[..., _OFFSET] = np.clip(delta[..., _OFFSET], -0.7, 0.7)
-        p = p + delta
-        p[..., _OFFSET] = np.clip(p[..., _OFFSET], -reach, reach)
-        for colour in (slice(0, 3), slice(5, 8)):
-            p[..., colour] = np.clip(p[..., colour], 1e-4, 1.5)
+        p = _moved(p, delta, reach)
         if 1 <= it < iterations - 1:
             enough = good.sum(axis=1, keepdims=True) > 16
             around = _around(p[..., _LIMB], good, 0.02), _around(p[..., _SLOPE], good, 0.1)
@@ -182,8 +202,27 @@ def fit_limb(
     contrast = np.abs(p[..., :3] - p[..., 5:8]).max(axis=2)
     ok = usable & (np.abs(p[..., _OFFSET]) < reach - 1e-3) & (sigma < 0.6) & (misfit < 9 * typical)
     # Blur also acts along the curved outline, which shifts the edge of a disc inwards.
-    offset = p[..., _OFFSET] + (blur**2 / (2 * radius))[:, None]
+    offset = p[..., _OFFSET] + (blur**2 / (2 * profiles.radius))[:, None]
     return LimbFit(offset, sigma, ok, contrast, blur, chroma_blur)
+
+
+def _model(profiles: LimbProfiles, tone: Array32) -> _Model:
+    t = profiles.offsets
+    step = float(t[1] - t[0])
+    margin = int(np.ceil(3.6 / step)) if step < 0.8 else 3
+    wide = t[0] - margin * step + step * np.arange(len(t) + 2 * margin)
+    data = _mixed(np.moveaxis(profiles.coded_bgr, 3, 1).astype(np.float32) / np.float32(255))
+    return _Model(data, t, wide, _interpolation(t, wide), profiles.radius, tone, profiles.srgb)
+
+
+def _moved(p: Array, delta: Array, reach: float) -> Array:
+    """The profiles' parameters after a step, within their limits."""
+    delta[..., _OFFSET] = np.clip(delta[..., _OFFSET], -0.7, 0.7)
+    p = p + delta
+    p[..., _OFFSET] = np.clip(p[..., _OFFSET], -reach, reach)
+    for colour in (slice(0, 3), slice(5, 8)):
+        p[..., colour] = np.clip(p[..., colour], 1e-4, 1.5)
+    return p
 
 
 def _gauss_newton(
@@ -263,16 +302,28 @@ def _mixed(channels: Array32) -> Array32:
     return (_MIX @ channels.reshape(*channels.shape[:2], -1)).reshape(channels.shape)
 
 
-def _evaluate(
-    p: Array, blur: Array, chroma_blur: Array, data: Array32, t: Array, wide: Array, sharp: Array32, radius: Array,
-    tone: Array32, *, srgb: bool,
-) -> tuple[Array32, Array32]:  # fmt: skip
-    """Jacobian and, last, residual (G, 13, 3, K, J) of the model in Y, Cb, Cr; the sphere's share (G, K, J)."""
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """The model before interpolation and the colours' blur.
+
+    Attributes:
+        mixed: (G, 3, 6, K, J') of Y, Cb, Cr: derivatives by limb, inner and outer slope, offset and blur; the value.
+        slope: (G, 3, K, J') of the coded values by linear light, of B, G, R.
+        share: (G, K, J') of the sphere in each sample.
+    """
+
+    mixed: Array32
+    slope: Array32
+    share: Array32
+
+
+def _shown(p: Array, blur: Array, model: _Model) -> _Shown:
+    """Light of sphere and surroundings, blurred by lens and pixel, then coded."""
     s = blur.astype(np.float32)[:, None, None]
-    R = radius.astype(np.float32)[:, None, None]
+    R = model.radius.astype(np.float32)[:, None, None]
     q = p.astype(np.float32)
-    tones = tone[:, :, None, None]
-    u = wide.astype(np.float32) - q[..., _OFFSET, None]  # (G, K, J')
+    tones = model.tone[:, :, None, None]
+    u = model.wide.astype(np.float32) - q[..., _OFFSET, None]  # (G, K, J')
     x = np.clip(u / s, -12, 12)
     S = ndtr(-x)
     density = np.exp(-0.5 * x * x) * (np.float32(0.3989422804) / s)
@@ -291,9 +342,8 @@ def _evaluate(
     A, D = (np.ascontiguousarray(np.moveaxis(q[..., k : k + 3], 2, 1))[..., None] for k in (0, 5))  # (G, 3, K, 1)
     rest = 1 - S
     L = A * S[:, None] + tones * (b * limb + c * inner)[:, None] + D * (rest + e * near)[:, None]
-    value, slope = _coded(np.asarray(L, dtype=np.float32), srgb=srgb)
+    value, slope = _coded(np.asarray(L, dtype=np.float32), srgb=model.srgb)
     G, K, wider = u.shape
-    J = len(t)
     by_tone, by_outer = _mixed(tones * slope), _mixed(D * slope)
     jump = _mixed(A * slope) - by_outer
     mixed = np.empty((G, 3, 6, K, wider), dtype=np.float32)
@@ -309,18 +359,27 @@ def _evaluate(
         + (e * s * density)[:, None] * by_outer
     )
     mixed[:, :, 5] = _mixed(value)
-    smooth, d_smooth = _smoothing(t, wide, chroma_blur)
+    return _Shown(mixed, slope, S)
+
+
+def _evaluate(p: Array, blur: Array, chroma_blur: Array, model: _Model) -> tuple[Array32, Array32]:
+    """Jacobian and, last, residual (G, 13, 3, K, J) of the model in Y, Cb, Cr; the sphere's share (G, K, J)."""
+    shown = _shown(p, blur, model)
+    mixed, S, sharp = shown.mixed, shown.share, model.sharp
+    G, K, wider = S.shape
+    J = len(model.t)
+    smooth, d_smooth = _smoothing(model.t, model.wide, chroma_blur)
     rows = np.empty((G, _N + 1, 3, K, J), dtype=np.float32)
     columns = [_LIMB, _SLOPE, _OUTER, _OFFSET, _OWN, _N]
     rows[:, columns, 0] = (mixed[:, 0].reshape(G, -1, wider) @ sharp).reshape(G, 6, K, J)
     colour = (mixed[:, 1:].reshape(G, -1, wider) @ smooth).reshape(G, 2, 6, K, J)
     rows[:, columns, 1], rows[:, columns, 2] = colour[:, 0], colour[:, 1]
-    rows[:, _N] = data - rows[:, _N]
+    rows[:, _N] = model.data - rows[:, _N]
     rows[:, _OWN + 1, 0] = 0
     rows[:, _OWN + 1, 1:] = (mixed[:, 1:, 5].reshape(G, -1, wider) @ d_smooth).reshape(G, 2, K, J)
     # Columns of a colour's own parameters affect only its channel.
-    for first, part_of in ((0, S), (5, rest)):
-        single = (slope * part_of[:, None]).reshape(G, -1, wider)
+    for first, part_of in ((0, S), (5, 1 - S)):
+        single = (shown.slope * part_of[:, None]).reshape(G, -1, wider)
         rows[:, first : first + 3, 0] = (single @ sharp).reshape(G, 3, K, J) * _MIX[0][:, None, None]
         blurred = (single @ smooth).reshape(G, 3, K, J)
         for k in (1, 2):

@@ -18,7 +18,7 @@ from service.compute.markers.outlines.edges import (
     sample_averaged,
     sample_sharp,
 )
-from service.compute.markers.outlines.limb import fit_limb, masked_median
+from service.compute.markers.outlines.limb import LimbFit, LimbProfiles, fit_limb, masked_median
 from service.compute.markers.records import DEFAULTS, DetectionOptions, Evidence, SphereOutline, outline_from_cone
 from service.core.geometry import Array
 
@@ -106,7 +106,7 @@ def approach_outlines(
     for _ in range(3):
         if not todo:
             break
-        measured = _measure(image_bgr, camera, [a for _, a in todo], count, 1.0, 2.5, 4, unit, options)
+        measured = _measure(image_bgr, camera, [a for _, a in todo], _Sampling(count, 1.0, 2.5, 4, unit), options)
         again: list[tuple[int, AveragedCone]] = []
         for (i, before), found in zip(todo, measured, strict=True):
             if found is None:
@@ -140,12 +140,12 @@ def measure_outlines(
     wanted = _MOST_PROFILES * min(1.0, _FINE_RADIUS_PX / radius_px)
     count = max(_FEWEST_PROFILES, _BLOCKS * round(wanted / _BLOCKS))
     fine = radius_px < _FINE_RADIUS_PX
-    step, iterations = (0.5, 3) if fine else (0.7, 4)
-    found = _measure(image_bgr, camera, starts, count, step, 1.6 if fine else 2.5, iterations, 1, options)
+    sampling = _Sampling(count, 0.5, 1.6, 3) if fine else _Sampling(count, 0.7, 2.5, 4)
+    found = _measure(image_bgr, camera, starts, sampling, options)
     for i, best in enumerate(found):
         if best is not None and not fine and best.blur_px > _FOCUS * max(1.0, starts[i].blur_px):
             longer = AveragedCone(best.cone, best.blur_px, best.chroma_blur_px)
-            found[i] = _measure(image_bgr, camera, [longer], count, step, 2.5, iterations, 1, options)[0]
+            found[i] = _measure(image_bgr, camera, [longer], sampling, options)[0]
     return [
         None if best is None else _outline(image_bgr, camera, best, options, score)
         for best, score in zip(found, scores or [1.0] * len(found), strict=True)
@@ -206,74 +206,97 @@ class _SubpixelCone:
     covariance: Array
 
 
+@dataclass(frozen=True, slots=True)
+class _Sampling:
+    """How outlines are sampled and fitted; lengths are in units of `unit` averaged pixels.
+
+    Attributes:
+        n_profiles: number of profiles across each outline.
+        step: distance of samples along a profile.
+        reach: largest distance of an edge from the outline expected.
+        iterations: number of steps of the fit.
+        unit: pixels averaged into one sample.
+    """
+
+    n_profiles: int
+    step: float
+    reach: float
+    iterations: int
+    unit: int = 1
+
+
 def _measure(
     image: NDArray[np.uint8],
     camera: CameraModel,
     starts: Sequence[AveragedCone],
-    n_profiles: int,
-    step: float,
-    reach: float,
-    iterations: int,
-    unit: int,
+    sampling: _Sampling,
     options: DetectionOptions,
 ) -> list[_SubpixelCone | None]:
-    """Cones near `starts` from `n_profiles` each; lengths are in units of `unit` averaged pixels."""
+    """Cones near `starts`."""
+    unit, step = sampling.unit, sampling.step
     cones = [s.cone for s in starts]
     radius = np.array([c.half_angle_rad for c in cones]) * camera.fx / unit
     if not np.all(radius >= _LEAST_RADIUS):
         large = {i: s for i, s in enumerate(starts) if radius[i] >= _LEAST_RADIUS}
-        found = iter(
-            _measure(image, camera, list(large.values()), n_profiles, step, reach, iterations, unit, options)
-            if large
-            else ()
-        )
+        found = iter(_measure(image, camera, list(large.values()), sampling, options) if large else ())
         return [next(found) if i in large else None for i in range(len(starts))]
-    typical = float(np.median(radius))
-    # Inside, far enough to separate the limb's falloff from the edge; outside, only what the blurred edge needs.
-    blur = max(1.0, float(np.median([s.blur_px for s in starts])))
-    inner = min(float(np.clip(0.13 * typical, 4.0, 12.0)) + 2 * (blur - 1), 0.6 * typical)
-    outer = 4.0 + 2.5 * (blur - 1)
-    offsets = np.asarray(np.arange(-round(inner / step), round(outer / step) + 1) * step, dtype=np.float64)
+    offsets = _offsets(radius, [s.blur_px for s in starts], step)
     finer = (offsets[:, None] * unit + np.arange(unit) - 0.5 * (unit - 1)).reshape(-1)
-    where = profiles_of(cones, camera, n_profiles, finer)
+    where = profiles_of(cones, camera, sampling.n_profiles, finer)
     values = sample_sharp(image, where.pixels) if unit == 1 else sample_averaged(image, where.pixels, unit)
     limb = fit_limb(
-        values, offsets, np.all(where.inside, axis=2), radius, srgb=options.srgb,
-        blur=np.array([s.blur_px for s in starts]), chroma_blur=np.array([s.chroma_blur_px for s in starts]),
-        iterations=iterations, reach=reach,
-    )  # fmt: skip
-    azimuth, per_pixel = where.azimuth_rad, where.per_pixel_rad * unit
+        LimbProfiles(values, offsets, np.all(where.inside, axis=2), radius, options.srgb),
+        blur=np.array([s.blur_px for s in starts]),
+        chroma_blur=np.array([s.chroma_blur_px for s in starts]),
+        iterations=sampling.iterations,
+        reach=sampling.reach,
+    )
+    per_pixel = where.per_pixel_rad * unit
     angle = np.median(per_pixel, axis=1)
-    fit = _robust_cones(azimuth, limb.offset * per_pixel / angle[:, None], limb.sigma, limb.ok)
-    covariance = _covariances(azimuth, fit)
+    fit = _robust_cones(where.azimuth_rad, limb.offset * per_pixel / angle[:, None], limb.sigma, limb.ok)
+    covariance = _covariances(where.azimuth_rad, fit)
     contrast = masked_median(limb.contrast, fit.used)
-    out: list[_SubpixelCone | None] = []
-    for i, cone in enumerate(cones):
-        blur_px = float(limb.blur[i]) * unit
-        if not fit.good[i] or fit.scale[i] > max(MOST_SIGMA_PX, 0.3 * float(limb.blur[i])):
-            out.append(None)
-            continue
-        half = cone.half_angle_rad + float(fit.step[i, 2] * angle[i])
-        if not 1 / _MOST_CHANGE < half / cone.half_angle_rad < _MOST_CHANGE:  # a short arc gives no radius
-            out.append(None)
-            continue
-        axis = cone.axis + cone.frame()[:, :2] @ fit.step[i, :2] * angle[i]
-        systematic = SYSTEMATIC_PER_BLUR * blur_px
-        out.append(
-            _SubpixelCone(
-                cone=Cone(axis / float(np.linalg.norm(axis)), half),
-                blur_px=blur_px,
-                chroma_blur_px=float(limb.chroma_blur[i]) * unit,
-                coverage=float(fit.coverage[i]),
-                sigma_px=float(fit.scale[i]) * unit,
-                rms_px=float(np.sqrt(np.mean(fit.residual[i, fit.used[i]] ** 2))) * unit,
-                n_edges=int(fit.used[i].sum()),
-                contrast=float(contrast[i]),
-                systematic_px=systematic,
-                covariance=(covariance[i] + np.eye(3) * (systematic / unit) ** 2) * angle[i] ** 2,
-            )
-        )
-    return out
+    return [
+        _measured(i, cone, limb, fit, (float(angle[i]), covariance[i], float(contrast[i])), unit)
+        for i, cone in enumerate(cones)
+    ]
+
+
+def _offsets(radius: Array, blurs: Sequence[float], step: float) -> Array:
+    """(J,) positions along the profiles, for outlines of these radii and blurs."""
+    typical = float(np.median(radius))
+    # Inside, far enough to separate the limb's falloff from the edge; outside, only what the blurred edge needs.
+    blur = max(1.0, float(np.median(blurs)))
+    inner = min(float(np.clip(0.13 * typical, 4.0, 12.0)) + 2 * (blur - 1), 0.6 * typical)
+    outer = 4.0 + 2.5 * (blur - 1)
+    return np.asarray(np.arange(-round(inner / step), round(outer / step) + 1) * step, dtype=np.float64)
+
+
+def _measured(
+    i: int, cone: Cone, limb: LimbFit, fit: _ConeFits, worth: tuple[float, Array, float], unit: int
+) -> _SubpixelCone | None:
+    """Outline `i`, or None if unreliable; `worth`: radians per unit, covariance in squared units, contrast."""
+    angle, covariance, contrast = worth
+    blur_px = float(limb.blur[i]) * unit
+    if not fit.good[i] or fit.scale[i] > max(MOST_SIGMA_PX, 0.3 * float(limb.blur[i])):
+        return None
+    half = cone.half_angle_rad + float(fit.step[i, 2] * angle)
+    if not 1 / _MOST_CHANGE < half / cone.half_angle_rad < _MOST_CHANGE:  # a short arc gives no radius
+        return None
+    axis = cone.axis + cone.frame()[:, :2] @ fit.step[i, :2] * angle
+    systematic = SYSTEMATIC_PER_BLUR * blur_px
+    return _SubpixelCone(
+        cone=Cone(axis / float(np.linalg.norm(axis)), half),
+        blur_px=blur_px,
+        chroma_blur_px=float(limb.chroma_blur[i]) * unit,
+        coverage=float(fit.coverage[i]),
+        sigma_px=float(fit.scale[i]) * unit,
+        rms_px=float(np.sqrt(np.mean(fit.residual[i, fit.used[i]] ** 2))) * unit,
+        n_edges=int(fit.used[i].sum()),
+        contrast=contrast,
+        systematic_px=systematic,
+        covariance=(covariance + np.eye(3) * (systematic / unit) ** 2) * angle**2,
+    )
 
 
 @dataclass(frozen=True, slots=True)
