@@ -23,6 +23,7 @@ from service.compute.planning.information import (
     view_information,
 )
 from service.compute.planning.next_best_view import Candidate, CurrentInformation, next_best_views
+from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
 from tests.support.runs.measuring_rig import CENTRE_M, SPHERES_M, hill, informations
@@ -91,7 +92,7 @@ def test_an_error_of_the_mounting_moves_the_scan_with_the_cameras() -> None:
     for i, T in enumerate(seen_from):
         outlines, which = exact_outlines(made, i, SPHERES_M, 0.0)
         view = view_information(
-            T, made.T_world_scan, outlines, dict(enumerate(which)), SPHERES_M, RADIUS_M, centre, 1e-2
+            T, made.T_world_scan, outlines, dict(enumerate(which)), ScanSpheres(SPHERES_M, RADIUS_M), centre, 1e-2
         )
         normal += view.information
         right += view.information @ view.offset

@@ -89,8 +89,7 @@ def look_at_image(
         np.eye(4),
         outlines,
         markers,
-        spheres_m,
-        radius_m,
+        ScanSpheres(spheres_m, radius_m),
         spheres_m.mean(axis=0),
         _ROUGH_SIGMA_M if rough else _POSE_SIGMA_M,
     )

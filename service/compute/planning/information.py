@@ -17,6 +17,7 @@ import numpy as np
 from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import cone_residuals
+from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse, place_jacobian, skew
 
@@ -38,24 +39,26 @@ def view_information(
     T_base_scan: Transform,
     outlines: Sequence[SphereOutline],
     markers: Mapping[int, int],
-    spheres_m: Array,
-    radius_m: float,
+    spheres: ScanSpheres,
     centre_m: Array,
     pose_sigma_m: float,
 ) -> ViewInformation:
     """Information of one image's assigned outlines about T_base_scan, linearised there.
 
     Args:
+        T_base_camera: pose of the camera.
+        T_base_scan: where it is linearised.
+        outlines: of the image.
         markers: outline → sphere.
-        spheres_m: (M, 3) in the scan frame.
+        spheres: in the scan frame.
         centre_m: (3,) base frame.
         pose_sigma_m: the arm's nominal scatter; outlines that contradict the solution by much more are excluded.
     """
-    base = apply(T_base_scan, spheres_m)
+    base = apply(T_base_scan, spheres.centres_m)
     normal, b, used = np.zeros((6, 6)), np.zeros(6), 0
     for o, m in markers.items():
         outline = outlines[o]
-        residual, J = cone_rows(T_base_camera, base[m], centre_m, radius_m, outline.cone)
+        residual, J = cone_rows(T_base_camera, base[m], centre_m, spheres.radius_m, outline.cone)
         slack = pose_sigma_m**2 * (J[:, :3] @ J[:, :3].T)
         if residual @ np.linalg.solve(outline.cone_covariance + slack, residual) > _OUTLIER:
             continue

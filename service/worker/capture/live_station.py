@@ -21,6 +21,7 @@ from service.compute.planning.information import (
     view_information,
 )
 from service.compute.registration.identification.pairing import paired
+from service.compute.scene import ScanSpheres
 from service.core.geometry import Array, Transform, apply, inverse
 from service.jobs.capture.live_view import LiveArguments
 from service.jobs.records import Hash
@@ -119,7 +120,7 @@ def solve_station(
         view_information(
             v.T_base_camera, T, v.outlines,
             paired(v.outlines, inverse(v.T_base_camera) @ T, spheres, radius_m, scene.camera),
-            spheres, radius_m, centre, 3 * sigma_m,
+            ScanSpheres(spheres, radius_m), centre, 3 * sigma_m,
         )
         for v in views
     )  # fmt: skip

@@ -14,6 +14,7 @@ from service.compute.planning.information import (
     ViewInformation,
     view_information,
 )
+from service.compute.scene import ScanSpheres
 from service.core.geometry import Array, apply, transform
 from tests.support.rig.bench_rig import BenchRig
 from tests.support.scenes.sphere_images import (
@@ -39,7 +40,13 @@ def informations(made: Scene, *, pose_noise_m: float = 0.0, seed: int = 0) -> li
         markers = dict(enumerate(which))
         out.append(
             view_information(
-                shift @ T, made.T_world_scan, outlines, markers, SPHERES_M, RADIUS_M, centre, 10 * pose_noise_m + 1e-4
+                shift @ T,
+                made.T_world_scan,
+                outlines,
+                markers,
+                ScanSpheres(SPHERES_M, RADIUS_M),
+                centre,
+                10 * pose_noise_m + 1e-4,
             )
         )
     return out
