@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 import logging
 import math
 import os
@@ -20,8 +18,9 @@ from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.poses.colmap.process import ColmapProcess
 from service.compute.poses.files.pose_covariance import blocks, similarity_covariance
-from service.compute.poses.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
-from service.compute.poses.sfm.front_end import FrontEnd, missing_pairs, pairs_of
+from service.compute.poses.sfm.features import ImageFeatures, PairMatches
+from service.compute.poses.sfm.front_end import FrontEnd, pairs_of
+from service.compute.poses.sfm.kept import KeptFrontEnd
 from service.compute.poses.sfm.options import Mapper, Progress, SfmOptions
 from service.compute.poses.sfm.tracks import Tracks
 from service.core.errors import ComputeError, DataError
@@ -120,8 +119,9 @@ def reconstruct(
     pairs = pairs_of(files, T_world_camera_prior, settings, stations=stations)
     seconds: dict[str, float] = {}
     with FrontEnd(camera, settings, processes=settings.threads, log=workspace / "colmap_front.log") as front:
-        features = _features(files, camera, settings, workspace, front, seconds, progress)
-        matches = _matches(features, pairs, camera, settings, workspace, front, seconds, progress)
+        kept = KeptFrontEnd(workspace, camera, settings, seconds)
+        features = kept.features(files, front, progress)
+        matches = kept.matches(features, pairs, front, progress)
     model = reconstruct_from(
         features,
         matches,
@@ -209,82 +209,6 @@ def reconstruct_from(
 def _check_count(count: int) -> None:
     if count < 3:
         raise ComputeError(f"structure from motion needs at least 3 images, got {count}")
-
-
-def _features(
-    files: Mapping[str, Path],
-    camera: CameraModel,
-    settings: SfmOptions,
-    workspace: Path,
-    front: FrontEnd,
-    seconds: dict[str, float],
-    progress: Progress | None,
-) -> dict[str, ImageFeatures]:
-    """Features of every image; those in the workspace are used if file, camera and settings are the same."""
-    folder = workspace / "features"
-    folder.mkdir(exist_ok=True)
-    kept = {name: folder / f"{_key(file, camera, settings)}.npz" for name, file in files.items()}
-    wanted = {name: files[name] for name, path in kept.items() if not path.is_file()}
-    start = time.monotonic()
-    fresh = front.extract_all(wanted, progress) if wanted else {}
-    if wanted:
-        seconds["extract"] = time.monotonic() - start
-    for name, found in fresh.items():
-        _write(kept[name], found.to_bytes())
-    return {
-        name: fresh[name] if name in fresh else ImageFeatures.from_bytes(kept[name].read_bytes())
-        for name in sorted(files)
-    }
-
-
-def _matches(
-    features: Mapping[str, ImageFeatures],
-    pairs: Sequence[tuple[str, str]],
-    camera: CameraModel,
-    settings: SfmOptions,
-    workspace: Path,
-    front: FrontEnd,
-    seconds: dict[str, float],
-    progress: Progress | None,
-) -> list[PairMatches]:
-    """Matches of exactly these pairs; those in the workspace are used if the features are the same."""
-    kept = workspace / "matches.npz"
-    stamp = workspace / "matches.json"
-    recipe = json.dumps([dataclasses.asdict(camera), settings.verification_error_px, settings.seed, _hash(features)])
-    known: list[PairMatches] = []
-    if kept.is_file() and stamp.is_file() and stamp.read_text(encoding="utf-8") == recipe:
-        known = unpack_matches(kept.read_bytes())
-    missing = missing_pairs(pairs, known)
-    if missing:
-        start = time.monotonic()
-        known += front.match_pairs(features, missing, progress)
-        seconds["match"] = time.monotonic() - start
-        stamp.unlink(missing_ok=True)
-        _write(kept, pack_matches(known))
-        stamp.write_text(recipe, encoding="utf-8")
-    wanted = set(pairs)
-    return [m for m in known if m.pair in wanted]
-
-
-def _hash(features: Mapping[str, ImageFeatures]) -> str:
-    digest = hashlib.sha256()
-    for name, found in features.items():
-        digest.update(name.encode() + found.pixels.tobytes() + found.descriptors.tobytes())
-    return digest.hexdigest()
-
-
-def _key(file: Path, camera: CameraModel, settings: SfmOptions) -> str:
-    stat = file.stat()
-    front = ("max_image_size", "max_features", "first_octave")
-    words = [str(file.resolve()), stat.st_size, stat.st_mtime_ns, camera.width, camera.height]
-    text = json.dumps([*words, *(getattr(settings, key) for key in front)])
-    return hashlib.sha256(text.encode()).hexdigest()[:24]
-
-
-def _write(path: Path, data: bytes) -> None:
-    part = path.with_suffix(".part")
-    part.write_bytes(data)
-    part.replace(path)
 
 
 def _by_name(images: Mapping[str, Path] | Sequence[Path]) -> dict[str, Path]:
