@@ -9,25 +9,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.layout.misfits import bounded_misfits, misfits, rigid_motions
+from service.compute.layout.confusions import (
+    MOST_JUDGED,
+    SUBSET,
+    Matches,
+    by_visible_count,
+    confusions,
+    distances,
+    distinct,
+)
+from service.compute.layout.misfits import bounded_misfits
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 from service.core.units import deg, mm
 
 IntArray = NDArray[np.int64]
 
-SUBSET = 4  # least number of spheres visible in an image
 # For ten random centres, the best wrong assignment of four misfits by 0.5 to 4 mm. Measured centres err by 0.01 mm,
 # and an image of exactly those four may be resolved by the others. If five can be confused, nothing resolves them.
 REQUIRED_MARGIN_M = 0.4e-3
 REQUIRED_MARGIN_OF_FIVE_M = 2.0e-3
 REQUIRED_DEPTH_M = 5.0e-3  # rms height over the best plane: a flat layout has no handedness and gives weak poses
 LARGEST_GAP_RAD = np.deg2rad(150.0)  # between neighbouring azimuths; above it the spheres are all on one side
-_FIRST_TOLERANCE_M = 1.0e-3
-_ROWS = 2_000_000  # combinations processed at a time
-_MOST_MATCHES = 200_000  # a layout with so many near-symmetries needs no longer list
 _REACH_M = 3.0e-3  # misfits up to which assignments of four are judged and extended to more spheres
-_MOST_JUDGED = 600  # assignments whose bounds are computed, the best first
 _QUANTILE = 2.326  # of the normal distribution at 99 %
 
 
@@ -141,15 +145,15 @@ def check_layout(
     order = np.argsort(matches.misfit, kind="stable")
     worst = tuple(
         Confusion(_ints(matches.seen[k]), _ints(matches.taken[k]), float(matches.misfit[k]))
-        for k in _distinct(matches, order)
+        for k in distinct(matches, order)
     )
     sphere_margins = np.full(len(centres), np.inf)
     moved = matches.seen != matches.taken
     for column in range(SUBSET):
         chosen = moved[:, column]
         np.minimum.at(sphere_margins, matches.seen[chosen, column], matches.misfit[chosen])
-    by_count = _by_count(centres, matches, order)
-    best = order[:_MOST_JUDGED]
+    by_count = by_visible_count(centres, matches, order)
+    best = order[:MOST_JUDGED]
     margin = _least(centres, joint, Matches(matches.seen[best], matches.taken[best], matches.misfit[best]))
     of_five = _least(centres, joint, by_count[SUBSET + 1]) if SUBSET + 1 in by_count else _NO_BOUND
     _, singular, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
@@ -228,115 +232,6 @@ def layout_measures(report: LayoutReport) -> dict[str, float]:
         "layout_gap_deg": deg(report.largest_gap_rad),
         "layout_problems": float(len(report.problems)),
     }
-
-
-# --- search ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Matches:
-    """Wrong assignments: `seen` (M, n) are taken for `taken` (M, n), with these misfits (M,) in metres."""
-
-    seen: IntArray
-    taken: IntArray
-    misfit: Array
-
-
-def confusions(centres: Array, beyond_m: float = 0.0) -> Matches:
-    """All wrong assignments of four up to a misfit of `beyond_m`; if there are none, up to the first found."""
-    between = distances(centres)
-    tolerance = max(_FIRST_TOLERANCE_M, beyond_m)
-    while True:
-        seen, taken = similar(between, 2 * np.sqrt(2.0) * tolerance)
-        misfit = misfits(centres, seen, taken)
-        sure = misfit <= tolerance
-        if np.any(sure):
-            return Matches(seen[sure], taken[sure], misfit[sure])
-        tolerance *= 2
-
-
-def similar(between: Array, tolerance: float) -> tuple[IntArray, IntArray]:
-    """Quadruples (M, 4) and others (M, 4) with equal pairwise distances, without the quadruple itself."""
-    n = len(between)
-    seen = np.stack(np.triu_indices(n, 1), axis=1)
-    taken = np.array([(p, q) for p in range(n) for q in range(n) if p != q])
-    a, b = np.nonzero(
-        np.abs(between[seen[:, 0], seen[:, 1]][:, None] - between[taken[:, 0], taken[:, 1]][None]) < tolerance
-    )
-    seen, taken = seen[a], taken[b]
-    for _ in range(SUBSET - 2):
-        step = max(1, _ROWS // (n * n))
-        parts = [
-            _extended(between, seen[k : k + step], taken[k : k + step], tolerance) for k in range(0, len(seen), step)
-        ]
-        seen = np.concatenate([s for s, _ in parts]) if parts else np.empty((0, seen.shape[1] + 1), dtype=np.int64)
-        taken = np.concatenate([t for _, t in parts]) if parts else seen
-        if len(seen) > _MOST_MATCHES:
-            seen, taken = seen[:_MOST_MATCHES], taken[:_MOST_MATCHES]
-    wrong = np.any(seen != taken, axis=1)
-    return seen[wrong], taken[wrong]
-
-
-def _extended(between: Array, seen: IntArray, taken: IntArray, tolerance: float) -> tuple[IntArray, IntArray]:
-    n = len(between)
-    agree = np.ones((len(seen), n, n), dtype=np.bool_)
-    for column in range(seen.shape[1]):
-        agree &= np.abs(between[seen[:, column]][:, :, None] - between[taken[:, column]][:, None, :]) < tolerance
-    later = np.arange(n)[None] > seen[:, -1:]
-    agree &= later[:, :, None]
-    for column in range(taken.shape[1]):
-        agree[np.arange(len(taken)), :, taken[:, column]] = False
-    row, new, image = np.nonzero(agree)
-    return (
-        np.concatenate([seen[row], new[:, None]], axis=1),
-        np.concatenate([taken[row], image[:, None]], axis=1),
-    )
-
-
-def distances(centres: Array) -> Array:
-    """(N, N) between all centres (N, 3)."""
-    return np.linalg.norm(centres[:, None] - centres[None], axis=2)
-
-
-# --- what follows from it -------------------------------------------------------------------------------
-
-
-def _distinct(matches: Matches, order: IntArray, most: int = 8) -> list[int]:
-    """Indices of the best assignments, each pair of sets once: an assignment and its inverse have equal misfits."""
-    chosen: list[int] = []
-    known: set[frozenset[tuple[int, int]]] = set()
-    for k in order[: 50 * most]:
-        pairs = frozenset((int(i), int(j)) for i, j in zip(matches.seen[k], matches.taken[k], strict=True))
-        if pairs in known or frozenset((j, i) for i, j in pairs) in known:
-            continue
-        known.add(pairs)
-        chosen.append(int(k))
-        if len(chosen) == most:
-            break
-    return chosen
-
-
-def _by_count(centres: Array, matches: Matches, order: IntArray) -> dict[int, Matches]:
-    """The best assignments by number of visible spheres, best first; those of four are extended to more spheres."""
-    n = len(centres)
-    seen, taken = matches.seen[order[:2000]], matches.taken[order[:2000]]
-    found = {SUBSET: Matches(seen, taken, matches.misfit[order[:2000]])}
-    R, t = rigid_motions(centres, seen, taken)
-    carried = np.einsum("mij,nj->mni", R, centres) + t[:, None]
-    distance = np.linalg.norm(carried[:, :, None] - centres[None, None], axis=3)
-    rows = np.arange(len(seen))
-    for column in range(SUBSET):
-        distance[rows, seen[:, column]] = np.inf
-        distance[rows, :, taken[:, column]] = np.inf
-    for count in range(SUBSET + 1, n + 1):
-        i, j = np.divmod(distance.reshape(len(seen), -1).argmin(axis=1), n)
-        distance[rows, i] = np.inf
-        distance[rows, :, j] = np.inf
-        seen, taken = np.concatenate([seen, i[:, None]], axis=1), np.concatenate([taken, j[:, None]], axis=1)
-        misfit = misfits(centres, seen, taken)
-        best = np.argsort(misfit, kind="stable")[:_MOST_JUDGED]
-        found[count] = Matches(seen[best], taken[best], misfit[best])
-    return found
 
 
 _NO_BOUND = BoundedLength(np.inf, np.inf, np.inf)

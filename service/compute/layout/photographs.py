@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from service.compute.layout.ambiguity import distances
+from service.compute.layout.confusions import distances
 from service.compute.layout.photo_adjustment import AdjustedLayout, LensPrior, Photograph, adjust
 from service.compute.markers.cones import Cone
 from service.core.errors import ComputeError

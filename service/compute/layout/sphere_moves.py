@@ -12,10 +12,8 @@ from service.compute.layout.ambiguity import (
     REQUIRED_MARGIN_M,
     REQUIRED_MARGIN_OF_FIVE_M,
     check_layout,
-    confusions,
-    distances,
-    similar,
 )
+from service.compute.layout.confusions import confusions, distances, similar
 from service.compute.layout.misfits import misfits
 from service.core.errors import ComputeError
 from service.core.geometry import Array

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.layout.ambiguity import SUBSET as LAYOUT_SUBSET
 from service.compute.layout.ambiguity import check_layout, layout_measures, layout_record
+from service.compute.layout.confusions import SUBSET as LAYOUT_SUBSET
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.isosurface import surface
 from service.compute.surfaces.loop_closure import LoopClosure, close_loop
