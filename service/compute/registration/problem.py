@@ -51,7 +51,7 @@ class Problem:
 
     @property
     def n_images(self) -> int:
-        """N."""
+        """Number of images."""
         return len(self.T_base_camera)
 
     @property
@@ -71,7 +71,7 @@ class Problem:
 
     @property
     def size(self) -> int:
-        """n: number of common unknowns."""
+        """Number of common unknowns."""
         return self.common_column + 3 + self.common.shape[2]
 
     def prior(self) -> Array:

@@ -94,7 +94,7 @@ class ImageOutlines:
     """Outlines of one image; where they were predicted, the sphere of each, and the reason for each missing one."""
 
     outlines: tuple[SphereOutline, ...] = field(repr=False)
-    spheres: tuple[int, ...] | None  # None: the whole image was searched, and which is which is still to be told
+    spheres: tuple[int, ...] | None  # None: the whole image was searched, and they are not identified
     missing: dict[int, str]
 
 

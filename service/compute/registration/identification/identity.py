@@ -116,7 +116,7 @@ def identify_each(
         raise ComputeError(
             f"the arrangement of spheres is ambiguous: {_named(readings[k][0].markers)} and "
             + " and ".join(_named(r.markers) for r in rivals(readings[k])[:3])
-            + " explain the outlines alike",
+            + " explain the outlines equally well",
             where=labels[k],
             remedy="Show more of the spheres in one image, or place them less symmetrically",
         )
