@@ -66,6 +66,7 @@ def _tracks_reproject(model: SfmModel) -> None:
         assert np.median(np.linalg.norm(pixels - tracks.pixels[mine], axis=1)) < 0.4
 
 
+@pytest.mark.slow
 def test_both_mappers_share_features_and_find_the_poses(
     camera: CameraModel, views: dict[str, tuple[Path, Transform]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
