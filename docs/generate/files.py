@@ -12,29 +12,29 @@ from service.core.protocol.models import ProtocolFields, StepFields
 from service.rig import RigSection
 
 _MADE = "Made from the code by `make reference`."
-_NOT_WRITTEN = ("imported",)  # by the program alone, in the record of an import
+_NOT_WRITTEN = ("imported",)  # only the program writes it, for an import
 
 
 def protocol_text() -> str:
-    """Every key of a protocol file but the `params` of its steps, which are as their kind says."""
+    """Every key of a protocol file except the `params` of its steps, which depend on the kind of the step."""
     return _page(
         "The protocol file",
-        "A lab procedure in YAML: how the scene is made up, how the arm moves, and the steps in their order. "
-        "`orthocapture protocol check protocols/exvivo_spine.yaml` says all that is wrong with one, by line and "
-        "field; editors check it with `protocol.schema.json` beside this page. What stands under `params` of a step, "
-        "and what its gates can measure, depends on its kind: [Step kinds](steps.md).",
+        "A lab procedure in YAML: the parts of the scene, the motion of the arm, and the steps in their order. "
+        "`orthocapture protocol check protocols/exvivo_spine.yaml` reports every error of a file, by line and "
+        "field; editors can check it with `protocol.schema.json` beside this page. The `params` of a step, and the "
+        "measures for its gates, depend on its kind: [Step kinds](steps.md).",
         {"The file": ProtocolFields, "A step": StepFields},
-        {"The file": ["Besides, `steps`: a list of at least one step, as below.", ""]},
+        {"The file": ["And `steps`: a list of at least one step, see below.", ""]},
     )
 
 
 def rig_text() -> str:
-    """Every key of a rig file; the keys of a device are its driver's."""
+    """Every key of a rig file; the keys of a device depend on its driver."""
     return (
         _page(
             "The rig file",
-            "Devices and stations of one site in YAML. `orthocapture doctor --rig rig.yaml` says what is wrong with "
-            "it and with the devices. How one is written: [Your own hardware](../howto/your_hardware.md).",
+            "Devices and stations of a site in YAML. `orthocapture doctor --rig rig.yaml` reports errors of the file "
+            "and of the devices. How to write one: [Connecting your own hardware](../howto/your_hardware.md).",
             {"The file": RigSection},
             {},
         )
@@ -43,12 +43,12 @@ def rig_text() -> str:
 
 
 def _devices() -> str:
-    """A table for each driver that is installed."""
+    """A table for each installed driver."""
     lines = [
         "## Devices",
         "",
-        "Under `devices` each device has a name, and beneath it `driver` and the keys of that driver. A driver of "
-        "your own: [A new driver](../howto/new_driver.md).",
+        "Each device under `devices` has a name, and below it `driver` and the keys of that driver. To write "
+        "a driver of your own: [A new driver](../howto/new_driver.md).",
         "",
     ]
     for point in sorted(entry_points(group="orthocapture.drivers"), key=lambda point: point.name):

@@ -21,12 +21,12 @@ A signature asks for the password again, or for a PIN or a badge where the rig f
 the hash of what was signed, and is an event of the run.
 
 - **A step** with `sign: true` is signed by a technician or a supervisor before it passes.
-- **Figures outside their limits** are accepted only where the gate says so. `accept_by: supervisor` is any
-  supervisor; `accept_by: another_supervisor` is one who neither began the run nor confirmed the step. The reason goes
-  with every result, as a deviation. Some measures can never be accepted, such as `moved_during_exposure`.
-- **A release** is a supervisor's who took no part in the run (`release: second_person` in the protocol). Nothing of
-  the run is exported before it.
-- **A protocol** is approved, by its bytes, by whoever is the first to begin a run of it. A changed content under the
+- **Figures outside their limits** are accepted only if the gate says so. `accept_by: supervisor` is any
+  supervisor; `accept_by: another_supervisor` is one who neither began the run nor confirmed the step. The reason
+  is listed with every result, as a deviation. Some measures can never be accepted, such as `moved_during_exposure`.
+- **A release** is given by a supervisor who took no part in the run (`release: second_person` in the protocol).
+  Nothing of the run can be exported before it.
+- **A protocol** is approved, by its bytes, by the first person who begins a run with it. Changed content under the
   same id and version needs a reason and a password.
 """
 

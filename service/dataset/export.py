@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from service.core.records.import_list import imported_sentence
 from service.dataset.late_results import late_results
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary
+from service.jobs.registration.register import Registration
 
 
 def export_dataset(summary: RunSummary, folder: Path, not_in_yet: Sequence[str] = ()) -> None:
@@ -44,21 +46,11 @@ def export_dataset(summary: RunSummary, folder: Path, not_in_yet: Sequence[str] 
         raise DataError(
             "the folder exists already", where=str(folder), remedy="Name a new one; nothing is overwritten"
         )
-    images = folder / "images"
-    images.mkdir(parents=True)
+    folder.mkdir(parents=True)
     registered = summary.registrations()[best]
-    calibrated = next(s.result for s in summary.state.steps.values() if s.result.get("camera"))
-    camera = CameraModel.from_record(calibrated["camera"])
-    poses: dict[str, Transform] = {}
-    sources: dict[str, str] = {}
-    for capture in summary.captures():
-        T = registered.T_scan_camera.get(capture.viewpoint)
-        photograph = capture.artefacts[0]
-        if T is None or photograph.kind not in ("image", "control_image"):
-            continue
-        name = f"{capture.viewpoint}.jpg"
-        shutil.copyfile(summary.store.artefact_path(photograph.sha256), images / name)
-        poses[name], sources[name] = np.array(T), photograph.sha256
+    camera = CameraModel.from_record((registered.full_camera or registered.camera).plain())
+    images = _copy_images(summary, registered, folder / "images")
+    poses = {image.name: image.T_scan_camera for image in images}
     write_camera_json(folder / "camera.json", camera)
     write_poses_csv(folder / "poses.csv", poses)
     write_transforms_json(folder / "transforms.json", camera, {f"images/{name}": T for name, T in poses.items()})
@@ -67,9 +59,32 @@ def export_dataset(summary: RunSummary, folder: Path, not_in_yet: Sequence[str] 
     description = {
         **described_run(summary, best, not_in_yet),
         "poses": "poses.csv is T_scan_camera: x right, y down, z forward; transforms.json has OpenGL axes",
-        "image_sha256": sources,
+        "image_sha256": {image.name: image.sha256 for image in images},
     }
     (folder / "dataset.json").write_text(json.dumps(description, indent=1), encoding="utf-8")
+
+
+@dataclass(frozen=True, slots=True)
+class _Image:
+    """A photograph of the data set."""
+
+    name: str
+    sha256: str
+    T_scan_camera: Transform
+
+
+def _copy_images(summary: RunSummary, registered: Registration, folder: Path) -> list[_Image]:
+    """Copy the registered photographs into a new folder."""
+    folder.mkdir()
+    images: list[_Image] = []
+    for capture in summary.captures():
+        T = registered.T_scan_camera.get(capture.viewpoint)
+        photograph = capture.artefacts[0]
+        if T is not None and photograph.kind in ("image", "control_image"):
+            image = _Image(f"{capture.viewpoint}.jpg", photograph.sha256, np.array(T))
+            shutil.copyfile(summary.store.artefact_path(photograph.sha256), folder / image.name)
+            images.append(image)
+    return images
 
 
 def described_run(summary: RunSummary, own: str, not_in_yet: Sequence[str]) -> dict[str, Any]:

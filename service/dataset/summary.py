@@ -23,8 +23,10 @@ from service.dataset.registrations import (
     own_registration,
     registrations,
 )
+from service.jobs.records import Point
 from service.jobs.registration.evaluate import ErrorBudget, Row
 from service.jobs.registration.register import Registration
+from service.jobs.surfaces import locate_spheres
 from service.store.store import Store
 
 
@@ -85,6 +87,11 @@ class RunSummary:
     def jobs(self) -> Sequence[JobFinished]:
         """All finished jobs."""
         return [event.payload for event in self.events if isinstance(event.payload, JobFinished)]
+
+    def scan_spheres_m(self) -> tuple[Point, ...]:
+        """Sphere centres of the registered scan in its own frame; empty before the scan was imported."""
+        result = self.result("scan_import")
+        return locate_spheres.KIND.read_answer(result).spheres_m if result else ()
 
     def scan_mesh(self) -> tuple[Array, Any]:
         """Vertices (V, 3) in metres and faces (F, 3) of the registered scan that was imported last."""

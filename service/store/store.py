@@ -357,16 +357,8 @@ class Store:
         or to the others ("background").
         """
         with self._database.writing() as connection:
-            return queue.claim(
-                connection,
-                self._clock,
-                self._ids,
-                worker=worker,
-                lease_s=lease_s,
-                kinds=kinds,
-                run_id=run_id,
-                lane=lane,
-            )
+            choice = queue.JobChoice(kinds, run_id, lane)
+            return queue.claim(connection, self._clock, self._ids, worker=worker, lease_s=lease_s, choice=choice)
 
     def renew_job(self, job: Job, lease_s: float) -> Job:
         """Keep a job for another `lease_s` seconds. Raises LeaseLostError."""

@@ -116,7 +116,7 @@ def test_signature_certificate_devices_and_verification(folder: Path, report: Re
         "0.0300 px rms, which is 0.0120 mm at 0.70 m (5 folds)",
         "0.040 mm (median over the views, each predicted by the others)",
         "Any of these makes a new one necessary",
-        "95% of the 96 cells hold a corner, 1 none",
+        "95% of the 96 cells hold a corner (empty: 1)",
         "1.10 / 11.53 (1920)",
         "UR10e 20231 5.12",
         "stayed within 0.0 ms",

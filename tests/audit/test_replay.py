@@ -15,7 +15,8 @@ from typer.testing import CliRunner
 
 from service.audit.record.run import read_run
 from service.audit.replay.differences import compare_data, compare_files
-from service.audit.replay.replay import ReplayReport, replay
+from service.audit.replay.replay import replay
+from service.audit.replay.results import ReplayReport
 from service.cli.main import app
 from service.core.errors import ComputeError, ConfigurationError, IntegrityError
 from service.core.jobs.references import Reference, jobs_of, references_in, resolve
@@ -180,7 +181,7 @@ def test_what_cannot_be_asked(folder: Path, options: Mapping[str, Any], said: st
 
 
 def test_recomputed_files_never_go_into_the_evidence(folder: Path) -> None:
-    with pytest.raises(ConfigurationError, match="do not belong"):
+    with pytest.raises(ConfigurationError, match="must not be written into the data folder"):
         again(folder, out=folder / "data" / "replayed")
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from service.core.equipment.camera_bodies import bodies_of
+from service.core.equipment.recorded_devices import RecordedIdentity
 
-SONY = {"kind": "camera", "serial": "3282933005318008"}
+SONY = RecordedIdentity(kind="camera", serial="3282933005318008")
 
 
 def test_the_bodys_own_number_is_shown_and_the_longer_one_explained() -> None:
@@ -31,7 +32,7 @@ def test_another_body_is_not_taken_for_the_same() -> None:
 
 
 def test_each_of_two_cameras_has_its_own() -> None:
-    other = {"kind": "camera", "serial": "000000042"}
+    other = RecordedIdentity(kind="camera", serial="000000042")
     known = bodies_of([("left", SONY), ("right", other)], ["42", "05318008"])
     assert (known.shown(SONY), known.shown(other)) == ("05318008", "42")
     assert known.strange == ""
@@ -39,8 +40,12 @@ def test_each_of_two_cameras_has_its_own() -> None:
 
 def test_a_camera_that_states_no_number_contradicts_nothing_and_a_robot_has_its_own() -> None:
     known = bodies_of(
-        [("camera", {"kind": "camera", "serial": ""}), ("robot", {"kind": "robot", "serial": "8"})], ["5"]
+        [
+            ("camera", RecordedIdentity(kind="camera", serial="")),
+            ("robot", RecordedIdentity(kind="robot", serial="8")),
+        ],
+        ["5"],
     )
     assert known.strange == ""
-    assert known.shown({"kind": "robot", "serial": "05318008"}) == "05318008"
+    assert known.shown(RecordedIdentity(kind="robot", serial="05318008")) == "05318008"
     assert known.explained == ()

@@ -9,7 +9,7 @@ import cv2
 import pytest
 
 from service.audit.record.run import RecordedFiles
-from service.audit.replay.replay import ScratchStore
+from service.audit.replay.scratch import ScratchStore
 from service.compute.poses.sfm.front_end import pairs_of
 from service.compute.poses.sfm.options import SfmOptions
 from service.core.records.events import ArtefactRef

@@ -220,7 +220,7 @@ def test_the_report_the_data_set_and_the_bundle_tell_the_same(run: Run, tmp_path
     dataset = next(item for item in crate["@graph"] if item["@id"] == "./")
     assert "Not in when this was made: " in dataset["description"]
     for told in (
-        "Results that came later",
+        "Results that arrived later",
         "colmap: arrived 12 min after the release",
         "What was judged and signed is robot",
         "COLMAP from nothing: was still being computed",

@@ -19,11 +19,11 @@ from service.cli.main import app
 from service.compute.camera_model import CameraModel
 from service.compute.poses.files.camera_files import write_camera_json
 from service.compute.poses.files.pose_files import write_colmap_text, write_poses_csv, write_transforms_json
-from service.core.geometry import apply, inverse, look_at
-from simulators.rendering.render import REFERENCE, Renderer
+from service.core.geometry import apply, inverse
 from simulators.scan_station.formats import encode
 from simulators.scan_station.station import scan_scene
-from simulators.scene.world import NOMINAL_LUX, RADIUS_M, SCENE_CENTRE_M, Scene
+from simulators.scene.world import RADIUS_M, Scene
+from tests.support.scenes.scene_photographs import photograph, pose_above
 
 pytestmark = pytest.mark.slow  # photographs are rendered and registered
 
@@ -61,25 +61,12 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     """Six photographs from two sides, a scan with the control spheres, and all the files a user would have."""
     folder = tmp_path_factory.mktemp("capture")
     scene = Scene.generate(SEED)
-    lens = scene.camera_intrinsics(WIDTH)
-    camera = CameraModel(**dataclasses.asdict(lens))
-    renderer = Renderer(WIDTH)
-    poses: dict[str, Array] = {}
-    (folder / "images").mkdir()
-    for i in range(N_IMAGES):
-        azimuth, tilt = 2 * np.pi * (i + 0.3) / N_IMAGES, np.deg2rad(18 + 9 * (i % 3))
-        out = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
-        pose = look_at(SCENE_CENTRE_M + 0.62 * out, SCENE_CENTRE_M, np.array([0.1, 1.0 if out[1] < 0 else -1.0, 0.0]))
-        view = {
-            "T_world_camera": pose.tolist(),
-            "intrinsics": lens.to_json(),
-            "scene": {"seed": SEED, "spray": False, "control_spheres": True, "board": None},
-            "light_lux": NOMINAL_LUX,
-        }
-        picture = renderer.render(view, REFERENCE, i)
-        name = f"DSC{i + 1:05d}.JPG"
-        cv2.imwrite(str(folder / "images" / name), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
-        poses[name] = pose
+    camera = CameraModel(**dataclasses.asdict(scene.camera_intrinsics(WIDTH)))
+    poses = {
+        f"DSC{i + 1:05d}.JPG": pose_above(2 * np.pi * (i + 0.3) / N_IMAGES, np.deg2rad(18 + 9 * (i % 3)))
+        for i in range(N_IMAGES)
+    }
+    photograph(scene, poses, WIDTH, folder / "images")
     scan = scan_scene(scene, spray=True, control_spheres=True, spacing_m=1.2e-3)
     (_, data), *_ = encode("ply", "scan.ply", 1e3 * scan.vertices_m, scan.faces, scan.normals)
     (folder / "scan.ply").write_bytes(data)

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.core.errors import StoreError
 from service.core.records.events import DataRestored, ViewpointCaptured
-from service.store.backup.backup import back_up
+from service.store.backup.backup import BackupOptions, back_up
 from service.store.backup.folder import BackupFolder
 from service.store.backup.restore import restore
 from service.store.durable_effects import DurableFiles, RandomIds
@@ -198,7 +198,7 @@ def test_a_roll_back_of_the_record_is_not_hidden_by_the_backup(tmp_path: Path, d
     run = str(rows(data, "SELECT run_id FROM runs WHERE run_id != 'site'")[0][0])
     tamper(data, *cut(run, 5), *cut(SITE, 5))
     assert not verify(data).ok
-    made = back_up(data, tmp_path / "backup", keep=1)
+    made = back_up(data, tmp_path / "backup", BackupOptions(keep=1))
     assert any("signatures.jsonl" in fault for fault in made.state.faults)
 
 
@@ -241,7 +241,7 @@ def test_a_run_goes_on_in_the_restored_folder(tmp_path: Path) -> None:
 def test_the_signing_key_leaves_only_when_asked_and_a_restored_run_can_be_signed(tmp_path: Path, data: Path) -> None:
     back_up(data, tmp_path / "without")
     assert not any(b"PRIVATE KEY" in p.read_bytes() for p in (tmp_path / "without").rglob("*") if p.is_file())
-    back_up(data, tmp_path / "with", with_keys=True)
+    back_up(data, tmp_path / "with", BackupOptions(with_keys=True))
     restore(tmp_path / "with", tmp_path / "restored", actor="Ada")
     capture_more(tmp_path / "restored", "v9")
     assert verify(tmp_path / "restored").ok

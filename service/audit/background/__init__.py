@@ -1,1 +1,1 @@
-"""Work that takes longer than a page may take."""
+"""Background work for pages: work that takes longer than a request may take."""

@@ -1,6 +1,6 @@
-"""Work for a run in a child process, followed from this one: how far it is, and how it ended.
+"""Work for a run in a child process: this process follows its progress and its result.
 
-The child writes one line of JSON for each piece of news, see `report`; the parent keeps the last one.
+The child writes each change as a line of JSON (`report`), and the parent keeps the last one.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from typing import Any
 from service.core.errors import OrthocaptureError
 from service.store.durable_effects import Clock, utc_text
 
-Progress = Callable[[str, int, int], None]  # what is done now, how much of it is done, of how much
+Progress = Callable[[str, int, int], None]  # activity, amount done, total
 _BETWEEN_REPORTS_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class ChildState:
-    """A child process under way, or how the last one ended."""
+    """The state of the running child process, or the result of the last one."""
 
     by: str  # who asked for it
     since_utc: str
@@ -36,7 +36,7 @@ class ChildState:
 
     @property
     def pending(self) -> bool:
-        """Whether it is still under way."""
+        """Whether it is still running."""
         return not self.problem and self.result is None
 
 
@@ -44,7 +44,7 @@ class ChildProcesses:
     """Runs one module in child processes, at most one at a time for each run."""
 
     def __init__(self, module: str, name: str, clock: Clock) -> None:
-        """`name`: what the module makes, for messages: "export"."""
+        """Args: `name`: what the module makes, for messages, such as "export"."""
         self._module = module
         self._name = name
         self._clock = clock
@@ -53,20 +53,20 @@ class ChildProcesses:
         self._lock = Lock()
 
     def state(self, run_id: str) -> ChildState | None:
-        """How far the present child is, or how the last one ended; None before the first."""
+        """The state of the running child, or of the last one; None before the first."""
         with self._lock:
             return self._states.get(run_id)
 
     def start(
         self, run_id: str, arguments: Sequence[str], *, by: str, keep: Callable[[ChildState], None] | None = None
     ) -> bool:
-        """Start a child unless one is under way for this run; whether it was started.
+        """Start a child unless one is running for this run. Returns whether it was started.
 
         Args:
-            run_id: of which run.
+            run_id: the run.
             arguments: of the module's command line.
             by: who asked for it.
-            keep: called with the result before anybody else sees it; may raise OSError or ValueError.
+            keep: called with the result before it is shown; may raise OSError or ValueError.
         """
         with self._lock:
             now = self._states.get(run_id)
@@ -82,7 +82,7 @@ class ChildProcesses:
         return True
 
     def wait(self, run_id: str, timeout_s: float) -> None:
-        """Until the present child has ended."""
+        """Wait until the running child has ended."""
         thread = self._threads.get(run_id)
         if thread is not None:
             thread.join(timeout_s)
@@ -116,8 +116,8 @@ def report(work: Callable[[Progress], Any], *, outlives_parent: bool) -> None:
     """Do the work of a child process and write its progress, then its result or its problem, to stdout.
 
     Args:
-        work: gets a function that reports progress; returns the result, as plain data.
-        outlives_parent: go on when nobody reads any more. Otherwise BrokenPipeError is raised.
+        work: a function that takes a progress callback and returns the result as plain data.
+        outlives_parent: continue if nobody reads the output any more; otherwise BrokenPipeError is raised.
     """
     last_s = -_BETWEEN_REPORTS_S
     listening = True

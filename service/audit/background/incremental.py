@@ -1,4 +1,4 @@
-"""What takes longer than a page may: computed in the background, kept while the process lives, brought up to date."""
+"""Values that take longer to compute than a request may: computed in the background, kept in memory, and updated."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from sqlalchemy import text
 from service.audit.record.queries import head
 from service.store.store import Store
 
-WAIT_S = 0.08  # that a page waits before it says "being computed"
-_LARGE = 2000  # events; a larger run is not waited for the first time
-_GRACE_S = 0.25  # before a long computation begins: the page that asked is answered first
-_REST_S = 0.001  # between two chunks, so that pages come first
+WAIT_S = 0.08  # how long a page waits before it says "being computed"
+_LARGE = 2000  # events; the first computation of a larger run is not waited for
+_GRACE_S = 0.25  # before a long computation begins, so that the page that asked is answered first
+_REST_S = 0.001  # pause between two chunks, so that pages come first
 
 
 class CopyableResult(Protocol):
-    """What can be computed."""
+    """A value that can be computed step by step."""
 
     def copy(self) -> Self:
-        """Another one, to go on with while pages read this one."""
+        """A copy that can be continued while pages read this one."""
         ...
 
 
@@ -38,14 +38,14 @@ class PartialResult(Generic[T]):
     """A result after one more chunk of events."""
 
     value: T
-    seq: int  # up to which event
+    seq: int  # the last event that it covers
     last: int  # of the run
-    sha256: str  # of its last event
+    sha256: str  # of that event
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a computation is."""
+    """The progress of a computation."""
 
     done: int
     total: int
@@ -60,9 +60,9 @@ class _Entry(Generic[T]):
 
 
 class IncrementalResults(Generic[T]):
-    """One value a run, made chunk by chunk by `advance(run_id, value before or None)`.
+    """One value for each run, computed in chunks by `advance(run_id, value so far or None)`.
 
-    Nothing of it is kept on the disk: what a page shows was read from the evidence by this very process.
+    Nothing is written to disk: this process has read everything that a page shows from the evidence.
     """
 
     def __init__(self, store: Store, advance: Callable[[str, T | None], PartialResult[T]], name: str) -> None:
@@ -75,11 +75,11 @@ class IncrementalResults(Generic[T]):
         self._warm = False
 
     def get(self, run_id: str, wait_s: float = WAIT_S) -> T | Progress:
-        """The value of the run as it is now, or how far it is. Raises UnknownRunError and what `advance` raises."""
+        """The value for the present events of a run, or its progress. Raises UnknownRunError, errors of `advance`."""
         ready = self.ready(run_id)
         if not isinstance(ready, Progress):
             return ready
-        # What is computed first in a process also loads what it needs, which takes a second.
+        # The first computation in a process also imports its modules, which takes a second.
         long = ready.total - ready.done > _LARGE or not self._warm
         future = self._submit(run_id, somebody_waits=True, grace_s=_GRACE_S if long and wait_s <= WAIT_S else 0.0)
         with suppress(FutureTimeoutError):
@@ -87,26 +87,26 @@ class IncrementalResults(Generic[T]):
         return self.ready(run_id)
 
     def ready(self, run_id: str) -> T | Progress:
-        """The same without computing anything. Raises UnknownRunError."""
+        """The value if it is up to date, else None; nothing is computed. Raises UnknownRunError."""
         with self._store.database.reading() as connection:
             last, sha256 = head(connection, run_id)
         return self.at(run_id, last, sha256)
 
     def at(self, run_id: str, last: int, sha256: str) -> T | Progress:
-        """The same for a head that is known."""
+        """`ready` for a known end of the chain."""
         entry = self._entry(run_id)
         step = entry.step
         if step is None:
             return Progress(0, last)
-        # The hash too: the folder may have been put back to an earlier copy of itself.
+        # The hash as well, because the folder may have been replaced by an earlier copy of it.
         return step.value if (step.seq, step.sha256) == (last, sha256) else Progress(min(step.seq, last), last)
 
     def warm(self, run_id: str) -> None:
-        """Compute it when nobody waits for another."""
+        """Compute the value when nobody waits for another one."""
         self._submit(run_id, somebody_waits=False)
 
     def close(self) -> None:
-        """Let the threads end."""
+        """Stop the threads."""
         for executor in (self._asked, self._ahead):
             executor.shutdown(wait=True, cancel_futures=True)
 

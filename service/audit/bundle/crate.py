@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from service.audit.bundle.contents import BundledRun
 from service.audit.bundle.zip_file import ManifestEntry
 from service.core.equipment.camera_bodies import bodies
+from service.core.equipment.recorded_devices import recorded_report
 from service.core.gates.acceptance import describe_accepted
 from service.core.records.events import (
     ArtefactRef,
@@ -20,7 +22,6 @@ from service.core.records.events import (
     ViewpointCaptured,
 )
 from service.core.records.import_list import imported_sentence
-from service.core.run.state import RunState
 from service.store.events import references
 from service.store.records import Artefact
 
@@ -50,78 +51,69 @@ _DESCRIPTIONS = {
 }
 
 
-def crate(
-    run_id: str,
-    root: RunStarted,
-    state: RunState,
-    events: Sequence[Event],
-    artefacts: Sequence[Artefact],
-    files: Sequence[ManifestEntry],
-    full_names: Mapping[str, str],
-    missing: Sequence[str] = (),
-) -> dict[str, Any]:
-    """The metadata as plain data. `files` are those of the bundle; recorded ones may be missing (only hashes).
-
-    `missing`: results that had not arrived yet, in words.
-    """
-    described = _artefact_entities(artefacts, {item.path for item in files})
+def crate(run: BundledRun, files: Sequence[ManifestEntry]) -> dict[str, Any]:
+    """The metadata as plain data. `files`: those in the bundle, which lacks recorded files if it has hashes alone."""
+    described = _artefact_entities(run.artefacts, {item.path for item in files})
     ids = {artefact.ref.sha256: entity["@id"] for artefact, entity in described}
-    accepted = [f"{name}: {describe_accepted(s.accepted)}" for name, s in state.steps.items() if s.accepted]
     own = [_file_entity(item) for item in files if not item.path.startswith("artefacts/")]
     parts = [*own, *(entity for _, entity in described)]
-    people = [
-        _person(name, full_names)
-        for name in sorted({*state.people, *filter(None, (root.operator, state.released_by))})
-    ]
-    devices = list(_devices(events))
-    actions = [*_captures(events, ids, {d["@id"] for d in devices}), *_jobs(events, ids)]
-    marked = "SIMULATED " if root.simulated else ""
-    dataset: dict[str, Any] = {
-        "@id": "./",
-        "@type": "Dataset",
-        "name": f"{marked}Evidence of run {run_id}",
-        "description": (
-            f"{marked}Evidence of {root.protocol_id} {root.protocol_version}: every event, signature and file."
-            + (" No real device took part: the whole rig was simulated." if root.simulated else "")
-            + (f" {imported_sentence(events[0].at_utc, root.operator)}." if root.origin == "imported" else "")
-            + "".join(f" Accepted outside its limits: {text}." for text in accepted)
-            + (f" Not in when this was made: {'; '.join(missing)}." if missing else "")
-        ),
-        "datePublished": events[-1].at_utc,
-        "license": {"@id": "#rights"},
-        "keywords": ["simulated"] if root.simulated else [],
+    named = sorted({*run.state.people, *filter(None, (run.root.operator, run.state.released_by))})
+    people = [_person(name, run.full_names) for name in named]
+    devices = list(_devices(run.events))
+    actions = [*_captures(run.events, ids, {d["@id"] for d in devices}), *_jobs(run.events, ids)]
+    dataset = _dataset(run) | {
         "author": [{"@id": person["@id"]} for person in people],
         "hasPart": [{"@id": part["@id"]} for part in parts if part["@type"] == "File"],
         "mentions": [{"@id": item["@id"]} for item in (*(p for p in parts if p["@type"] != "File"), *actions)],
     }
+    graph = [*_about(run.root, dataset), *people, *devices, *parts, *actions]
+    return {"@context": _CONTEXT, "@graph": graph}
+
+
+def _dataset(run: BundledRun) -> dict[str, Any]:
+    root = run.root
+    marked = "SIMULATED " if root.simulated else ""
+    accepted = [f"{name}: {describe_accepted(s.accepted)}" for name, s in run.state.steps.items() if s.accepted]
     return {
-        "@context": _CONTEXT,
-        "@graph": [
-            {
-                "@id": METADATA,
-                "@type": "CreativeWork",
-                "conformsTo": {"@id": "https://w3id.org/ro/crate/1.1"},
-                "about": {"@id": "./"},
-            },
-            dataset,
-            {
-                "@id": "#rights",
-                "@type": "CreativeWork",
-                "name": "Rights",
-                "description": "This bundle grants none; ask the site that made it.",
-            },
-            {
-                "@id": "#software",
-                "@type": "SoftwareApplication",
-                "name": "orthocapture",
-                "softwareVersion": root.software.get("orthocapture", "unknown"),
-            },
-            *people,
-            *devices,
-            *parts,
-            *actions,
-        ],
+        "@id": "./",
+        "@type": "Dataset",
+        "name": f"{marked}Evidence of run {run.run_id}",
+        "description": (
+            f"{marked}Evidence of {root.protocol_id} {root.protocol_version}: every event, signature and file."
+            + (" No real device took part: the whole rig was simulated." if root.simulated else "")
+            + (f" {imported_sentence(run.events[0].at_utc, root.operator)}." if root.origin == "imported" else "")
+            + "".join(f" Accepted outside its limits: {text}." for text in accepted)
+            + (f" Not in when this was made: {'; '.join(run.missing)}." if run.missing else "")
+        ),
+        "datePublished": run.events[-1].at_utc,
+        "license": {"@id": "#rights"},
+        "keywords": ["simulated"] if root.simulated else [],
     }
+
+
+def _about(root: RunStarted, dataset: dict[str, Any]) -> list[dict[str, Any]]:
+    """The metadata file, the data set, the rights and the software, in the order of the graph."""
+    return [
+        {
+            "@id": METADATA,
+            "@type": "CreativeWork",
+            "conformsTo": {"@id": "https://w3id.org/ro/crate/1.1"},
+            "about": {"@id": "./"},
+        },
+        dataset,
+        {
+            "@id": "#rights",
+            "@type": "CreativeWork",
+            "name": "Rights",
+            "description": "This bundle grants none; ask the site that made it.",
+        },
+        {
+            "@id": "#software",
+            "@type": "SoftwareApplication",
+            "name": "orthocapture",
+            "softwareVersion": root.software.get("orthocapture", "unknown"),
+        },
+    ]
 
 
 def _file_entity(item: ManifestEntry) -> dict[str, Any]:
@@ -175,16 +167,15 @@ def _devices(events: Sequence[Event]) -> Iterable[dict[str, Any]]:
             opened.setdefault(event.payload.device, event.payload)
     known = bodies(events)
     for name, payload in opened.items():
-        identity: Mapping[str, Any] = payload.report.get("identity", {})
-        wire = str(identity.get("serial") or "")
+        identity = recorded_report(payload.report).identity
         yield {
             "@id": _anchor("device", name),
             "@type": "IndividualProduct",
             "name": name,
-            "description": " ".join(str(identity.get(key) or "") for key in ("vendor", "model", "firmware")).strip(),
+            "description": f"{identity.model} {identity.firmware}".strip(),
             "serialNumber": known.shown(identity),
             # As its connection states it, where photographs state the body's own: one camera.
-            **({"identifier": wire} if known.shown(identity) != wire else {}),
+            **({"identifier": identity.serial} if known.shown(identity) != identity.serial else {}),
         }
 
 

@@ -1,68 +1,45 @@
-"""The evidence of a run as one file for somebody outside, with everything that is needed to verify it there.
+"""Export of a run's evidence as one file, with everything that a reader outside needs to verify it.
 
-The site's chain goes along whole, sign-ins included: only an unbroken chain shows that no key was slipped in, and
-that the people who signed had the roles they had.
+The site's whole chain is included, sign-ins too: only an unbroken chain shows that no key was slipped in, and that
+the people who signed had the roles that they claimed.
 """
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
-from sqlalchemy import Connection, Table, select
-
+from service.audit.bundle.contents import BundledRun, Progress, read_bundled_run, write_artefacts, write_records
 from service.audit.bundle.crate import METADATA, crate
-from service.audit.bundle.zip_file import BundleZip, ManifestEntry, ZipTime, writing_bundle
-from service.audit.record.missing_results import not_in_yet
+from service.audit.bundle.zip_file import BundleZip, ZipTime, writing_bundle
 from service.core.errors import IntegrityError
 from service.core.gates.release import refuse_export
 from service.core.protocol.models import Protocol
 from service.core.records.events import EvidenceExported, RunStarted
 from service.core.run.fold import fold
-from service.people.rows import full_names
 from service.run_start import recorded_run
-from service.store.database.tables import artefacts as artefact_table
-from service.store.database.tables import events as event_table
-from service.store.database.tables import jobs as job_table
-from service.store.events import canonical, event_text, parse_canonical, read_events
-from service.store.files.artefacts import chunks_of, hash_file, read_artefacts
+from service.store.events import canonical
+from service.store.files.artefacts import hash_file
 from service.store.files.space_used import require_export_space
-from service.store.records import SITE, Artefact
-from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
-from service.store.signatures.signing import PublicKey, checkpoint, public_keys, sign
+from service.store.records import SITE
+from service.store.signatures.signing import checkpoint, public_keys, sign
 from service.store.store import Store
 from service.store.verification.verify import AuditReport, verify
 
 FORMAT = "orthocapture bundle v1"
 MANIFEST_PREFIX = b"orthocapture bundle manifest v1\n"
 MARK = "SIMULATED"
-_EVENT = ("actor", "at_utc", "monotonic_s", "previous_sha256", "run_id", "seq", "sha256")
-_NOT_OF_JOBS = (
-    "position",
-    "priority",
-    "token",
-    "until_utc_s",
-    "host",
-    "boot",
-    "pid",
-    "process_started_s",
-)  # a lease's, not evidence
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
 class WrittenBundle:
-    """A bundle as it was written and recorded."""
+    """A bundle that was written and recorded."""
 
     path: Path
     sha256: str
     size_bytes: int
-    head_seq: int  # of the run's chain in it
+    head_seq: int  # last event of the run's chain in the bundle
     head_sha256: str
     key_id: str
     simulated: bool
@@ -70,25 +47,18 @@ class WrittenBundle:
 
 @dataclass(frozen=True, slots=True)
 class ExportableRun:
-    """A run whose evidence verifies and that may leave."""
+    """A run whose evidence verifies and that may be exported."""
 
     protocol: Protocol
     root: RunStarted
     audit: AuditReport
 
 
-ReportMaker = Callable[[AuditReport, int], bytes]  # from what verifying gave; up to this event
-
-
-@dataclass(frozen=True, slots=True)
-class _ChainHead:
-    seq: int
-    sha256: str
-    at_utc: str
+ReportMaker = Callable[[AuditReport, int], bytes]  # (result of the verification, last event) → HTML
 
 
 def marked_name(name: str, *, simulated: bool) -> str:
-    """The name of an exported file; that of a simulated run says so."""
+    """The name of an exported file; for a simulated run it contains SIMULATED."""
     if not simulated or MARK in name:
         return name
     stem, dot, suffix = name.rpartition(".")
@@ -96,7 +66,7 @@ def marked_name(name: str, *, simulated: bool) -> str:
 
 
 def require_exportable(store: Store, run_id: str, progress: Progress | None = None) -> ExportableRun:
-    """Verify the evidence, every file included, and that people have released it.
+    """Verify the evidence with every file, and check that the run has been released if the protocol asks for it.
 
     Raises:
         IntegrityError: the evidence does not verify; it names the first fault.
@@ -119,9 +89,9 @@ def require_exportable(store: Store, run_id: str, progress: Progress | None = No
 def record_export(
     store: Store, run_id: str, path: Path, *, file_name: str, what: str, head_sha256: str, actor: str
 ) -> tuple[str, int]:
-    """Write down in the run's chain that a file leaves, and sign that. Hash and size of the file.
+    """Record in the run's chain that a file is exported, and sign the record. Returns hash and size of the file.
 
-    Called while the file still has another name, so that nothing leaves that is not recorded.
+    Called before the file gets its name, so that no export can be unrecorded.
     """
     sha256, size = hash_file(path)
     payload = EvidenceExported.model_validate(
@@ -148,205 +118,78 @@ def export_bundle(
     report: ReportMaker | None = None,
     progress: Progress | None = None,
 ) -> WrittenBundle:
-    """Write a run's bundle and record that it was exported. That record is not in the bundle: it tells its hash.
+    """Write a run's bundle and record the export. That record holds the bundle's hash and so is not in the bundle.
 
     Args:
         store: the data folder.
         run_id: the run.
-        target: the file, which must not exist; a simulated run's gets SIMULATED into its name.
-        actor: who exports.
-        hashes_only: leave the recorded files out; their hashes are in the records.
-        report: makes a report for people (HTML) that goes along.
-        progress: told what is being done, in bytes.
+        target: the file, which must not exist; for a simulated run, SIMULATED is added to its name.
+        actor: the person who exports.
+        hashes_only: leave out the recorded files; their hashes are in the records.
+        report: makes an HTML report to be included.
+        progress: called with the activity, the bytes done and the total.
 
     Raises:
         IntegrityError: the evidence does not verify. Nothing was written.
         IllegalTransitionError: the run has not been released. Nothing was written.
         DataError: the file exists.
-        SpaceShortError: the bundle would take the room that is kept for the evidence. Nothing was written.
+        SpaceShortError: the bundle would use the space that is reserved for the evidence. Nothing was written.
         StoreError: the disk refused, or the signing key cannot be used.
     """
     if not hashes_only:
         require_export_space(store, run_id, target)
     exportable = require_exportable(store, run_id, progress)
-    protocol, root = exportable.protocol, exportable.root
+    root = exportable.root
     target = target.with_name(marked_name(target.name, simulated=root.simulated))
     checkpoint(store, run_id)
     checkpoint(store, SITE)
     keys = public_keys(store)
     with store.database.reading() as connection:
-        head, site_head = _head(connection, run_id), _head(connection, SITE)
+        run = read_bundled_run(connection, run_id, exportable.protocol, root, keys)
         left: list[tuple[str, int]] = []
 
         def leave(part: Path) -> None:
-            named = {"file_name": target.name, "what": "bundle", "head_sha256": head.sha256}
+            named = {"file_name": target.name, "what": "bundle", "head_sha256": run.head.sha256}
             left.append(record_export(store, run_id, part, **named, actor=actor))
 
-        with writing_bundle(target, _zip_time(head.at_utc), leave) as bundle:
-            recorded = read_artefacts(connection, run_id)
-            events = read_events(connection, run_id, 0)
-            state = fold(protocol, events)
-            missing = not_in_yet(protocol, state, events)
-            _write_records(bundle, store, connection, run_id, root, keys, missing)
+        with writing_bundle(target, _zip_time(run.head.at_utc), leave) as bundle:
+            write_records(bundle, store, connection, run)
             if report is not None:
                 if progress is not None:
                     progress("writing the report", 0, 0)
-                bundle.add("report.html", [report(exportable.audit, head.seq)])
+                bundle.add("report.html", [report(exportable.audit, run.head.seq)])
             if not hashes_only:
-                _write_artefacts(bundle, store, recorded, progress)
-            names = full_names(connection)
-            metadata = crate(run_id, root, state, events, recorded, bundle.listed, names, missing)
-            bundle.add(METADATA, [canonical(metadata).encode()])
-            manifest = {
-                "format": FORMAT,
-                "run_id": run_id,
-                "simulated": root.simulated,
-                "hashes_only": hashes_only,
-                "head": {"seq": head.seq, "sha256": head.sha256},
-                "site_head": {"seq": site_head.seq, "sha256": site_head.sha256},
-                "made_by_key": keys[-1].key_id,
-                "software": root.software.get("orthocapture", ""),
-                "files": [asdict(item) for item in bundle.listed],
-            }
-            signed = canonical(manifest).encode()
-            key_id, signature = sign(store, MANIFEST_PREFIX + signed)
-            if key_id != keys[-1].key_id:
-                raise IntegrityError("the signing key was changed meanwhile", where=run_id, remedy="Export again")
-            bundle.add("manifest.json", [signed])
-            bundle.add("manifest.sig", [signature.encode() + b"\n"])
+                write_artefacts(bundle, store, run.artefacts, progress)
+            bundle.add(METADATA, [canonical(crate(run, bundle.listed)).encode()])
+            key_id = _add_manifest(bundle, store, run, hashes_only=hashes_only)
     ((sha256, size),) = left
-    return WrittenBundle(target, sha256, size, head.seq, head.sha256, key_id, root.simulated)
+    return WrittenBundle(target, sha256, size, run.head.seq, run.head.sha256, key_id, root.simulated)
 
 
-def _write_records(
-    bundle: BundleZip,
-    store: Store,
-    connection: Connection,
-    run_id: str,
-    root: RunStarted,
-    keys: list[PublicKey],
-    missing: Sequence[str],
-) -> None:
-    readme = _readme(run_id, keys[-1].key_id, root, missing)
-    bundle.add("README.txt", [readme.encode()])
-    bundle.add("verify.py", [(files("service.audit.verify") / "bundle_verifier.py").read_bytes()])
-    bundle.add("events.jsonl", _event_lines(connection, run_id))
-    bundle.add("site_events.jsonl", _event_lines(connection, SITE))
-    order = (artefact_table.c.seq, artefact_table.c.position)
-    bundle.add("artefacts.jsonl", _lines(_rows(connection, artefact_table, run_id, order)))
-    bundle.add("jobs.jsonl", _lines(map(_job, _rows(connection, job_table, run_id, (job_table.c.position,)))))
-    signed = [*read_checkpoints(connection, SITE), *read_checkpoints(connection, run_id)]
-    bundle.add("checkpoints.jsonl", _lines(map(asdict, signed)))
-    stamped = [*read_timestamps(connection, SITE), *read_timestamps(connection, run_id)]
-    bundle.add("timestamps.jsonl", _lines(map(asdict, stamped)))
-    bundle.add("keys.jsonl", _lines(map(_key, keys)))
-    for name, ref in (("protocol.yaml", root.protocol), ("rig.yaml", root.rig)):
-        bundle.add(name, chunks_of(store.artefact_path(ref.sha256)))
-
-
-def _write_artefacts(
-    bundle: BundleZip, store: Store, recorded: Iterable[Artefact], progress: Progress | None
-) -> None:
-    sizes = {artefact.ref.sha256: artefact.ref.size_bytes for artefact in recorded}
-    total, done = sum(sizes.values()), 0
-    for sha256, size in sizes.items():
-        path = store.artefact_path(sha256)
-        listed = bundle.add(f"artefacts/{sha256[:2]}/{sha256}", chunks_of(path), compress=False)
-        _require_same(listed, sha256, path)
-        done += size
-        if progress is not None:
-            progress("copying files", done, total)
-
-
-def _require_same(listed: ManifestEntry, sha256: str, path: Path) -> None:
-    if listed.sha256 != sha256:
-        raise IntegrityError(
-            f"nothing is exported, because a file changed while it was copied: its SHA-256 is {listed.sha256}",
-            where=str(path),
-            remedy="Run `orthocapture audit verify`; restore the file from a copy",
-        )
-
-
-def _head(connection: Connection, run_id: str) -> _ChainHead:
-    last = select(event_table.c.seq, event_table.c.sha256, event_table.c.at_utc).where(event_table.c.run_id == run_id)
-    row = connection.execute(last.order_by(event_table.c.seq.desc()).limit(1)).one()
-    return _ChainHead(row.seq, row.sha256, row.at_utc)
-
-
-def _event_lines(connection: Connection, run_id: str) -> Iterator[bytes]:
-    for row in _rows(connection, event_table, run_id, (event_table.c.seq,)):
-        yield event_text({name: row[name] for name in _EVENT}, row["payload"]).encode() + b"\n"
-
-
-def _rows(connection: Connection, table: Table, run_id: str, order: tuple[Any, ...]) -> Iterator[dict[str, Any]]:
-    statement = select(table).where(table.c.run_id == run_id).order_by(*order)
-    for row in connection.execution_options(yield_per=500).execute(statement).mappings():
-        yield dict(row)
-
-
-def _lines(records: Iterable[Mapping[str, Any]]) -> Iterator[bytes]:
-    return (canonical(dict(record)).encode() + b"\n" for record in records)
-
-
-def _job(row: Mapping[str, Any]) -> dict[str, Any]:
-    kept = {name: value for name, value in row.items() if name not in _NOT_OF_JOBS}
-    return kept | {"arguments": parse_canonical(row["arguments"])}
-
-
-def _key(key: PublicKey) -> dict[str, Any]:
-    return asdict(key) | {"public_key": base64.b64encode(key.public_key).decode()}
+def _add_manifest(bundle: BundleZip, store: Store, run: BundledRun, *, hashes_only: bool) -> str:
+    """Write the list of all files and its signature; the key's fingerprint. Raises IntegrityError, StoreError."""
+    manifest = {
+        "format": FORMAT,
+        "run_id": run.run_id,
+        "simulated": run.root.simulated,
+        "hashes_only": hashes_only,
+        "head": {"seq": run.head.seq, "sha256": run.head.sha256},
+        "site_head": {"seq": run.site_head.seq, "sha256": run.site_head.sha256},
+        "made_by_key": run.keys[-1].key_id,
+        "software": run.root.software.get("orthocapture", ""),
+        "files": [asdict(item) for item in bundle.listed],
+    }
+    signed = canonical(manifest).encode()
+    key_id, signature = sign(store, MANIFEST_PREFIX + signed)
+    if key_id != run.keys[-1].key_id:
+        raise IntegrityError("the signing key was changed meanwhile", where=run.run_id, remedy="Export again")
+    bundle.add("manifest.json", [signed])
+    bundle.add("manifest.sig", [signature.encode() + b"\n"])
+    return key_id
 
 
 def _zip_time(at_utc: str) -> ZipTime:
-    """Of the last event, so that the same evidence gives the same bytes; zip knows no odd seconds."""
+    """The time of the last event, so that the same evidence gives the same bytes; zip has no odd seconds."""
     year, month, day = (int(part) for part in at_utc[:10].split("-"))
     hour, minute, second = (int(part) for part in at_utc[11:19].split(":"))
     return max(year, 1980), month, day, hour, minute, second - second % 2
-
-
-def _readme(run_id: str, key_id: str, root: RunStarted, missing: Sequence[str]) -> str:
-    warning = (
-        "SIMULATED: no real device took part in this run. It is no record of a real acquisition.\n\n"
-        if root.simulated
-        else ""
-    )
-    if root.origin == "imported":
-        warning += (
-            "IMPORTED: how the images were captured is not in evidence, only when and by whom they were imported.\n\n"
-        )
-    if missing:
-        warning += (
-            "NOT IN YET: when this bundle was made, these results had not arrived. "
-            f"A later export has those that came.\n{''.join(f'  - {line}{chr(10)}' for line in missing)}\n"
-        )
-    return f"""Evidence of run {run_id}, exported by orthocapture
-
-{warning}To verify this bundle, on any machine with Python 3.9 or newer and the package `cryptography`, offline:
-
-    python verify.py BUNDLE.zip --key FINGERPRINT
-
-FINGERPRINT is that of the site's signing key, as the site told it to you in another way than with this bundle
-(`orthocapture audit keys` shows it there). This bundle says that it is
-{key_id}
-A verifier that came with what it verifies could be forged as well: take verify.py from an installation or a release
-of orthocapture that you trust (service/audit/verify/bundle_verifier.py, the same file byte for byte).
-
-events.jsonl        everything that happened in the run: who, what, when (UTC and monotonic), one record a line.
-                    sha256 is SHA-256 over the RFC 8785 canonical JSON of the other fields; previous_sha256 links
-                    them.
-site_events.jsonl   the same for the site: accounts and their roles, sign-ins, signing keys, starts of the service. It
-                    is here as a whole, because only an unbroken chain shows that no key was slipped in.
-checkpoints.jsonl   Ed25519 signatures; each covers every event and every artefact row up to its own event.
-timestamps.jsonl    what time-stamp authorities say of checkpoints (RFC 3161), if any.
-keys.jsonl          the public keys, oldest first; each signed its successor as its last act.
-artefacts.jsonl     where each recorded file came from; the files are artefacts/ab/ab… named by their SHA-256.
-jobs.jsonl          computations.
-protocol.yaml, rig.yaml     as they were when the run began.
-report.html         the same for people, made from the records above; it tells the chain up to the same event. Open it
-                    in a browser; it needs no network.
-ro-crate-metadata.json      the same for machines (RO-Crate 1.1).
-manifest.json, manifest.sig every file with its hash, and the signature over that list.
-
-What this proves: nothing was changed since the site's key signed it. What it cannot prove: that the people and
-devices told the truth, or that nobody but the site had the key.
-"""

@@ -1,4 +1,4 @@
-"""The report for people that goes along in a bundle."""
+"""The report in a bundle."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from service.store.verification.verify import AuditReport
 
 
 def bundle_report(data: Path, run_id: str, *, with_pictures: bool) -> Callable[[AuditReport, int], bytes]:
-    """What makes the report (HTML) of a run up to an event, from what verifying it gave.
+    """Returns a function that makes the HTML report of a run up to an event from the result of its verification.
 
-    The same evidence gives the same bytes, as it does for the rest of a bundle: the report is dated by the last event
-    that it tells, which the bundle ends with.
+    The report is dated by the last event in the bundle, so that the same evidence gives the same bytes.
     """
 
     def make(audit: AuditReport, last_seq: int) -> bytes:
-        # Numerics, pictures and the 3D scene, for which nothing else of a bundle waits.
+        # Imported here because numerics, pictures and the 3D scene take long to load, and only the report needs them.
         from service.audit.record.run import read_run  # noqa: PLC0415
         from service.audit.report.content import report_content  # noqa: PLC0415
         from service.audit.report.output.html import render_html  # noqa: PLC0415

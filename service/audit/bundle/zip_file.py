@@ -1,4 +1,4 @@
-"""Writing a bundle's zip file: streamed, hashed on the way, the same bytes for the same content."""
+"""A bundle's zip file: streamed and hashed while it is written; the same content gives the same bytes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ManifestEntry:
 
 
 class BundleZip:
-    """A zip file under way; every entry is hashed while it is written."""
+    """A zip file that is being written; every entry is hashed on the way."""
 
     def __init__(self, archive: zipfile.ZipFile, at: ZipTime) -> None:
         self._archive = archive
@@ -35,10 +35,10 @@ class BundleZip:
         self.listed: list[ManifestEntry] = []
 
     def add(self, path: str, chunks: Iterable[bytes], *, compress: bool = True) -> ManifestEntry:
-        """Write one file. What is stored as it came (images) is not compressed."""
+        """Write one file. Images are stored without compression."""
         info = zipfile.ZipInfo(path, date_time=self._at)
         info.compress_type = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
-        info.create_system = 3  # Unix, wherever it is written: the permissions below mean something
+        info.create_system = 3  # Unix on every machine, so that the permissions below count
         info.external_attr = (stat.S_IFREG | 0o644) << 16
         digest, size = hashlib.sha256(), 0
         with self._archive.open(info, "w", force_zip64=True) as entry:
@@ -53,12 +53,12 @@ class BundleZip:
 
 @contextmanager
 def writing_bundle(target: Path, at: ZipTime, leaving: Callable[[Path], None] | None = None) -> Generator[BundleZip]:
-    """A zip file that appears under its name only when it is complete and durable; nothing is left of it otherwise.
+    """A zip file that gets its name only when it is complete and durable; otherwise nothing is left of it.
 
     Args:
         target: the file.
         at: time stamp of its entries.
-        leaving: called with the complete file before it gets its name; when it raises, no file appears.
+        leaving: called with the complete file before it gets its name; if it raises, no file appears.
 
     Raises:
         DataError: a file of this name exists.
@@ -75,7 +75,7 @@ def writing_bundle(target: Path, at: ZipTime, leaving: Callable[[Path], None] | 
             os.fsync(handle.fileno())
         if leaving is not None:
             leaving(part)
-        os.link(part, target)  # unlike a rename, never replaces what another process has put there meanwhile
+        os.link(part, target)  # unlike a rename, it never replaces a file that another process has made meanwhile
         DurableFiles().sync_directory(target.parent)
     except FileExistsError as error:
         raise DataError("the file exists already", where=str(target), remedy="Name a new one") from error
@@ -83,7 +83,7 @@ def writing_bundle(target: Path, at: ZipTime, leaving: Callable[[Path], None] | 
         raise StoreError(
             f"the bundle cannot be written: {error.strerror or error}",
             where=str(error.filename or target),
-            remedy="Check free space and permissions; the evidence itself is as it was",
+            remedy="Check free space and permissions; the evidence is unchanged",
         ) from error
     finally:
         part.unlink(missing_ok=True)

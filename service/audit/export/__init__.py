@@ -1,1 +1,1 @@
-"""Exports asked for on the screen, each made by a process of its own."""
+"""Exports requested in the browser, each made by a process of its own."""

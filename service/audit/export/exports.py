@@ -1,4 +1,4 @@
-"""Exports asked for on the screen: started by a person, made by a process of its own, kept in DIR/exports."""
+"""Exports requested in the browser: each is made by a process of its own and kept in DIR/exports."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SUFFIX: dict[What, str] = {
 
 @dataclass(frozen=True, slots=True)
 class ExportedFile:
-    """One recorded export, and whether its file is still here."""
+    """A recorded export, and whether its file still exists."""
 
     seq: int
     at_utc: str
@@ -36,7 +36,7 @@ class ExportedFile:
 
 
 class Exports:
-    """Of one data folder, in one web process; one at a time for each run."""
+    """The exports of a data folder in a web process; one at a time for each run."""
 
     def __init__(self, data: Path, clock: Clock) -> None:
         self._data = data
@@ -45,15 +45,15 @@ class Exports:
 
     @property
     def folder(self) -> Path:
-        """Where the files lie."""
+        """The folder of the exported files."""
         return self._data / FOLDER
 
     def state(self, run_id: str) -> ChildState | None:
-        """How far the present export of a run is, or how the last one ended: its result is the file's name."""
+        """The state of a run's present or last export; its result is the file's name. None before the first."""
         return self._children.state(run_id)
 
     def start(self, run_id: str, export: What, by: str) -> None:
-        """Begin one. Raises IllegalTransitionError while another of the run is under way."""
+        """Start an export. Raises IllegalTransitionError while another export of the run is running."""
         self.folder.mkdir(exist_ok=True)
         at = f"{self._clock.utc_now():%Y%m%d-%H%M%S}"
         target = self.folder / f"{run_id}-exported-{at}-{_SUFFIX[export]}"
@@ -66,11 +66,11 @@ class Exports:
             )
 
     def wait(self, run_id: str, timeout_s: float) -> None:
-        """Until the present one has ended."""
+        """Wait until the present export has ended."""
         self._children.wait(run_id, timeout_s)
 
     def files(self, events: Sequence[Event]) -> list[ExportedFile]:
-        """Everything that was exported of a run, newest first."""
+        """Every export of a run, newest first."""
         found = [
             ExportedFile(e.seq, e.at_utc, e.actor, e.payload, self._path(e.payload) is not None)
             for e in events
@@ -79,7 +79,7 @@ class Exports:
         return found[::-1]
 
     def path(self, events: Sequence[Event], file_name: str) -> tuple[Path, EvidenceExported]:
-        """A file for download, by its recorded name. Raises DataError for any other."""
+        """A file for download, by its recorded name. Raises DataError for any other name."""
         for file in self.files(events):
             path = self._path(file.record) if file.record.file_name == file_name else None
             if path is not None:
@@ -91,7 +91,7 @@ class Exports:
         )
 
     def _path(self, record: EvidenceExported) -> Path | None:
-        """The file, when it is here and has the recorded size; a name that leads elsewhere is none."""
+        """The file if it exists with the recorded size, else None; names that lead out of the folder are refused."""
         path = self.folder / record.file_name
         if path.parent != self.folder or path.name != record.file_name:
             return None

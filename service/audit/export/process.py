@@ -1,6 +1,6 @@
-"""Exports one thing in a process of its own, so that pages stay quick: `python -m service.audit.export.process`.
+"""Makes one export in a process of its own, so that pages stay fast: `python -m service.audit.export.process`.
 
-It finishes the export even when nobody follows it any more.
+It finishes the export even if the process that started it has ended.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from service.audit.record.run import RecordedRun
     from service.store.verification.verify import AuditReport
 
-_OLDEST = (1980, 1, 1, 0, 0, 0)  # zip knows no earlier time; the files say themselves what they are of
+_OLDEST = (1980, 1, 1, 0, 0, 0)  # the earliest time in zip; the files state their own dates
 
 
 def export(data: Path, run_id: str, what: str, target: Path, actor: str, progress: Progress) -> Path:
-    """Make a bundle, a data set or a report, and record that it was exported. The file as it was named.
+    """Make a bundle, a data set or a report, and record the export. Returns the file.
 
-    Raises OrthocaptureError: the evidence does not verify, nothing was released, there is nothing to export …
+    Raises OrthocaptureError, for example if the evidence does not verify or the run was not released.
     """
     with Store.open(data, create=False) as store:
         if what in ("bundle", "hashes"):
@@ -43,7 +43,7 @@ def export(data: Path, run_id: str, what: str, target: Path, actor: str, progres
         if what == "dataset":
             require_export_space(store, run_id, target)
         exportable = require_exportable(store, run_id, progress)
-        # These load the numerics and the typesetting, which a bundle does without.
+        # Imported here because numerics and typesetting take long to load, and a bundle needs neither.
         from service.audit.record.run import read_run  # noqa: PLC0415
 
         run = read_run(data, run_id)
@@ -88,7 +88,7 @@ def _write_report(run: RecordedRun, audit: AuditReport, path: Path, *, pdf: bool
 
 
 def main(arguments: list[str]) -> None:
-    """Export, and write to stdout how far it is and which file was made."""
+    """Make the export, and write progress and the name of the file to stdout."""
     data, run_id, what, target, actor = arguments
     report(
         lambda progress: export(Path(data), run_id, what, Path(target), actor, progress).name, outlives_parent=True

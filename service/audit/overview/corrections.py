@@ -1,4 +1,4 @@
-"""Correcting a recorded value: the original stays, the new value stands beside it with who, when and why."""
+"""Corrections of recorded values: the original stays, and the new value is recorded with who, when and why."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def correct(store: Store, run_id: str, *, of_seq: int, field: str, new: str, rea
 
     Raises:
         UnknownRunError: there is no such run or event.
-        DataError: the field is not there or cannot be corrected, the value is of another type or the same, or no
+        DataError: the field does not exist or cannot be corrected, the value has another type or is the same, or no
             reason is given.
     """
     field, reason = field.strip(), reason.strip()
@@ -55,7 +55,7 @@ def correct(store: Store, run_id: str, *, of_seq: int, field: str, new: str, rea
 
 
 def correctable(payload: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Fields whose value can be corrected, each with its value as text; up to a few hundred."""
+    """The fields that can be corrected, each with its value as text; a few hundred at most."""
     found: list[tuple[str, str]] = []
 
     def walk(value: Any, path: tuple[str, ...]) -> None:

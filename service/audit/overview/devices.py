@@ -13,12 +13,31 @@ from service.audit.record.queries import (
     read_rows,
 )
 from service.core.equipment.camera_bodies import CameraBodies, bodies_of
+from service.core.equipment.recorded_devices import RecordedReport, recorded_report
+from service.core.records.events import DeviceOpened, SessionStarted, ViewpointCaptured
 
-_LOOKED_AT = 500  # photographs, the newest: one that states another body is an image that departs, which is judged
+_LOOKED_AT = 500  # newest photographs; one that states another body is judged as a departing image anyway
 
 
-def bodies_of_run(connection: Connection, run_id: str, opened: Iterable[EventRow]) -> CameraBodies:
-    """Serial numbers of the cameras. `opened`: its events device_opened with their payloads."""
+@dataclass(frozen=True, slots=True)
+class OpenedDevice:
+    """A device as it answered when it was opened."""
+
+    row: EventRow  # its device_opened event
+    name: str  # in rig.yaml
+    report: RecordedReport
+
+
+def opened_devices(rows: Iterable[EventRow]) -> list[OpenedDevice]:
+    """The devices of some device_opened events, read with their payloads."""
+    opened = ((row, row.record(DeviceOpened)) for row in rows)
+    return [
+        OpenedDevice(row, known.device, recorded_report(known.report)) for row, known in opened if known is not None
+    ]
+
+
+def bodies_of_run(connection: Connection, run_id: str, opened: Iterable[OpenedDevice]) -> CameraBodies:
+    """Serial numbers of the cameras among the opened devices."""
     rows = connection.execute(
         text(
             "SELECT DISTINCT json_extract(e.payload, '$.camera.body_serial') AS body "
@@ -28,16 +47,13 @@ def bodies_of_run(connection: Connection, run_id: str, opened: Iterable[EventRow
         ),
         {"run": plain(run_id), "most": _LOOKED_AT},
     ).all()
-    identities = (
-        (str(row.payload.get("device", "")), (row.payload.get("report") or {}).get("identity") or {})
-        for row in opened
-    )
+    identities = ((device.name, device.report.identity) for device in opened)
     return bodies_of(identities, (str(row.body or "") for row in rows))
 
 
 @dataclass(frozen=True, slots=True)
 class ClockSeries:
-    """How a device's clock stood against the host's over a step."""
+    """The offset of a device's clock from the host's over a step."""
 
     step: str
     captures: int
@@ -67,14 +83,16 @@ def clock_offsets(connection: Connection, run_id: str) -> list[ClockSeries]:
     ).all()
     ends = [row.first for row in rows] + [row.last for row in rows]
     offsets = {
-        event.seq: float(event.payload.get("clock_offset_s") or 0.0) for event in read_rows(connection, run_id, ends)
+        event.seq: captured.clock_offset_s
+        for event in read_rows(connection, run_id, ends, whole=True)
+        if (captured := event.record(ViewpointCaptured)) is not None
     }
     return [
         ClockSeries(
             row.step or "",
             row.n,
-            offsets[row.first],
-            offsets[row.last],
+            offsets.get(row.first, 0.0),
+            offsets.get(row.last, 0.0),
             float(row.low or 0.0),
             float(row.high or 0.0),
             float(row.over or 0.0),
@@ -89,7 +107,7 @@ class Session:
 
     row: EventRow
     software: Mapping[str, str]
-    changed: Mapping[str, tuple[str, str]]  # against the session before it: distribution → before, now
+    changed: Mapping[str, tuple[str, str]]  # since the session before: distribution → before, now
 
 
 def sessions(rows: Sequence[EventRow]) -> list[Session]:
@@ -97,7 +115,8 @@ def sessions(rows: Sequence[EventRow]) -> list[Session]:
     found: list[Session] = []
     before: dict[str, str] | None = None
     for row in rows:
-        software = {str(name): str(version) for name, version in dict(row.payload.get("software") or {}).items()}
+        started = row.record(SessionStarted)
+        software = {} if started is None else started.software
         names = sorted({*software, *before}) if before is not None else []
         earlier = before or {}
         changed = {

@@ -1,4 +1,4 @@
-"""A run's state for its first page: folded in the background from the few kinds of events that decide it."""
+"""A run's state for the auditor's first page, folded in the background from the few kinds of events that matter."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from service.core.run.state import Deviation, RunState
 from service.dataset.late_results import LateResult, late_results
 from service.store.store import Store
 
-CHUNK = 300  # events between two looks at who waits
+CHUNK = 300  # events in one step, after which waiting pages come first
 
-# Of computations only these change what a first page says: results that came after the evaluation.
+# Only these computations change the first page: results that arrived after the evaluation.
 _JOB_EVENTS = ("job_enqueued", "job_finished")
 _JOB_KINDS = ("evaluate",)
 
-# Of these the fold needs only step, attempt and name.
+# The fold needs only step, attempt and viewpoint of these events.
 _VIEWS = {kind: payload for kind, payload in RUN_EVENTS.items() if issubclass(payload, View)}
 _PLACE: TypeAdapter[tuple[str, int, str]] = TypeAdapter(tuple[str, int, str])
 
 
 @dataclass(frozen=True, slots=True)
 class FailedGate:
-    """A gate that did not pass, and when: outside its limits, or not decided."""
+    """A gate that did not pass, because its figure is outside the limits or not decided."""
 
     seq: int
     at_utc: str
@@ -50,44 +50,44 @@ class FailedGate:
 
 @dataclass
 class Digest:
-    """What a run's events add up to, as far as `seq`."""
+    """The state of a run after the event `seq`."""
 
     run_id: str
     seq: int = 0
     protocol: Protocol | None = None
-    state: RunState | None = None  # None when the protocol cannot be read
+    state: RunState | None = None  # None if the protocol cannot be read
     failed_gates: list[FailedGate] = field(default_factory=list[FailedGate])
     times: dict[int, str] = field(default_factory=dict[int, str])  # of the deviations' events
     facets: Facets = field(default_factory=Facets)
-    problem: str = ""  # why the fold ends before the chain does
+    problem: str = ""  # why the fold stopped before the end of the chain; "" if it did not
 
     def copy(self) -> Digest:
-        """Another one, to go on with."""
+        """A copy that can be continued while pages read this one."""
         return replace(self, failed_gates=list(self.failed_gates), times=dict(self.times), facets=self.facets.copy())
 
     @property
     def deviations(self) -> Sequence[Deviation]:
-        """All, in order; notes included."""
+        """All deviations in order, notes included."""
         return self.state.deviations if self.state else ()
 
     @property
     def late(self) -> list[LateResult]:
-        """Results that came after the evaluation."""
+        """Results that arrived after the evaluation."""
         return late_results(self.protocol, self.state) if self.protocol and self.state else []
 
     @property
     def status(self) -> str:
-        """active, paused, completed, aborted; unknown when the events do not add up."""
+        """active, paused, completed or aborted; unknown if the events contradict each other."""
         return self.state.status if self.state and not self.problem else "unknown"
 
     @property
     def people(self) -> list[str]:
-        """Who took part, in alphabetical order."""
+        """The people who took part, in alphabetical order."""
         return sorted(self.state.people) if self.state else []
 
     @property
     def unsigned(self) -> list[tuple[str, str]]:
-        """Steps that the protocol wants signed and that are not, each with how it stands."""
+        """Steps that need a signature and have none, each with its phase."""
         if self.protocol is None or self.state is None:
             return []
         steps = [(step.id, self.state.steps[step.id]) for step in self.protocol.steps if step.sign]
@@ -95,12 +95,12 @@ class Digest:
 
 
 def digests(store: Store) -> IncrementalResults[Digest]:
-    """Digests of a data folder's runs, kept up in the background."""
+    """Digests of a data folder's runs, kept up to date in the background."""
     return IncrementalResults(store, lambda run_id, before: step(store, run_id, before), "digest")
 
 
 def step(store: Store, run_id: str, before: Digest | None) -> PartialResult[Digest]:
-    """One chunk further. Raises UnknownRunError, StoreError."""
+    """Continue a digest by one chunk of events. Raises UnknownRunError, StoreError."""
     digest = before or Digest(run_id)
     with store.database.reading() as connection:
         last, sha256 = head(connection, run_id)
@@ -117,7 +117,7 @@ def step(store: Store, run_id: str, before: Digest | None) -> PartialResult[Dige
 
 
 def _begin(digest: Digest, store: Store, connection: Connection) -> None:
-    # Loading every step kind for its parameters takes a second: not when the pages are loaded.
+    # Imported here because loading every step kind takes a second.
     from service.steps import params_models  # noqa: PLC0415
 
     try:
@@ -132,7 +132,7 @@ def _begin(digest: Digest, store: Store, connection: Connection) -> None:
 
 
 def _chunk_end(connection: Connection, run_id: str, after: int, last: int) -> int:
-    """Where a chunk of the events that count ends; those between them cost nothing."""
+    """The last event of a chunk. Only events that matter are counted; the others cost nothing."""
     found = connection.execute(
         text(
             "SELECT seq FROM event_index WHERE run_id = :run AND seq > :after "
@@ -147,7 +147,7 @@ def _quoted(kinds: Sequence[str]) -> str:
     return ", ".join(f"'{kind}'" for kind in kinds)
 
 
-# A result without all but the evaluation's table, where it has one; its files are not needed either.
+# Of a result, only the evaluation's table is needed; its files are not.
 _WITH_TABLE_ALONE = (
     "json_set(json_remove(payload, '$.artefacts'), '$.result', CASE json_type(payload, '$.result.table') "
     "WHEN 'array' THEN json_object('table', json_extract(payload, '$.result.table')) ELSE json('{}') END)"

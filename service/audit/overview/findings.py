@@ -1,4 +1,4 @@
-"""What was replaced in a run: corrected values, steps done again, views taken again."""
+"""What was replaced in a run: corrected values, repeated steps, retaken views."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pydantic import TypeAdapter
 from sqlalchemy import Connection, text
 
 from service.audit.overview.digest import Digest
@@ -17,13 +18,16 @@ from service.audit.record.queries import (
     seqs_of_kind,
 )
 from service.core.gates.verdict import quantity, uncertain
+from service.core.records.events import RecordCorrected, Uncertainty
 
-LISTED = 200  # of what is listed whole; the timeline has the rest
+_UNCERTAINTIES = TypeAdapter(dict[str, Uncertainty])
+_MEASURES = TypeAdapter(dict[str, float])
+LISTED = 200  # most rows of a list; the timeline has the rest
 
 
 @dataclass(frozen=True, slots=True)
 class CorrectedValue:
-    """One correction: the original beside the new value."""
+    """A correction: the original and the new value."""
 
     seq: int
     at_utc: str
@@ -34,55 +38,57 @@ class CorrectedValue:
     old: Any
     new: Any
     reason: str
-    original: Any  # what the event really holds: equals `old`
+    original: Any  # what the event holds; equals `old`
     latest: bool  # no later correction of the same value
 
     @property
     def old_text(self) -> str:
-        """The original for people."""
+        """The original value as text."""
         return value_text(self.old)
 
     @property
     def new_text(self) -> str:
-        """The new value for people."""
+        """The new value as text."""
         return value_text(self.new)
 
 
 def corrected_values(connection: Connection, run_id: str) -> list[CorrectedValue]:
     """All corrections of a run, in order."""
-    rows = read_rows(connection, run_id, seqs_of_kind(connection, run_id, ["record_corrected"], limit=LISTED))
-    of = {int(row.payload["of_seq"]) for row in rows}
-    events = {event.seq: event for event in read_rows(connection, run_id, sorted(of), whole=True)}
-    last = {(row.payload["of_seq"], row.payload["field"]): row.seq for row in rows}
+    rows = read_rows(
+        connection, run_id, seqs_of_kind(connection, run_id, ["record_corrected"], limit=LISTED), whole=True
+    )
+    made = [(row, correction) for row in rows if (correction := row.record(RecordCorrected)) is not None]
+    of = sorted({correction.of_seq for _, correction in made})
+    events = {event.seq: event for event in read_rows(connection, run_id, of, whole=True)}
+    last = {(correction.of_seq, correction.field): row.seq for row, correction in made}
     found: list[CorrectedValue] = []
-    for row in rows:
-        p = row.payload
-        event = events.get(int(p["of_seq"]))
+    for row, correction in made:
+        event = events.get(correction.of_seq)
         found.append(
             CorrectedValue(
                 seq=row.seq,
                 at_utc=row.at_utc,
                 person=row.actor,
-                of_seq=int(p["of_seq"]),
+                of_seq=correction.of_seq,
                 of_kind=event.kind if event else "",
-                field=str(p["field"]),
-                old=p["old"],
-                new=p["new"],
-                reason=str(p["reason"]),
-                original=value_at(event.payload, str(p["field"])) if event else None,
-                latest=last[p["of_seq"], p["field"]] == row.seq,
+                field=correction.field,
+                old=correction.old,
+                new=correction.new,
+                reason=correction.reason,
+                original=value_at(event.payload, correction.field) if event else None,
+                latest=last[correction.of_seq, correction.field] == row.seq,
             )
         )
     return found
 
 
 def value_text(value: Any) -> str:
-    """A value for people: text as it is, anything else as JSON."""
+    """A value as text: strings unchanged, anything else as JSON."""
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 def value_at(payload: Mapping[str, Any], path: str) -> Any:
-    """The value at a path such as environment.light_lux or verdicts.0.value; None when there is nothing."""
+    """The value at a path such as environment.light_lux or verdicts.0.value; None if there is none."""
     value: Any = payload
     for part in path.split("."):
         if isinstance(value, Mapping) and part in value:
@@ -101,15 +107,15 @@ class Attempt:
     attempt: int
     seq: int
     at_utc: str
-    measures: Mapping[str, str]  # as people read them, with their bounds where they state any
+    measures: Mapping[str, str]  # as text, with bounds if the measure states any
 
 
 @dataclass(frozen=True, slots=True)
 class ReplacedStep:
-    """A step that was done more than once: the old measures beside the new."""
+    """A step that was done more than once, with the measures of every attempt."""
 
     step: str
-    reasons: Sequence[tuple[int, str]]  # event that superseded an attempt, and why
+    reasons: Sequence[tuple[int, str]]  # for each superseded attempt: the event, and why
     attempts: Sequence[Attempt]
 
     @property
@@ -149,28 +155,28 @@ def replaced_steps(connection: Connection, run_id: str, digest: Digest) -> list[
 
 
 def _numbers(measures: str | None, uncertainties: str | None) -> Mapping[str, str]:
-    known: Mapping[str, Mapping[str, float]] = json.loads(uncertainties or "{}")
-    values: Mapping[str, float] = json.loads(measures or "{}")
+    known = _UNCERTAINTIES.validate_json(uncertainties or "{}")
+    values = _MEASURES.validate_json(measures or "{}")
     return {
-        name: uncertain(value, known[name]["lower"], known[name]["upper"]) if name in known else quantity(value)
+        name: uncertain(value, known[name].lower, known[name].upper) if name in known else quantity(value)
         for name, value in values.items()
     }
 
 
 @dataclass(frozen=True, slots=True)
 class ReplacedViewpoint:
-    """A viewpoint taken again: which event it was, which one counts now."""
+    """A viewpoint that was retaken: the replaced event, and the one that counts."""
 
-    seq: int  # of what superseded it
+    seq: int  # of the event that superseded it
     step: str
     viewpoint: str
     reason: str
     old_seq: int
-    new_seq: int | None  # None: not taken again yet
+    new_seq: int | None  # None: not retaken yet
 
 
 def replaced_viewpoints(digest: Digest) -> list[ReplacedViewpoint]:
-    """All, in order."""
+    """All retaken viewpoints, in order."""
     if digest.state is None:
         return []
     return [
@@ -189,6 +195,6 @@ def replaced_viewpoints(digest: Digest) -> list[ReplacedViewpoint]:
 
 
 def events_of(connection: Connection, run_id: str, *kinds: str, newest: bool = False) -> list[EventRow]:
-    """All events of some kinds, up to LISTED of them, with their payloads."""
+    """The events of some kinds with their payloads, LISTED of them at most."""
     seqs = seqs_of_kind(connection, run_id, kinds, limit=LISTED, newest=newest)
     return read_rows(connection, run_id, seqs, whole=True)

@@ -1,4 +1,4 @@
-"""What an auditor reads first: every deviation in plain words, counted and listed; and the list of runs."""
+"""The first page of an audit: every deviation in plain words, counted and listed; and the list of runs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from service.audit.verify.verifications import Verification
 from service.core.gates.verdict import describe_judged
 from service.core.run.state import DeviationKind
 
-# Group on the page → its name, and the kinds of deviations in it.
+# Group on the page → its name in the plural, and the kinds of deviations in it.
 GROUPS: Mapping[str, tuple[str, frozenset[DeviationKind]]] = {
     "accepted": ("Gates accepted", frozenset({"gate_accepted"})),
     "redone": ("Re-dos", frozenset({"redo", "redo_viewpoint", "reset_by_redo"})),
@@ -22,10 +22,10 @@ GROUPS: Mapping[str, tuple[str, frozenset[DeviationKind]]] = {
     "refused": ("Refused actions", frozenset({"refused"})),
     "failed_gates": ("Failed gates", frozenset()),
     "undecided_gates": ("Gates not decided", frozenset()),
-    "late_results": ("Results that came later", frozenset()),
+    "late_results": ("Results that arrived later", frozenset()),
     "automatic": ("Automatic confirmations", frozenset({"automatic"})),
 }
-# The same of one alone.
+# Group → its name in the singular.
 _OF_ONE: Mapping[str, str] = {
     "accepted": "Gate accepted",
     "redone": "Re-do",
@@ -35,13 +35,13 @@ _OF_ONE: Mapping[str, str] = {
     "refused": "Refused action",
     "failed_gates": "Failed gate",
     "undecided_gates": "Gate not decided",
-    "late_results": "Result that came later",
+    "late_results": "Result that arrived later",
     "automatic": "Automatic confirmation",
 }
 
 
 def group_name(group: str, number: int) -> str:
-    """Name of a group beside how many are in it."""
+    """The name of a group for this number of findings."""
     return _OF_ONE[group] if number == 1 else GROUPS[group][0]
 
 
@@ -55,7 +55,7 @@ _NAMES: Mapping[str, str] = {
     "viewpoint_skipped": "View skipped",
     "refused": "Refused",
     "automatic": "Automatic (note)",
-    "late_result": "Result came later (note)",
+    "late_result": "Result arrived later (note)",
     "failed_gate": "Gate failed",
     "undecided_gate": "Gate not decided",
 }
@@ -63,7 +63,7 @@ _NAMES: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line of the list."""
+    """A line in the list of deviations."""
 
     seq: int
     at_utc: str
@@ -74,17 +74,17 @@ class Finding:
 
     @property
     def name(self) -> str:
-        """The kind in words."""
+        """The kind of deviation in words."""
         return _NAMES[self.kind]
 
     @property
     def is_note(self) -> bool:
-        """For the record only."""
+        """Whether this is a note, not a deviation."""
         return self.kind in ("automatic", "late_result")
 
 
 def findings(digest: Digest, group: str = "") -> list[Finding]:
-    """Deviations and failed gates, what was accepted first; of one group, or all without the notes."""
+    """Deviations and failed gates, accepted gates first: those of one group, or all of them without the notes."""
     kinds = GROUPS[group][1] if group in GROUPS else None
     found = [
         Finding(d.seq, digest.times.get(d.seq, ""), d.kind, d.step or "", d.actor, d.text)
@@ -114,7 +114,7 @@ def _of_gate(gate: FailedGate) -> Finding:
 
 
 def counts(digest: Digest) -> dict[str, int]:
-    """How many of each group."""
+    """The number of findings in each group."""
     by_kind: dict[str, int] = {}
     for deviation in digest.deviations:
         by_kind[deviation.kind] = by_kind.get(deviation.kind, 0) + 1
@@ -129,7 +129,7 @@ def counts(digest: Digest) -> dict[str, int]:
 
 @dataclass(frozen=True, slots=True)
 class RunFilter:
-    """Which runs are wanted; an empty field wants all."""
+    """A filter for runs; an empty field matches every run."""
 
     since: str = ""  # 2026-11-21
     until: str = ""
@@ -137,12 +137,12 @@ class RunFilter:
     person: str = ""
     status: str = ""
     simulated: str = ""  # yes, no
-    deviations: bool = False  # only those with some
-    unverified: bool = False  # only those that do not verify as they are now
+    deviations: bool = False  # only runs with deviations
+    unverified: bool = False  # only runs whose last verification is missing, outdated or found faults
     q: str = ""
 
     def query(self) -> dict[str, str]:
-        """For a link that keeps it."""
+        """The filter as query parameters of a link."""
         names = ("since", "until", "protocol", "person", "status", "simulated", "q")
         fields = {name: getattr(self, name) for name in names}
         fields |= {"deviations": "1" if self.deviations else "", "unverified": "1" if self.unverified else ""}
@@ -151,7 +151,7 @@ class RunFilter:
 
 @dataclass(frozen=True, slots=True)
 class ListedRun:
-    """One line of the list of runs."""
+    """A row in the list of runs."""
 
     basics: RunBasics
     digest: Digest | None  # None: being computed
@@ -159,24 +159,24 @@ class ListedRun:
 
     @property
     def status(self) -> str:
-        """As the digest says; "" while it is being computed."""
+        """The status in the digest; "" while the digest is being computed."""
         return self.digest.status if self.digest else ""
 
     @property
     def deviations(self) -> int | None:
-        """How many, without the notes."""
+        """The number of deviations without the notes."""
         if self.digest is None or self.digest.state is None:
             return None
         return self.digest.state.deviation_count
 
     @property
     def verified(self) -> str:
-        """See verified."""
+        """The state of the verification as a word, by `verified`."""
         return verified(self.verification, self.basics.head_sha256)
 
 
 def verified(verification: Verification | None, head_sha256: str) -> str:
-    """never, faults, outdated (events came since), or current."""
+    """never, faults, outdated (there are newer events) or current."""
     if verification is None:
         return "never"
     if not verification.ok:
@@ -185,7 +185,7 @@ def verified(verification: Verification | None, head_sha256: str) -> str:
 
 
 def matches(run: ListedRun, wanted: RunFilter) -> bool:
-    """Whether a run is wanted, its words aside (`find_runs`). What is not known yet does not hide a run."""
+    """Whether a run matches, words aside (`find_runs`). A run whose digest is not known yet is not hidden."""
     basics, digest = run.basics, run.digest
     day = basics.created_utc[:10]
     fits = (
@@ -205,12 +205,12 @@ def matches(run: ListedRun, wanted: RunFilter) -> bool:
 
 
 def known(value: Digest | Progress) -> Digest | None:
-    """The digest, when there is one."""
+    """The digest, or None while it is being computed."""
     return None if isinstance(value, Progress) else value
 
 
 def people_of(runs: Sequence[ListedRun]) -> list[str]:
-    """Everybody who took part in any of them."""
+    """Everybody who took part in any of these runs."""
     return sorted(
         {name for run in runs for name in (run.basics.operator, *(run.digest.people if run.digest else ()))}
     )

@@ -1,4 +1,4 @@
-"""How many photographs each step took: those that count, those taken again, and exposures that failed."""
+"""The number of photographs of each step: those that count, replaced ones, and failed exposures."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from service.core.text.counts import counted
 
 @dataclass(frozen=True, slots=True)
 class Shots:
-    """Of one step, or of a whole run. What was replaced stays in the evidence and is verified like the rest."""
+    """Photographs of a step or of a run. Replaced ones stay in the evidence and are verified like the rest."""
 
     step: str
     title: str
     count: int  # photographs that count
-    replaced: int  # taken again since, or of an attempt that was done again
-    failed: int  # exposures that failed and were tried again or given up: no file came of them
-    given_up: int  # views that the step went on without
+    replaced: int  # retaken since, or of a repeated attempt
+    failed: int  # exposures that failed and gave no file
+    given_up: int  # views that were skipped
 
     @property
     def taken(self) -> int:
@@ -44,7 +44,7 @@ class Shots:
 
 
 def shots_by_step(protocol: Protocol, state: RunState, failures: Mapping[str, int]) -> list[Shots]:
-    """The steps that took photographs or tried to. `failures`: exposures that failed, by step."""
+    """The photographs of each step that took any or tried to. `failures`: number of failed exposures by step."""
     found: list[Shots] = []
     for step in protocol.steps:
         now = state.steps[step.id]
@@ -59,14 +59,14 @@ def shots_by_step(protocol: Protocol, state: RunState, failures: Mapping[str, in
 
 
 def shots_of(digest: Digest | None, failures: Mapping[str, int]) -> list[Shots]:
-    """The same of a digest; empty while there is none."""
+    """`shots_by_step` of a digest; empty while there is none."""
     if digest is None or digest.protocol is None or digest.state is None:
         return []
     return shots_by_step(digest.protocol, digest.state, failures)
 
 
 def together(shots: Sequence[Shots]) -> Shots:
-    """Of the whole run."""
+    """The photographs of all steps together."""
     return Shots(
         "",
         "Together",
@@ -78,7 +78,7 @@ def together(shots: Sequence[Shots]) -> Shots:
 
 
 def failed_exposures(events: Sequence[Event]) -> dict[str, int]:
-    """How many exposures of each step failed."""
+    """The number of failed exposures of each step."""
     found: dict[str, int] = {}
     for event in events:
         if isinstance(event.payload, ViewpointFailed):
@@ -87,7 +87,7 @@ def failed_exposures(events: Sequence[Event]) -> dict[str, int]:
 
 
 def failed_exposures_of(connection: Connection, run_id: str) -> dict[str, int]:
-    """The same from the database, without its events being read."""
+    """The number of failed exposures of each step, counted in the database without reading the events."""
     rows = connection.execute(
         text(
             "SELECT step, count(*) AS n FROM event_index "

@@ -1,4 +1,4 @@
-"""Signatures of a run: who signed what with which meaning, and whether each still stands."""
+"""Signatures of a run: who signed what, with which meaning, and whether each is still valid."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from service.audit.record.queries import (
     seq_of_hash,
 )
 from service.core.errors import StoreError
+from service.core.records.events import OperatorAction, RunReleased
 
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """Who signed what, when, in what meaning, and whether it still stands."""
+    """A signature: who signed what, when, with which meaning, and whether it is still valid."""
 
     seq: int
     at_utc: str
@@ -28,16 +29,16 @@ class Signature:
     meaning: str
     step: str
     signed_sha256: str
-    bound: EventRow | None  # the event that has this hash; None: no event of the run has it
-    unaltered: bool  # the bound event's content gives this hash today
-    stands: bool | None  # it is the record on which the step stands now; None: cannot be told yet
-    refused: bool  # it had no effect
-    known_by: str  # password, pin, badge, claimed; "" where the record does not tell
+    bound: EventRow | None  # the event with this hash; None: the run has none
+    unaltered: bool  # whether the bound event's content still has this hash
+    stands: bool | None  # whether it binds the present record of the step; None: not known yet
+    refused: bool  # the action had no effect
+    known_by: str  # password, pin, badge or claimed; "" if not recorded
 
 
 def signatures(connection: Connection, run_id: str, digest: Digest | None) -> list[Signature]:
-    """All of a run, its release included, in order. With `digest`, whether each one still stands."""
-    # The word narrows the actions down before any payload is read.
+    """All signatures of a run in order, its release included. With `digest`, also whether each is still valid."""
+    # The word index narrows the actions down before any payload is read.
     seqs = connection.execute(
         text(
             "SELECT i.seq FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq "
@@ -49,11 +50,14 @@ def signatures(connection: Connection, run_id: str, digest: Digest | None) -> li
         ),
         {"run": plain(run_id), "limit": LISTED},
     ).scalars()
-    return [_signature(connection, run_id, row, digest) for row in read_rows(connection, run_id, list(seqs))]
+    return [
+        _signature(connection, run_id, row, digest) for row in read_rows(connection, run_id, list(seqs), whole=True)
+    ]
 
 
 def _signature(connection: Connection, run_id: str, row: EventRow, digest: Digest | None) -> Signature:
-    signed = str(row.payload.get("signed_sha256", ""))
+    action, release = row.record(OperatorAction), row.record(RunReleased)
+    signed = action.signed_sha256 if action else release.signed_sha256 if release else ""
     seq = seq_of_hash(connection, run_id, signed) if signed else None
     # The hash covers the whole payload, however long.
     bound = next(iter(read_rows(connection, run_id, [seq], whole=True)), None) if seq else None
@@ -62,21 +66,21 @@ def _signature(connection: Connection, run_id: str, row: EventRow, digest: Diges
         seq=row.seq,
         at_utc=row.at_utc,
         person=row.actor,
-        meaning=_meaning(row),
+        meaning=_meaning(action) if action else release.meaning if release else "",
         step=row.step,
         signed_sha256=signed,
         bound=bound,
         unaltered=bound is not None and _is_unaltered(run_id, bound, signed),
-        stands=None if digest is None or digest.state is None else _stands(digest, row, signed) and not refused,
+        stands=None
+        if digest is None or digest.state is None
+        else _stands(digest, row, action, signed) and not refused,
         refused=refused,
-        known_by=str(row.payload.get("identified", "")),
+        known_by=action.identified if action else "",
     )
 
 
-def _meaning(row: EventRow) -> str:
-    if row.payload.get("action") == "accept":
-        return f"accepted outside its limits: {row.payload.get('reason', '')}"
-    return str(row.payload.get("meaning", ""))
+def _meaning(action: OperatorAction) -> str:
+    return f"accepted outside its limits: {action.reason}" if action.action == "accept" else action.meaning
 
 
 def _is_unaltered(run_id: str, bound: EventRow, signed: str) -> bool:
@@ -86,13 +90,13 @@ def _is_unaltered(run_id: str, bound: EventRow, signed: str) -> bool:
         return False
 
 
-def _stands(digest: Digest, row: EventRow, signed: str) -> bool:
+def _stands(digest: Digest, row: EventRow, action: OperatorAction | None, signed: str) -> bool:
     state = digest.state
-    assert state is not None  # the caller has looked
+    assert state is not None  # the caller has checked
     if row.kind == "run_released":
         return state.released_by == row.actor and state.completed_sha256 == signed
     step = state.steps.get(row.step)
-    if step is not None and row.payload.get("action") == "accept":
+    if step is not None and action is not None and action.action == "accept":
         return step.accepted is not None and step.accepted.seq == row.seq
     if step is None or not step.signed or step.signed_by != row.actor:
         return False

@@ -1,1 +1,1 @@
-"""Where every result came from, as a graph and as its drawing."""
+"""Provenance: where every result came from, as a graph and as a drawing."""

@@ -1,7 +1,8 @@
-"""The provenance graph laid out from left to right: numbers for an SVG, nothing of the web."""
+"""The provenance graph laid out from left to right, as coordinates for an SVG."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from service.audit.provenance.graph import Graph, Node
@@ -12,9 +13,13 @@ BOX_HEIGHT = 46
 _COLUMN = 262
 _ROW = 62
 _MARGIN = 8
+_SWEEPS = 6  # of ordering the rows
 DRAWN = 70  # nodes; a larger graph is read in the list
-# What helps during the capture and leads to no result: among all else it would hide what does.
+# Computations that only help during the capture: they lead to no result and would hide those that do.
 _ASIDE = frozenset(name for name, kind in job_kinds().items() if kind.aside)
+
+
+Edge = tuple[str, str]  # keys of two nodes
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,44 +43,27 @@ class Arrow:
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """Everything, with its size."""
+    """The whole drawing and its size, in pixels."""
 
     width: float
     height: float
     boxes: list[Box]
     arrows: list[Arrow]
-    left_out: int  # nodes that are in the list alone
+    left_out: int  # number of nodes that are only in the list
 
 
 def draw(graph: Graph) -> Drawing:
-    """Columns by the longest way from a source; within a column in the order that keeps the arrows short."""
+    """Lay out a graph: columns by the longest path from a source, rows so that the arrows are short."""
     ordered = graph.ordered()
     connected = {key for edge in graph.edges for key in edge if graph.nodes[key].kind not in _ASIDE}
     shown = [node for node in ordered if node.key in connected][:DRAWN]
     names = {node.key for node in shown}
-    place = {node.key: index for index, node in enumerate(shown)}
-    # A group may feed what made part of it (registrations from registrations): such an edge is drawn, not ranked.
     edges = [(a, b) for a, b in graph.edges if a in names and b in names]
-    ranking = sorted(((a, b) for a, b in edges if place[a] < place[b]), key=lambda edge: place[edge[0]])
-    column = dict.fromkeys(names, 0)
-    for node in shown:
-        for a, b in ranking:
-            if a == node.key:
-                column[b] = max(column[b], column[a] + 1)
-    # Sources stand beside what first uses them.
-    for node in shown:
-        uses = [column[b] for a, b in ranking if a == node.key]
-        if uses and not any(b == node.key for _, b in ranking):
-            column[node.key] = min(uses) - 1
+    column = _columns(shown, edges)
     columns: dict[int, list[str]] = {}
     for node in shown:
         columns.setdefault(column[node.key], []).append(node.key)
-    row = {key: index for keys in columns.values() for index, key in enumerate(keys)}
-    for _ in range(6):
-        for number in sorted(columns):
-            keys = columns[number]
-            keys.sort(key=lambda key: (_mean([row[a] for a, b in edges if b == key] or [row[key]]), place[key]))
-            row |= {key: index for index, key in enumerate(keys)}
+    row = _rows(columns, edges, {node.key: index for index, node in enumerate(shown)})
     tallest = max((len(keys) for keys in columns.values()), default=0)
     boxes = [
         Box(
@@ -89,6 +77,34 @@ def draw(graph: Graph) -> Drawing:
     arrows = [_arrow(at[a], at[b], graph.edges[a, b]) for a, b in edges]
     width = _MARGIN * 2 + max(columns, default=0) * _COLUMN + BOX_WIDTH
     return Drawing(width, _MARGIN * 2 + tallest * _ROW, boxes, arrows, len(ordered) - len(shown))
+
+
+def _columns(shown: Sequence[Node], edges: Sequence[Edge]) -> dict[str, int]:
+    """The column of each node: after all of its sources. Nodes without a source stand just before their first use."""
+    place = {node.key: index for index, node in enumerate(shown)}
+    # A group may feed itself (registrations from registrations): such an edge is drawn but does not count here.
+    ranking = sorted(((a, b) for a, b in edges if place[a] < place[b]), key=lambda edge: place[edge[0]])
+    column = dict.fromkeys(place, 0)
+    for node in shown:
+        for a, b in ranking:
+            if a == node.key:
+                column[b] = max(column[b], column[a] + 1)
+    for node in shown:
+        uses = [column[b] for a, b in ranking if a == node.key]
+        if uses and not any(b == node.key for _, b in ranking):
+            column[node.key] = min(uses) - 1
+    return column
+
+
+def _rows(columns: Mapping[int, list[str]], edges: Sequence[Edge], place: Mapping[str, int]) -> dict[str, int]:
+    """The row of each node in its column, near the mean row of its sources, in a few sweeps. Sorts `columns`."""
+    row = {key: index for keys in columns.values() for index, key in enumerate(keys)}
+    for _ in range(_SWEEPS):
+        for number in sorted(columns):
+            keys = columns[number]
+            keys.sort(key=lambda key: (_mean([row[a] for a, b in edges if b == key] or [row[key]]), place[key]))
+            row |= {key: index for index, key in enumerate(keys)}
+    return row
 
 
 def _mean(values: list[int]) -> float:

@@ -1,4 +1,4 @@
-"""Where every result came from: files grouped by step and kind, and the computations between them."""
+"""The provenance graph: files grouped by step and kind, and the computations between them."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from service.audit.background.incremental import IncrementalResults, PartialResu
 from service.audit.record.artefact_queries import ArtefactRow, artefacts_of_events, one_artefact
 from service.audit.record.queries import EventRow, head, plain, read_rows
 from service.core.jobs.references import Each, Reference, references_in
+from service.core.records.events import FilesKept, JobEnqueued
 from service.store.events import parse_canonical
 from service.store.store import Store
 
-CHUNK = 500  # events between two looks at who waits
+CHUNK = 500  # events in one step, after which waiting pages come first
 _HASH = re.compile(r'"([0-9a-f]{64})"')
-# Jobs of version 1 hold copies of earlier results (a camera, centres of spheres): so many digits nobody typed.
+# Jobs of version 1 hold copies of earlier results (a camera, centres of spheres), found by their many digits.
 _NUMBER = re.compile(r"-?\d+\.\d{12,}(?:e-?\d+)?")
 _NUMBERS_A_JOB = 3000
-_JOBS_A_KIND = 20  # whose numbers are remembered: views by the thousand give nothing to others by value
-_KEPT_AS_IT_CAME = "kept "  # how the note of a file begins that no program has decoded
+_JOBS_A_KIND = 20  # jobs whose numbers are kept; jobs on thousands of views give no values to others
+_KEPT_AS_IT_CAME = "kept "  # beginning of the note on a file that was kept undecoded
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,32 +50,34 @@ class Graph:
     seq: int = 0
     nodes: dict[str, Node] = field(default_factory=dict[str, Node])
     edges: dict[tuple[str, str], int] = field(default_factory=dict[tuple[str, str], int])
-    by_value: set[tuple[str, str]] = field(default_factory=set[tuple[str, str]])  # numbers of a result, not its files
+    by_value: set[tuple[str, str]] = field(
+        default_factory=set[tuple[str, str]]
+    )  # edges that carry numbers of a result, not files
     groups: dict[str, str] = field(default_factory=dict[str, str])  # SHA-256 → key of its node
     jobs: dict[str, str] = field(default_factory=dict[str, str])  # job → key of its node
     numbers: dict[str, str] = field(default_factory=dict[str, str])  # a number of a result → key of its job's node
     originals: dict[tuple[str, int, str], str] = field(default_factory=dict[tuple[str, int, str], str])
 
     def copy(self) -> Graph:
-        """Another one, to go on with."""
+        """A copy that can be continued while pages read this one."""
         names = ("nodes", "edges", "groups", "jobs", "numbers", "originals")
         return replace(self, by_value=set(self.by_value), **{name: dict(getattr(self, name)) for name in names})
 
     def ordered(self) -> list[Node]:
-        """By first event."""
+        """The nodes in the order of their first events."""
         return sorted(self.nodes.values(), key=lambda node: (node.first_seq, not node.is_job, node.key))
 
     def sources(self, key: str) -> list[tuple[Node, int]]:
-        """What goes into a node, with how many files of it."""
+        """The nodes that feed a node, each with its number of files."""
         return [(self.nodes[a], n) for (a, b), n in self.edges.items() if b == key]
 
     def results(self, key: str) -> list[tuple[Node, int]]:
-        """What comes out of a node, or where its files go."""
+        """The nodes that a node feeds, each with its number of files."""
         return [(self.nodes[b], n) for (a, b), n in self.edges.items() if a == key]
 
 
 def graphs(store: Store) -> IncrementalResults[Graph]:
-    """Graphs of a data folder's runs, kept up in the background."""
+    """Graphs of a data folder's runs, kept up to date in the background."""
     return IncrementalResults(store, lambda run_id, before: _step(store, run_id, before), "provenance")
 
 
@@ -146,18 +149,18 @@ def _add_job(graph: Graph, row: Any) -> None:
     taken = Counter(graph.groups[name] for name in set(_HASH.findall(row.payload)) if name in graph.groups)
     for source, number in taken.items():
         graph.edges[source, key] = max(graph.edges.get((source, key), 0), number)
-    payload = parse_canonical(row.payload)
-    if payload.get("version", 1) == 1:
+    enqueued = JobEnqueued.model_validate(parse_canonical(row.payload))
+    if enqueued.version == 1:
         results = {graph.numbers[name] for name in _NUMBER.findall(row.payload) if name in graph.numbers} - {key}
     else:
-        results = _referred_to(graph, payload["arguments"], key)
+        results = _referred_to(graph, enqueued.arguments, key)
     for source in results:
         graph.edges.setdefault((source, key), 0)
         graph.by_value.add((source, key))
 
 
 def _referred_to(graph: Graph, arguments: Any, key: str) -> set[str]:
-    """Nodes of the jobs whose results the arguments refer to; files that they refer to become edges here."""
+    """The nodes of jobs whose results the arguments refer to. Files that they refer to are added as edges."""
     results: set[str] = set()
     for reference in references_in(arguments):
         if isinstance(reference, Reference):
@@ -191,30 +194,30 @@ def _connect(graph: Graph, source: str, target: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where one file came from and what was made of it."""
+    """Where a file came from and what was made from it."""
 
-    records: Sequence[ArtefactRow]  # the first is where it came from
+    records: Sequence[ArtefactRow]  # the first says where it came from
     event: EventRow  # that brought it
-    job: EventRow | None  # job_enqueued of the computation that made it
-    inputs: Sequence[ArtefactRow]  # files that this computation was given, or beside which it was decoded
+    job: EventRow | None  # job_enqueued event of the computation that made it
+    inputs: Sequence[ArtefactRow]  # the files that it was computed or decoded from
     input_count: int
-    beside: Sequence[ArtefactRow]  # what the same event brought
-    used_by: Sequence[EventRow]  # events that name it, up to a page of them
-    made_of_it: Sequence[ArtefactRow]  # results of the computations that were given it
+    beside: Sequence[ArtefactRow]  # other artefacts of the same event
+    used_by: Sequence[EventRow]  # events that name it, LISTED of them at most
+    made_of_it: Sequence[ArtefactRow]  # results of computations that used it
 
 
 LISTED = 50
 
 
 def origin(connection: Connection, run_id: str, sha256: str) -> Origin:
-    """Both ways from one file. Raises UnknownRunError when the run has none of this hash."""
+    """What a file came from and what was made from it. Raises UnknownRunError if the run has no such file."""
     records = one_artefact(connection, run_id, sha256)
     (event,) = read_rows(connection, run_id, [records[0].seq], whole=True)
     job = _job_of(connection, run_id, event)
     inputs, count = _inputs(connection, run_id, job) if job else _decoded_from(connection, run_id, event, records[0])
     uses = [seq for seq in _naming(connection, run_id, sha256) if seq != event.seq]
     used_by = read_rows(connection, run_id, uses)
-    jobs = [str(row.payload.get("job")) for row in used_by if row.kind == "job_enqueued"]
+    jobs = [row.job for row in used_by if row.kind == "job_enqueued"]
     return Origin(
         records=records,
         event=event,
@@ -228,7 +231,7 @@ def origin(connection: Connection, run_id: str, sha256: str) -> Origin:
 
 
 def _naming(connection: Connection, run_id: str, word: str, limit: int = LISTED) -> list[int]:
-    """Events in whose payload this word stands."""
+    """The events whose payload has this word."""
     found = connection.execute(
         text(
             "SELECT i.seq FROM event_words AS w JOIN event_index AS i ON i.position = w.rowid "
@@ -242,15 +245,14 @@ def _naming(connection: Connection, run_id: str, word: str, limit: int = LISTED)
 def _job_of(connection: Connection, run_id: str, event: EventRow) -> EventRow | None:
     if event.kind != "job_finished":
         return None
-    named = read_rows(connection, run_id, _naming(connection, run_id, str(event.payload.get("job", ""))), whole=True)
-    job = event.payload.get("job")
-    return next((row for row in named if row.kind == "job_enqueued" and row.payload.get("job") == job), None)
+    named = read_rows(connection, run_id, _naming(connection, run_id, event.job), whole=True)
+    return next((row for row in named if row.kind == "job_enqueued" and row.job == event.job), None)
 
 
 def _ends(connection: Connection, run_id: str, jobs: Sequence[str]) -> Iterator[int]:
     for job in jobs:
         for row in read_rows(connection, run_id, _naming(connection, run_id, job)):
-            if row.kind == "job_finished" and row.payload.get("job") == job:
+            if row.kind == "job_finished" and row.job == job:
                 yield row.seq
 
 
@@ -270,7 +272,8 @@ def _inputs(connection: Connection, run_id: str, job: EventRow) -> tuple[list[Ar
 
 def _listed(connection: Connection, run_id: str, job: EventRow) -> Iterator[str]:
     """The files of the many earlier jobs that a job refers to at once."""
-    for each in references_in(job.payload.get("arguments", {})):
+    enqueued = job.record(JobEnqueued)
+    for each in references_in({} if enqueued is None else enqueued.arguments):
         if isinstance(each, Each) and each.field.startswith("artefacts/"):
             for stem in each.jobs:
                 yield from connection.execute(
@@ -287,8 +290,9 @@ def _listed(connection: Connection, run_id: str, job: EventRow) -> Iterator[str]
 def _decoded_from(
     connection: Connection, run_id: str, event: EventRow, row: ArtefactRow
 ) -> tuple[list[ArtefactRow], int]:
-    """The files as they came, for one that a driver decoded: kept before it in the same step from the same device."""
-    if event.kind != "files_kept" or str(event.payload.get("note", "")).startswith(_KEPT_AS_IT_CAME):
+    """The originals of a file that a driver decoded: those kept before it in the same step from the same device."""
+    kept = event.record(FilesKept)
+    if kept is None or kept.note.startswith(_KEPT_AS_IT_CAME):
         return [], 0
     seqs = connection.execute(
         text(

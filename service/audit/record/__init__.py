@@ -1,1 +1,1 @@
-"""What the audit reads: runs, events and files of the evidence, without the means to change them."""
+"""Read-only access to the runs, events and files of the evidence."""

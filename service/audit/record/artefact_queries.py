@@ -17,7 +17,7 @@ _LARGEST_PAGE = 10**6
 
 @dataclass(frozen=True, slots=True)
 class ArtefactFilter:
-    """Which artefacts are wanted; an empty field wants all."""
+    """A filter for artefacts; an empty field matches all."""
 
     kind: str = ""
     step: str = ""
@@ -31,14 +31,14 @@ class ArtefactFilter:
         return any((self.kind, self.step, self.device, self.viewpoint, self.q))
 
     def query(self) -> dict[str, str]:
-        """For a link that keeps it."""
+        """The filter as query parameters of a link."""
         fields = {name: getattr(self, name) for name in ("kind", "step", "device", "viewpoint", "q")}
         return {name: value for name, value in fields.items() if value}
 
 
 @dataclass(frozen=True, slots=True)
 class ArtefactRow:
-    """One artefact as it was recorded."""
+    """A recorded artefact."""
 
     seq: int
     position: int
@@ -58,19 +58,19 @@ class ArtefactRow:
 
     @property
     def is_picture(self) -> bool:
-        """Whether a browser could show it."""
+        """Whether a browser can show it."""
         return self.media_type in ("image/jpeg", "image/png")
 
 
 @dataclass(frozen=True, slots=True)
 class ArtefactPage:
-    """Some artefacts, and what there is beside them."""
+    """A page of artefacts, and the number of pages and matches."""
 
     rows: Sequence[ArtefactRow]
     page: int
     pages: int
     count: int
-    size_bytes: int  # of all that match
+    size_bytes: int  # number of matches
 
 
 _COLUMNS = (
@@ -82,7 +82,7 @@ _COLUMNS = (
 def artefacts_page(
     connection: Connection, run_id: str, wanted: ArtefactFilter, *, page: int = 1, size: int = PAGE
 ) -> ArtefactPage:
-    """One page, in the order of the events; a number beyond the ends gives the nearest. Raises UnknownRunError."""
+    """One page, in the order of the events; a page number out of range gives the nearest. Raises UnknownRunError."""
     head(connection, run_id)
     where, values = _where(run_id, wanted)
     totals = connection.execute(
@@ -116,7 +116,7 @@ def _where(run_id: str, wanted: ArtefactFilter) -> tuple[str, dict[str, Any]]:
 
 
 def to_row(row: Any) -> ArtefactRow:
-    """A row of the table, for people."""
+    """A row of the table `artefacts` as an ArtefactRow."""
     return ArtefactRow(
         seq=row.seq,
         position=row.position,
@@ -137,7 +137,7 @@ def to_row(row: Any) -> ArtefactRow:
 
 
 def artefacts_of_events(connection: Connection, run_id: str, seqs: Sequence[int]) -> list[ArtefactRow]:
-    """What these events brought."""
+    """The artefacts that these events brought."""
     if not seqs:
         return []
     rows = connection.execute(
@@ -151,7 +151,7 @@ def artefacts_of_events(connection: Connection, run_id: str, seqs: Sequence[int]
 
 
 def one_artefact(connection: Connection, run_id: str, sha256: str) -> list[ArtefactRow]:
-    """Every record of a file in this run, the first being where it came from. Raises UnknownRunError."""
+    """Every record of a file in this run; the first says where it came from. Raises UnknownRunError."""
     head(connection, run_id)
     rows = connection.execute(
         text(
@@ -165,13 +165,13 @@ def one_artefact(connection: Connection, run_id: str, sha256: str) -> list[Artef
         raise UnknownRunError(
             "the run has no artefact of this SHA-256",
             where=plain(sha256)[:80],
-            remedy="Search it among the artefacts",
+            remedy="Search for it among the artefacts",
         )
     return found
 
 
 def artefact_facets(connection: Connection, run_id: str) -> dict[str, dict[str, int]]:
-    """What there is to filter by, with how many artefacts each."""
+    """The values to filter by, each with its number of artefacts."""
     rows = connection.execute(
         text("SELECT kind, step, device, count(*) AS n FROM artefacts WHERE run_id = :run GROUP BY 1, 2, 3"),
         {"run": plain(run_id)},

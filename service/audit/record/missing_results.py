@@ -1,4 +1,4 @@
-"""Results that were planned and had not arrived when something was exported: by the record alone, without a guess."""
+"""Results that were planned but had not arrived at an export, according to the record."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from service.steps.poses.time_left import missing_results
 
 
 def not_in_yet(protocol: Protocol, state: RunState, events: Sequence[Event]) -> list[str]:
-    """`COLMAP from nothing: was still being computed`, or why it never comes; empty when all is there.
+    """Lines such as `COLMAP from nothing: was still being computed`; empty if every result has arrived.
 
-    The same events give the same lines: how long it would have taken is not among them.
+    The same events give the same lines, so the time that is left is not among them.
     """
     return [
         f"{left.what}: {f'there will be none, {left.failed}' if left.failed else 'was still being computed'}"

@@ -1,4 +1,4 @@
-"""What the auditor's pages read: runs and events, filtered, searched and paged in SQL; never a whole run."""
+"""Queries of the auditor's pages: runs and events, filtered, searched and paged in SQL. None reads a whole run."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
+from pydantic import ValidationError
 from sqlalchemy import Connection, text
 
 from service.core.errors import IntegrityError
+from service.core.records.base import Record
 from service.core.records.events import RunStarted
 from service.store.errors import UnknownRunError
 from service.store.events import event_sha256, parse_canonical
@@ -18,25 +20,27 @@ from service.store.records import SITE
 from service.store.verification.chain_checks import summary
 
 PAGE = 50  # events or artefacts on one page
-COUNT_LIMIT = 10_000  # beyond it a filter's matches are not counted
-_INLINE_CHARACTERS = 6_000  # of a payload; a longer one has a page of its own
+COUNT_LIMIT = 10_000  # matches of a filter beyond this number are not counted
+_INLINE_CHARACTERS = 6_000  # of a payload in a list; a longer one is shown on the page of its event
 _LARGEST_SEQ = 2**53
 _SEARCH_CHARACTERS = 200
 _SEARCH_TERMS = 8
 _WORD = re.compile(r"[^\W_]")
 
 
+P = TypeVar("P", bound=Record)
+
 # --- runs ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class RunBasics:
-    """What never changes of a run, and where its chain ends now."""
+    """What never changes in a run, and the present end of its chain."""
 
     run_id: str
     created_utc: str
     simulated: bool
-    protocol: str  # its id, "" when the first event cannot be read
+    protocol: str  # its id; "" if the first event cannot be read
     version: str
     operator: str
     origin: str  # captured, imported
@@ -45,7 +49,7 @@ class RunBasics:
 
 
 def runs(connection: Connection, run_id: str | None = None) -> list[RunBasics]:
-    """All runs, newest first; or the one of this name, if there is one."""
+    """All runs, newest first; or the run of this name, if there is one."""
     rows = connection.execute(
         text(
             "SELECT r.run_id, r.created_utc, r.simulated, h.seq, h.sha256, "
@@ -95,7 +99,7 @@ def root(connection: Connection, run_id: str) -> RunStarted:
 
 
 def plain(value: str) -> str:
-    """As SQLite can take it: a request may hold lone surrogates."""
+    """The text without lone surrogates, which a request may hold and SQLite refuses."""
     return value.encode("utf-8", "replace").decode()
 
 
@@ -104,7 +108,7 @@ def plain(value: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class EventFilter:
-    """Which events are wanted; an empty field wants all."""
+    """A filter for events; an empty field matches all."""
 
     step: str = ""
     device: str = ""
@@ -118,14 +122,14 @@ class EventFilter:
         return any((self.step, self.device, self.person, self.kind, self.q))
 
     def query(self) -> dict[str, str]:
-        """For a link that keeps it."""
+        """The filter as query parameters of a link."""
         fields = {"step": self.step, "device": self.device, "person": self.person, "kind": self.kind, "q": self.q}
         return {name: value for name, value in fields.items() if value}
 
 
 @dataclass(frozen=True, slots=True)
 class EventRow:
-    """One event as a page shows it."""
+    """An event as a page shows it."""
 
     seq: int
     at_utc: str
@@ -136,26 +140,34 @@ class EventRow:
     attempt: int | None
     summary: str
     size: int  # characters of the payload
-    shown: str  # the payload for people, indented; "" when it is too long for a list
-    payload: Mapping[str, Any]  # whole, or its short fields where it is long
+    shown: str  # the payload, indented; "" if it is too long for a list
+    payload: Mapping[str, Any]  # complete, or only the short fields of a long payload
     previous_sha256: str
     sha256: str
     artefacts: int
+    job: str = ""  # that it is about
+
+    def record(self, kind: type[P]) -> P | None:
+        """The payload as a record of this kind; None if it is another kind, was altered, or is not complete here."""
+        try:
+            return kind.model_validate(self.payload)
+        except ValidationError:
+            return None
 
 
 @dataclass(frozen=True, slots=True)
 class EventPage:
-    """Some events in order, and where the neighbouring pages begin."""
+    """A page of events in order, and where the neighbouring pages begin."""
 
     rows: Sequence[EventRow]
-    before: int | None  # give this for the page before; None: there is none
+    before: int | None  # parameter for the page before; None: there is none
     after: int | None
-    count: int | None  # of all that match; None: more than COUNT_LIMIT
-    missing: int = 0  # events that the index does not hold: filters cannot find them
+    count: int | None  # number of matches; None: more than COUNT_LIMIT
+    missing: int = 0  # events missing from the index, which filters cannot find
 
 
 def search_expression(q: str) -> str | None:
-    """A person's words as an FTS5 expression: every word, from its beginning. None when nothing can be sought."""
+    """A person's words as an FTS5 expression that matches every word as a prefix; None if there is no word."""
     words = plain(q)[:_SEARCH_CHARACTERS].replace("\0", " ").replace('"', " ").split()
     terms = [word for word in words if _WORD.search(word)][:_SEARCH_TERMS]
     return " AND ".join(f'"{term}"*' for term in terms) or None
@@ -174,7 +186,7 @@ def events_page(
     """The first events after `after`, or with `before` the last ones before it. Raises UnknownRunError.
 
     Args:
-        counted: how many match, when that is known; they are counted otherwise.
+        counted: the number of matches, if known; otherwise they are counted.
     """
     last, _ = head(connection, run_id)
     after, before = (min(max(value, 0), _LARGEST_SEQ) for value in (after, before))
@@ -201,7 +213,7 @@ def events_page(
 
 
 def _where(connection: Connection, run_id: str, wanted: EventFilter) -> tuple[str, dict[str, Any]]:
-    """Conditions on event_index AS i. A range of positions is read in order: cheaper than any choice of an index."""
+    """Conditions on event_index AS i. Reading a range of positions in order is cheaper than using another index."""
     ends = connection.execute(
         text(
             "SELECT (SELECT position FROM event_index WHERE run_id = :run ORDER BY seq LIMIT 1), "
@@ -279,14 +291,14 @@ _ROW = (
 
 
 def read_rows(connection: Connection, run_id: str, seqs: Sequence[int], *, whole: bool = False) -> list[EventRow]:
-    """These events; unless `whole`, long payloads come without their lists and tables."""
+    """These events; unless `whole`, long payloads lack their lists and tables."""
     inline = _LARGEST_SEQ if whole else _INLINE_CHARACTERS
     values = {"run": plain(run_id), "seqs": json.dumps(list(seqs)), "inline": inline}
     return [_event_row(row, whole=row.size <= inline) for row in connection.execute(text(_ROW), values)]
 
 
 def one_event(connection: Connection, run_id: str, seq: int) -> EventRow:
-    """One event with its whole payload. Raises UnknownRunError."""
+    """An event with its whole payload. Raises UnknownRunError."""
     last, _ = head(connection, run_id)
     found = read_rows(connection, run_id, [min(max(seq, 0), _LARGEST_SEQ)], whole=True)
     if not found:
@@ -299,9 +311,9 @@ def _event_row(row: Any, *, whole: bool) -> EventRow:
         payload: dict[str, Any] = parse_canonical(row.payload or "null") or {}
         shown = json.dumps(payload, indent=1, ensure_ascii=False, sort_keys=True) if whole else ""
         line = headline(payload)
-    except (ValueError, AttributeError):  # altered: shown as it is
+    except (ValueError, AttributeError):  # altered: shown unchanged
         payload, shown, line = {}, str(row.payload)[:_INLINE_CHARACTERS], "this payload cannot be read"
-    step, attempt = payload.get("step"), payload.get("attempt")
+    step, attempt, job = payload.get("step"), payload.get("attempt"), payload.get("job")
     return EventRow(
         seq=row.seq,
         at_utc=row.at_utc,
@@ -317,6 +329,7 @@ def _event_row(row: Any, *, whole: bool) -> EventRow:
         previous_sha256=row.previous_sha256,
         sha256=row.sha256,
         artefacts=row.artefacts,
+        job=job if isinstance(job, str) else "",
     )
 
 
@@ -329,7 +342,7 @@ _TELLING = (
 
 
 def headline(payload: Mapping[str, Any]) -> str:
-    """One line on an event: what tells most comes first, without names of fields where the value speaks."""
+    """An event in one line: the most telling fields first, without field names if the value is clear without them."""
     told = [str(payload[name]) for name in _TELLING if isinstance(payload.get(name), str) and payload[name]]
     if "passed" in payload:
         told.append("passed" if payload["passed"] else _not_passed(payload.get("verdicts")))
@@ -344,7 +357,7 @@ def _not_passed(verdicts: Any) -> str:
 
 
 def computed_sha256(run_id: str, row: EventRow) -> str:
-    """The hash of an event's content as it is now; differs from the recorded one when it was altered."""
+    """The hash of an event's content as it is now; an altered event has another hash than the recorded one."""
     fields = {
         "seq": row.seq,
         "run_id": run_id,
@@ -358,7 +371,7 @@ def computed_sha256(run_id: str, row: EventRow) -> str:
 
 
 def seq_of_hash(connection: Connection, run_id: str, sha256: str) -> int | None:
-    """Which event of the run has this hash: the one before its successor, or the last."""
+    """The event of the run that has this hash, by the link in its successor or as the last one; or None."""
     last, end = head(connection, run_id)
     if sha256 == end:
         return last
@@ -372,12 +385,12 @@ def seq_of_hash(connection: Connection, run_id: str, sha256: str) -> int | None:
 def seqs_of_kind(
     connection: Connection, run_id: str, kinds: Sequence[str], *, limit: int = 1000, newest: bool = False
 ) -> list[int]:
-    """Numbers of the events of some kinds, in order: the first ones, or the last."""
+    """Numbers of the first events of some kinds, or with `newest` of the last ones, in order."""
     order = "DESC" if newest else "ASC"
     found = connection.execute(
         text(
             "SELECT seq FROM event_index WHERE run_id = :run AND kind IN (SELECT value FROM json_each(:kinds)) "
-            f"ORDER BY +seq {order} LIMIT :limit"  # by kind first: those are few
+            f"ORDER BY +seq {order} LIMIT :limit"  # "+": use the index on the kind, which has few rows
         ),
         {"run": plain(run_id), "kinds": json.dumps(list(kinds)), "limit": limit},
     ).scalars()
@@ -385,14 +398,14 @@ def seqs_of_kind(
 
 
 def count_of_kind(connection: Connection, run_id: str, kind: str) -> int:
-    """How many events of a kind there are."""
+    """The number of events of a kind."""
     statement = text("SELECT count(*) FROM event_index WHERE run_id = :run AND kind = :kind")
     return int(connection.execute(statement, {"run": plain(run_id), "kind": kind}).scalar_one())
 
 
 @dataclass(slots=True)
 class Facets:
-    """What there is to filter by, with how many events each."""
+    """The values to filter by, each with its number of events."""
 
     kinds: dict[str, int] = field(default_factory=dict[str, int])
     steps: dict[str, int] = field(default_factory=dict[str, int])
@@ -400,7 +413,7 @@ class Facets:
     devices: dict[str, int] = field(default_factory=dict[str, int])
 
     def matching(self, wanted: EventFilter) -> int | None:
-        """How many events match a filter of one property; None for any other."""
+        """The number of events that match a filter of one property; None for other filters."""
         counts = {"kind": self.kinds, "step": self.steps, "person": self.people}
         fields = wanted.query()
         if len(fields) != 1 or not counts.keys() & fields.keys():
@@ -409,7 +422,7 @@ class Facets:
         return counts[name].get(value, 0)
 
     def copy(self) -> Facets:
-        """Another one, to go on with."""
+        """A copy that can be continued while pages read this one."""
         return Facets(dict(self.kinds), dict(self.steps), dict(self.people), dict(self.devices))
 
     def add(self, connection: Connection, run_id: str, after: int, upto: int) -> None:

@@ -1,4 +1,4 @@
-"""A run as the evidence has it, read without the means to change anything."""
+"""A run read from the evidence, read-only."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from service.store.store import read_runs, resolve_run
 
 
 class RecordedFiles:
-    """The files of a data folder, to be read."""
+    """Read-only access to the files of a data folder."""
 
     def __init__(self, data_dir: Path) -> None:
         self._files = ArtefactFiles(data_dir / "artefacts", DurableFiles(), RandomIds())
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """The file of an artefact. Raises IntegrityError when missing or, with `verify`, altered."""
+        """The file of an artefact. Raises IntegrityError if it is missing or, with `verify`, altered."""
         return self._files.verified_path(sha256) if verify else self._files.path(sha256)
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedRun:
-    """Events, their fold, and the files of one run."""
+    """A run: its events, their fold, and its files."""
 
     data_dir: Path
     run_id: str
@@ -49,16 +49,16 @@ class RecordedRun:
     full_names: Mapping[str, str]  # of accounts, as they are now
 
     def summary(self) -> RunSummary:
-        """The same for the report's and the data set's functions."""
+        """The run as the functions of the report and of the data set take it."""
         return RunSummary(self.run_id, self.protocol, self.root, self.state, self.events, self.files)
 
     def named(self, account: str) -> str:
-        """A person by full name and account; who has no account is called as recorded."""
+        """A person by full name and account; a person without an account by the recorded name."""
         return named(account, self.full_names)
 
 
 def read_run(data_dir: Path, name: str, *, last_seq: int | None = None) -> RecordedRun:
-    """A run by its name, the beginning of its name, or `latest`; up to its end, or as it was at an event.
+    """Read a run by its name, the beginning of its name, or `latest`; all of it, or up to the event `last_seq`.
 
     Raises:
         UnknownRunError: there is no such run.

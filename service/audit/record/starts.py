@@ -1,4 +1,4 @@
-"""The log of starts: what runs here, what is different from the last time, and what was left open."""
+"""The log of starts of the service: what runs here, what changed since the last start, and which runs are open."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from service.store.store import Store, read_open_runs
 
 
 def record_start(store: Store, rig: Rig, protocols: Sequence[Path], address: str) -> ServiceStarted:
-    """Record in the site's chain that a service came up on these files, and how things stood then.
+    """Record in the site's chain that the service started, with its files, its software and the open runs.
 
-    The ends of all chains that grew since the last start go into it: a run that is cut back later is found by them.
+    The record holds the ends of all chains that grew since the last start, which reveal a run that is cut later.
     Raises ConfigurationError for a protocol file that cannot be read.
     """
     software = software_versions()
@@ -67,13 +67,13 @@ def _hashes(files: Sequence[Path]) -> dict[str, str]:
 
 
 def _changes(before: Mapping[str, str], now: Mapping[str, str]) -> dict[str, tuple[str, str]]:
-    """Name → before, now; "" for what was not there."""
+    """Name → before, now; "" for what did not exist."""
     names = sorted({*before, *now})
     return {n: (before.get(n, ""), now.get(n, "")) for n in names if before.get(n) != now.get(n)}
 
 
 def _last_start(connection: Connection) -> tuple[Event | None, int]:
-    """The last ServiceStarted and its place in the order of all events; None, 0 for none."""
+    """The last ServiceStarted and its position among all events; (None, 0) if there is none."""
     found = (
         select(event_index.c.seq, event_index.c.position)
         .where(event_index.c.run_id == SITE, event_index.c.kind == "service_started")
@@ -92,7 +92,7 @@ def _same_boot(before: ServiceStarted | None, boot: str) -> bool:
 
 
 def _clock_jump_s(clock: Clock, last: Event) -> float:
-    """By how much UTC has moved on more than the monotonic clock, which nobody can set."""
+    """How much further UTC has advanced than the monotonic clock, which nobody can set, since the last start."""
     utc_s = clock.utc_now().timestamp() - datetime.fromisoformat(last.at_utc).timestamp()
     return round(utc_s - (clock.monotonic_s() - last.monotonic_s), 6)
 

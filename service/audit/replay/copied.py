@@ -1,4 +1,4 @@
-"""Records of version 1: the copies of earlier results in their arguments, read as references to these."""
+"""Jobs of version 1: copies of earlier results in their arguments are recognised and read as references."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any, cast
 from service.core.jobs.references import Reference
 from service.core.run.state import JobState
 
-_TELLING_DIGITS = 12  # a number of so many digits is found again by its value: nobody typed it
+_TELLING_DIGITS = 12  # a number with so many digits is recognised by its value, since nobody typed it
 
 
 @dataclass
 class CopiedResults:
-    """Parts of the answers so far, by their content: what is bit for bit a part of one was copied from there."""
+    """Parts of the answers so far, by their content: an argument that equals a part was copied from there."""
 
     _parts: dict[str, Reference] = field(default_factory=dict[str, Reference])
 
     def add(self, job: JobState) -> None:
-        """Note the answer of a finished job."""
+        """Add the answer of a finished job."""
         self._index(job.job, "result", job.result)
 
     def _index(self, job: str, path: str, value: Any) -> None:
@@ -34,7 +34,7 @@ class CopiedResults:
                 self._index(job, f"{path}/{index}", item)
 
     def as_references(self, arguments: Any) -> Any:
-        """Arguments with a reference in the place of every copy."""
+        """The arguments with a reference in place of every copy."""
         if _is_telling(arguments):
             found = self._parts.get(_key(arguments))
             if found is not None:
@@ -51,7 +51,7 @@ def _key(value: Any) -> str:
 
 
 def _is_telling(value: Any) -> bool:
-    """Whether this holds a number that can be told from every other."""
+    """Whether this holds a number with so many digits that equality means a copy."""
     if isinstance(value, float):
         return len(repr(value).split("e")[0].replace("-", "").replace(".", "").strip("0")) >= _TELLING_DIGITS
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Two pieces of plain data, or two files, compared: equal, or where and by how much not."""
+"""Comparison of plain data and of files: where they differ, and by how much."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ import numpy as np
 from service.core.geometry import Array
 from service.core.records.events import ArtefactRef
 
-TOLERANCE = 1e-9  # of the largest number of the same field: what another processor or library may round otherwise
-_SHOWN = 200  # fields of one comparison that are kept
+TOLERANCE = 1e-9  # relative to the largest number of a field: rounding that differs between processors and libraries
+_SHOWN = 200  # most differing fields kept of one comparison
 
-# Ends of names → unit that people read, and the factor to it.
+# End of a name → unit in which the difference is shown, and the factor to it.
 _UNITS: Mapping[str, tuple[str, float]] = {
     "_mm": ("mm", 1.0),
     "_px": ("px", 1.0),
@@ -32,20 +32,20 @@ _UNITS: Mapping[str, tuple[str, float]] = {
     "_lux": ("lx", 1.0),
 }
 
-_EXPLANATIONS = ("how", "verdict")  # of the error budget: words about numbers that stand beside them
+_EXPLANATIONS = ("how", "verdict")  # of the error budget: explanations of numbers that are compared themselves
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A field whose recomputed value is another than the recorded one; of several values, the one furthest off."""
+    """A field whose recomputed value differs from the recorded one; of an array, the value that differs most."""
 
     path: str
     recorded: Any
     recomputed: Any
-    difference: float | None  # in `unit`; None when they are not both numbers
-    relative: float | None  # to the largest number of the field
+    difference: float | None  # in `unit`; None unless both are numbers
+    relative: float | None  # relative to the largest number of the field
     unit: str
-    values: int = 1  # that differ in this field
+    values: int = 1  # number of values that differ
 
     @property
     def wording(self) -> bool:
@@ -61,14 +61,14 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What comparing gave."""
+    """The result of a comparison."""
 
     compared: int = 0  # values
     differences: tuple[Difference, ...] = ()  # worst first
 
     @property
     def identical(self) -> bool:
-        """Whether every bit is the same."""
+        """Whether both are bit-identical."""
         return not self.differences
 
     @property
@@ -110,10 +110,10 @@ def compare_data(
     """Compare plain data (what JSON can hold) number by number.
 
     Args:
-        recorded: of the evidence.
-        recomputed: now.
-        path: what stands before every path.
-        renamed: hashes of files that stand for one another: recorded → recomputed.
+        recorded: from the evidence.
+        recomputed: by the replay.
+        path: prefix of every path.
+        renamed: hashes of recomputed files: recorded → recomputed.
     """
     collector = _Collector(renamed or {})
     _walk(collector, recorded, recomputed, path, path)
@@ -175,7 +175,7 @@ def _arrays(out: _Collector, a: Array, b: Array, path: str, group: str) -> None:
 def _one_array(
     out: _Collector, a: Array, b: Array, path: str, group: str, unit: tuple[str, float], least_scale: float = 0.0
 ) -> None:
-    """`least_scale`: a pose at the origin is still of a world of metres."""
+    """Compare two arrays. `least_scale`: smallest scale of the tolerance, because a pose may be at the origin."""
     apart = (a != b) & ~(np.isnan(a) & np.isnan(b))
     if not apart.any():
         return
@@ -201,7 +201,7 @@ def _scalar(a: float, b: float, path: str) -> Difference:
 
 
 def unit_of(path: str) -> tuple[str, float]:
-    """Unit that people read and the factor to it, by the last name in a path that tells one; else none."""
+    """The unit to show and the factor to it, by the last name in a path that has one."""
     for name in reversed(re.split(r"[.\[\] ]+", path)):
         for ending in sorted(_UNITS, key=len, reverse=True):
             if name.endswith(ending):
@@ -214,7 +214,7 @@ def _is_pose(path: str) -> bool:
 
 
 def _is_table(mapping: Mapping[str, Any]) -> bool:
-    """Many entries of one shape by name, such as viewpoints: one field, not many."""
+    """Whether a mapping has many entries of one form, such as viewpoints, and so counts as one field."""
     kinds = {type(value) for value in mapping.values()}
     return len(mapping) > 5 and len(kinds) == 1 and kinds <= {list, tuple, dict}
 
@@ -224,7 +224,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _numbers(values: Sequence[Any]) -> Array | None:
-    """The array that nested lists of numbers make, or None."""
+    """Nested lists of numbers as an array, or None."""
     if not _only_numbers(values):
         return None
     try:

@@ -1,4 +1,4 @@
-"""Recomputed answers in the place of recorded ones: for a replay from end to end, and the drift at its end."""
+"""The answers that a replay has computed, as input of later jobs, and how far the final registrations drift."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from service.worker.job import JobAnswer
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """How far the scan lies from where the recorded registration put it, at the centre of its spheres."""
+    """Displacement of the scan from its recorded registration, at the centre of its spheres."""
 
     registration: str
-    in_world_mm: float | None  # by T_world_scan; None where the world frame is the reconstruction's own
-    against_cameras_mm: float  # the cameras being laid over one another
+    in_world_mm: float | None  # by T_world_scan; None if the world frame is that of the reconstruction
+    against_cameras_mm: float  # after aligning the cameras
 
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """A job as it was recorded and as it came out now."""
+    """A job as recorded, and as computed again."""
 
     step: str
     before: JobState
@@ -39,16 +39,16 @@ class _Pair:
 
 
 class RecomputedJobs:
-    """The jobs of a run, with the answers that the replay gave."""
+    """The jobs of a run with the answers of the replay."""
 
     def __init__(self, state: RunState) -> None:
-        self.renamed: dict[str, str] = {}  # file → the same file written again, where its hash is another
+        self.renamed: dict[str, str] = {}  # hash of a recorded file → hash of the file written again, if it differs
         self.pairs: list[_Pair] = []
         self._jobs = jobs_of(state)
         self._copied = CopiedResults()
 
     def add(self, step: str, job: JobState, now: Mapping[str, Any], answer: JobAnswer) -> None:
-        """Note a job computed again, after those that it follows; `now` is its JobFinished as plain data."""
+        """Add a recomputed job, in the order of the jobs; `now` is its JobFinished as plain data."""
         again = replace(job, measures=now["measures"], result=now["result"], artefacts=answer.artefacts)
         for old, new in zip(job.artefacts, answer.artefacts, strict=False):
             if old.sha256 != new.sha256:
@@ -58,7 +58,7 @@ class RecomputedJobs:
         self.pairs.append(_Pair(step, job, again))
 
     def arguments(self, job: JobState) -> Mapping[str, Any]:
-        """A job's arguments, with what earlier jobs gave now."""
+        """A job's arguments with the recomputed answers of earlier jobs."""
         return self._with_new_hashes(resolve(self._copied.as_references(job.arguments), self._jobs))
 
     def _with_new_hashes(self, value: Any) -> Any:
@@ -69,7 +69,7 @@ class RecomputedJobs:
         return self.renamed.get(value, value) if isinstance(value, str) else value
 
     def measures_of(self, step: str, recorded: Mapping[str, float]) -> dict[str, float] | None:
-        """A step's measures with those of its jobs replaced; None where no job of it was computed again.
+        """A step's measures with the recomputed measures of its jobs; None if no job of it was computed again.
 
         A registration step puts a registration's name before the name of each of its measures.
         """
@@ -88,8 +88,8 @@ class RecomputedJobs:
 
 
 def drifts(summary: RunSummary, recomputed: RecomputedJobs) -> Iterator[Drift]:
-    """For every registration that was computed again."""
-    spheres = summary.result("scan_import").get("spheres_m")
+    """The drift of every registration that was computed again."""
+    spheres = summary.scan_spheres_m()
     if not spheres:
         return
     centre_m = np.array(spheres, dtype=np.float64).mean(axis=0)

@@ -1,148 +1,45 @@
-"""Replay: every recorded computation done again from the recorded files and parameters, and compared."""
+"""Replay: recorded jobs are computed again from the recorded files and arguments, and compared with the record."""
 
 from __future__ import annotations
 
-import hashlib
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from service.audit.record.run import RecordedFiles, RecordedRun
-from service.audit.replay.differences import Comparison, Difference, compare_data, compare_files
-from service.audit.replay.recomputed import Drift, RecomputedJobs, drifts
+from service.audit.replay.differences import Comparison, compare_data, compare_files
+from service.audit.replay.recomputed import RecomputedJobs, drifts
+from service.audit.replay.results import (
+    ArtefactReplay,
+    GateReplay,
+    JobReplay,
+    ReplayReport,
+    Verdict,
+    VersionChange,
+)
+from service.audit.replay.scratch import ScratchStore
 from service.core.errors import ConfigurationError, IntegrityError, OrthocaptureError
 from service.core.gates.verdict import evaluate_gates
 from service.core.jobs.references import jobs_of, resolve
-from service.core.records.events import ArtefactRef, GateVerdict, JobFinished, SessionStarted
+from service.core.records.events import ArtefactRef, JobFinished, SessionStarted
 from service.core.run.state import JobState
 from service.jobs import job_kinds
 from service.runner.software import software_versions
 from service.store.events import parse_canonical, payload_text
-from service.store.verification.verify import verify
+from service.store.verification.verify import AuditReport, verify
 from service.worker.job import JobAnswer, JobContext
 from service.worker.loop import HANDLERS
 
 Progress = Callable[[str, int, int], None]
-Verdict = Literal["identical", "within_tolerance", "different", "not_replayed"]
 
-# What a specimen's data set rests on; the looks at each image during the capture are left out unless asked for.
+# The computations behind a data set; the checks of each live image are left out unless asked for.
 DEFAULT_KINDS = tuple(name for name, kind in job_kinds().items() if kind.replayed)
-_WORST_FIRST: tuple[Verdict, ...] = ("not_replayed", "different", "within_tolerance")
 _FAILURES = (ValueError, ArithmeticError, LookupError, OSError, MemoryError, np.linalg.LinAlgError)
-
-
-@dataclass(frozen=True, slots=True)
-class VersionChange:
-    """A distribution that is not what it was when the run was recorded; "" where it is or was not installed."""
-
-    name: str
-    recorded: str
-    now: str
-
-
-@dataclass(frozen=True, slots=True)
-class ArtefactReplay:
-    """A file that a job wrote, and the same file written again."""
-
-    name: str
-    kind: str
-    recorded_sha256: str
-    recomputed_sha256: str
-    content: Comparison  # empty where the hashes are the same
-
-
-@dataclass(frozen=True, slots=True)
-class JobReplay:
-    """One job computed again."""
-
-    job: str
-    kind: str
-    step: str
-    attempt: int
-    label: str  # what tells it from others of its kind: the source of poses
-    verdict: Verdict
-    measures: Comparison = field(default_factory=Comparison)
-    result: Comparison = field(default_factory=Comparison)
-    artefacts: tuple[ArtefactReplay, ...] = ()
-    recorded_s: float = 0.0
-    duration_s: float = 0.0
-    error: str = ""  # why it could not be replayed
-
-    @property
-    def differences(self) -> tuple[Difference, ...]:
-        """Of measures, result and files, in this order, each worst first."""
-        parts = (self.measures, self.result, *(artefact.content for artefact in self.artefacts))
-        return tuple(difference for part in parts for difference in part.differences)
-
-
-@dataclass(frozen=True, slots=True)
-class GateReplay:
-    """A step's gates judged again by the measures that the replay gave."""
-
-    step: str
-    attempt: int
-    recorded: tuple[GateVerdict, ...]
-    recomputed: tuple[GateVerdict, ...]
-
-    @property
-    def changed(self) -> tuple[tuple[GateVerdict, GateVerdict], ...]:
-        """Verdicts that come out otherwise."""
-        pairs = zip(self.recorded, self.recomputed, strict=True)
-        return tuple((old, new) for old, new in pairs if old.passed != new.passed)
-
-
-@dataclass(frozen=True, slots=True)
-class ReplayReport:
-    """What came of it. `gates_judged`: verdicts that follow again from the recorded measures."""
-
-    run_id: str
-    head_sha256: str
-    end_to_end: bool
-    versions: tuple[VersionChange, ...]
-    files_verified: int
-    bytes_verified: int
-    gates_judged: int
-    gates: tuple[GateReplay, ...]
-    jobs: tuple[JobReplay, ...]
-    drifts: tuple[Drift, ...] = ()
-
-    @property
-    def verdict(self) -> Verdict:
-        """The worst of all jobs; a gate that comes out otherwise is a difference."""
-        found: set[Verdict] = {job.verdict for job in self.jobs}
-        if any(gate.changed for gate in self.gates):
-            found.add("different")
-        for verdict in _WORST_FIRST:
-            if verdict in found:
-                return verdict
-        return "identical"
-
-
-class ScratchStore:
-    """What handlers see as the store: reads the evidence, writes into a folder of its own."""
-
-    def __init__(self, recorded: RecordedFiles, folder: Path) -> None:
-        self._recorded = recorded
-        self._folder = folder
-
-    def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """A recomputed file, or else the recorded one. Raises IntegrityError."""
-        own = self._folder / sha256
-        return own if own.is_file() else self._recorded.artefact_path(sha256, verify=verify)
-
-    def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
-        """Keep bytes in the scratch folder."""
-        digest = hashlib.sha256(data).hexdigest()
-        self._folder.mkdir(parents=True, exist_ok=True)
-        (self._folder / digest).write_bytes(data)
-        return ArtefactRef(
-            sha256=digest, kind=kind, media_type=media_type, size_bytes=len(data), original_name=original_name
-        )
 
 
 def replay(
@@ -163,24 +60,18 @@ def replay(
         run: as `read_run` gives it.
         kinds: of jobs.
         step: only this step's jobs.
-        end_to_end: see above; the report then has the drift of each registration.
+        end_to_end: feed each job the recomputed results; the report then has the drift of each registration.
         out: folder to keep the recomputed files in, by step, job and name.
-        progress: told what is being done, how much of it is, and all of it.
+        progress: called with the activity, the amount done and the total.
 
     Raises:
         IntegrityError: the evidence does not verify; the message names the first fault.
         ConfigurationError: unknown kind or step, `out` within the data folder, nothing to replay.
     """
     if out is not None and run.data_dir.resolve() in (out.resolve(), *out.resolve().parents):
-        raise ConfigurationError("the recomputed files do not belong into the evidence", where=str(out))
+        raise ConfigurationError("the recomputed files must not be written into the data folder", where=str(out))
     chosen = _chosen(run, kinds, step)
-    checked = verify(run.data_dir, run.run_id, progress)
-    if checked.first_fault is not None:
-        raise IntegrityError(
-            f"the evidence does not verify, so there is nothing to compare with: {checked.first_fault}",
-            where=str(run.data_dir),
-            remedy="See `orthocapture audit verify`; restore the file from a copy",
-        )
+    checked = _require_sound(run, progress)
     recomputed = RecomputedJobs(run.state)
     recorded = jobs_of(run.state)
     replays: list[JobReplay] = []
@@ -209,6 +100,18 @@ def replay(
             jobs=tuple(replays),
             drifts=tuple(drifts(run.summary(), recomputed)) if end_to_end else (),
         )
+
+
+def _require_sound(run: RecordedRun, progress: Progress) -> AuditReport:
+    """Verify the evidence. Raises IntegrityError."""
+    checked = verify(run.data_dir, run.run_id, progress)
+    if checked.first_fault is not None:
+        raise IntegrityError(
+            f"the evidence does not verify, so there is nothing to compare with: {checked.first_fault}",
+            where=str(run.data_dir),
+            remedy="See `orthocapture audit verify`; restore the file from a copy",
+        )
+    return checked
 
 
 def _chosen(run: RecordedRun, kinds: Collection[str], step: str | None) -> list[tuple[str, JobState]]:
@@ -264,28 +167,40 @@ def _replay_job(
     except _FAILURES as error:
         return replace(about, error=repr(error), duration_s=time.monotonic() - started_s)
     about = replace(about, duration_s=time.monotonic() - started_s)
-    before = parse_canonical(payload_text(recorded))
     recomputed.add(step, job, now, answer)
-    renamed = recomputed.renamed
+    return _compare(about, recorded, now, answer, (run.files, store), recomputed.renamed)
+
+
+def _compare(
+    about: JobReplay,
+    recorded: JobFinished,
+    now: Mapping[str, Any],
+    answer: JobAnswer,
+    files: tuple[RecordedFiles, ScratchStore],
+    renamed: Mapping[str, str],
+) -> JobReplay:
+    """The job with its measures, result and files compared. `now`: its JobFinished as plain data."""
+    before = parse_canonical(payload_text(recorded))
     artefacts = [
-        _compare_artefacts(store, run.files, old, new, renamed)
+        _compare_artefacts(*files, old, new, renamed)
         for old, new in zip(recorded.artefacts, answer.artefacts, strict=False)
     ]
     names = [[ref.original_name for ref in refs] for refs in (recorded.artefacts, answer.artefacts)]
-    files = compare_data(*names, path="files")
+    listed = compare_data(*names, path="files")
     measures = compare_data(before["measures"], now["measures"], path="measures")
     result = compare_data(before["result"], now["result"], path="result", renamed=renamed)
-    parts = (measures, result, files, *(artefact.content for artefact in artefacts))
+    parts = (measures, result, listed, *(artefact.content for artefact in artefacts))
     same_files = all(artefact.recorded_sha256 == artefact.recomputed_sha256 for artefact in artefacts)
-    verdict: Verdict = (
-        "different"
-        if not all(part.equal for part in parts)
-        else "identical"
-        if same_files and all(part.identical for part in parts)
-        else "within_tolerance"
-    )
-    result = replace(result, differences=(*files.differences, *result.differences))
+    result = replace(result, differences=(*listed.differences, *result.differences))
+    verdict = _verdict(parts, same_files=same_files)
     return replace(about, verdict=verdict, measures=measures, result=result, artefacts=tuple(artefacts))
+
+
+def _verdict(parts: Iterable[Comparison], *, same_files: bool) -> Verdict:
+    compared = tuple(parts)
+    if not all(part.equal for part in compared):
+        return "different"
+    return "identical" if same_files and all(part.identical for part in compared) else "within_tolerance"
 
 
 def _finished(run: RecordedRun, job: JobState) -> JobFinished:
@@ -307,7 +222,7 @@ def _as_recorded(recorded: JobFinished, answer: JobAnswer) -> Any:
 
 
 def _compare_artefacts(
-    store: ScratchStore, recorded: RecordedFiles, old: ArtefactRef, new: ArtefactRef, renamed: Mapping[str, str]
+    recorded: RecordedFiles, store: ScratchStore, old: ArtefactRef, new: ArtefactRef, renamed: Mapping[str, str]
 ) -> ArtefactReplay:
     content = Comparison()
     if old.sha256 != new.sha256:

@@ -1,4 +1,4 @@
-"""What a report is made of, as plain records: HTML and PDF are two ways to write the same."""
+"""The content of a report as plain records, which are written as HTML or as PDF."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Style = Literal["text", "number", "code"]
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A text with how it is meant."""
+    """A text and its tone."""
 
     text: str
     tone: Tone = "plain"
@@ -29,7 +29,7 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Paragraph:
-    """Running text, or with a tone a statement that is set apart."""
+    """Running text; with a tone other than plain, a highlighted statement."""
 
     text: str
     tone: Tone = "plain"
@@ -44,14 +44,14 @@ class Heading:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Names and values, one below the other."""
+    """A list of names and values."""
 
     rows: tuple[tuple[str, Cell | str], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of texts. `strong`: indices of rows to be seen first; `spanning`: of rows that are one text throughout."""
+    """Rows. `strong`: indices of highlighted rows; `spanning`: of rows whose first text spans every column."""
 
     columns: tuple[Column, ...]
     rows: tuple[tuple[Cell | str, ...], ...]
@@ -62,9 +62,9 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A small copy of a photograph with its caption; None where the file is missing or altered.
+    """A small copy of a photograph with its caption; `jpeg` is None if the file is missing or altered.
 
-    The photograph itself is named by its hash: it lies in the evidence under that name.
+    `sha256` is the name of the original in the evidence.
     """
 
     caption: str
@@ -76,7 +76,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """Photographs in so many columns."""
+    """Photographs in a number of columns."""
 
     items: tuple[Picture, ...]
     columns: int
@@ -107,7 +107,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A text in a drawing; x, y: its base line at the anchor."""
+    """A text in a drawing; x, y: position of its baseline at the anchor."""
 
     x: float
     y: float
@@ -133,10 +133,9 @@ Shape = Box | Line | Label | Raster
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A chart in its own units, drawn to the width that there is; `text` says the same in words.
+    """A chart in its own units, scaled to the available width; `text` describes it in words.
 
-    `name`: what its file is called, without an ending; `rows`: the figures that it draws, the first row their names
-    with units.
+    `name`: of its file, without suffix; `rows`: the figures that it shows, below a row of their names with units.
     """
 
     title: str
@@ -150,14 +149,14 @@ class Drawing:
 
 @dataclass(frozen=True, slots=True)
 class Drawings:
-    """Charts side by side, two a row."""
+    """Charts, two in a row."""
 
     items: tuple[Drawing, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """The scene: drawn as it is first seen, and to be turned in HTML; `html` is "" where that is not wanted."""
+    """The 3D scene: a drawing of the initial view, and an HTML element that can be turned, or ""."""
 
     drawing: Drawing
     html: str = field(repr=False)
@@ -168,7 +167,7 @@ Block = Paragraph | Heading | Facts | Table | Pictures | Drawings | Scene
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of the report under its own number."""
+    """A numbered section of the report."""
 
     title: str
     blocks: tuple[Block, ...]
@@ -176,12 +175,12 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The whole; the first six say on the first page what a reader must not miss."""
+    """A whole report; the first six fields are what a reader must not miss, on the first page."""
 
     title: str
     simulated: bool
-    origin: Cell | None  # None: the run captured its photographs itself
-    release: Cell | None  # None: the protocol asks for none
+    origin: Cell | None  # None: the run took its photographs itself
+    release: Cell | None  # None: the protocol does not ask for one
     verification: Cell
     result: Cell
     deviations: Cell

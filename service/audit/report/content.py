@@ -1,4 +1,4 @@
-"""What a report says, put together from a run's evidence; how it looks is report_html's and report_pdf's."""
+"""The content of a report, made from a run's evidence; report/output writes it as HTML or PDF."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def report_content(
 
     Args:
         run: the run.
-        audit: what verifying it gave, before anything else; the first page says so.
-        made_at: the time stamp of the report; now unless given. With the same one the same evidence gives the same.
-        true_error_mm: by source of poses, on a simulated rig where the truth is known; marked as such.
-        with_scene: the scene to be turned as well, which only HTML can show; its drawing is there without.
-        with_pictures: False leaves out what shows the photographs.
+        audit: the result of the verification, which is shown on the first page.
+        made_at: the time stamp of the report, default: now. The same evidence and time stamp give the same report.
+        true_error_mm: by source of poses, on a simulated rig, where the truth is known; marked as such.
+        with_scene: include the scene that can be turned, which only HTML can show; its drawing is always included.
+        with_pictures: False leaves out everything that shows photographs.
     """
     summary = run.summary()
     listed = deviations(run)
@@ -54,7 +54,9 @@ def report_content(
         devices_section(run),
         pictures_section(run, turning=with_scene)
         if with_pictures
-        else Section("Pictures", (Paragraph("They were left out: this report goes with hashes alone."),)),
+        else Section(
+            "Pictures", (Paragraph("They were left out, because this report belongs to a bundle without files."),)
+        ),
         verification_section(run, audit),
         software_section(run),
     ]
@@ -87,14 +89,14 @@ def _verification(audit: AuditReport) -> Cell:
 
 
 def _origin(run: RecordedRun) -> Cell | None:
-    """None where the run captured its photographs itself."""
+    """The statement on imported photographs; None if the run took its photographs itself."""
     if run.root.origin != "imported":
         return None
     return Cell(imported_sentence(run.events[0].at_utc, run.named(run.root.operator)), "attention")
 
 
 def _release(run: RecordedRun) -> Cell | None:
-    """None where the protocol asks for no release."""
+    """The statement on the release; None if the protocol does not ask for one."""
     if run.protocol.release != "second_person":
         return None
     if run.state.released_by:

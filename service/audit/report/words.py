@@ -1,4 +1,4 @@
-"""How a report writes times, names and numbers."""
+"""Times, names and numbers as text in a report."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from service.jobs.words import term
 
 
 def utc(text: str) -> str:
-    """2026-11-21 10:12:03 UTC, from ISO 8601."""
+    """A time in ISO 8601 as `2026-11-21 10:12:03 UTC`."""
     moment = datetime.fromisoformat(text)
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
     return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def moment(at: datetime) -> str:
-    """The same of a time."""
+    """A datetime as `2026-11-21 10:12:03 UTC`."""
     return utc(at.isoformat())
 
 
 def clock(text: str) -> str:
-    """The same without the date."""
+    """A time in ISO 8601 as `10:12:03`, in UTC."""
     return utc(text).split()[1]
 
 
 def duration(start: str, end: str) -> str:
-    """3 min 5 s, between two times."""
+    """The time between two times in ISO 8601, as `3 min 5 s`."""
     seconds = round((datetime.fromisoformat(end) - datetime.fromisoformat(start)).total_seconds())
     hours, rest = divmod(max(seconds, 0), 3600)
     minutes, seconds = divmod(rest, 60)
@@ -38,17 +38,17 @@ def duration(start: str, end: str) -> str:
 
 
 def words(name: str) -> str:
-    """A name of the records as words: viewpoint_skipped → viewpoint skipped."""
+    """A name in the records as words: viewpoint_skipped → viewpoint skipped."""
     return term(name)
 
 
 def limit(verdict: GateVerdict) -> str:
-    """What a gate allows: ≥ 0.2 and ≤ 1."""
+    """The limits of a gate, as `≥ 0.2 and ≤ 1`."""
     return limits(verdict.minimum, verdict.maximum)
 
 
 def measured(verdict: GateVerdict) -> tuple[str, str]:
-    """Name of what a gate judges without its unit, and the value with it."""
+    """The name of a gate's measure without its unit, and the value with the unit."""
     name = verdict.measure
     for ending, unit in (("_mm", "mm"), ("_px", "px"), ("_deg", "°"), ("_min", "min")):
         if verdict.unit == unit:
@@ -65,10 +65,10 @@ _JUDGED: dict[Standing, Cell] = {
 
 
 def judged(verdict: GateVerdict, *, accepted: bool = False) -> Cell:
-    """A word, a sign and a colour. `accepted`: a person let the step pass with its figures as they are."""
+    """The verdict of a gate as a sign and a word with a tone. `accepted`: a person accepted the step's figures."""
     return _JUDGED[standing(verdict, accepted=accepted)]
 
 
 def mm(value: float | None, digits: int = 3) -> str:
-    """Millimetres without the unit; – for none."""
+    """Millimetres without the unit; `–` for None."""
     return "–" if value is None else f"{value:.{digits}f}"

@@ -1,1 +1,1 @@
-"""Many runs at once: found, compared, and their figures over time."""
+"""Several runs at once: searching, comparing, and figures over time."""

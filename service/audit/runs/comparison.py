@@ -1,23 +1,26 @@
-"""Two runs held against one another: protocol, figures and gates, accuracy, calibration, durations, deviations."""
+"""A comparison of two runs: protocol, figures and gates, accuracy, calibration, durations, deviations."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
 
 import numpy as np
 
 from service.core.errors import IntegrityError
 from service.core.gates.verdict import figure, limits, quantity, standing
+from service.core.geometry import Transform
 from service.core.protocol.models import Protocol
 from service.core.records.entered import ABOUT, RunAbout
 from service.core.records.events import Event, GateVerdict, RunStarted
 from service.core.run.state import RunState, StepState
 from service.core.units import mm
 from service.dataset.registrations import evaluated
+from service.jobs.calibration import calibrate
+from service.jobs.records import Camera
+from service.jobs.registration.evaluate import Row as EvaluatedRow
 from service.people.approvals import difference
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "°", "_min": "min"}  # by the end of a measure's name
@@ -31,19 +34,19 @@ _STANDINGS = {
 
 @dataclass(frozen=True, slots=True)
 class ComparedRun:
-    """One of the two."""
+    """One of the compared runs."""
 
     run_id: str
     root: RunStarted
     protocol: Protocol
-    source: str  # of the protocol, as it is in the evidence
+    source: str  # text of the protocol
     events: Sequence[Event]
     state: RunState
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One thing in both runs, in words; `change` from the first to the second, "" where there is none to tell."""
+    """One property of both runs, in words; `change`: from the first to the second, "" if there is none."""
 
     name: str
     first: str
@@ -55,13 +58,13 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class RunComparison:
-    """What is the same and what is not."""
+    """Two runs and their comparison."""
 
     first: ComparedRun
     second: ComparedRun
     about: tuple[Row, ...]
     same_protocol: bool
-    protocol_changes: tuple[str, ...]  # − of the first, + of the second
+    protocol_changes: tuple[str, ...]  # lines with − are of the first run, with + of the second
     gates: tuple[Row, ...]
     measures: tuple[Row, ...]
     accuracy: tuple[Row, ...]
@@ -71,7 +74,7 @@ class RunComparison:
 
 
 def compare_runs(first: ComparedRun, second: ComparedRun) -> RunComparison:
-    """Hold two runs against one another. What only one of them has is told as such."""
+    """Compare two runs. What only one of them has is listed too."""
     same = first.root.protocol_sha256 == second.root.protocol_sha256
     return RunComparison(
         first=first,
@@ -89,7 +92,7 @@ def compare_runs(first: ComparedRun, second: ComparedRun) -> RunComparison:
 
 
 def root_of(events: Sequence[Event]) -> RunStarted:
-    """The root of a run's chain. Raises IntegrityError where it is of another kind."""
+    """The first event of a run. Raises IntegrityError if it is not run_started."""
     root = events[0].payload if events else None
     if not isinstance(root, RunStarted):
         raise IntegrityError("the run's first event is not run_started", where=events[0].run_id if events else "")
@@ -114,7 +117,7 @@ def _about(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
 
 
 def _steps(first: ComparedRun, second: ComparedRun) -> list[tuple[str, str]]:
-    """Identifier and title, in the order of the first run; what the second has alone at the end."""
+    """Identifier and title of every step, in the order of the first run; steps of the second alone come last."""
     titles = {step.id: step.title for run in (second, first) for step in run.protocol.steps}
     return [(name, titles[name]) for name in dict.fromkeys([*first.protocol.step_ids, *second.protocol.step_ids])]
 
@@ -157,29 +160,32 @@ def _unit(name: str) -> str:
 
 
 def _change(values: Sequence[float | None], unit: str = "") -> str:
-    """`+0.012 mm`; "" where one of the two is missing or they are the same."""
+    """The change in words, such as `+0.012 mm`; "" if a value is missing or both are equal."""
     first, second = values
     if first is None or second is None or not math.isfinite(apart := second - first) or apart == 0:
         return ""
     return f"{apart:+.4g} {unit}".rstrip().replace("-", "−", 1)
 
 
+_ERRORS: tuple[tuple[str, str, Callable[[EvaluatedRow], float | None]], ...] = (
+    ("mean radial error", "mm", lambda row: row.mean_radial_error_mm),
+    ("predicted error", "mm", lambda row: row.predicted_error_mm),
+    ("reprojection", "px", lambda row: row.mean_reprojection_error_px),
+)
+
+
 def _accuracy(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
-    tables = [{row.poses: row.plain() for row in evaluated(run.protocol, run.state)} for run in (first, second)]
+    tables = [{row.poses: row for row in evaluated(run.protocol, run.state)} for run in (first, second)]
     for poses in dict.fromkeys([*tables[0], *tables[1]]):
-        rows = [table.get(poses, {}) for table in tables]
-        for field, name, unit in (
-            ("mean_radial_error_mm", "mean radial error", "mm"),
-            ("predicted_error_mm", "predicted error", "mm"),
-            ("mean_reprojection_error_px", "reprojection", "px"),
-        ):
-            values = [row.get(field) for row in rows]
+        rows = [table.get(poses) for table in tables]
+        for name, unit, value_of in _ERRORS:
+            values = [None if row is None else value_of(row) for row in rows]
             if any(value is not None for value in values):
                 texts = ["" if value is None else f"{value:.3f} {unit}" for value in values]
                 yield _row(name, *texts, change=_change(values, unit), step=poses)
 
 
-# Of the camera; those of the hand-eye transform come from the measures.
+# Parameters of the camera.
 _CAMERA = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 _OF_CALIBRATION = (
     "rms_px", "five_fold_rms_px", "coverage", "uncertainty_mm", "hand_eye_sigma_mm", "hand_eye_sigma_deg",
@@ -189,20 +195,19 @@ _OF_CALIBRATION = (
 
 def _calibration(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
     found = [_calibrated(run) for run in (first, second)]
-    cameras = [camera for camera, *_ in found]
     for name in _CAMERA:
-        values = [camera.get(name) for camera in cameras]
+        values = [one.parameter(name) for one in found]
         if any(value is not None for value in values):
             unit = "px" if name in ("fx", "fy", "cx", "cy") else ""
             texts = ["" if value is None else f"{value:.6g} {unit}".rstrip() for value in values]
             yield _row(f"Camera {name}", *texts, change=_change(values, unit))
     for name in _OF_CALIBRATION:
-        values = [measures.get(name) for _, _, measures in found]
+        values = [one.measures.get(name) for one in found]
         if any(value is not None for value in values):
             unit = _unit(name)
             texts = ["" if value is None else quantity(value, unit) for value in values]
             yield _row(name, *texts, change=_change(values, unit))
-    here, there = (T for _, T, _ in found)
+    here, there = (one.T_flange_camera for one in found)
     if here is not None and there is not None:
         moved_mm = mm(float(np.linalg.norm(there[:3, 3] - here[:3, 3])))
         turned = here[:3, :3].T @ there[:3, :3]
@@ -212,19 +217,34 @@ def _calibration(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
         yield _row("Camera on the flange", *where, change=change)
 
 
-def _calibrated(run: ComparedRun) -> tuple[Mapping[str, float], Any, Mapping[str, float]]:
-    """The camera, T_flange_camera (4, 4) or None, and the measures of all calibration steps together."""
-    camera: Mapping[str, float] = {}
-    T_flange_camera = None
+@dataclass(frozen=True, slots=True)
+class _Calibrated:
+    """The camera and T_flange_camera (4, 4) that were solved last, and the measures of all calibration steps."""
+
+    camera: Camera | None
+    T_flange_camera: Transform | None
+    measures: Mapping[str, float]
+
+    def parameter(self, name: str) -> float | None:
+        """A parameter of the camera; None where it was not recorded."""
+        if self.camera is None or name not in self.camera.model_fields_set:
+            return None
+        return float(getattr(self.camera, name))
+
+
+def _calibrated(run: ComparedRun) -> _Calibrated:
+    camera: Camera | None = None
+    T_flange_camera: Transform | None = None
     measures: dict[str, float] = {}
     for step in run.protocol.steps:
         state = run.state.steps[step.id]
         if step.kind == "calibration" and state.result:
-            camera = state.result.get("camera") or camera
-            if state.result.get("T_flange_camera") is not None:
-                T_flange_camera = np.array(state.result["T_flange_camera"], dtype=np.float64)
+            answer = calibrate.KIND.read_answer(state.result)
+            camera = answer.camera
+            if answer.T_flange_camera is not None:
+                T_flange_camera = np.array(answer.T_flange_camera, dtype=np.float64)
             measures |= state.measures
-    return camera, T_flange_camera, measures
+    return _Calibrated(camera, T_flange_camera, measures)
 
 
 def _durations(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:

@@ -1,4 +1,4 @@
-"""How calibration and accuracy went over time, by camera, lens and arm: one row for each run with such figures."""
+"""Calibration and accuracy over time, by camera, lens and arm: one row for each run that has such figures."""
 
 from __future__ import annotations
 
@@ -8,11 +8,17 @@ import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from sqlalchemy import Connection, text
 
 from service.audit.runs.search import FoundRun, RunSearch, find_runs
+from service.core.equipment.recorded_devices import (
+    RecordedIdentity,
+    RecordedOptics,
+    recorded_identity,
+    recorded_optics,
+)
 from service.store.store import Store
 
 InstrumentKind = Literal["camera", "lens", "arm"]
@@ -20,13 +26,13 @@ InstrumentKind = Literal["camera", "lens", "arm"]
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A number that is followed: its unit, what it is in words, and of which instruments it tells something."""
+    """A figure that is followed over time: its name, its unit, and the instruments that it describes."""
 
     key: str
     name: str
     unit: str
     of: tuple[InstrumentKind, ...]
-    from_zero: bool = True  # its axis; a focal length changes by a thousandth of itself
+    from_zero: bool = True  # whether its axis begins at 0; a focal length changes by a thousandth only
 
 
 FIGURES: tuple[Figure, ...] = (
@@ -53,7 +59,7 @@ _COLUMNS = (*_MEASURED, *(f"{name}_px" for name in _OF_CAMERA), "mean_radial_err
 
 @dataclass(frozen=True, slots=True)
 class Instrument:
-    """A camera, lens or arm as its makers number them; "" is what was not told."""
+    """A camera, lens or arm by the maker's model and serial number; "" if not stated."""
 
     kind: InstrumentKind
     model: str
@@ -62,12 +68,12 @@ class Instrument:
     @property
     def name(self) -> str:
         """`ILCE-7RM5, serial number 1234567`."""
-        return f"{self.model or 'model not told'}, serial number {self.serial or 'not told'}"
+        return f"{self.model or 'model not stated'}, serial number {self.serial or 'not stated'}"
 
 
 @dataclass(frozen=True, slots=True)
 class HistoryRow:
-    """The figures of one run, with the time of its calibration, else of its beginning."""
+    """The figures of one run, with the time of its calibration or, without one, of its beginning."""
 
     run: FoundRun
     at_utc: str
@@ -77,7 +83,7 @@ class HistoryRow:
     values: Mapping[str, float]
 
     def instruments(self) -> tuple[Instrument, ...]:
-        """All that took part."""
+        """All instruments of the run."""
         return tuple(one for one in (self.camera, self.lens, *self.arms) if one is not None)
 
 
@@ -98,13 +104,15 @@ def history(store: Store) -> list[HistoryRow]:
             at_utc = max((step.at_utc for step in steps), default=run.created_utc)
             mine = devices.get(run.run_id, {})
             rows.append(
-                HistoryRow(run, at_utc, *_optical(mine, optics.get(run.run_id, {})), _arms(mine, steps), values)
+                HistoryRow(
+                    run, at_utc, *_optical(mine, optics.get(run.run_id, RecordedOptics())), _arms(mine, steps), values
+                )
             )
     return sorted(rows, key=lambda row: row.at_utc)
 
 
 def by_instrument(rows: Sequence[HistoryRow]) -> dict[Instrument, list[HistoryRow]]:
-    """The rows of each instrument, cameras before lenses before arms, each by its model and number."""
+    """The rows of each instrument: cameras, then lenses, then arms, each sorted by model and serial number."""
     found: dict[Instrument, list[HistoryRow]] = defaultdict(list)
     for row in rows:
         for instrument in row.instruments():
@@ -118,7 +126,7 @@ def by_instrument(rows: Sequence[HistoryRow]) -> dict[Instrument, list[HistoryRo
 
 @dataclass(frozen=True, slots=True)
 class _Calibration:
-    """What one step of a run solved, as it measured it last."""
+    """The last result of one calibration step."""
 
     at_utc: str
     measures: Mapping[str, float]
@@ -149,8 +157,8 @@ def _calibrations(connection: Connection) -> dict[str, tuple[_Calibration, ...]]
     return {run: tuple(steps.values()) for run, steps in found.items()}
 
 
-def _devices(connection: Connection) -> dict[str, dict[str, Mapping[str, Any]]]:
-    """By run and name in the rig: who answered, the last time."""
+def _devices(connection: Connection) -> dict[str, dict[str, RecordedIdentity]]:
+    """By run and name in rig.yaml: the identity that a device stated when it was last opened."""
     rows = connection.execute(
         text(
             "SELECT e.run_id, json_extract(e.payload, '$.device') AS device, "
@@ -160,14 +168,14 @@ def _devices(connection: Connection) -> dict[str, dict[str, Mapping[str, Any]]]:
             "AND json_type(e.payload, '$.report.identity') = 'object' ORDER BY e.run_id, e.seq"
         )
     )
-    found: dict[str, dict[str, Mapping[str, Any]]] = defaultdict(dict)
+    found: dict[str, dict[str, RecordedIdentity]] = defaultdict(dict)
     for row in rows:
-        found[row.run_id][str(row.device)] = json.loads(row.identity)
+        found[row.run_id][str(row.device)] = recorded_identity(json.loads(row.identity))
     return found
 
 
-def _optics(connection: Connection) -> dict[str, Mapping[str, Any]]:
-    """By run: what the first photograph says of camera and lens."""
+def _optics(connection: Connection) -> dict[str, RecordedOptics]:
+    """By run: what the first photograph states of camera and lens."""
     rows = connection.execute(
         text(
             "SELECT e.run_id, json_extract(e.payload, '$.camera') AS camera FROM runs AS r CROSS JOIN events AS e "
@@ -175,11 +183,11 @@ def _optics(connection: Connection) -> dict[str, Mapping[str, Any]]:
             "AND i.kind IN ('viewpoint_captured', 'view_held', 'view_imported')) WHERE json_valid(e.payload)"
         )
     )
-    return {row.run_id: json.loads(row.camera) for row in rows if row.camera}
+    return {row.run_id: recorded_optics(json.loads(row.camera)) for row in rows if row.camera}
 
 
 def _numbers(content: str | None) -> dict[str, float]:
-    read: dict[str, Any] = json.loads(content) if content else {}
+    read: dict[str, object] = json.loads(content) if content else {}
     return {name: float(v) for name, v in read.items() if isinstance(v, int | float) and not isinstance(v, bool)}
 
 
@@ -192,32 +200,31 @@ def _values(steps: Iterable[_Calibration]) -> dict[str, float]:
 
 
 def _optical(
-    devices: Mapping[str, Mapping[str, Any]], told: Mapping[str, Any]
+    devices: Mapping[str, RecordedIdentity], stated: RecordedOptics
 ) -> tuple[Instrument | None, Instrument | None]:
-    """Camera and lens: by what the images say, which the certificate shows too; else as the camera answered."""
-    answered = next((i for name, i in devices.items() if i.get("kind") == "camera" or name == "camera"), {})
-    model = str(told.get("model") or answered.get("model") or "")
-    serial = str(told.get("body_serial") or answered.get("serial") or "")
-    lens, lens_serial = str(told.get("lens") or ""), str(told.get("lens_serial") or "")
+    """Camera and lens as the photographs state them, else as the camera stated when it was opened."""
+    cameras = (one for name, one in devices.items() if one.kind == "camera" or name == "camera")
+    answered = next(cameras, RecordedIdentity())
+    model, serial = stated.model or answered.model, stated.body_serial or answered.serial
     return (
         Instrument("camera", model, serial) if model or serial else None,
-        Instrument("lens", lens, lens_serial) if lens or lens_serial else None,
+        Instrument("lens", stated.lens, stated.lens_serial) if stated.lens or stated.lens_serial else None,
     )
 
 
-def _arms(devices: Mapping[str, Mapping[str, Any]], steps: Sequence[_Calibration]) -> tuple[Instrument, ...]:
-    """Those that the calibration names; where it names none, every arm that answered."""
+def _arms(devices: Mapping[str, RecordedIdentity], steps: Sequence[_Calibration]) -> tuple[Instrument, ...]:
+    """The arms that the calibration names; if it names none, every arm that was opened."""
     named = dict.fromkeys(robot for step in steps for robot in step.robots)
-    names = named or [name for name, i in devices.items() if i.get("kind") == "robot" or name.startswith("robot")]
+    names = named or [name for name, i in devices.items() if i.kind == "robot" or name.startswith("robot")]
     arms = (devices[name] for name in names if name in devices)
-    return tuple(dict.fromkeys(Instrument("arm", str(a.get("model", "")), str(a.get("serial", ""))) for a in arms))
+    return tuple(dict.fromkeys(Instrument("arm", arm.model, arm.serial) for arm in arms))
 
 
 # --- CSV -------------------------------------------------------------------------------------------------------
 
 
 def history_csv(rows: Sequence[HistoryRow]) -> str:
-    """The rows as CSV (RFC 4180) with a line of names; units are in the names."""
+    """The rows as CSV (RFC 4180) with a header line; units are in the names."""
     out = io.StringIO()
     writer = csv.writer(out)
     about = ("run", "at_utc", "simulated", "state", "specimen", "purpose", "site", "protocol", "version")
@@ -241,5 +248,5 @@ def history_csv(rows: Sequence[HistoryRow]) -> str:
 
 
 def _harmless(word: str) -> str:
-    """A spreadsheet takes a text that begins so for a formula."""
+    """The text, with an apostrophe in front if a spreadsheet would take it for a formula."""
     return f"'{word}" if word.startswith(("=", "+", "-", "@", "\t")) else word

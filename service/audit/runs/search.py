@@ -1,17 +1,17 @@
-"""The runs of a data folder, found by what people said of them, by when they were and by how they came out."""
+"""A search for runs of a data folder by what people wrote about them, by time and by result."""
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 from pydantic import ValidationError
 from sqlalchemy import Connection, text
 
 from service.core.records.entered import RunAbout
+from service.core.records.events import GatesEvaluated
 from service.store.records import SITE
 from service.store.store import Store, read_open_runs
 
@@ -25,36 +25,36 @@ RESULT_WORDS: Mapping[Result, str] = {
     "outside": "accuracy outside its limit",
     "released": "released",
 }
-_ERROR = "mean_radial_error_mm"  # the measure of an evaluation that says how accurate the run came out
+_ERROR = "mean_radial_error_mm"  # the measure of an evaluation that is shown as the accuracy of the run
 
 
 @dataclass(frozen=True, slots=True)
 class RunSearch:
-    """Which runs are wanted; an empty field wants all."""
+    """A search; an empty field matches every run."""
 
-    q: str = ""  # words, all of which are found somewhere in what people said of the run
+    q: str = ""  # words that must all occur in what people wrote about the run
     since: str = ""  # 2026-11-21, in UTC
     until: str = ""
     result: str = ""  # one of RESULTS
 
     @property
     def active(self) -> bool:
-        """Whether anything is sought."""
+        """Whether any field is set."""
         return any((self.q.strip(), self.since, self.until, self.result))
 
     def query(self) -> dict[str, str]:
-        """For a link that keeps it."""
+        """The search as query parameters of a link."""
         fields = {"q": self.q, "since": self.since, "until": self.until, "result": self.result}
         return {name: value for name, value in fields.items() if value}
 
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """The mean radial error on the control spheres as it was judged last."""
+    """The mean radial error on the control spheres, as it was last judged."""
 
     error_mm: float
     most_mm: float | None
-    within: bool | None  # None: its uncertainty leaves that open
+    within: bool | None  # None: not decided, because a limit lies within its uncertainty
 
     @property
     def words(self) -> str:
@@ -80,7 +80,7 @@ class FoundRun:
     accuracy: Accuracy | None
 
     def has(self, result: str) -> bool:
-        """Whether it came out so: one of RESULTS."""
+        """Whether it has this result, one of RESULTS."""
         if result == "released":
             return self.released
         if result in ("within", "outside"):
@@ -89,14 +89,14 @@ class FoundRun:
 
     @property
     def words(self) -> str:
-        """All in which a search looks, in small letters."""
+        """The text that is searched, in lower case."""
         said = (value for value in self.about.model_dump().values())
         parts = (self.run_id, self.protocol, self.version, self.begun_by, *said, *self.notes)
         return "\n".join(map(str, parts)).casefold()
 
 
 def find_runs(store: Store, wanted: RunSearch) -> list[FoundRun]:
-    """The runs that are wanted, newest first. A root that cannot be read leaves its fields empty."""
+    """The runs that match, newest first. If a first event cannot be read, its fields are empty."""
     with store.database.reading() as connection:
         every = _every(connection)
     terms = wanted.q.casefold().split()
@@ -152,7 +152,7 @@ def _of_kind(connection: Connection, kind: str, shown: str) -> Sequence[tuple[st
     """Run and text of each event of a kind, in order; those without text are left out."""
     rows = connection.execute(
         text(
-            # Run by run, as the index goes: not through every event of the folder.
+            # Run by run, in the order of the index, to avoid reading every event of the folder.
             f"SELECT i.run_id, {shown} AS shown FROM runs AS r CROSS JOIN event_index AS i "
             "ON i.run_id = r.run_id AND i.kind = :kind CROSS JOIN events AS e "
             "ON e.run_id = i.run_id AND e.seq = i.seq WHERE json_valid(e.payload) ORDER BY i.run_id, i.seq"
@@ -165,15 +165,16 @@ def _of_kind(connection: Connection, kind: str, shown: str) -> Sequence[tuple[st
 def _about(content: str | None) -> RunAbout:
     try:
         return RunAbout.model_validate_json(content) if content else RunAbout()
-    except ValidationError:  # for the verification to find
+    except ValidationError:  # the verification reports it
         return RunAbout()
 
 
 def _accuracy(payload: str) -> Accuracy | None:
-    verdicts: list[dict[str, Any]] = json.loads(payload).get("verdicts", []) if payload else []
-    mine = [v for v in verdicts if str(v.get("measure", "")).endswith(_ERROR) and v.get("value") is not None]
-    if not mine:
+    try:
+        verdicts = GatesEvaluated.model_validate_json(payload).verdicts if payload else ()
+    except ValidationError:  # the verification reports it
         return None
-    judged = mine[0]
-    within = None if judged.get("undecided") else bool(judged.get("passed"))
-    return Accuracy(float(judged["value"]), judged.get("maximum"), within)
+    for judged in verdicts:
+        if judged.measure.endswith(_ERROR) and judged.value is not None:
+            return Accuracy(judged.value, judged.maximum, None if judged.undecided else judged.passed)
+    return None

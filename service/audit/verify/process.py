@@ -1,6 +1,6 @@
-"""Verifies one run in a process of its own, so that pages stay quick: `python -m service.audit.verify.process`.
+"""Verifies a run in a process of its own, so that pages stay fast: `python -m service.audit.verify.process`.
 
-Reads the data folder only, and ends when nobody follows it any more.
+It only reads the data folder, and ends when the process that started it ends.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from service.store.verification.verify import verify
 
 
 def verification(data: Path, run_id: str, progress: Progress) -> dict[str, object]:
-    """Verify a run: the fields of a `Verification`. Raises StoreError."""
+    """Verify a run. Returns the fields of a `Verification`. Raises StoreError."""
     begun_s = time.monotonic()
     progress("reading the events", 0, 0)
     found = verify(data, run_id, progress)

@@ -1,6 +1,6 @@
-"""Verifying a run from the screen: started by a person, done by a process of its own, its result kept in a file.
+"""Verifications started in the browser: each is done by a process of its own, and the result is kept in a file.
 
-The result is a note for people beside the data, not evidence: whoever doubts it verifies again.
+The result is a note beside the data, not evidence: if in doubt, verify again.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from service.core.records.events import Record
 from service.store.durable_effects import Clock, utc_text
 from service.store.verification.verify import AuditReport
 
-LISTED = 500  # faults that a result spells out
+LISTED = 500  # most faults listed in a result
 
 
 class VerifiedFault(Record):
-    """One thing that did not verify."""
+    """A fault that the verification found."""
 
     run_id: str | None
     seq: int | None
@@ -29,7 +29,7 @@ class VerifiedFault(Record):
 
 
 class Verification(Record):
-    """What the last verification of a run found."""
+    """The result of the last verification of a run."""
 
     at_utc: str
     by: str
@@ -46,7 +46,7 @@ class Verification(Record):
 
 
 def keep_verification(data: Path, run_id: str, kept: Verification) -> None:
-    """Put a result where the pages find it. Raises OSError."""
+    """Write a result to the file that the pages read. Raises OSError."""
     path = _path(data, run_id)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
@@ -55,7 +55,7 @@ def keep_verification(data: Path, run_id: str, kept: Verification) -> None:
 
 
 def verification_of(report: AuditReport, run_id: str, *, by: str, at_utc: str, duration_s: float) -> Verification:
-    """What a report says of one of its runs; its counts are those of all that were verified together."""
+    """The result for one run of a report; the counts are those of all runs that were verified together."""
     faults = [fault for fault in report.faults if fault.run_id in (None, run_id)]
     together = [f"verified together with {len(report.runs) - 1} other runs"] if len(report.runs) > 1 else []
     return Verification(
@@ -79,7 +79,7 @@ def _path(data: Path, run_id: str) -> Path:
 
 
 class Verifications:
-    """Of one data folder, in one web process."""
+    """The verifications of a data folder in a web process."""
 
     def __init__(self, data: Path, clock: Clock) -> None:
         self._data = data
@@ -87,23 +87,23 @@ class Verifications:
         self._children = ChildProcesses("service.audit.verify.process", "verification", clock)
 
     def last(self, run_id: str) -> Verification | None:
-        """The last result; None when there is none that can be read."""
+        """The last result; None if there is none that can be read."""
         try:
             return Verification.model_validate_json(_path(self._data, run_id).read_bytes())
         except (OSError, ValidationError):
             return None
 
     def running(self, run_id: str) -> ChildState | None:
-        """How far the present one is; with a `problem`, why the last one gave no result."""
+        """The state of the present verification; `problem` says why the last one gave no result."""
         state = self._children.state(run_id)
         return state if state is not None and state.result is None else None
 
     def start(self, run_id: str, by: str) -> None:
-        """Begin one, unless one is under way."""
+        """Start a verification, unless one is running."""
         self._children.start(run_id, [str(self._data), run_id], by=by, keep=lambda ended: self._keep(run_id, ended))
 
     def wait(self, run_id: str, timeout_s: float) -> None:
-        """Until the present one has ended."""
+        """Wait until the present verification has ended."""
         self._children.wait(run_id, timeout_s)
 
     def _keep(self, run_id: str, ended: ChildState) -> None:

@@ -20,7 +20,7 @@ from service.cli.common import (
 )
 from service.core.text.counts import counted
 from service.core.units import gigabytes
-from service.store.backup.backup import BackupReport, back_up
+from service.store.backup.backup import BackupOptions, BackupReport, back_up
 from service.store.backup.restore import RestoreReport, restore
 
 
@@ -44,7 +44,7 @@ def backup_command(
     the copied data does not verify.
     """
     with reporting_errors(json), progress_bar(quiet=json) as progress:
-        made = back_up(data, destination, with_keys=with_keys, read_all=read_all, keep=keep, progress=progress)
+        made = back_up(data, destination, BackupOptions(with_keys, read_all, keep), progress=progress)
     if json:
         print_json(_backup_json(made))
     else:

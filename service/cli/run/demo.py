@@ -121,7 +121,7 @@ def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
     T_world_camera = {exposure["sha256"]: np.array(exposure["T_world_camera"]) for exposure in exposures}
     T_scan_world = inverse(np.array(truth["scans"][-1]["T_world_scan"]))
     photographs = {capture.viewpoint: capture.artefacts[0].sha256 for capture in summary.captures()}
-    centre_scan_m = np.array(summary.result("scan_import")["spheres_m"]).mean(axis=0)
+    centre_scan_m = np.array(summary.scan_spheres_m()).mean(axis=0)
     errors: dict[str, float] = {}
     for source, registration in summary.registrations().items():
         cameras = registration.T_scan_camera

@@ -6,7 +6,7 @@ import dataclasses
 import importlib.util
 import shutil
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.markup import escape
@@ -24,7 +24,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.run.commands import RigOption
-from service.core.equipment.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, offset_told
+from service.core.equipment.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, clock_offset_words
 from service.core.equipment.disk_space import Forecast, Usage, forecast
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.protocol.models import Protocol, load_protocol
@@ -110,13 +110,13 @@ def _clock_words(clock: HostClock) -> str:
     return "is not known to be set" if clock.synchronised is None else "is not set by the network's time"
 
 
-def _offset_words(offset_s: float, clock: str, *, late: bool) -> str:
+def _offset_words(offset_s: float, clock: Literal["utc", "uptime"], *, late: bool) -> str:
     if clock == "uptime":
         return (
             f"its clock counts from when it was switched on, {offset_s:+.3f} s from this machine's count: that is "
             "normal, only a change during a run matters"
         )
-    words = f"clock {offset_told(offset_s, clock)}"
+    words = f"clock {clock_offset_words(offset_s, clock)}"
     if not late:
         return words
     return (

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+from service.core.equipment.recorded_devices import RecordedIdentity, recorded_optics, recorded_report
 from service.core.records.events import DeviceOpened, Event, View
 
 
@@ -22,10 +22,9 @@ class CameraBodies:
     wires: Mapping[str, str]
     stated: tuple[str, ...]
 
-    def shown(self, identity: Mapping[str, Any]) -> str:
+    def shown(self, identity: RecordedIdentity) -> str:
         """The serial number to show for a device: for a camera that of the body, as its photographs state it."""
-        wire = str(identity.get("serial") or "")
-        return self._own(wire) if identity.get("kind") == "camera" else wire
+        return self._own(identity.serial) if identity.kind == "camera" else identity.serial
 
     def _own(self, wire: str) -> str:
         return next((number for number in self.stated if wire and _same(wire, number)), wire)
@@ -56,21 +55,19 @@ class CameraBodies:
 def bodies(events: Sequence[Event]) -> CameraBodies:
     """The serial numbers in a run's events."""
     opened = [event.payload for event in events if isinstance(event.payload, DeviceOpened)]
-    stated = (event.payload.camera.get("body_serial") for event in events if isinstance(event.payload, View))
-    identities = ((payload.device, payload.report.get("identity") or {}) for payload in opened)
-    return bodies_of(identities, (str(number or "") for number in stated))
+    views = (event.payload for event in events if isinstance(event.payload, View))
+    identities = ((payload.device, recorded_report(payload.report).identity) for payload in opened)
+    return bodies_of(identities, (recorded_optics(view.camera).body_serial for view in views))
 
 
-def bodies_of(identities: Iterable[tuple[str, Mapping[str, Any]]], stated: Iterable[str]) -> CameraBodies:
+def bodies_of(identities: Iterable[tuple[str, RecordedIdentity]], stated: Iterable[str]) -> CameraBodies:
     """The serial numbers of cameras.
 
     Args:
         identities: (name in rig.yaml, identity in its DeviceReport) of each opened device.
         stated: serial numbers in the photographs; "" is ignored.
     """
-    wires = {
-        str(identity.get("serial") or ""): name for name, identity in identities if identity.get("kind") == "camera"
-    }
+    wires = {identity.serial: name for name, identity in identities if identity.kind == "camera"}
     return CameraBodies(wires, tuple(dict.fromkeys(number for number in stated if number)))
 
 

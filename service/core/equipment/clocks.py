@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Any, Literal
+from typing import Literal
 
+from service.core.equipment.recorded_devices import RecordedReport, recorded_optics, recorded_report
 from service.core.records.events import DeviceOpened, Event, SessionStarted, ViewpointCaptured
 
 #: Limits. EXIF times may be whole seconds, and a release takes part of one. A host synchronised over the network is a
@@ -85,19 +86,13 @@ class ClockReading:
         return f"{what}: more than {self.limit_s:g} s. Set it: times in the record are compared with it"
 
 
-def offset_told(offset_s: float | None, clock: str) -> str:
-    """The clock offset in words that a device reported when it was opened; `clock` is "utc" or "uptime"."""
+def clock_offset_words(offset_s: float | None, clock: Literal["utc", "uptime"]) -> str:
+    """The clock offset in words that a device reported when it was opened."""
     if clock == "uptime":
         return "counts from when it was switched on: only its drift matters"
     if offset_s is None:
         return "not reported"
     return f"{abs(offset_s):.3f} s {'ahead of' if offset_s > 0 else 'behind'} this machine's"
-
-
-def clock_of(report: Mapping[str, Any]) -> str:
-    """The clock of a recorded DeviceReport, "utc" or "uptime"; in old records the device's kind decides."""
-    kind = str((report.get("identity") or {}).get("kind", ""))
-    return str(report.get("clock") or ("uptime" if kind == "robot" else "utc"))
 
 
 def clock_readings(events: Sequence[Event]) -> tuple[ClockReading, ...]:
@@ -120,29 +115,30 @@ def clock_readings(events: Sequence[Event]) -> tuple[ClockReading, ...]:
             clock = payload.host_clock
             note = "" if clock.synchronised else "not set by the network"
             host = [ClockReading("host", "NTP", clock.offset_s, HOST_LIMIT_S, event.at_utc, note)]
-    kinds = Counter(_kind(event) for event in opened.values())
+    reports = {name: _report(event) for name, event in opened.items()}
+    kinds = Counter(report.identity.kind for report in reports.values())
     # A capture does not say which of several cameras or arms it came from.
-    of_captures = {name for name, event in opened.items() if kinds[_kind(event)] == 1}
+    of_captures = {name for name, report in reports.items() if kinds[report.identity.kind] == 1}
     found: list[ClockReading] = []
     for name, event in opened.items():
         since = (first[name], newest) if name in first and newest is not None and name in of_captures else None
-        found += _readings(name, event, since)
+        found += _readings(name, event, reports[name], since)
     return (*host, *found)
 
 
-def _kind(opened: Event) -> str:
+def _report(opened: Event) -> RecordedReport:
     assert isinstance(opened.payload, DeviceOpened)
-    return str((opened.payload.report.get("identity") or {}).get("kind", ""))
+    return recorded_report(opened.payload.report)
 
 
-def _readings(name: str, opened: Event, captures: tuple[Event, Event] | None) -> list[ClockReading]:
+def _readings(
+    name: str, opened: Event, report: RecordedReport, captures: tuple[Event, Event] | None
+) -> list[ClockReading]:
     """The readings of one device from its last opening and the first and newest image since."""
-    assert isinstance(opened.payload, DeviceOpened)
-    kind, report = _kind(opened), opened.payload.report
-    if clock_of(report) == "uptime":
+    if report.clock == "uptime":
         return [_drift(name, opened, captures)]
-    offset_s, at_utc = report.get("clock_offset_s"), opened.at_utc
-    if kind == "camera" and captures is not None:
+    offset_s, at_utc = report.clock_offset_s, opened.at_utc
+    if report.identity.kind == "camera" and captures is not None:
         of_image_s = _exif_offset_s(captures[1])
         if of_image_s is not None:
             offset_s, at_utc = of_image_s, captures[1].at_utc
@@ -167,7 +163,7 @@ def _exif_offset_s(event: Event) -> float | None:
     payload = event.payload
     assert isinstance(payload, ViewpointCaptured)
     try:
-        stamp = datetime.strptime(str(payload.camera.get("exif_time", "")), "%Y:%m:%d %H:%M:%S.%f%z")
+        stamp = datetime.strptime(recorded_optics(payload.camera).exif_time, "%Y:%m:%d %H:%M:%S.%f%z")
         recorded = datetime.fromisoformat(event.at_utc)
     except ValueError:
         return None

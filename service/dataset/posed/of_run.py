@@ -47,8 +47,8 @@ def data_set_of(summary: RunSummary, not_in_yet: Sequence[str] = (), *, personal
         DataError: the run has no evaluated registration, no scan, or no registered image.
     """
     own = summary.best()
-    spheres = summary.result("scan_import").get("spheres_m")
-    if own is None or spheres is None:
+    spheres = summary.scan_spheres_m()
+    if own is None or not spheres:
         raise DataError("the run has no evaluated registration", where=summary.run_id, remedy="Finish the run first")
     registered = summary.registrations()[own]
     files = _photographs(summary, registered)
@@ -84,7 +84,7 @@ def data_set_of(summary: RunSummary, not_in_yet: Sequence[str] = (), *, personal
 
 def specimen_pixels(summary: RunSummary, view: View) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """(H, W) pixels between the spheres, which stand around the specimen."""
-    return hull_mask(view.camera, view.T_world_camera, np.array(summary.result("scan_import")["spheres_m"]))
+    return hull_mask(view.camera, view.T_world_camera, np.array(summary.scan_spheres_m()))
 
 
 def _photographs(summary: RunSummary, registered: Registration) -> dict[str, tuple[Path, str]]:
@@ -125,7 +125,7 @@ def _markers(summary: RunSummary, views: Sequence[View], mesh: Mesh) -> tuple[tu
     radius_m = metres(summary.protocol.spheres.radius_mm)
     balls, extra = (
         tuple(Ball(np.array(centre), radius_m) for centre in centres)
-        for centres in (summary.result("scan_import")["spheres_m"], control_spheres(summary))
+        for centres in (summary.scan_spheres_m(), control_spheres(summary))
     )
     return (*balls, *extra), _posts(balls, mesh, views)
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+from service.jobs.calibration.records import HandEye, Intrinsics
 from service.jobs.kind import JobKind, JobRecord
-from service.jobs.records import ArmCorrection, BoardSize, Camera, Hash, Matrix, ParameterCovariance, Photograph
+from service.jobs.records import BoardSize, Camera, Hash, Matrix, Photograph
 
 
 class Arguments(BoardSize):
@@ -24,48 +25,6 @@ class Arguments(BoardSize):
     camera: Camera | None = None
     corners: tuple[Hash | None, ...] | None = None
     known: dict[str, Any] | None = None
-
-
-class Spread(JobRecord):
-    """Uncertainty of T_flange_camera: (6, 6) covariance of translation (m), then rotation (rad)."""
-
-    covariance: Matrix
-
-
-class Residuals(JobRecord):
-    """Errors of each held-out board image, by name."""
-
-    held_out_mm: dict[str, float]
-    held_out_deg: dict[str, float]
-
-
-class ArmAnswer(ArmCorrection):
-    """The hand-eye calibration with the arm's errors corrected."""
-
-    sigma: Spread
-    residuals: Residuals
-
-
-class HandEye(JobRecord):
-    """Where the camera is on the flange (service/compute/calibration/hand_eye/record.py)."""
-
-    T_flange_camera: Matrix
-    T_base_board: Matrix | None = None
-    sigma: Spread
-    residuals: Residuals
-    arm_correction: ArmAnswer | None = None
-
-    @property
-    def best(self) -> HandEye | ArmAnswer:
-        """The calibration that the registration uses: with the arm's correction, if there is one."""
-        return self.arm_correction or self
-
-
-class Intrinsics(JobRecord):
-    """Uncertainty and warnings of the intrinsics (service/compute/calibration/intrinsics/record.py)."""
-
-    covariance: ParameterCovariance | None = None
-    warnings: tuple[str, ...] = ()
 
 
 class CalibrationDetails(JobRecord):

@@ -46,13 +46,29 @@ class BackupReport:
     present: int  # number of files already there from earlier backups
 
 
+@dataclass(frozen=True, slots=True)
+class BackupOptions:
+    """What a backup does beside copying what is new.
+
+    Attributes:
+        with_keys: also copy the private signing key.
+        read_all: hash again every file that earlier backups copied, and copy altered ones again.
+        keep: number of newest states to keep; None keeps all. If this state has faults, none is discarded.
+    """
+
+    with_keys: bool = False
+    read_all: bool = False
+    keep: int | None = None
+
+
+_NEW_FILES_ONLY = BackupOptions()
+
+
 def back_up(
     data_dir: Path,
     destination: Path,
+    options: BackupOptions = _NEW_FILES_ONLY,
     *,
-    with_keys: bool = False,
-    read_all: bool = False,
-    keep: int | None = None,
     progress: Progress | None = None,
     files: Files | None = None,
     clock: Clock | None = None,
@@ -62,9 +78,7 @@ def back_up(
     Args:
         data_dir: the data folder, which a run may be using.
         destination: the folder of backups: new, empty, or with earlier backups of this data folder.
-        with_keys: also copy the private signing key.
-        read_all: hash again every file that earlier backups copied, and copy altered ones again.
-        keep: number of newest states to keep; None keeps all. If this state has faults, none is discarded.
+        options: what else to do.
         progress: called with the number of bytes copied.
         files: durable file operations.
         clock: gives the state its name.
@@ -88,7 +102,7 @@ def back_up(
         folder.discard_unfinished()
         at_utc = utc_text((clock or SystemClock()).utc_now())
         name = at_utc.replace(":", "").replace("-", "")
-        return _Backup(data_dir, folder, name, at_utc, with_keys, read_all, progress or _silent).make(keep)
+        return _Backup(data_dir, folder, name, at_utc, options, progress or _silent).make()
 
 
 def _silent(_what: str, _done: int, _total: int) -> None:
@@ -110,26 +124,20 @@ class _Backup:
     folder: BackupFolder
     name: str
     at_utc: str
-    with_keys: bool
-    read_all: bool
+    options: BackupOptions
     progress: Progress
 
-    def make(self, keep: int | None) -> BackupReport:
-        files, part = self.folder.files, self.folder.path(self.name + PART)
-        files.make_directory(part)
+    def make(self) -> BackupReport:
+        part = self.folder.path(self.name + PART)
+        self.folder.files.make_directory(part)
         database_sha256 = self._copy_database(part)
-        copy = open_read_only(part, files)
-        try:
-            with copy.reading() as connection:
-                holds, signed = _holds(connection), _signed(connection)
-        finally:
-            copy.close()
+        holds, signed = self._read_copy(part)
         signatures_sha256 = self._copy_signatures(part, signed)
         self._require_same_site(holds)
         missing = self._missing(holds.sizes)
         self._require_space({sha256: holds.sizes[sha256] for sha256 in missing})
         lost = self._copy_files(missing, holds.sizes)
-        if self.with_keys:
+        if self.options.with_keys:
             self._copy_keys(part)
         checked = audit.verify(part, files=False)
         state = BackupState(
@@ -142,19 +150,33 @@ class _Backup:
             artefact_bytes=sum(holds.sizes.values()),
             heads=holds.heads,
             root_sha256=holds.root_sha256,
-            with_keys=self.with_keys,
+            with_keys=self.options.with_keys,
             faults=(*lost, *(str(fault) for fault in checked.faults)),
         )
+        self._publish(part, state)
+        copied = [sha256 for sha256 in missing if (self.folder.artefacts.folder / relative_path(sha256)).exists()]
+        size = sum(holds.sizes[sha256] for sha256 in copied)
+        return BackupReport(self.folder.folder, self.name, state, len(copied), size, len(holds.sizes) - len(missing))
+
+    def _publish(self, part: Path, state: BackupState) -> None:
+        """Give the finished state its name, and discard the oldest ones beyond the number to keep."""
+        files = self.folder.files
         self._write(part / STATE_FILE, state.model_dump_json(indent=1).encode())
         files.sync_directory(part)
         files.rename(part, self.folder.path(self.name))
         files.sync_directory(part.parent)
-        if keep is not None and not state.faults:
-            for old in self.folder.states()[: -max(keep, 1)]:
+        if self.options.keep is not None and not state.faults:
+            for old in self.folder.states()[: -max(self.options.keep, 1)]:
                 self.folder.discard(self.folder.path(old))
-        copied = [sha256 for sha256 in missing if (self.folder.artefacts.folder / relative_path(sha256)).exists()]
-        size = sum(holds.sizes[sha256] for sha256 in copied)
-        return BackupReport(self.folder.folder, self.name, state, len(copied), size, len(holds.sizes) - len(missing))
+
+    def _read_copy(self, part: Path) -> tuple[_ReferencedFiles, set[tuple[str, int]]]:
+        """What the copied database refers to, and the (run, seq) of its signatures."""
+        copy = open_read_only(part, self.folder.files)
+        try:
+            with copy.reading() as connection:
+                return _holds(connection), _signed(connection)
+        finally:
+            copy.close()
 
     def _copy_database(self, part: Path) -> str:
         """Copy in one step of SQLite's backup, which gives one consistent state. Returns the copy's SHA-256."""
@@ -216,7 +238,7 @@ class _Backup:
         for sha256, size in sizes.items():
             path = self.folder.artefacts.folder / relative_path(sha256)
             whole = path.is_file() and path.stat().st_size == size
-            if whole and self.read_all:
+            if whole and self.options.read_all:
                 whole = hash_file(path)[0] == sha256
                 self.progress("reading earlier copies again", done, total)
             done += size

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, func, insert, select, true, update
+from sqlalchemy import ColumnElement, Connection, Row, and_, func, insert, select, true, update
 
 from service.core.jobs.priorities import EARLY, Lane
 from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished, StepNote
@@ -89,40 +90,37 @@ def started(connection: Connection, run_id: str) -> dict[str, str]:
     return {row.job_id: row.started_utc for row in connection.execute(running)}
 
 
+@dataclass(frozen=True, slots=True)
+class JobChoice:
+    """Which jobs a worker may claim; None allows every kind, every run, every lane."""
+
+    kinds: Collection[str] | None = None
+    run_id: str | None = None
+    lane: Lane | None = None
+
+    def condition(self) -> ColumnElement[bool]:
+        """The choice as a condition on the rows of `jobs`."""
+        return and_(
+            _of_lane(self.lane),
+            true() if self.kinds is None else jobs.c.kind.in_(tuple(self.kinds)),
+            true() if self.run_id is None else jobs.c.run_id == self.run_id,
+        )
+
+
 def claim(
-    connection: Connection,
-    clock: Clock,
-    ids: IdSource,
-    *,
-    worker: str,
-    lease_s: float,
-    kinds: Collection[str] | None,
-    run_id: str | None,
-    lane: Lane | None = None,
+    connection: Connection, clock: Clock, ids: IdSource, *, worker: str, lease_s: float, choice: JobChoice
 ) -> Job | None:
     """Claim the oldest job of the highest priority that is queued or that its worker has lost; None if there is none.
 
-    A worker loses a job when it dies or its lease expires. `kinds`, `run_id` and `lane` restrict the choice. A job
-    that has lost its worker `try_limit` times is failed here, so that it is not retried for ever.
+    A worker loses a job when it dies or its lease expires. A job that has lost its worker `try_limit` times is failed
+    here, so that it is not retried for ever.
     """
     now = clock.utc_now()
-    statement = select(jobs).where(jobs.c.state.in_(("queued", "running"))).order_by(jobs.c.priority, jobs.c.position)
-    statement = statement.where(_of_lane(lane))
-    if kinds is not None:
-        statement = statement.where(jobs.c.kind.in_(tuple(kinds)))
-    if run_id is not None:
-        statement = statement.where(jobs.c.run_id == run_id)
-    for row in connection.execute(statement).all():
-        if row.state == "running":
-            if now.timestamp() < row.until_utc_s and identity_of(row).life() != "dead":
-                continue
-            _note(connection, clock, row, actor=ACTOR, note="job_lease_lost", data={"worker": row.worker})
-            if row.tries >= row.try_limit:
-                message = f"the worker died or stopped answering {row.tries} times"
-                _end_failed(
-                    connection, clock, row, worker=row.worker, error="WorkerLost", message=message, actor=ACTOR
-                )
-                continue
+    unfinished = jobs.c.state.in_(("queued", "running"))
+    ordered = select(jobs).where(unfinished, choice.condition()).order_by(jobs.c.priority, jobs.c.position)
+    for row in connection.execute(ordered).all():
+        if row.state == "running" and not _take_over(connection, clock, row):
+            continue
         connection.execute(
             update(jobs)
             .where(jobs.c.job_id == row.job_id)
@@ -138,6 +136,18 @@ def claim(
         )
         return to_job(connection.execute(select(jobs).where(jobs.c.job_id == row.job_id)).one())
     return None
+
+
+def _take_over(connection: Connection, clock: Clock, row: Row[Any]) -> bool:
+    """Whether another worker may have this running job. Records the loss of its worker, and fails it at its limit."""
+    if clock.utc_now().timestamp() < row.until_utc_s and identity_of(row).life() != "dead":
+        return False
+    _note(connection, clock, row, actor=ACTOR, note="job_lease_lost", data={"worker": row.worker})
+    if row.tries < row.try_limit:
+        return True
+    message = f"the worker died or stopped answering {row.tries} times"
+    _end_failed(connection, clock, row, actor=ACTOR, error="WorkerLost", message=message)
+    return False
 
 
 def _of_lane(lane: Lane | None) -> ColumnElement[bool]:
@@ -179,16 +189,7 @@ def fail(
     """
     row = held_row(connection, job)
     if not retry or row.tries >= row.try_limit:
-        end = _end_failed(
-            connection,
-            clock,
-            row,
-            worker=row.worker,
-            error=error,
-            message=message,
-            actor=row.worker,
-            traceback=traceback,
-        )
+        end = _end_failed(connection, clock, row, actor=row.worker, error=error, message=message, traceback=traceback)
         return [end]
     event = _note(
         connection,
@@ -237,10 +238,9 @@ def _end_failed(
     clock: Clock,
     row: Row[Any],
     *,
-    worker: str,
+    actor: str,
     error: str,
     message: str,
-    actor: str,
     traceback: str = "",
 ) -> Event:
     payload = JobFailed(
@@ -248,7 +248,7 @@ def _end_failed(
         job_kind=row.kind,
         step=row.step,
         attempt=row.attempt,
-        worker=worker,
+        worker=row.worker,
         error=error,
         message=message,
         traceback=traceback,

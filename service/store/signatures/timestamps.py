@@ -68,7 +68,15 @@ def timestamp(store: Store, signed: Checkpoint, authority: Authority) -> Timesta
         if (present.seq, present.authority) == (signed.seq, authority.url):
             return present
     asked_utc = utc_text(store.clock.utc_now())
-    message = stamped_bytes(signed)
+    reply = _request(stamped_bytes(signed), authority)
+    found = Timestamp(signed.run_id, signed.seq, authority.url, asked_utc, base64.b64encode(reply).decode())
+    _keep(store, found)
+    checkpoint(store, SITE)
+    return found
+
+
+def _request(message: bytes, authority: Authority) -> bytes:
+    """The authority's answer, verified (DER). Raises TimestampError."""
     request = TimestampRequestBuilder().data(message).hash_algorithm(HashAlgorithm.SHA256).build()
     try:
         reply = _post_within(authority, request.as_bytes())
@@ -82,7 +90,11 @@ def timestamp(store: Store, signed: Checkpoint, authority: Authority) -> Timesta
             where=authority.url,
             remedy="Check the network, address and certificates in the rig file; the checkpoint is valid without it",
         ) from error
-    found = Timestamp(signed.run_id, signed.seq, authority.url, asked_utc, base64.b64encode(reply).decode())
+    return reply
+
+
+def _keep(store: Store, found: Timestamp) -> None:
+    """Store a stamp and record it in the site's chain, unless one of this authority is already there."""
     with store.database.writing() as connection:
         taken = select(timestamps.c.seq).where(
             timestamps.c.run_id == found.run_id,
@@ -107,8 +119,6 @@ def timestamp(store: Store, signed: Checkpoint, authority: Authority) -> Timesta
                 token_sha256=sha256_text(found.token),
             )
             store.append_site(connection, [kept], actor="service")
-    checkpoint(store, SITE)
-    return found
 
 
 def stamp_end(store: Store, run_id: str, authority: Authority | None) -> None:

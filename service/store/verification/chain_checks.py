@@ -92,24 +92,27 @@ class ChainFacts:
             self.heads_at_start.append((seq, payload["heads"]))
 
 
+@dataclass(frozen=True, slots=True)
+class ChainRows:
+    """The rows of one run, or of the site, in the order of the events."""
+
+    runs: Rows
+    heads: Rows
+    events: Iterable[Mapping[Any, Any]]
+    artefacts: Rows
+    jobs: Rows
+
+
 def run_faults(
-    run_id: str,
-    *,
-    run_rows: Rows,
-    head_rows: Rows,
-    event_rows: Iterable[Mapping[Any, Any]],
-    artefact_rows: Rows,
-    job_rows: Rows,
-    files: Mapping[str, FileState] | None,  # None: not read
-    facts: ChainFacts,
+    run_id: str, rows: ChainRows, files: Mapping[str, FileState] | None, facts: ChainFacts
 ) -> Iterator[Fault]:
-    """Every fault of one run: first by event, then of the run as a whole. Fills `facts`."""
+    """Every fault of one run: first by event, then of the run as a whole. Fills `facts`; `files` None: not read."""
     by_seq: dict[int, list[Mapping[str, Any]]] = {}
-    for row in artefact_rows:
+    for row in rows.artefacts:
         by_seq.setdefault(int(row["seq"]), []).append(row)
     recorded: set[tuple[str, int]] = set()
     seq, previous = 0, ROOT
-    for row in event_rows:
+    for row in rows.events:
         yield from _link_faults(run_id, row, seq, previous)
         seq, previous = int(row["seq"]), str(row["sha256"])
         facts.sha256_at[seq] = previous
@@ -126,8 +129,8 @@ def run_faults(
         for item in left:
             what = f"artefact {item['original_name']} ({item['sha256']}) belongs to an event that is not there"
             yield Fault(run_id, int(item["seq"]), "", what)
-    yield from _end_faults(run_id, run_rows, head_rows, facts.first, (seq, previous))
-    yield from _job_faults(run_id, job_rows, facts.jobs, facts.jobs_utc)
+    yield from _end_faults(run_id, rows.runs, rows.heads, facts.first, (seq, previous))
+    yield from _job_faults(run_id, rows.jobs, facts.jobs, facts.jobs_utc)
 
 
 def chain_fault(

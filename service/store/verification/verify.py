@@ -2,33 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-from sqlalchemy import Connection, Table, select, text
+from sqlalchemy import Connection
 
 from service.core.errors import StoreError
 from service.store.database.engine import DATABASE_NAME, RESTORE, database_path, open_read_only
-from service.store.database.tables import (
-    accounts,
-    artefacts,
-    checkpoints,
-    events,
-    heads,
-    invitations,
-    jobs,
-    runs,
-    sessions,
-)
 from service.store.database.wal import wal_findings
 from service.store.durable_effects import DurableFiles
 from service.store.errors import UnknownRunError
 from service.store.events import read_events
-from service.store.files.artefacts import TEMPORARY, hash_file, read_artefacts, relative_path
-from service.store.records import SITE, Artefact, Checkpoint, RunRow, Timestamp
-from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
+from service.store.files.artefacts import read_artefacts
+from service.store.records import SITE, Artefact, RunRow
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import log_findings, read_log
 from service.store.signatures.log_copy import copy_faults
@@ -38,10 +25,10 @@ from service.store.verification import chain_checks as checks
 from service.store.verification import derived_checks as derived
 from service.store.verification import signature_checks as signatures
 from service.store.verification.chain_checks import ChainFacts, Fault, FileState
+from service.store.verification.evidence_rows import EvidenceRows, database_damage, event_rows, read_evidence
+from service.store.verification.file_checks import Progress, hash_files, unlisted_files
 from service.store.verification.people_checks import people_faults
 from service.store.verification.search_checks import word_faults
-
-Progress = Callable[[str, int, int], None]  # (activity, bytes done, bytes in total)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,15 +131,10 @@ def _verify_readable(
     try:
         return _verify(data_dir, connection, run_id, progress, certificates, with_files=with_files)
     except (TypeError, ValueError, LookupError, ArithmeticError) as error:
-        damage = _damage(connection)
+        damage = database_damage(connection)
         if not damage:
             raise
         raise StoreError(damage[0], where=str(database_path(data_dir)), remedy=RESTORE) from error
-
-
-def _damage(connection: Connection) -> tuple[str, ...]:
-    found = connection.execute(text("PRAGMA integrity_check(5)")).scalars()
-    return tuple(f"SQLite finds the database damaged: {line}" for line in found if line != "ok")
 
 
 def _verify(
@@ -164,80 +146,118 @@ def _verify(
     *,
     with_files: bool,
 ) -> AuditReport:
-    evidence = _read(connection, run_id)
+    evidence = read_evidence(connection, run_id)
     folder = data_dir / "artefacts"
-    files, hashed = _hash_files(folder, evidence, progress) if with_files else (None, 0)
-    chains = {SITE: ChainFacts()} | {run: ChainFacts() for run in evidence.run_ids}
-    found: dict[str, list[Fault]] = {run: [] for run in chains}
-    for run, facts in chains.items():
-        if run == SITE and not evidence.has_site:
-            continue
-        found[run] += checks.run_faults(
-            run,
-            run_rows=evidence.runs.get(run, []),
-            head_rows=evidence.heads.get(run, []),
-            event_rows=_stream(connection, run),
-            artefact_rows=evidence.artefacts.get(run, []),
-            job_rows=evidence.jobs.get(run, []),
-            files=files,
-            facts=facts,
-        )
+    artefact_rows = (row for rows in evidence.artefacts.values() for row in rows)
+    files = hash_files(folder, artefact_rows, progress) if with_files else None
+    chains, found = _check_chains(connection, evidence, files)
     site = chains[SITE]
     keys = signatures.key_history(site, evidence.checkpoints[SITE])
     found[SITE] += keys.faults
+    stamps_differ = tuple(signatures.stamp_faults(site, evidence.checkpoints, evidence.timestamps))
+    check = _SignatureCheck(evidence, site, keys.periods, stamps_differ, certificates)
     notes = list(keys.notes)
-    unsigned: dict[str, int] = {}
-    stamps = 0
-    kept = list(signatures.stamp_faults(site, evidence.checkpoints, evidence.timestamps))
     for run, facts in chains.items():
-        signed = evidence.checkpoints[run]
-        rows = evidence.artefacts.get(run, [])
-        found[run] += signatures.checkpoint_faults(run, signed, facts, site, keys.periods, rows)
-        found[run] += signatures.start_faults(run, facts, site)
-        found[run] += signatures.unsigned_end_faults(run, signed, facts)
-        faults, said = timestamp_findings(signed, evidence.timestamps[run], certificates)
+        faults, said = check.findings(run, facts)
         found[run] += faults
-        found[run] += [fault for fault in kept if fault.run_id == run and not faults]
-        count, note = signatures.unsigned(run, signed, len(facts.sha256_at))
-        notes += [*said, *([note] if note else [])]
-        if run in evidence.run_ids:
-            unsigned[run] = count
-            stamps += len(evidence.timestamps[run])
-    orphans, foreign = _unlisted(folder, evidence.every_sha256) if with_files else ([], [])
+        notes += said
+    orphans, foreign = unlisted_files(folder, evidence.every_sha256) if with_files else ([], [])
     if not with_files:
         notes.append("the files were not read again: only records and signatures were checked")
     public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
     of_log, said_of_log = log_findings(
         read_log(data_dir / LOG_NAME), evidence.checkpoints, public_keys, awaited=bool(site.key_changes)
     )
-    notes += said_of_log
+    every_run = run_id is None
     ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]
-    faults = [Fault(None, None, DATABASE_NAME, problem) for problem in evidence.damage]
-    faults += [fault for run in ordered for fault in found[run]]
-    faults += signatures.signed_run_faults(site, chains, every_run=run_id is None)
-    faults += of_log
-    faults += foreign
-    faults += derived.schema_faults(connection)
-    faults += derived.reference_faults(connection)
-    faults += derived.index_faults(connection, ordered, every_run=run_id is None)
-    faults += derived.queue_faults(connection, ordered)
-    faults += word_faults(connection, ordered)
-    faults += people_faults(site.people, evidence.accounts, evidence.links, evidence.sessions)
+    faults = [
+        *(Fault(None, None, DATABASE_NAME, problem) for problem in evidence.damage),
+        *(fault for run in ordered for fault in found[run]),
+        *signatures.signed_run_faults(site, chains, every_run=every_run),
+        *of_log,
+        *foreign,
+        *_derived_faults(connection, ordered, every_run=every_run),
+        *people_faults(site.people, evidence.accounts, evidence.links, evidence.sessions),
+    ]
+    counted = _counted(data_dir, evidence, chains, files or {})
+    return replace(counted, key_ids=tuple(keys.periods), faults=tuple(faults), notes=(*notes, *said_of_log, *orphans))
+
+
+def _check_chains(
+    connection: Connection, evidence: EvidenceRows, files: Mapping[str, FileState] | None
+) -> tuple[dict[str, ChainFacts], dict[str, list[Fault]]]:
+    """The facts and the faults of the site's chain and of each run's, by run; `files` None: they were not read."""
+    chains = {SITE: ChainFacts()} | {run: ChainFacts() for run in evidence.run_ids}
+    found: dict[str, list[Fault]] = {run: [] for run in chains}
+    for run, facts in chains.items():
+        if run != SITE or evidence.has_site:
+            rows = checks.ChainRows(
+                runs=evidence.runs.get(run, []),
+                heads=evidence.heads.get(run, []),
+                events=event_rows(connection, run),
+                artefacts=evidence.artefacts.get(run, []),
+                jobs=evidence.jobs.get(run, []),
+            )
+            found[run] += checks.run_faults(run, rows, files, facts)
+    return chains, found
+
+
+@dataclass(frozen=True, slots=True)
+class _SignatureCheck:
+    """What the signatures and time stamps of every chain are checked against."""
+
+    evidence: EvidenceRows
+    site: ChainFacts
+    keys: Mapping[str, signatures.KeyPeriod]
+    stamps_differ: Sequence[Fault]  # time stamps that differ from those recorded in the site's chain
+    certificates: Path | None
+
+    def findings(self, run: str, facts: ChainFacts) -> tuple[list[Fault], list[str]]:
+        """Faults and notes of one chain."""
+        signed = self.evidence.checkpoints[run]
+        rows = self.evidence.artefacts.get(run, [])
+        stamped, notes = timestamp_findings(signed, self.evidence.timestamps[run], self.certificates)
+        faults = [
+            *signatures.checkpoint_faults(run, signed, facts, self.site, self.keys, rows),
+            *signatures.start_faults(run, facts, self.site),
+            *signatures.unsigned_end_faults(run, signed, facts),
+            *stamped,
+            *(fault for fault in self.stamps_differ if fault.run_id == run and not stamped),
+        ]
+        _, note = signatures.unsigned(run, signed, len(facts.sha256_at))
+        return faults, [*notes, *([note] if note else [])]
+
+
+def _derived_faults(connection: Connection, runs: Sequence[str], *, every_run: bool) -> Iterator[Fault]:
+    """Faults of the schema and of what is derived from the events: references, indexes, queue, words."""
+    yield from derived.schema_faults(connection)
+    yield from derived.reference_faults(connection)
+    yield from derived.index_faults(connection, runs, every_run=every_run)
+    yield from derived.queue_faults(connection, runs)
+    yield from word_faults(connection, runs)
+
+
+def _counted(
+    data_dir: Path, evidence: EvidenceRows, chains: Mapping[str, ChainFacts], files: Mapping[str, FileState]
+) -> AuditReport:
+    """The figures of a report, without faults and notes."""
+    events = {run: len(chains[run].sha256_at) for run in evidence.run_ids}
+    signed = evidence.checkpoints
     return AuditReport(
         data_dir=str(data_dir),
         runs=evidence.run_ids,
         heads={row["run_id"]: row["sha256"] for heads in evidence.heads.values() for row in heads},
-        events=sum(len(chains[run].sha256_at) for run in evidence.run_ids),
+        events=sum(events.values()),
         artefacts=sum(len(evidence.artefacts.get(run, [])) for run in evidence.run_ids),
-        files=len(files or {}),
-        bytes_hashed=hashed,
+        files=len(files),
+        bytes_hashed=sum(state.size for state in files.values()),
         jobs=sum(len(evidence.jobs.get(run, [])) for run in evidence.run_ids),
-        checkpoints=sum(len(evidence.checkpoints[run]) for run in evidence.run_ids),
-        timestamps=stamps,
-        unsigned_events=unsigned,
-        key_ids=tuple(keys.periods),
-        faults=tuple(faults),
-        notes=(*notes, *orphans),
+        checkpoints=sum(len(signed[run]) for run in evidence.run_ids),
+        timestamps=sum(len(evidence.timestamps[run]) for run in evidence.run_ids),
+        unsigned_events={run: signatures.unsigned(run, signed[run], events[run])[0] for run in evidence.run_ids},
+        key_ids=(),
+        faults=(),
+        notes=(),
     )
 
 
@@ -277,120 +297,3 @@ def list_runs(data_dir: Path) -> list[RunRow]:
             return read_runs(connection)
     finally:
         database.close()
-
-
-_Rows = dict[str, list[dict[str, Any]]]  # by run
-
-
-@dataclass(frozen=True, slots=True)
-class _Evidence:
-    """All rows other than the events, which may be many and are streamed instead."""
-
-    run_ids: tuple[str, ...]
-    has_site: bool
-    runs: _Rows
-    heads: _Rows
-    artefacts: _Rows
-    jobs: _Rows
-    checkpoints: Mapping[str, list[Checkpoint]]
-    timestamps: Mapping[str, list[Timestamp]]
-    every_sha256: frozenset[str]
-    accounts: Sequence[Mapping[str, Any]]
-    links: Sequence[Mapping[str, Any]]
-    sessions: Sequence[Mapping[str, Any]]
-    damage: tuple[str, ...]
-
-
-def _read(connection: Connection, run_id: str | None) -> _Evidence:
-    damage = _damage(connection)
-    known = set(connection.execute(select(runs.c.run_id)).scalars())
-    # A run whose row was deleted may still have events or checkpoints.
-    known |= set(connection.execute(select(events.c.run_id).distinct()).scalars())
-    known |= set(connection.execute(select(checkpoints.c.run_id).distinct()).scalars())
-    if run_id is not None and run_id not in known:
-        raise UnknownRunError(
-            f"there is no run {run_id!r}",
-            where=str(connection.engine.url.database),
-            remedy="List the runs with `orthocapture status`",
-        )
-    chosen = tuple(sorted(known)) if run_id is None else (run_id,)
-    read = tuple({*chosen, SITE})
-
-    def rows(table: Table, *order: Any) -> _Rows:
-        grouped: _Rows = {}
-        statement = select(table).where(table.c.run_id.in_(read)) if run_id is not None else select(table)
-        for row in connection.execute(statement.order_by(*order)).mappings():
-            grouped.setdefault(str(row["run_id"]), []).append(dict(row))
-        return grouped
-
-    def all_of(table: Table) -> list[dict[str, Any]]:
-        return [dict(row) for row in connection.execute(select(table)).mappings()]
-
-    return _Evidence(
-        run_ids=chosen,
-        has_site=SITE in known,
-        runs=rows(runs),
-        heads=rows(heads),
-        artefacts=rows(artefacts, artefacts.c.run_id, artefacts.c.seq, artefacts.c.position),
-        jobs=rows(jobs, jobs.c.position),
-        checkpoints={run: read_checkpoints(connection, run) for run in read},
-        timestamps={run: read_timestamps(connection, run) for run in read},
-        every_sha256=frozenset(connection.execute(select(artefacts.c.sha256)).scalars()),
-        accounts=all_of(accounts),
-        links=all_of(invitations),
-        sessions=all_of(sessions),
-        damage=damage,
-    )
-
-
-def _stream(connection: Connection, run_id: str) -> Iterator[Mapping[Any, Any]]:
-    statement = select(events).where(events.c.run_id == run_id).order_by(events.c.seq)
-    return iter(connection.execution_options(yield_per=500).execute(statement).mappings())
-
-
-def _hash_files(folder: Path, evidence: _Evidence, progress: Progress | None) -> tuple[dict[str, FileState], int]:
-    wanted = {row["sha256"]: int(row["size_bytes"]) for rows in evidence.artefacts.values() for row in rows}
-    total, done = sum(wanted.values()), 0
-    states: dict[str, FileState] = {}
-    for sha256, size in wanted.items():
-        states[sha256] = _file_state(folder, sha256)
-        done += size
-        if progress is not None:
-            progress("hashing files again", done, total)
-    return states, sum(state.size for state in states.values())
-
-
-def _file_state(folder: Path, sha256: str) -> FileState:
-    try:
-        name = relative_path(sha256)
-    except StoreError:
-        return FileState(sha256, "", 0, "the row names no SHA-256")
-    path = folder / name
-    shown = str(Path(folder.name) / name)
-    if path.is_symlink() or not path.is_file():
-        return FileState(shown, "", 0, "the file is missing")
-    try:
-        digest, size = hash_file(path)
-    except OSError as error:
-        return FileState(shown, "", 0, f"the file cannot be read: {error.strerror}")
-    return FileState(shown, digest, size, "")
-
-
-def _unlisted(folder: Path, listed: frozenset[str]) -> tuple[list[str], list[Fault]]:
-    """(notes, faults) on files that no row names. Leftovers of crashes are notes: partial and unrecorded files."""
-    notes: list[str] = []
-    foreign: list[Fault] = []
-    for path in sorted(path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()):
-        relative = path.relative_to(folder)
-        shown = str(Path(folder.name) / relative)
-        if relative.parts[0] == TEMPORARY and path.suffix == ".part":
-            notes.append(f"{shown}: left over from an interrupted write; no record refers to it")
-        elif path.name in listed and relative == relative_path(path.name):
-            continue
-        elif not path.is_symlink() and path.is_file() and hash_file(path)[0] == path.name:
-            notes.append(
-                f"{shown}: stored but never recorded (interrupted before the record); no record refers to it"
-            )
-        else:
-            foreign.append(Fault(None, None, shown, "this file is not in the evidence and is not a crash's leftover"))
-    return notes, foreign

@@ -6,9 +6,9 @@ from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, Response
 
 from service.audit.overview import findings
-from service.audit.overview.devices import bodies_of_run, clock_offsets, sessions
+from service.audit.overview.devices import bodies_of_run, clock_offsets, opened_devices, sessions
 from service.audit.record import queries
-from service.core.equipment.clocks import clock_of, clock_readings, offset_told
+from service.core.equipment.clocks import clock_offset_words, clock_readings
 from service.web.audit.frame import CurrentAudit, audit_frame
 from service.web.page.rendering import render
 from service.web.security.guards import requires
@@ -26,7 +26,7 @@ def devices_page(request: Request, audit: CurrentAudit, run_id: str) -> Response
     """Devices with versions, clocks, troubles; sessions and software."""
     frame = audit_frame(audit, run_id, "/devices")
     with audit.site.store.database.reading() as connection:
-        opened = findings.events_of(connection, run_id, "device_opened", newest=True)
+        opened = opened_devices(findings.events_of(connection, run_id, "device_opened", newest=True))
         started = findings.events_of(connection, run_id, "session_started", newest=True)
         troubles = findings.events_of(connection, run_id, "device_trouble", newest=True)
         trouble_count = queries.count_of_kind(connection, run_id, "device_trouble")
@@ -39,8 +39,7 @@ def devices_page(request: Request, audit: CurrentAudit, run_id: str) -> Response
         audit=frame,
         opened=opened,
         bodies=bodies,
-        offset_told=offset_told,
-        clock_of=clock_of,
+        clock_offset_words=clock_offset_words,
         sessions=sessions(started),
         troubles=troubles[-50:],
         trouble_count=trouble_count,

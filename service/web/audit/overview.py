@@ -10,7 +10,7 @@ from fastapi.responses import HTMLResponse, Response
 
 from service.audit.background.incremental import Progress
 from service.audit.overview import findings, first_page
-from service.audit.overview.devices import bodies_of_run
+from service.audit.overview.devices import bodies_of_run, opened_devices
 from service.audit.overview.digest import Digest
 from service.audit.overview.first_page import GROUPS
 from service.audit.overview.shots import failed_exposures_of, shots_of, together
@@ -48,7 +48,7 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
     with audit.site.store.database.reading() as connection:
         root = queries.read_rows(connection, run_id, [1], whole=True)
         corrected = queries.count_of_kind(connection, run_id, "record_corrected")
-        devices = findings.events_of(connection, run_id, "device_opened", newest=True)
+        devices = opened_devices(findings.events_of(connection, run_id, "device_opened", newest=True))
         sessions = findings.events_of(connection, run_id, "session_started", newest=True)
         exports = findings.events_of(connection, run_id, "evidence_exported", newest=True)
         signatures = signatures_of(connection, run_id, known)
@@ -75,7 +75,7 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
         shots=shots_of(known, failures),
         together=together,
         bodies=bodies,
-        devices={row.payload.get("device"): row for row in devices},
+        devices={device.name: device.report.identity for device in devices},
         session=sessions[-1] if sessions else None,
         sessions=len(sessions),
         exports=exports,

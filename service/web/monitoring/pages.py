@@ -31,7 +31,7 @@ class ReaderOrLocalRequest(Guard):
     """
 
     async def __call__(self, request: Request, site: CurrentSite) -> None:
-        """See Guard."""
+        """Refuse the request unless it comes from this machine or from somebody who may read."""
         if not _is_this_machine(request):
             await super().__call__(request, site)
 

@@ -19,12 +19,12 @@ class RecordOfRun(Interface):
 
     @property
     def protocol(self) -> Protocol:
-        """As it was when the run began."""
+        """The protocol as it was when the run began."""
         ...
 
     @property
     def events(self) -> Sequence[Event]:
-        """All of them, in order."""
+        """All events, in order."""
         ...
 
     @property

@@ -27,7 +27,7 @@ class Listener(socket.socket):
         self._exhausted = False
 
     def listen(self, backlog: int = _BACKLOG, /) -> None:
-        """See socket. asyncio gives the number that it accepts at once, which is no reason for a short queue."""
+        """Listen with a queue of at least _BACKLOG; asyncio's number only limits how many it accepts at once."""
         super().listen(max(backlog, _BACKLOG))
 
     def accept(self) -> tuple[socket.socket, Any]:
@@ -69,7 +69,7 @@ class _AcceptedSocket(socket.socket):
         self._closed_hook = finalize(self, hook)
 
     def close(self) -> None:
-        """See socket."""
+        """Close the socket and call the hook of `at_close`."""
         super().close()
         self._closed_hook()
 
@@ -79,6 +79,6 @@ def _nothing() -> None:
 
 
 def affordable_connections(wanted: int) -> int:
-    """As many as wanted, but no more than half of the files that this process may open: the rest is the store's."""
+    """The wanted number of connections, at most half of the files that this process may open."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return wanted if soft == resource.RLIM_INFINITY else max(1, min(wanted, soft // 2))

@@ -41,7 +41,7 @@ class SparingHandler(logging.StreamHandler[TextIO]):
         self._told: dict[Kind, _Repeats] = {}
 
     def emit(self, record: logging.LogRecord) -> None:
-        """See logging.Handler, which holds the lock meanwhile."""
+        """Write a record, or count it if one of its kind was just written; logging.Handler holds its lock."""
         now_s = time.monotonic()
         self._tell(now_s)
         kind = _kind(record)

@@ -292,6 +292,7 @@ def calibration() -> dict[str, Any]:
         "residuals": {"corners": counts, "mean_px": [[[0.01, -0.02]] * 12] * 8},
         "uncertainty": {
             "distance_m": 0.7, "centre_px": 0.01, "worst_px": 0.05, "centre_mm": 0.004, "worst_mm": 0.02,
+            "sigma_px": [[0.01 + 0.0025 * row for _ in range(24)] for row in range(16)],
             "sigma_mm": [[0.004 + 0.001 * row for _ in range(24)] for row in range(16)],
         },
         "cross_validation": {"folds": 5, "five_fold_rms_px": 0.03},
@@ -305,9 +306,14 @@ def calibration() -> dict[str, Any]:
         "camera": {"fx": 2033.77, "fy": 2034.06, "cx": 714.3, "cy": 484.2, "width": 1440, "height": 960},
         "T_flange_camera": [list(row) for row in EYE],
         "hand_eye": {
+            "T_flange_camera": [list(row) for row in EYE],
             "method": "weighted",
-            "residuals": {"held_out_mm": held_out_mm},
-            "sigma": {"mm": 0.033, "deg": 0.002},
+            "residuals": {"held_out_mm": held_out_mm, "held_out_deg": dict.fromkeys(held_out_mm, 0.002)},
+            "sigma": {
+                "mm": 0.033,
+                "deg": 0.002,
+                "covariance": [[1e-10 * (i == j) for j in range(6)] for i in range(6)],
+            },
             "arm_correction": None,
         },
         "details": {"intrinsics": intrinsics},

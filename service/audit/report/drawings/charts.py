@@ -1,16 +1,16 @@
-"""Charts of a report as drawings: coverage, residuals and uncertainty of a calibration, and bars by view."""
+"""Charts of a report: coverage, residuals and uncertainty of a calibration, and bars for each view."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from service.audit.report.blocks import Box, Drawing, Label, Line, Shape
 from service.core.geometry import Array
 from service.core.units import mm
+from service.jobs.calibration.records import Coverage, ProjectionUncertainty, ResidualField
 
 _WIDTH = 480.0
 _LEGEND = 26.0
@@ -18,14 +18,15 @@ _INK, _LINE, _BLUE, _RED = "#1a1f24", "#c9d1d9", "#1f5fbf", "#b3261e"
 _PALE, _DEEP = (239, 244, 250), (31, 95, 191)
 
 
-def coverage_drawing(record: Mapping[str, Any], size: tuple[int, int]) -> Drawing:
-    """Corners in each cell. `record`: intrinsics_record's; `size`: (width, height) of the image in px."""
-    counts = np.array(record["coverage"]["corners"], dtype=np.float64)
-    share, empty = float(record["coverage"]["share"]), int(np.sum(counts == 0))
+def coverage_drawing(coverage: Coverage, size: tuple[int, int]) -> Drawing:
+    """Number of board corners in each cell of an image of `size` (width, height), px."""
+    counts = np.array(coverage.corners, dtype=np.float64)
+    empty = int(np.sum(counts == 0))
     shapes, height = _cells(counts, size, lambda value: f"{value:.0f}")
     return Drawing(
         "Coverage: corners of the board in each part of the image",
-        f"{share:.0%} of the {counts.size} cells hold a corner, {empty} none; the fullest holds {counts.max():.0f}.",
+        f"{coverage.share:.0%} of the {counts.size} cells hold a corner (empty: {empty}); the fullest holds "
+        f"{counts.max():.0f}.",
         _WIDTH,
         height,
         tuple(shapes),
@@ -34,16 +35,15 @@ def coverage_drawing(record: Mapping[str, Any], size: tuple[int, int]) -> Drawin
     )
 
 
-def uncertainty_drawing(record: Mapping[str, Any], size: tuple[int, int]) -> Drawing:
+def uncertainty_drawing(known: ProjectionUncertainty, size: tuple[int, int]) -> Drawing:
     """Standard deviation of a projected point over the image, in micrometres at the board's distance."""
-    known = record["uncertainty"]
-    field = np.array(known["sigma_mm"], dtype=np.float64)
+    field = np.array(known.sigma_mm, dtype=np.float64)
     coarse = mm(field[:: max(1, len(field) // 8), :: max(1, len(field[0]) // 12)])
     shapes, height = _cells(np.log(coarse), size, lambda value: f"{math.exp(value):.2g}")
     return Drawing(
-        f"Uncertainty of a projected point at {known['distance_m']:.2f} m, in µm",
-        f"σ {known['centre_mm']:.4f} mm in the centre and {known['worst_mm']:.4f} mm at worst "
-        f"({known['centre_px']:.4f} and {known['worst_px']:.4f} px).",
+        f"Uncertainty of a projected point at {known.distance_m:.2f} m, in µm",
+        f"σ {known.centre_mm:.4f} mm in the centre and {known.worst_mm:.4f} mm at worst "
+        f"({known.centre_px:.4f} and {known.worst_px:.4f} px).",
         _WIDTH,
         height,
         tuple(shapes),
@@ -52,10 +52,10 @@ def uncertainty_drawing(record: Mapping[str, Any], size: tuple[int, int]) -> Dra
     )
 
 
-def residual_drawing(record: Mapping[str, Any], size: tuple[int, int]) -> Drawing:
-    """Mean residual of each cell as an arrow: what the lens model does not hold."""
-    mean = np.array(record["residuals"]["mean_px"], dtype=np.float64)
-    counts = np.array(record["residuals"]["corners"])
+def residual_drawing(residuals: ResidualField, rms_px: float | None, size: tuple[int, int]) -> Drawing:
+    """Mean residual of each cell as an arrow: the error of the lens model. `rms_px`: of all corners."""
+    mean = np.array(residuals.mean_px, dtype=np.float64)
+    counts = np.array(residuals.corners)
     known = counts > 0
     lengths = np.linalg.norm(mean, axis=2)
     longest = float(lengths[known].max(initial=0.0))
@@ -71,8 +71,8 @@ def residual_drawing(record: Mapping[str, Any], size: tuple[int, int]) -> Drawin
         shapes += _arrow(middle, tip)
     return Drawing(
         "Residuals: mean of each part of the image",
-        f"An arrow of half a cell is {usual:.4f} px, the longest stands for {longest:.4f} px; "
-        f"{record['rms_px']:.4f} px rms over all corners.",
+        f"An arrow of half a cell is {usual:.4f} px, the longest stands for {longest:.4f} px"
+        + ("." if rms_px is None else f"; {rms_px:.4f} px rms over all corners."),
         _WIDTH,
         height,
         tuple(shapes),
@@ -88,7 +88,7 @@ def residual_drawing(record: Mapping[str, Any], size: tuple[int, int]) -> Drawin
 
 
 def bars_drawing(name: str, title: str, text: str, values: Mapping[str, float], unit: str) -> Drawing:
-    """One bar a view, with the largest value at the scale; `name` is that of its file."""
+    """A bar for each view, on a scale up to the largest value; `name`: of the file."""
     height, base = 190.0, 160.0
     largest = max(values.values(), default=0.0) or 1.0
     step = (_WIDTH - 50) / max(len(values), 1)
@@ -110,7 +110,7 @@ def bars_drawing(name: str, title: str, text: str, values: Mapping[str, float], 
 
 
 def _by_cell(values: Array, size: tuple[int, int], name: str, form: str) -> tuple[tuple[str, ...], ...]:
-    """One row a cell: which, where in the image, and its value."""
+    """One row for each cell: its indices, its position in the image, and its value."""
     cells = (
         (*_cell(int(at[0]), int(at[1]), values.shape, size), form.format(value))
         for at, value in np.ndenumerate(values)
@@ -124,7 +124,7 @@ def _cell(row: int, column: int, shape: tuple[int, ...], size: tuple[int, int]) 
     return str(row), str(column), f"{x:.1f}", f"{y:.1f}"
 
 
-def _cells(values: Array, size: tuple[int, int], text: Any) -> tuple[list[Shape], float]:
+def _cells(values: Array, size: tuple[int, int], text: Callable[[float], str]) -> tuple[list[Shape], float]:
     rows, columns = values.shape
     height = _WIDTH * size[1] / size[0]
     width, tall = _WIDTH / columns, height / rows

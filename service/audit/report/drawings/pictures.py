@@ -1,4 +1,4 @@
-"""Pictures of a report: small copies of what the evidence holds, each file verified by its hash first."""
+"""Pictures of a report: small copies of recorded images, each verified by its hash first."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from service.core.errors import IntegrityError
 
 THUMBNAIL_PX = 240
 LARGE_PX = 720
-_QUALITY = 76  # a report of 36 photographs is to stay under 3 MB
+_QUALITY = 76  # so that a report of 36 photographs stays under 3 MB
 
 
 def picture(run: RecordedRun, sha256: str, caption: str, width_px: int, *, upright: bool = False) -> Picture:
-    """A JPEG copy no wider than this, without the camera's own data; empty where the file is missing or altered.
+    """A JPEG copy of limited width without the camera's metadata; empty if the file is missing or altered.
 
-    `upright`: turned as its orientation tag says, which what is measured in never is.
+    `upright`: rotate by the orientation tag. Images that are measured are never rotated.
     """
     try:
         path = run.files.artefact_path(sha256, verify=True)
@@ -37,7 +37,7 @@ def picture(run: RecordedRun, sha256: str, caption: str, width_px: int, *, uprig
 
 
 def _read(path: Path, width_px: int, how: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]] | None:
-    """Thumbnails are decoded at a quarter where the photograph is large enough: 60 MP take long otherwise."""
+    """Decode an image; at a quarter of its size if that is enough, because 60 MP take long otherwise."""
     if width_px <= THUMBNAIL_PX:
         small = cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_4 | how)
         if small is not None and small.shape[1] >= width_px:

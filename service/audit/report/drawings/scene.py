@@ -1,6 +1,6 @@
-"""The scene of a report: cameras, spheres and the scan's mesh as a drawing, and as what a browser turns in 3D.
+"""The scene of a report: cameras, spheres and the scan's mesh, as a drawing and for turning in a browser.
 
-plotly's script, which the screens show the scene with, has 4.8 MB: a report is a file to be sent by post.
+The pages show the scene with plotly, whose script of 4.8 MB is too large for a report that is sent by e-mail.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from service.audit.report.blocks import Box, Drawing, Label, Line, Raster, Scene, Shape
 from service.compute.evaluation.closure import Alignment
 from service.core.errors import IntegrityError
-from service.core.geometry import Array, apply
+from service.core.geometry import Array, Transform, apply
 from service.core.text.counts import counted
 from service.core.units import metres, mm
 from service.dataset import scene_view
@@ -56,15 +56,15 @@ class _Geometry:
 
 
 def report_scene(summary: RunSummary, *, turning: bool) -> Scene | None:
-    """Cameras, spheres and mesh in one frame; None where there is no registration. `turning`: for a browser too."""
+    """Cameras, spheres and mesh in one frame; None without a registration. `turning`: also for a browser."""
     best, registrations = summary.best(), summary.registrations()
-    spheres = summary.result("scan_import").get("spheres_m")
-    if best is None or best not in registrations or spheres is None or not summary.artefacts("scan_mesh"):
+    spheres = summary.scan_spheres_m()
+    if best is None or best not in registrations or not spheres or not summary.artefacts("scan_mesh"):
         return None
     try:
         summary.store.artefact_path(summary.artefacts("scan_mesh")[-1].sha256, verify=True)
     except IntegrityError:
-        return None  # the first page says which file it is
+        return None  # the first page names the file
     registered = registrations[best]
     points_m, triangles = scene_view.decimated(*summary.scan_mesh(), most=_FACES)
     placed = Alignment(np.array(registered.T_world_scan), np.array(registered.covariance)[:6, :6])
@@ -88,69 +88,99 @@ def report_scene(summary: RunSummary, *, turning: bool) -> Scene | None:
     return Scene(drawing, _turned(geometry) if turning else "")
 
 
+@dataclass(slots=True)
+class _Parts:
+    """The geometry while it is put together; coordinates in millimetres of the viewing frame."""
+
+    points: list[NDArray[np.float32]] = field(default_factory=list[NDArray[np.float32]])
+    triangles: list[NDArray[np.uint32]] = field(default_factory=list[NDArray[np.uint32]])
+    colours: list[NDArray[np.uint8]] = field(default_factory=list[NDArray[np.uint8]])
+    segments: list[NDArray[np.float32]] = field(default_factory=list[NDArray[np.float32]])
+    strokes: list[NDArray[np.uint8]] = field(default_factory=list[NDArray[np.uint8]])
+    labels: list[tuple[str, NDArray[np.float32]]] = field(default_factory=list[tuple[str, NDArray[np.float32]]])
+    legend: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+
+    def add_surface(self, points: NDArray[np.float32], faces: NDArray[np.int64], colour: NDArray[np.uint8]) -> None:
+        """Add triangles in one colour, or in one for each point."""
+        self.triangles.append((faces + sum(map(len, self.points))).astype(np.uint32))
+        self.points.append(points)
+        self.colours.append(np.broadcast_to(colour, (len(points), 3)))
+
+    def add_lines(self, segments: NDArray[np.float32], colour: str) -> None:
+        """Add line segments (N, 2, 3) in one colour."""
+        self.segments.append(segments)
+        self.strokes.append(np.broadcast_to(_rgb(colour), (len(segments), 3)))
+
+    def geometry(self, error_mm: tuple[float, float] | None) -> _Geometry:
+        """All parts as one."""
+        return _Geometry(
+            np.concatenate(self.points),
+            np.concatenate(self.triangles),
+            np.concatenate(self.colours),
+            np.concatenate(self.segments),
+            np.concatenate(self.strokes),
+            self.labels,
+            self.legend,
+            error_mm,
+        )
+
+
 def _geometry(scene: scene_view.Scene) -> _Geometry:
     to_view = scene_view.viewing_frame(scene)
+    parts = _Parts()
+    error_mm = _add_mesh(parts, scene.mesh, to_view)
+    _add_spheres(parts, scene, to_view)
+    _add_cameras(parts, scene, to_view)
+    _add_scale_bar(parts)
+    return parts.geometry(error_mm)
 
-    def in_view_mm(points_m: Array) -> NDArray[np.float32]:
-        return mm(apply(to_view, np.asarray(points_m, dtype=np.float64).reshape(-1, 3))).astype(np.float32)
 
-    points: list[NDArray[np.float32]] = []
-    triangles: list[NDArray[np.uint32]] = []
-    colours: list[NDArray[np.uint8]] = []
-    labels: list[tuple[str, NDArray[np.float32]]] = []
-    legend: list[tuple[str, str]] = []
+def _in_view_mm(points_m: Array, to_view: Transform) -> NDArray[np.float32]:
+    return mm(apply(to_view, np.asarray(points_m, dtype=np.float64).reshape(-1, 3))).astype(np.float32)
 
-    def add(vertices: NDArray[np.float32], faces: NDArray[np.int64], colour: NDArray[np.uint8]) -> None:
-        triangles.append((faces + sum(map(len, points))).astype(np.uint32))
-        points.append(vertices)
-        colours.append(np.broadcast_to(colour, (len(vertices), 3)))
 
-    error_mm: tuple[float, float] | None = None
-    if scene.mesh is not None and scene.mesh.error_mm is not None:
-        error = scene.mesh.error_mm
-        error_mm = float(error.min()), float(error.max())
-        share = (error - error_mm[0]) / max(error_mm[1] - error_mm[0], 1e-12)
-        add(in_view_mm(scene.mesh.points_m), scene.mesh.triangles, _viridis(share))
+def _add_mesh(parts: _Parts, mesh: scene_view.SceneMesh | None, to_view: Transform) -> tuple[float, float] | None:
+    """Add the mesh, coloured by its predicted error, of which the smallest and the largest are returned, mm."""
+    if mesh is None or mesh.error_mm is None:
+        return None
+    least, most = float(mesh.error_mm.min()), float(mesh.error_mm.max())
+    share = (mesh.error_mm - least) / max(most - least, 1e-12)
+    parts.add_surface(_in_view_mm(mesh.points_m, to_view), mesh.triangles, _viridis(share))
+    return least, most
+
+
+def _add_spheres(parts: _Parts, scene: scene_view.Scene, to_view: Transform) -> None:
     ball, faces = scene_view.unit_ball()
     radius_mm = mm(scene.radius_m)
     for sphere in scene.spheres:
-        centre = in_view_mm(np.array(sphere.centre_m))[0]
+        centre = _in_view_mm(np.array(sphere.centre_m), to_view)[0]
         vertices = (centre + scene_view.PROUD * radius_mm * ball).astype(np.float32)
-        add(vertices, faces, _rgb(scene_view.KINDS[sphere.kind]))
-        labels.append((sphere.label, centre + np.array([0, 0, 1.6 * radius_mm], np.float32)))
-    legend += [
-        (scene_view.KINDS[kind], scene_view.KIND_NAMES[kind]) for kind in dict.fromkeys(s.kind for s in scene.spheres)
-    ]
-    segments: list[NDArray[np.float32]] = []
-    strokes: list[NDArray[np.uint8]] = []
+        parts.add_surface(vertices, faces, _rgb(scene_view.KINDS[sphere.kind]))
+        parts.labels.append((sphere.label, centre + np.array([0, 0, 1.6 * radius_mm], np.float32)))
+    kinds = dict.fromkeys(sphere.kind for sphere in scene.spheres)
+    parts.legend += [(scene_view.KINDS[kind], scene_view.KIND_NAMES[kind]) for kind in kinds]
+
+
+def _add_cameras(parts: _Parts, scene: scene_view.Scene, to_view: Transform) -> None:
+    """Add the frustums of each station's cameras in a colour of their own."""
     for number, station in enumerate(sorted(set(scene.stations.values()))):
         colour = scene_view.STYLES[number % len(scene_view.STYLES)][0]
         mine = [to_view @ T for name, T in scene.cameras.items() if scene.stations[name] == station]
         path = scene_view.frustum_lines(mine).astype(np.float32)
         pairs = np.stack([path[:-1], path[1:]], axis=1)
-        pairs = pairs[np.isfinite(pairs).all(axis=(1, 2))]
-        segments.append(pairs)
-        strokes.append(np.broadcast_to(_rgb(colour), (len(pairs), 3)))
-        legend.append((colour, f"cameras of {station}".replace("_", " ") if station else "cameras"))
+        parts.add_lines(pairs[np.isfinite(pairs).all(axis=(1, 2))], colour)
+        parts.legend.append((colour, f"cameras of {station}".replace("_", " ") if station else "cameras"))
+
+
+def _add_scale_bar(parts: _Parts) -> None:
     bar = scene_view.BAR_MM
     ends = np.array([[[-bar / 2, -300, -60], [bar / 2, -300, -60]]], np.float32)
-    segments.append(ends)
-    strokes.append(_rgb("#52606d")[None])
-    labels.append((f"{bar:.0f} mm", ends[0, 1] + np.array([0.4 * bar, 0, 0], np.float32)))
-    return _Geometry(
-        np.concatenate(points),
-        np.concatenate(triangles),
-        np.concatenate(colours),
-        np.concatenate(segments),
-        np.concatenate(strokes),
-        labels,
-        legend,
-        error_mm,
-    )
+    parts.add_lines(ends, "#52606d")
+    parts.labels.append((f"{bar:.0f} mm", ends[0, 1] + np.array([0.4 * bar, 0, 0], np.float32)))
 
 
 def _viridis(share: Array) -> NDArray[np.uint8]:
-    """Red first, (N, 3), for shares between 0 and 1."""
+    """Colours (N, 3), red first, of the map viridis for shares between 0 and 1."""
     grey = np.clip(np.rint(255 * share), 0, 255).astype(np.uint8)[:, None]
     coloured = np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS), dtype=np.uint8)
     return np.ascontiguousarray(coloured[:, 0, ::-1])
@@ -169,7 +199,7 @@ def _hex(colour: NDArray[np.uint8]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Camera:
-    """Where the picture is taken from, and how it fills the sheet: u, v = offset + scale · x / z."""
+    """The view of the drawing, and its place on the sheet: u, v = offset + scale · x / z."""
 
     rotation: Array
     eye_mm: Array
@@ -177,7 +207,7 @@ class _Camera:
     offset: Array
 
     def project(self, points_mm: Array | NDArray[np.float32]) -> tuple[Array, Array]:
-        """Places (N, 2) on the sheet, y downwards, and distances (N,)."""
+        """Positions (N, 2) on the sheet, y downwards, and distances (N,)."""
         seen = (np.asarray(points_mm, dtype=np.float64) - self.eye_mm) @ self.rotation.T
         return self.offset + self.scale * seen[:, :2] / seen[:, 2:], seen[:, 2]
 
@@ -221,7 +251,7 @@ def _drawing(geometry: _Geometry, text: str, rows: tuple[tuple[str, ...], ...]) 
 
 
 def _scale(error_mm: tuple[float, float], y: float) -> list[Shape]:
-    """Colours of the mesh, at the right end of the legend."""
+    """The colour scale of the mesh, at the right end of the legend."""
     width, steps = 140.0, 35
     x = _WIDTH - width - 92
     shapes: list[Shape] = [Label(x - 62, y, "predicted error", 13, anchor="end")]
@@ -233,7 +263,7 @@ def _scale(error_mm: tuple[float, float], y: float) -> list[Shape]:
 
 
 def _painted(geometry: _Geometry, camera: _Camera) -> bytes:
-    """Surfaces alone, the farthest first, as PNG."""
+    """The surfaces as PNG, painted from the farthest to the nearest triangle."""
     grown = _SUPERSAMPLED
     canvas = np.full((int(_HEIGHT * grown), int(_WIDTH * grown), 3), _BACK, np.uint8)
     places, distances = camera.project(geometry.points)
@@ -242,7 +272,7 @@ def _painted(geometry: _Geometry, camera: _Camera) -> bytes:
     lengths = np.linalg.norm(normals, axis=1)
     lit = np.abs(normals @ (_LIGHT / np.linalg.norm(_LIGHT))) / np.maximum(lengths, 1e-12)
     shades = geometry.colours[geometry.triangles].astype(np.float64).mean(axis=1) * (0.5 + 0.5 * lit[:, None])
-    fixed = np.rint(places[geometry.triangles] * grown * 16).astype(np.int32)  # four bits behind the point
+    fixed = np.rint(places[geometry.triangles] * grown * 16).astype(np.int32)  # four fractional bits
     for face in np.argsort(-distances[geometry.triangles].mean(axis=1), kind="stable"):
         red, green, blue = (float(value) for value in shades[face])
         cv2.fillConvexPoly(canvas, fixed[face], (blue, green, red), cv2.LINE_8, 4)
@@ -251,7 +281,7 @@ def _painted(geometry: _Geometry, camera: _Camera) -> bytes:
 
 
 def _rows(scene: scene_view.Scene) -> tuple[tuple[str, ...], ...]:
-    """What stands where, in the scan's frame."""
+    """The positions of cameras and spheres in the scan's frame, as rows of a table."""
     head = ("what", "name", "station", "x_mm", "y_mm", "z_mm", "axis_x", "axis_y", "axis_z")
     rows: list[tuple[str, ...]] = [head]
     for name, T in sorted(scene.cameras.items()):
@@ -269,8 +299,7 @@ def _numbers(values: Array, digits: int) -> tuple[str, ...]:
 
 
 def _turned(geometry: _Geometry) -> str:
-    """A canvas that covers the drawing, but for its legend, where a browser can show it, and what templates/scene.js
-    draws on it."""
+    """A canvas over the drawing, except its legend, and the data that templates/scene.js draws on it."""
     wide = len(geometry.points) > 0xFFFF
     data: Mapping[str, object] = {
         "points": _packed(geometry.points),
@@ -284,7 +313,7 @@ def _turned(geometry: _Geometry) -> str:
         "eye": scene_view.EYE_MM,
     }
     text = json.dumps(data, separators=(",", ":"))
-    # base64 and numbers, and labels that are escaped: nothing in it ends the element.
+    # base64, numbers and escaped labels: nothing in it can close the element.
     kept = text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
     height = 100 * _HEIGHT / (_HEIGHT + _LEGEND)
     return (

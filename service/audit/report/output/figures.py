@@ -1,4 +1,4 @@
-"""The figures of a report as files of their own: each as SVG, and what it draws as CSV; its tables of numbers too."""
+"""The figures of a report as files: each as SVG, its numbers as CSV, and the tables of errors as CSV."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class FigureFile:
 
 
 def figure_files(report: Report, summary: RunSummary) -> list[FigureFile]:
-    """Every figure of a report, numbered by the section that it stands in, then its tables of numbers as CSV."""
+    """Every figure of a report, numbered by its section, then the tables of errors as CSV."""
     found: list[FigureFile] = []
     for number, section in enumerate(report.sections, 1):
-        # A run may calibrate twice: then two sections have figures of the same names.
+        # If a run calibrates twice, two sections have figures of the same names.
         for drawing in _drawings(section.blocks):
             name = f"{number:02d}_{drawing.name}"
             shows = f"{section.title}. {drawing.title}"
@@ -55,7 +55,7 @@ def figure_files(report: Report, summary: RunSummary) -> list[FigureFile]:
 
 
 def write_figures(files: Sequence[FigureFile], folder: Path) -> None:
-    """Write them, and the folder where there is none."""
+    """Write the files; the folder is made if it does not exist."""
     folder.mkdir(parents=True, exist_ok=True)
     for file in files:
         (folder / file.name).write_text(file.text, encoding="utf-8", newline="")
@@ -76,7 +76,7 @@ def _csv(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _plain(cell: str) -> str:
-    """A spreadsheet computes what begins like a formula, and somebody may have named a view so; numbers stay."""
+    """The text, with an apostrophe in front if a spreadsheet would take it for a formula; numbers are unchanged."""
     return f"'{cell}" if re.match(r"[=+@\t\r]|-(?![\d.])", cell) else cell
 
 

@@ -1,4 +1,4 @@
-"""A report as one HTML file that opens anywhere: nothing in it is fetched from elsewhere."""
+"""A report as one HTML file, which loads nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from service.audit.report.words import moment
 
 
 def write_html(report: Report, path: Path) -> None:
-    """Write the file, and its folder where there is none."""
+    """Write the file; its folder is made if it does not exist."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(render_html(report), encoding="utf-8")
 
 
 def render_html(report: Report) -> str:
-    """The whole document."""
+    """The report as HTML."""
     environment = Environment(
         loader=PackageLoader("service.audit.report.output"),
         autoescape=select_autoescape(["html", "j2"]),

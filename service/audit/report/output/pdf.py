@@ -1,6 +1,6 @@
-"""A report as PDF on A4: for the file, for the post, and for whoever has no browser at hand.
+"""A report as PDF on A4, for printing and filing.
 
-Typeset by Typst, which tags every part of it and holds it to PDF/UA-1, so that a screen reader reads it too.
+Typeset by Typst, which tags every part and checks PDF/UA-1, so that screen readers can read it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from service.audit.report.blocks import (
 from service.audit.report.output.svg import drawing_svg
 from service.audit.report.words import moment
 
-# DejaVu has every sign that a report writes. Where it is not installed, Typst's own fonts take its place.
+# DejaVu has every character that a report writes. If it is not installed, Typst's own fonts are used.
 _FONT_FOLDERS = (
     "/usr/share/fonts/truetype/dejavu",
     "/usr/share/fonts/dejavu",
@@ -42,24 +42,24 @@ _FONT_FOLDERS = (
     "/usr/local/share/fonts",
 )
 _FONT_FILE = "DejaVuSans.ttf"
-# With fonts of the machine too, and at last without the standard.
+# Then also with the fonts of the machine, and at last without the standard.
 _TRIES: tuple[tuple[bool, Literal["ua-1"] | None], ...] = ((False, "ua-1"), (True, "ua-1"), (True, None))
 _LONG_WORD = re.compile(r"\S{24,}")
 _MEETING = re.compile(r"(?<=[_/.:,-])(?=[^_/.:,-]{2})")
-_WIDE = 0.45  # of the page: in a column narrower than that a hash takes two lines
+_WIDE = 0.45  # of the page; in a narrower column a hash needs two lines
 
 
 def write_pdf(report: Report, path: Path) -> None:
-    """Write the file, and its folder where there is none."""
+    """Write the file; its folder is made if it does not exist."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(render_pdf(report))
 
 
 def render_pdf(report: Report) -> bytes:
-    """The whole document; the same report gives the same bytes wherever the same fonts are.
+    """The report as PDF; the same report and the same fonts give the same bytes.
 
-    It states PDF/UA-1, unless somebody's name or reason has signs that no font of this machine shows: then they are
-    boxes on the page, which that standard does not allow, and the document is tagged without stating it.
+    It conforms to PDF/UA-1, unless a text has characters that no font of this machine has. They are then shown as
+    boxes, which the standard does not allow, and the document is tagged but does not claim the standard.
     """
     with tempfile.TemporaryDirectory(prefix="orthocapture-report-") as name:
         folder = Path(name)
@@ -81,7 +81,7 @@ def render_pdf(report: Report) -> bytes:
 
 
 def _document(report: Report, folder: Path) -> dict[str, Any]:
-    """The report as plain data; pictures and drawings lie beside it as files."""
+    """The report as plain data; pictures and drawings are written beside it as files."""
     numbers = itertools.count()
     at = report.made_at
     statements = [report.origin, report.verification, report.deviations, report.result]
@@ -160,7 +160,7 @@ def _table(table: Table) -> dict[str, Any]:
 def _cell(value: Cell | str, *, code: bool = False, wide: bool = True) -> dict[str, Any]:
     text, tone = (value, "plain") if isinstance(value, str) else (value.text, value.tone)
     if _is_hash(text):
-        # A hash is easier to compare in a typeface of fixed width, and copied without anything in between.
+        # A hash is easier to compare in a monospaced font, and is copied without line breaks.
         return {"parts": [text] if wide else [text[:32], text[32:]], "tone": tone, "code": True}
     return {"parts": _parts(text), "tone": tone, "code": code}
 
@@ -170,7 +170,7 @@ def _is_hash(text: str) -> bool:
 
 
 def _parts(text: str) -> list[str]:
-    """Pieces between which a line may end: the name of a file has no space, and a column is narrow."""
+    """Parts of a text between which a line may break, for long names without spaces in narrow columns."""
     return [part for part in _LONG_WORD.sub(lambda found: _MEETING.sub("\n", found[0]), text).split("\n") if part]
 
 

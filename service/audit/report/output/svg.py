@@ -1,4 +1,4 @@
-"""A drawing of a report as SVG: in the pages, in the PDF, and as a file of its own."""
+"""A drawing of a report as SVG, for pages, PDF and files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _FONTS = "'DejaVu Sans', system-ui, sans-serif"
 
 
 def drawing_svg(drawing: Drawing) -> str:
-    """One element, which says its title and what it shows to whoever cannot see it."""
+    """An svg element with title and description for screen readers."""
     parts: list[str] = []
     for shape in drawing.shapes:
         if isinstance(shape, Box):

@@ -1,8 +1,8 @@
-"""How accurate a run's data set is: in one sentence, by source of camera poses beside the paper, and as a budget."""
+"""The accuracy of a run's data set: a sentence, a table by source of camera poses beside the paper's, a budget."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from service.core.gates.dependence import depends_on
 from service.dataset.late_results import late_results
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary
-from service.jobs.registration.evaluate import Row
+from service.jobs.registration.evaluate import ErrorBudget, Row
 
 PAPER_LIMIT_MM = 0.35
 _LIMITED = "best_mean_radial_error_mm"
@@ -78,11 +78,29 @@ def _best_row(summary: RunSummary) -> Row | None:
 
 
 def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | None) -> Section:
-    """One row a source of poses, beside what the paper reached."""
+    """A table with one row for each source of camera poses, with the paper's figures."""
     rows = summary.table()
     title = "Registration error by source of camera poses"
     if not rows:
         return Section(title, (Paragraph("Not evaluated."),))
+    blocks: list[Block] = [Paragraph(text, "attention") for text in rests_on(summary)]
+    blocks.append(_table(rows, summary.best(), true_error_mm))
+    blocks.append(
+        Paragraph(
+            f"Measured on {rows[0].evaluated_on}. The radial error is the distance between the sphere seen by the "
+            "camera and the sphere of the scan, across the line of sight; the reprojection error is the same in the "
+            "image. The paper's figures are of real images at its own widths; reprojection errors can be compared "
+            "only at the same width."
+        )
+    )
+    note = shared_adjustment_note(summary.protocol, summary.state)
+    if note:
+        blocks.append(Paragraph(note))
+    return Section(title, tuple(blocks))
+
+
+def _table(rows: Sequence[Row], own: str | None, true_error_mm: Mapping[str, float] | None) -> Table:
+    """One row for each source of poses; that of the run's `own` registration is marked."""
     columns = [
         Column("camera poses", 2.6),
         Column("images", 1.1),
@@ -94,49 +112,41 @@ def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | N
     ]
     if true_error_mm is not None:
         columns.append(Column("true error (mm), known to the simulator alone", 1.2, "number"))
-    shown: list[tuple[Cell | str, ...]] = []
-    strong: set[int] = set()
-    for number, row in enumerate(rows):
-        best = row.poses == summary.best()
-        if best:
-            strong.add(number)
-        late = f" ({row.late})" if row.late else ""
-        named = row.poses + (" (best)" if best else late)
-        texts: list[Cell | str] = [
-            f"{named}: {_SOURCES.get(row.source, words(row.source))}",
-            str(row.resolution).replace(" ", "\N{NO-BREAK SPACE}"),
-            f"{row.mean_radial_error_mm:.3f}",
-            "–" if row.mean_reprojection_error_px is None else f"{row.mean_reprojection_error_px:.2f}",
-            mm(row.predicted_error_mm),
-            str(row.control_outlines),
-            _paper(row),
-        ]
-        if true_error_mm is not None:
-            texts.append(mm(true_error_mm.get(row.poses)))
-        shown.append(tuple(texts))
-    on = rows[0].evaluated_on
-    explained = (
-        f"Measured on {on}. The radial error is how far the sphere seen by the camera lies from the sphere of the "
-        "scan, across the line of sight; the reprojection error is the same in the image. The paper's figures are of "
-        "real images at its own widths; reprojection errors compare only at the same width."
+    shown = tuple(
+        (*_texts(row, best=row.poses == own), *(() if true_error_mm is None else (mm(true_error_mm.get(row.poses)),)))
+        for row in rows
     )
-    blocks: list[Block] = [Paragraph(text, "attention") for text in rests_on(summary)]
-    blocks += [Table(tuple(columns), tuple(shown), frozenset(strong)), Paragraph(explained)]
-    note = shared_adjustment_note(summary.protocol, summary.state)
-    if note:
-        blocks.append(Paragraph(note))
-    return Section(title, tuple(blocks))
+    strong = frozenset(number for number, row in enumerate(rows) if row.poses == own)
+    return Table(tuple(columns), shown, strong)
+
+
+def _texts(row: Row, *, best: bool) -> tuple[str, ...]:
+    late = f" ({row.late})" if row.late else ""
+    named = row.poses + (" (best)" if best else late)
+    return (
+        f"{named}: {_SOURCES.get(row.source, words(row.source))}",
+        row.resolution.replace(" ", "\N{NO-BREAK SPACE}"),
+        f"{row.mean_radial_error_mm:.3f}",
+        "–" if row.mean_reprojection_error_px is None else f"{row.mean_reprojection_error_px:.2f}",
+        mm(row.predicted_error_mm),
+        str(row.control_outlines),
+        _paper(row),
+    )
 
 
 def later_section(summary: RunSummary) -> Section | None:
-    """Results that came after the evaluation, what they changed, and those that had not come; None without any."""
+    """Results that arrived after the evaluation, what they changed, and what is still missing; None without any."""
     late = late_results(summary.protocol, summary.state)
     missing = not_in_yet(summary.protocol, summary.state, summary.events)
     if not late and not missing:
         return None
     blocks: list[Block] = []
     if late:
-        columns = (Column("event", 0.5, "number"), Column("time", 1.2), Column("what came, and what it changed", 5.0))
+        columns = (
+            Column("event", 0.5, "number"),
+            Column("time", 1.2),
+            Column("what arrived, and what it changed", 5.0),
+        )
         blocks.append(Table(columns, tuple((str(one.seq), utc(one.at_utc), f"{one.text}.") for one in late)))
         better = summary.better_later()
         if better is not None:
@@ -149,11 +159,11 @@ def later_section(summary: RunSummary) -> Section | None:
     if missing:
         blocks.append(Paragraph("Not in when this was made:", "attention"))
         blocks += [Paragraph(f"{line}.", "attention") for line in missing]
-    return Section("Results that came later", tuple(blocks))
+    return Section("Results that arrived later", tuple(blocks))
 
 
 def _paper(row: Row) -> str:
-    """What the paper reached with this source, at the width nearest to the row's."""
+    """The paper's figures for this source, at the image width nearest to the row's."""
     width = int(row.resolution.split()[0])
     known = [at for source, at in _PAPER if source == row.source]
     if not known:
@@ -164,22 +174,42 @@ def _paper(row: Row) -> str:
 
 
 def budget_section(summary: RunSummary) -> Section | None:
-    """Source by source, and what independent measurements say of it; None without an evaluation."""
+    """The error budget by source, compared with independent measurements; None without an evaluation."""
     best = summary.best()
     budget = summary.budgets().get(best or "")
     if budget is None or budget.total_mm is None:
         return None
+    return Section(
+        "Error budget",
+        (
+            *(Paragraph(text, "attention") for text in rests_on(summary)),
+            Paragraph(f"Standard deviations (3D) in the middle of the anatomy, with the poses of {best}."),
+            _contributions(budget, budget.total_mm),
+            Heading("Does it hold?"),
+            Paragraph(
+                "Each independent measurement is compared with what the budget predicts for it. "
+                "A normalised χ² near 1 means that the stated errors are right."
+            ),
+            _observations(budget),
+        ),
+    )
+
+
+def _contributions(budget: ErrorBudget, total_mm: float) -> Table:
     contributions = [
         (c.name + ("" if c.counted else " (not in the sum)"), f"{c.sigma_mm:.4f}", c.how)
         for c in budget.contributions
     ]
-    total = ("sum", f"{budget.total_mm:.4f}", "root of the sum of squares")
-    sources = Table(
-        (Column("source", 1.3), Column("σ (mm)", 0.7, "number"), Column("how it was got", 4.5)),
+    total = ("sum", f"{total_mm:.4f}", "root of the sum of squares")
+    return Table(
+        (Column("source", 1.3), Column("σ (mm)", 0.7, "number"), Column("how it was found", 4.5)),
         (*contributions, total),
         frozenset({len(contributions)}),
     )
-    checks = Table(
+
+
+def _observations(budget: ErrorBudget) -> Table:
+    return Table(
         (
             Column("independent measurement", 3.0),
             Column("spheres", 0.8, "number"),
@@ -198,19 +228,5 @@ def budget_section(summary: RunSummary) -> Section | None:
                 Cell(o.verdict, "ok" if _HONEST[0] <= o.normalised_chi2 <= _HONEST[1] else "attention"),
             )
             for o in budget.observations
-        ),
-    )
-    return Section(
-        "Error budget",
-        (
-            *(Paragraph(text, "attention") for text in rests_on(summary)),
-            Paragraph(f"Standard deviations (3D) in the middle of the anatomy, with the poses of {best}."),
-            sources,
-            Heading("Does it hold?"),
-            Paragraph(
-                "Each comparison of independent measurements is set against what the budget predicts for it. "
-                "A normalised χ² near 1 says that the stated errors can be believed."
-            ),
-            checks,
         ),
     )

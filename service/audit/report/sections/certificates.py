@@ -1,9 +1,8 @@
-"""Calibration certificates: number, validity, held-out errors in mm, what makes a new one necessary, charts."""
+"""Calibration certificates: number, validity, held-out errors in mm, reasons for a new calibration, charts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -11,120 +10,144 @@ from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Cell, Column, Drawings, Facts, Heading, Paragraph, Section, Table
 from service.audit.report.drawings.charts import bars_drawing, coverage_drawing, residual_drawing, uncertainty_drawing
 from service.audit.report.words import judged, limit, measured, utc
+from service.core.equipment.recorded_devices import RecordedOptics, recorded_optics
 from service.core.gates.dependence import depends_on
 from service.core.records.events import View
+from service.jobs.calibration import calibrate
+from service.jobs.calibration.records import HandEye, Intrinsics, Residuals
+from service.jobs.records import Camera
 
+_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
 _INVARIANTS = ("settings_departures", "optics_departures")
 
 
 def certificate_sections(run: RecordedRun) -> Iterator[Section]:
-    """One for each calibration step that has a result."""
+    """A certificate for each calibration step that has a result."""
     for step in run.protocol.steps:
         state = run.state.steps[step.id]
         kept = [ref for ref in state.artefacts if ref.kind == "calibration"]
         if step.kind == "calibration" and state.result and kept:
+            solved = calibrate.KIND.read_answer(state.result)
             blocks = (
-                _facts(run, step.id, kept[-1].sha256),
+                _facts(run, step.id, kept[-1].sha256, solved),
                 *(
                     Paragraph(f"Depends on an accepted gate: {gate.text}", "attention")
                     for gate in depends_on(run.protocol, run.state, step.id)
                 ),
-                *_intrinsics(state.result),
-                *_hand_eye(state.result),
+                *_intrinsics(solved),
+                *_hand_eye(solved),
                 *_validity(run, step.id),
             )
             yield Section(f"Calibration certificate: {step.title}", blocks)
 
 
-def _facts(run: RecordedRun, step_id: str, sha256: str) -> Facts:
+def _facts(run: RecordedRun, step_id: str, sha256: str, solved: calibrate.Answer) -> Facts:
     state = run.state.steps[step_id]
     first = next((run.events[seq - 1].payload for seq in sorted(state.captured.values())), None)
-    camera = first.camera if isinstance(first, View) else {}
-    optics = ", ".join(
-        text
-        for text in (
-            str(camera.get("lens", "")),
-            f"{camera['focal_length_mm']:g} mm" if camera.get("focal_length_mm") else "",
-            f"f/{camera['aperture_f']:g}" if camera.get("aperture_f") else "",
-            f"{camera.get('focus_mode', '')} focus" if camera.get("focus_mode") else "",
-        )
-        if text
-    )
-    intrinsics: Mapping[str, Any] = state.result["details"].get("intrinsics") or {}
-    hand_eye: Mapping[str, Any] = state.result.get("hand_eye") or {}
-    best = hand_eye.get("arm_correction") or hand_eye
-    body = f"body {camera['body_serial']}" if camera.get("body_serial") else ""
+    camera = recorded_optics(first.camera if isinstance(first, View) else {})
     rows: list[tuple[str, Cell | str]] = [
         ("Certificate number (SHA-256 of calibration.json)", sha256),
         ("Calibrated", utc(state.ended_utc) if state.ended_utc else "not accepted yet"),
-        ("Camera and lens", ", ".join(filter(None, (body, optics))) or "not recorded"),
+        ("Camera and lens", _camera_and_lens(camera) or "not recorded"),
     ]
-    if intrinsics:
-        checked, sigma = intrinsics.get("cross_validation"), intrinsics["uncertainty"]
-        if checked is not None:
-            off_mm = checked["five_fold_rms_px"] * sigma["worst_mm"] / sigma["worst_px"]
-            text = (
-                f"{checked['five_fold_rms_px']:.4f} px rms, which is {off_mm:.4f} mm at {sigma['distance_m']:.2f} m"
-            )
-            rows.append(("Held-out error of the intrinsics", f"{text} ({checked['folds']} folds)"))
-        spread = f"{sigma['centre_mm']:.4f} mm in the centre, {sigma['worst_mm']:.4f} mm at worst"
-        rows.append(("Uncertainty of a projected point", f"{spread}, at {sigma['distance_m']:.2f} m"))
-    if best:
-        held = np.median(list(best["residuals"]["held_out_mm"].values()))
-        text = f"{held:.3f} mm (median over the views, each predicted by the others)"
-        corrected = "" if best is hand_eye else ", the arm's errors corrected"
-        rows += [
-            ("Held-out error of the hand-eye", text + corrected),
-            ("Uncertainty of the hand-eye", f"{best['sigma']['mm']:.3f} mm, {best['sigma']['deg']:.4f}°"),
-        ]
+    if solved.details.intrinsics is not None:
+        rows += _intrinsics_facts(solved.details.intrinsics)
+    if solved.hand_eye is not None:
+        rows += _hand_eye_facts(solved.hand_eye)
     return Facts(tuple(rows))
 
 
-def _intrinsics(result: Mapping[str, Any]) -> Iterator[Block]:
-    record: Mapping[str, Any] | None = result["details"].get("intrinsics")
-    if not record:
-        return
-    size = int(result["camera"]["width"]), int(result["camera"]["height"])
-    yield Heading("Intrinsics")
-    sigma: Mapping[str, float] = record["sigma"]
-    names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
-    columns = (Column("parameter"), Column("value", 1.4, "number"), Column("σ", 1.2, "number"))
-    known = [name for name in names if name in result["camera"]]
-    texts = [(n, f"{result['camera'][n]:.7g}", f"{sigma[n]:.2g}" if n in sigma else "held") for n in known]
-    half = (len(texts) + 1) // 2
-    empty = ("", "", "")
-    pairs = zip(texts[:half], [*texts[half:], *[empty] * (2 * half - len(texts))], strict=True)
-    yield Table((*columns, *columns), tuple((*a, *b) for a, b in pairs))
-    yield Drawings(
-        (coverage_drawing(record, size), residual_drawing(record, size), uncertainty_drawing(record, size))
+def _camera_and_lens(camera: RecordedOptics) -> str:
+    parts = (
+        f"body {camera.body_serial}" if camera.body_serial else "",
+        camera.lens,
+        f"{camera.focal_length_mm:g} mm" if camera.focal_length_mm else "",
+        f"f/{camera.aperture_f:g}" if camera.aperture_f else "",
+        f"{camera.focus_mode} focus" if camera.focus_mode else "",
     )
-    excluded = [f"{item['image']}: {item['reason']}" for item in record["excluded"]]
-    if excluded:
-        yield Paragraph(f"Views left out: {'; '.join(excluded)}.")
-    for warning in record["warnings"]:
+    return ", ".join(filter(None, parts))
+
+
+def _intrinsics_facts(solved: Intrinsics) -> Iterator[tuple[str, str]]:
+    checked, sigma = solved.cross_validation, solved.uncertainty
+    if checked is not None:
+        text = f"{checked.five_fold_rms_px:.4f} px rms"
+        if sigma is not None:
+            off_mm = checked.five_fold_rms_px * sigma.worst_mm / sigma.worst_px
+            text += f", which is {off_mm:.4f} mm at {sigma.distance_m:.2f} m"
+        yield "Held-out error of the intrinsics", f"{text} ({checked.folds} folds)"
+    if sigma is not None:
+        spread = f"{sigma.centre_mm:.4f} mm in the centre, {sigma.worst_mm:.4f} mm at worst"
+        yield "Uncertainty of a projected point", f"{spread}, at {sigma.distance_m:.2f} m"
+
+
+def _hand_eye_facts(solved: HandEye) -> Iterator[tuple[str, str]]:
+    best = solved.best
+    corrected = ", the arm's errors corrected" if solved.arm_correction is not None else ""
+    text = f"{_median_mm(best.residuals):.3f} mm (median over the views, each predicted by the others)"
+    yield "Held-out error of the hand-eye", text + corrected
+    if best.sigma.mm is not None and best.sigma.deg is not None:
+        yield "Uncertainty of the hand-eye", f"{best.sigma.mm:.3f} mm, {best.sigma.deg:.4f}°"
+
+
+def _median_mm(residuals: Residuals) -> float:
+    return float(np.median(list(residuals.held_out_mm.values())))
+
+
+def _intrinsics(solved: calibrate.Answer) -> Iterator[Block]:
+    record, camera = solved.details.intrinsics, solved.camera
+    if record is None:
+        return
+    yield Heading("Intrinsics")
+    yield _parameters(camera, record)
+    size = camera.width, camera.height
+    drawings = (
+        None if record.coverage is None else coverage_drawing(record.coverage, size),
+        None if record.residuals is None else residual_drawing(record.residuals, record.rms_px, size),
+        None if record.uncertainty is None else uncertainty_drawing(record.uncertainty, size),
+    )
+    yield Drawings(tuple(drawing for drawing in drawings if drawing is not None))
+    if record.excluded:
+        excluded = "; ".join(f"{one.image}: {one.reason}" for one in record.excluded)
+        yield Paragraph(f"Views left out: {excluded}.")
+    for warning in record.warnings:
         yield Paragraph(warning[:1].upper() + warning[1:] + ".", "attention")
 
 
-def _hand_eye(result: Mapping[str, Any]) -> Iterator[Block]:
-    record: Mapping[str, Any] | None = result.get("hand_eye")
-    if not record:
+def _parameters(camera: Camera, record: Intrinsics) -> Table:
+    """Value and standard deviation of each recorded parameter, in two columns."""
+    known = {name: float(getattr(camera, name)) for name in _PARAMETERS if name in camera.model_fields_set}
+    texts = [
+        (name, f"{value:.7g}", f"{record.sigma[name]:.2g}" if name in record.sigma else "held")
+        for name, value in known.items()
+    ]
+    half = (len(texts) + 1) // 2
+    empty = ("", "", "")
+    pairs = zip(texts[:half], [*texts[half:], *[empty] * (2 * half - len(texts))], strict=True)
+    columns = (Column("parameter"), Column("value", 1.4, "number"), Column("σ", 1.2, "number"))
+    return Table((*columns, *columns), tuple((*a, *b) for a, b in pairs))
+
+
+def _hand_eye(solved: calibrate.Answer) -> Iterator[Block]:
+    record = solved.hand_eye
+    if record is None:
         return
     yield Heading("Hand-eye")
-    best: Mapping[str, Any] = record.get("arm_correction") or record
-    held: Mapping[str, float] = best["residuals"]["held_out_mm"]
-    median_mm, largest_mm = float(np.median(list(held.values()))), max(held.values())
-    text = f"Median {median_mm:.3f} mm, largest {largest_mm:.3f} mm; solved by {record['method']}."
+    held = record.best.residuals.held_out_mm
+    text = (
+        f"Median {_median_mm(record.best.residuals):.3f} mm, largest {max(held.values()):.3f} mm; "
+        f"solved by {record.method}."
+    )
     yield Drawings((bars_drawing("hand_eye_held_out", "Held-out error of each view", text, held, "mm"),))
-    if best is not record:
-        without = float(np.median(list(record["residuals"]["held_out_mm"].values())))
+    if record.arm_correction is not None:
         yield Paragraph(
-            f"With the arm's poses as reported the median is {without:.3f} mm: the correction ({best['terms']}) is "
-            "of this arm alone, and holds for the stations where this arm stood."
+            f"With the arm's poses as reported the median is {_median_mm(record.residuals):.3f} mm. The correction "
+            f"({record.arm_correction.terms}) is of this arm alone, and holds for the stations where this arm stood."
         )
 
 
 def _validity(run: RecordedRun, step_id: str) -> Iterator[Block]:
-    """What the certificate holds for, and what was watched after it."""
+    """What the certificate is valid for, and the gates that watch it."""
     yield Heading("Validity, and what makes a new calibration necessary")
     yield Paragraph(
         "It holds for this camera, lens and mount as long as zoom, focus, aperture and the screws between flange and "
@@ -142,7 +165,7 @@ def _validity(run: RecordedRun, step_id: str) -> Iterator[Block]:
                 rows.append((step.title, *measured(verdict), limit(verdict), judged(verdict, accepted=accepted)))
     columns = (
         Column("step", 2.4),
-        Column("watched", 2.0),
+        Column("measure", 2.0),
         Column("value", 1.1, "number"),
         Column("limit", 0.9, "number"),
         Column("verdict", 0.8),

@@ -1,7 +1,8 @@
-"""How a run went: what departed from the protocol, the steps with their gates, and who did and signed what."""
+"""The course of a run: deviations from the protocol, steps and gates, and who did and signed what."""
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -25,7 +26,7 @@ from service.core.text.counts import counted
 
 @dataclass(frozen=True, slots=True)
 class NotableEvent:
-    """Something that an outsider must know of, with its event."""
+    """An event that a reader must know of, in words."""
 
     seq: int
     kind: str
@@ -35,7 +36,7 @@ class NotableEvent:
 
 
 def deviations(run: RecordedRun) -> list[NotableEvent]:
-    """Accepted gates first; then deviations, failed gates, troubles of devices and corrections, by their events."""
+    """Accepted gates, then deviations, failed gates, device faults and corrections in the order of their events."""
     titles = {step.id: step.title for step in run.protocol.steps}
     found = [
         NotableEvent(d.seq, words(d.kind), titles.get(d.step or "", ""), d.text, d.actor)
@@ -78,7 +79,7 @@ def _of_event(payload: object) -> Iterator[tuple[str, str, str]]:
 
 
 def deviations_section(run: RecordedRun, listed: Sequence[NotableEvent]) -> Section:
-    """First of all."""
+    """The deviations, and the number of replaced attempts and views."""
     blocks: list[Block] = []
     if listed:
         at = {event.seq: clock(event.at_utc) for event in run.events}
@@ -95,7 +96,7 @@ def deviations_section(run: RecordedRun, listed: Sequence[NotableEvent]) -> Sect
         )
         blocks.append(Table(columns, rows))
     else:
-        blocks.append(Paragraph("None: every step was done once, as the protocol says, within its limits.", "ok"))
+        blocks.append(Paragraph("None: every step was done once, by the protocol, within its limits.", "ok"))
     automatic = sum(deviation.is_note for deviation in run.state.deviations)
     if automatic:
         were = "was" if automatic == 1 else "were"
@@ -110,7 +111,7 @@ def deviations_section(run: RecordedRun, listed: Sequence[NotableEvent]) -> Sect
 
 
 def steps_section(run: RecordedRun) -> Section:
-    """Every step with its gates, value against limit."""
+    """Every step with its gates: value, limit and verdict."""
     columns = (
         Column("gate", 3.4),
         Column("value", 1.4, "number"),
@@ -150,57 +151,60 @@ def _state(run: RecordedRun, title: str, state: StepState, shots: Mapping[str, S
 
 
 def people_section(run: RecordedRun) -> Section:
-    """Signatures with name, time, meaning and the hash that they bind; then who acted how often."""
-    titles = {step.id: step.title for step in run.protocol.steps}
-    rows: list[tuple[Cell | str, ...]] = []
-    acts: dict[str, dict[str, int]] = {}
-    for event in run.events:
-        payload = event.payload
-        if isinstance(payload, OperatorAction):
-            counts = acts.setdefault(event.actor, {})
-            counts[payload.action] = counts.get(payload.action, 0) + 1
-            if payload.action in ("sign", "accept"):
-                how = "automatic" if payload.automatic else payload.via
-                how += {"pin": ", by PIN", "badge": ", by badge"}.get(payload.identified, "")
-                said = (
-                    f"accepted outside its limits, {payload.reason}"
-                    if payload.action == "accept"
-                    else payload.meaning
-                )
-                meaning = f"{titles.get(payload.step or '', '')}: {said or 'no meaning given'} ({how})"
-                rows.append(
-                    (str(event.seq), utc(event.at_utc), run.named(event.actor), meaning, payload.signed_sha256)
-                )
-        elif isinstance(payload, RunReleased):
-            meaning = f"Release of the run: {payload.meaning}"
-            rows.append((str(event.seq), utc(event.at_utc), run.named(event.actor), meaning, payload.signed_sha256))
-    signatures = Table(
-        (
-            Column("event", 0.5, "number"),
-            Column("time", 1.35),
-            Column("name", 0.9),
-            Column("what and in what meaning", 2.4),
-            Column("SHA-256 of the record that was signed", 2.3, "code"),
-        ),
-        tuple(rows),
-        small=True,
-    )
-    people = Table(
-        (Column("name", 1.0), Column("took part by", 4.0)),
-        tuple(
-            (run.named(name), ", ".join(f"{count} × {words(action)}" for action, count in sorted(counts.items())))
-            for name, counts in sorted(acts.items())
-        ),
-    )
+    """Signatures with name, time, meaning and the hash that they bind; then who did what, and how often."""
+    signatures = _signatures(run)
     unsigned = [
         step.title
         for step in run.protocol.steps
         if step.sign and not run.state.steps[step.id].signed and not run.state.steps[step.id].skipped
     ]
-    blocks: list[Block] = [signatures if rows else Paragraph("Nothing was signed.", "attention")]
+    blocks: list[Block] = [signatures if signatures.rows else Paragraph("Nothing was signed.", "attention")]
     if unsigned:
         blocks.append(
             Paragraph(f"Without a signature that the protocol asks for: {', '.join(unsigned)}.", "attention")
         )
-    blocks.append(people if acts else Paragraph("Nobody acted on this run."))
+    people = _people(run)
+    blocks.append(people if people.rows else Paragraph("Nobody acted on this run."))
     return Section("People and signatures", tuple(blocks))
+
+
+def _signatures(run: RecordedRun) -> Table:
+    titles = {step.id: step.title for step in run.protocol.steps}
+    rows: list[tuple[Cell | str, ...]] = []
+    for event in run.events:
+        payload = event.payload
+        if isinstance(payload, OperatorAction) and payload.action in ("sign", "accept"):
+            meaning = f"{titles.get(payload.step or '', '')}: {_meaning(payload)}"
+        elif isinstance(payload, RunReleased):
+            meaning = f"Release of the run: {payload.meaning}"
+        else:
+            continue
+        rows.append((str(event.seq), utc(event.at_utc), run.named(event.actor), meaning, payload.signed_sha256))
+    columns = (
+        Column("event", 0.5, "number"),
+        Column("time", 1.35),
+        Column("name", 0.9),
+        Column("what was signed, and its meaning", 2.4),
+        Column("SHA-256 of the record that was signed", 2.3, "code"),
+    )
+    return Table(columns, tuple(rows), small=True)
+
+
+def _meaning(signed: OperatorAction) -> str:
+    """The stated meaning of a signature or an acceptance, and how the person was identified."""
+    how = "automatic" if signed.automatic else signed.via
+    how += {"pin": ", by PIN", "badge": ", by badge"}.get(signed.identified, "")
+    said = f"accepted outside its limits, {signed.reason}" if signed.action == "accept" else signed.meaning
+    return f"{said or 'no meaning given'} ({how})"
+
+
+def _people(run: RecordedRun) -> Table:
+    acts: dict[str, Counter[str]] = defaultdict(Counter)
+    for event in run.events:
+        if isinstance(event.payload, OperatorAction):
+            acts[event.actor][event.payload.action] += 1
+    rows = tuple(
+        (run.named(name), ", ".join(f"{count} × {words(action)}" for action, count in sorted(counts.items())))
+        for name, counts in sorted(acts.items())
+    )
+    return Table((Column("name", 1.0), Column("took part by", 4.0)), rows)

@@ -1,4 +1,4 @@
-"""What a report says of the run as a whole: of what and where, who began it, by which protocol, how it stands."""
+"""The facts of a run on the first page: specimen, site, operator, protocol, state."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def facts(run: RecordedRun) -> Facts:
 
 
 def _of_what_and_where(run: RecordedRun) -> Iterator[tuple[str, Cell | str]]:
-    """What was entered of specimen, site and purpose; a run's root names its rig, a session its machine."""
+    """Specimen, site and purpose as entered, the rig, and the machine that drove the run."""
     entered = about_facts(run)
     names = {name for name, _ in entered}
     if "Specimen" not in names:
@@ -70,20 +70,20 @@ def _of_what_and_where(run: RecordedRun) -> Iterator[tuple[str, Cell | str]]:
 
 
 def _rig_name(run: RecordedRun) -> str:
-    """As its description says; "" for imported photographs, and where the description is missing or altered."""
+    """The name in the rig file; "" for imported photographs, or if the file is missing or altered."""
     if run.root.origin == "imported":
         return ""
     try:
         path = run.files.artefact_path(run.root.rig.sha256, verify=True)
         return parse_recorded_rig(path.read_bytes(), path).section.name
     except (OrthocaptureError, OSError):
-        return ""  # the first page says which file it is
+        return ""  # the first page names the file
 
 
 def _later(run: RecordedRun) -> Iterator[tuple[str, Cell]]:
     late = late_results(run.protocol, run.state)
     if late:
-        yield "Results that came after the evaluation", Cell(", ".join(one.name for one in late), "attention")
+        yield "Results that arrived after the evaluation", Cell(", ".join(one.name for one in late), "attention")
     missing = not_in_yet(run.protocol, run.state, run.events)
     if missing:
         yield "Results not in yet", Cell("; ".join(missing), "attention")

@@ -1,4 +1,4 @@
-"""What a run is of and for, and what people wrote down on its steps: the report's words of it."""
+"""Entries and notes in a report: what was entered at the start of a run, and the notes on its steps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _PIECE_CHARACTERS = 900
 
 
 def about_facts(run: RecordedRun) -> list[tuple[str, Cell | str]]:
-    """What was entered when the run began; empty for runs that were recorded without."""
+    """What was entered when the run began; empty for old runs, which did not ask."""
     rows: list[tuple[str, Cell | str]] = []
     for name, value in about_rows(run.root.about):
         rows += [(name if part == 0 else "", text) for part, text in enumerate(_pieces(value))]
@@ -23,7 +23,7 @@ def about_facts(run: RecordedRun) -> list[tuple[str, Cell | str]]:
 
 
 def _pieces(text: str) -> list[str]:
-    """A long text in parts: a row of a table has to fit on a page."""
+    """A long text in parts, because a row of a table has to fit on a page."""
     return wrap(text, _PIECE_CHARACTERS, replace_whitespace=False, break_on_hyphens=False) or [""]
 
 

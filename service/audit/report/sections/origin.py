@@ -1,17 +1,17 @@
-"""Where the data comes from: devices and clocks, and the software."""
+"""The origin of the data: devices, clocks and software."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
 from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Section, Table
 from service.audit.report.words import clock
-from service.core.equipment.camera_bodies import bodies
-from service.core.equipment.clocks import clock_of, clock_readings, offset_told
+from service.core.equipment.camera_bodies import CameraBodies, bodies
+from service.core.equipment.clocks import clock_offset_words, clock_readings
+from service.core.equipment.recorded_devices import recorded_report
 from service.core.records.events import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
 from service.core.text.counts import counted
 from service.core.units import ms, um
@@ -22,6 +22,19 @@ _COMPUTES = ("orthocapture", "numpy", "scipy", "opencv-python-headless", "pycolm
 
 def devices_section(run: RecordedRun) -> Section:
     """Every device that answered, its versions and clocks; light and temperature over the captures."""
+    known = bodies(run.events)
+    blocks: list[Block] = [_devices(run, known)]
+    blocks += [Paragraph(f"{text}.") for text in known.explained]
+    if known.strange:
+        blocks.append(Paragraph(f"{known.strange}.", "stop"))
+    blocks += _clocks(run)
+    captures = [view for view in run.summary().captures() if isinstance(view, ViewpointCaptured)]
+    if captures:
+        blocks.append(Paragraph(_stillness(captures) + _environment(captures)))
+    return Section("Devices and clocks", tuple(blocks))
+
+
+def _devices(run: RecordedRun, known: CameraBodies) -> Table:
     columns = (
         Column("device", 0.8),
         Column("model", 1.6),
@@ -31,44 +44,38 @@ def devices_section(run: RecordedRun) -> Section:
         Column("its clock when it was opened", 1.7),
         Column("opened (UTC)", 0.9),
     )
-    known = bodies(run.events)
     rows: list[tuple[Cell | str, ...]] = []
     for event in run.events:
         if isinstance(event.payload, DeviceOpened):
-            report: Mapping[str, Any] = event.payload.report
-            identity: Mapping[str, Any] = report.get("identity") or {}
+            report = recorded_report(event.payload.report)
+            identity = report.identity
             rows.append(
                 (
                     event.payload.device,
-                    str(identity.get("model", "")),
+                    identity.model,
                     known.shown(identity) or "–",
-                    str(identity.get("firmware", "")) or "–",
-                    f"{identity.get('driver', '')}: {identity.get('driver_version', '')}",
-                    offset_told(report.get("clock_offset_s"), clock_of(report)),
+                    identity.firmware or "–",
+                    f"{identity.driver}: {identity.driver_version}",
+                    clock_offset_words(report.clock_offset_s, report.clock),
                     clock(event.at_utc),
                 )
             )
-    blocks: list[Block] = [Table(columns, tuple(rows), small=True)]
-    blocks += [Paragraph(f"{text}.") for text in known.explained]
-    if known.strange:
-        blocks.append(Paragraph(f"{known.strange}.", "stop"))
-    blocks += _clocks(run)
-    captures = [view for view in run.summary().captures() if isinstance(view, ViewpointCaptured)]
-    if captures:
-        offsets = np.array([capture.clock_offset_s for capture in captures])
-        sigma_m = max(capture.pose_sigma_m for capture in captures)
-        text = (
-            f"Over {counted(len(captures), 'capture')} the robot's clock stayed within "
-            f"{ms(float(np.ptp(offsets))):.1f} ms of its distance from the host's "
-            f"monotonic clock; the flange stood still within {um(sigma_m):.2f} µm "
-            "(1σ) during every exposure."
-        )
-        blocks.append(Paragraph(text + _environment(captures)))
-    return Section("Devices and clocks", tuple(blocks))
+    return Table(columns, tuple(rows), small=True)
+
+
+def _stillness(captures: list[ViewpointCaptured]) -> str:
+    """How far the robot's clock drifted over the captures, and how still the flange stood."""
+    offsets = np.array([capture.clock_offset_s for capture in captures])
+    sigma_m = max(capture.pose_sigma_m for capture in captures)
+    return (
+        f"Over {counted(len(captures), 'capture')} the offset of the robot's clock from the host's monotonic clock "
+        f"stayed within {ms(float(np.ptp(offsets))):.1f} ms; the flange stood still within {um(sigma_m):.2f} µm (1σ) "
+        "during every exposure."
+    )
 
 
 def _clocks(run: RecordedRun) -> Iterator[Block]:
-    """Each clock as it was last compared, and what rests on it."""
+    """The last comparison of each clock, and what depends on it."""
     readings = clock_readings(run.events)
     if not readings:
         return
@@ -108,7 +115,7 @@ def _environment(captures: list[ViewpointCaptured]) -> str:
 
 
 def software_section(run: RecordedRun) -> Section:
-    """What computed, for how long, and every version installed."""
+    """The software, the number and duration of the computations, and every installed distribution."""
     sessions = [event.payload for event in run.events if isinstance(event.payload, SessionStarted)]
     software = sessions[-1].software if sessions else run.root.software
     first = ", ".join(f"{name} {software[name]}" for name in _COMPUTES if name in software)

@@ -1,7 +1,7 @@
-"""The pictures of a report: outlines found and predicted, the scene, every photograph that counts, and its original.
+"""The pictures of a report: detected and predicted outlines, the scene, the photographs, and their originals.
 
-A report is sent by post: 36 photographs, the scene and all else are to stay under 3 MB. The photographs themselves
-are named by their hashes, under which they lie in the evidence.
+A report should be small enough to send: under 3 MB with 36 photographs and the scene. The originals are named by
+their hashes, which are their names in the evidence.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from service.core.records.events import View
 
 
 def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
-    """Overlays of the evaluation, the scene, then a contact sheet of every capture that counts, and the originals.
+    """Overlays of the evaluation, the scene, a contact sheet of the valid captures, and the list of originals.
 
-    `turning`: the scene can be turned, which only HTML can show.
+    `turning`: include the scene that can be turned, which only HTML can show.
     """
     blocks: list[Block] = []
     overlays = run.summary().artefacts("overlay")
@@ -48,11 +48,11 @@ def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
         columns = (
             Column("event", 0.5, "number"),
             Column("view", 0.9),
-            Column("file as it came", 1.4),
+            Column("original file name", 1.4),
             Column("SHA-256, its name in the evidence", 4.2, "code"),
         )
         text = (
-            "What is shown above are small copies. The photographs as they came from the camera lie in the folder "
+            "The pictures above are small copies. The original photographs are in the folder "
             "artefacts of the evidence, and of a bundle made from it, each under its SHA-256."
         )
         blocks += [Heading("Originals"), Paragraph(text), Table(columns, tuple(originals), small=True)]

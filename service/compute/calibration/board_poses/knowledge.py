@@ -72,7 +72,7 @@ class BoardKnowledge:
     measured: int = 0
 
     def record(self) -> dict[str, Any]:
-        """As plain data."""
+        """The knowledge as plain data."""
         return {
             "camera": self.camera.record(),
             "T_flange_camera": self.T_flange_camera.tolist(),

@@ -1,0 +1,31 @@
+"""A store for recomputed jobs: reads the evidence, and writes into a folder of its own."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from service.audit.record.run import RecordedFiles
+from service.core.records.events import ArtefactRef
+
+
+class ScratchStore:
+    """The store that a job's handler sees during a replay."""
+
+    def __init__(self, recorded: RecordedFiles, folder: Path) -> None:
+        self._recorded = recorded
+        self._folder = folder
+
+    def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
+        """A recomputed file, or else the recorded one. Raises IntegrityError."""
+        own = self._folder / sha256
+        return own if own.is_file() else self._recorded.artefact_path(sha256, verify=verify)
+
+    def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Keep bytes in the scratch folder."""
+        digest = hashlib.sha256(data).hexdigest()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        (self._folder / digest).write_bytes(data)
+        return ArtefactRef(
+            sha256=digest, kind=kind, media_type=media_type, size_bytes=len(data), original_name=original_name
+        )

@@ -1,0 +1,142 @@
+"""Records of a camera calibration and of a hand-eye calibration, as the worker writes them into its answer.
+
+Written by service/compute/calibration/intrinsics/record.py and service/compute/calibration/hand_eye/record.py. Parts
+that are None here are not in the records of early versions.
+"""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from service.jobs.kind import JobRecord
+from service.jobs.records import ArmCorrection, Matrix, ParameterCovariance
+
+
+class Coverage(JobRecord):
+    """Board corners over the image: their number in each cell, row by row, and the share of cells that hold one."""
+
+    share: float
+    corners: tuple[tuple[int, ...], ...]
+
+
+class ResidualField(JobRecord):
+    """Mean residual (dx, dy), px, of the corners in each cell of the image, row by row, and their number."""
+
+    corners: tuple[tuple[int, ...], ...]
+    mean_px: tuple[tuple[tuple[float, float], ...], ...]
+
+
+class CrossValidation(JobRecord):
+    """Residuals, px, of corners in images that the fit has not seen; by image in the order of Intrinsics.images."""
+
+    folds: int
+    five_fold_rms_px: float
+    five_fold_view_px: tuple[float, ...] = ()
+    leave_one_out_rms_px: float | None = None
+    leave_one_out_view_px: tuple[float | None, ...] = ()
+
+
+class ProjectionUncertainty(JobRecord):
+    """Standard deviation of a projected point: in px, and in mm at the board's distance; on a grid, row by row."""
+
+    distance_m: float
+    centre_px: float
+    worst_px: float
+    centre_mm: float
+    worst_mm: float
+    sigma_px: Matrix
+    sigma_mm: Matrix
+
+
+class ExcludedImage(JobRecord):
+    """A board image that was not used, and why."""
+
+    image: str
+    reason: str
+
+
+class Intrinsics(JobRecord):
+    """What is known of the calibrated camera beside its parameters.
+
+    Attributes:
+        images: names of the images used.
+        rms_px: residual of all corners.
+        per_view_rms_px: residual of each image's corners, in the order of `images`.
+        sigma: standard deviation of each free parameter of the camera, in the parameter's own unit.
+        covariance: of the free parameters.
+    """
+
+    images: tuple[str, ...] = ()
+    rms_px: float | None = None
+    per_view_rms_px: tuple[float, ...] = ()
+    sigma: dict[str, float] = Field(default_factory=dict)
+    covariance: ParameterCovariance | None = None
+    excluded: tuple[ExcludedImage, ...] = ()
+    coverage: Coverage | None = None
+    residuals: ResidualField | None = None
+    cross_validation: CrossValidation | None = None
+    uncertainty: ProjectionUncertainty | None = None
+    warnings: tuple[str, ...] = ()
+
+
+class Spread(JobRecord):
+    """How well T_flange_camera is known.
+
+    Attributes:
+        covariance: (6, 6), translation in m, then rotation in rad.
+        mm: standard deviation of the position, 3D.
+        deg: standard deviation of the rotation, about all axes.
+    """
+
+    covariance: Matrix
+    mm: float | None = None
+    deg: float | None = None
+
+
+class Residuals(JobRecord):
+    """How far each board image, by name, puts the board from where the others put it.
+
+    Attributes:
+        mm: position, in the fit.
+        deg: rotation, in the fit.
+        held_out_mm: position, predicted by the other images alone.
+        held_out_deg: rotation, predicted by the other images alone.
+    """
+
+    mm: dict[str, float] = Field(default_factory=dict)
+    deg: dict[str, float] = Field(default_factory=dict)
+    held_out_mm: dict[str, float]
+    held_out_deg: dict[str, float]
+
+
+class RobotNoise(JobRecord):
+    """Repeatability of the arm's poses, 1σ; None where there were too few images to tell."""
+
+    mm: float | None = None
+    deg: float | None = None
+
+
+class ArmAnswer(ArmCorrection):
+    """The hand-eye answer with the arm's errors corrected; `terms`: of the arm's model, such as geometry+gears."""
+
+    sigma: Spread
+    residuals: Residuals
+    robot_noise: RobotNoise = RobotNoise()
+    terms: str = ""
+
+
+class HandEye(JobRecord):
+    """Where the camera sits on the flange, and how it was found; T_flange_camera is for poses as reported."""
+
+    T_flange_camera: Matrix
+    T_base_board: Matrix | None = None
+    sigma: Spread
+    residuals: Residuals
+    robot_noise: RobotNoise = RobotNoise()
+    method: str = ""
+    arm_correction: ArmAnswer | None = None
+
+    @property
+    def best(self) -> HandEye | ArmAnswer:
+        """What the registration uses: with the arm's correction, where there is one."""
+        return self.arm_correction or self

@@ -1,0 +1,64 @@
+"""Verification of the recorded files: each is hashed again, and files without a row are found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from service.core.errors import StoreError
+from service.store.files.artefacts import TEMPORARY, hash_file, relative_path
+from service.store.verification.chain_checks import Fault, FileState
+
+Progress = Callable[[str, int, int], None]  # (activity, bytes done, bytes in total)
+
+
+def hash_files(
+    folder: Path, artefact_rows: Iterable[Mapping[str, Any]], progress: Progress | None
+) -> dict[str, FileState]:
+    """Hash every file that the rows name, by its recorded SHA-256."""
+    wanted = {str(row["sha256"]): int(row["size_bytes"]) for row in artefact_rows}
+    total, done = sum(wanted.values()), 0
+    states: dict[str, FileState] = {}
+    for sha256, size in wanted.items():
+        states[sha256] = _file_state(folder, sha256)
+        done += size
+        if progress is not None:
+            progress("hashing files again", done, total)
+    return states
+
+
+def _file_state(folder: Path, sha256: str) -> FileState:
+    try:
+        name = relative_path(sha256)
+    except StoreError:
+        return FileState(sha256, "", 0, "the row names no SHA-256")
+    path = folder / name
+    shown = str(Path(folder.name) / name)
+    if path.is_symlink() or not path.is_file():
+        return FileState(shown, "", 0, "the file is missing")
+    try:
+        digest, size = hash_file(path)
+    except OSError as error:
+        return FileState(shown, "", 0, f"the file cannot be read: {error.strerror}")
+    return FileState(shown, digest, size, "")
+
+
+def unlisted_files(folder: Path, listed: frozenset[str]) -> tuple[list[str], list[Fault]]:
+    """(notes, faults) on files that no row names. Leftovers of crashes are notes: partial and unrecorded files."""
+    notes: list[str] = []
+    foreign: list[Fault] = []
+    for path in sorted(path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()):
+        relative = path.relative_to(folder)
+        shown = str(Path(folder.name) / relative)
+        if relative.parts[0] == TEMPORARY and path.suffix == ".part":
+            notes.append(f"{shown}: left over from an interrupted write; no record refers to it")
+        elif path.name in listed and relative == relative_path(path.name):
+            continue
+        elif not path.is_symlink() and path.is_file() and hash_file(path)[0] == path.name:
+            notes.append(
+                f"{shown}: stored but never recorded (interrupted before the record); no record refers to it"
+            )
+        else:
+            foreign.append(Fault(None, None, shown, "this file is not in the evidence and is not a crash's leftover"))
+    return notes, foreign
