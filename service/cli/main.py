@@ -32,6 +32,7 @@ _COMMANDS = {
     "register": "service.cli.compute.register:register_command",
     "spheres": "service.cli.compute.spheres:spheres_command",
     "layout": "service.cli.compute.layout:layout_command",
+    "fuse": "service.cli.compute.fuse:fuse_command",
     "evaluate": "service.cli.compute.evaluate:evaluate_app",
     "simulate": "service.cli.site.simulate:simulate_command",
     "audit": "service.cli.evidence.audit:audit_app",

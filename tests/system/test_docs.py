@@ -230,6 +230,9 @@ RUN_ELSEWHERE = {
     "orthocapture evaluate chamfer mesh.ply truth.ply --heat-map heat.ply": (
         "tests/ground_truth/test_chamfer.py::test_the_command_writes_heat_maps_in_the_unit_of_the_surface"
     ),
+    "orthocapture fuse --ct ct.ply --scan scan.ply --radius-mm 15 --out truth.ply": (
+        "tests/ground_truth/test_fuse_command.py::test_the_command_fuses_measures_and_cuts_out_the_spheres"
+    ),
     "orthocapture layout --spheres spheres.json": "tests/steps/test_layout.py::test_command",
     "orthocapture export latest --format colmap --out dataset --data runs": (
         "tests/dataset/test_export_command.py::test_a_run_is_exported_recorded_and_still_verifies"

@@ -1,0 +1,1 @@
+"""Ground truth: speed of the Chamfer distance, accuracy of the fusion."""
