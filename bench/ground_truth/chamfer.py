@@ -105,7 +105,9 @@ def main() -> None:
     (RESULTS / f"{args.out}-{day}.md").write_text(_page(record, times, whole), encoding="utf-8")
 
 
-def _page(record: Mapping[str, object], times: dict[str, dict[str, dict[str, float]]], whole: dict[str, float]) -> str:
+def _page(
+    record: Mapping[str, object], times: dict[str, dict[str, dict[str, float]]], whole: dict[str, float]
+) -> str:
     rows: list[str] = []
     for order, by in times.items():
         fastest = min(by["pykdtree"]["cpu_s"], by["scipy"]["cpu_s"])
