@@ -10,7 +10,8 @@ import numpy as np
 from service.compute.arm.kinematics import matching_arm
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.board.images import UsableViews, usable_views
-from service.compute.calibration.hand_eye.estimate import HandEyeResult, HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.hand_eye.answers import HandEyeResult
+from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.record import board_corners, hand_eye_record
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
 from service.compute.calibration.intrinsics.record import intrinsics_record
