@@ -55,10 +55,22 @@ class ExcludedImage(JobRecord):
     reason: str
 
 
+class BoardSeen(JobRecord):
+    """The calibration board: inner corners, and the edge of a square."""
+
+    pattern: str
+    columns: int
+    rows: int
+    square_mm: float
+
+
 class Intrinsics(JobRecord):
     """What is known of the calibrated camera beside its parameters.
 
     Attributes:
+        model: of the distortion.
+        board: that was seen.
+        n_views: number of images used.
         images: names of the images used.
         rms_px: residual of all corners.
         per_view_rms_px: residual of each image's corners, in the order of `images`.
@@ -66,6 +78,9 @@ class Intrinsics(JobRecord):
         covariance: of the free parameters.
     """
 
+    model: str = ""
+    board: BoardSeen | None = None
+    n_views: int = 0
     images: tuple[str, ...] = ()
     rms_px: float | None = None
     per_view_rms_px: tuple[float, ...] = ()
@@ -116,9 +131,18 @@ class RobotNoise(JobRecord):
     deg: float | None = None
 
 
+class Method(JobRecord):
+    """A hand-eye transform by one method, and its distance from the one in use."""
+
+    T_flange_camera: Matrix
+    distance_mm: float
+    distance_deg: float
+
+
 class ArmAnswer(ArmCorrection):
     """The hand-eye answer with the arm's errors corrected; `terms`: of the arm's model, such as geometry+gears."""
 
+    T_base_board: Matrix | None = None
     sigma: Spread
     residuals: Residuals
     robot_noise: RobotNoise = RobotNoise()
@@ -134,6 +158,10 @@ class HandEye(JobRecord):
     residuals: Residuals
     robot_noise: RobotNoise = RobotNoise()
     method: str = ""
+    methods: dict[str, Method] = Field(default_factory=dict[str, Method])
+    corner_sigma_px: float | None = None  # of a board corner, 1σ
+    excluded: dict[str, str] = Field(default_factory=dict[str, str])  # reasons, by image
+    arm_held_out_rms_mm: dict[str, float] = Field(default_factory=dict[str, float])  # by terms of the arm's model
     arm_correction: ArmAnswer | None = None
 
     @property

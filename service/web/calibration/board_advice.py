@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from service.compute.arm.correction import corrected_T_base_flange
 from service.compute.arm.inverse_kinematics import nearest_posture
@@ -22,10 +22,13 @@ from service.core.geometry import Transform, inverse
 from service.core.protocol.models import Board as BoardSection
 from service.core.records.events import ViewpointCaptured
 from service.core.units import deg, metres, mm
+from service.jobs.calibration.records import ArmAnswer, HandEye
+from service.jobs.records import Camera
 from service.steps.capture.plan.planning import known_arm
 from service.web.record.pictures import cached
 
 POSES = 6
+_USUAL_CORNER_PX = 0.1  # 1σ of a board corner, for records that do not state it
 _ROWS, _COLUMNS = ("upper", "middle", "lower"), ("left", "centre", "right")
 
 
@@ -51,6 +54,9 @@ class PoseAdvice:
     flange_mm: tuple[float, float, float]
 
 
+_KEPT = TypeAdapter(tuple[PoseAdvice, ...])
+
+
 def empty_regions(corners: Sequence[Sequence[int]]) -> list[tuple[str, int, int]]:
     """Ninths of the image that have cells without corners: name, empty cells, all its cells; worst first."""
     grid = np.array(corners)
@@ -65,8 +71,8 @@ def empty_regions(corners: Sequence[Sequence[int]]) -> list[tuple[str, int, int]
 
 
 def advised_poses(
-    record: Mapping[str, Any],
-    camera: Mapping[str, Any],
+    hand_eye: HandEye,
+    camera: Camera,
     captures: Sequence[ViewpointCaptured],
     board: BoardSection,
     arm: str,
@@ -76,36 +82,39 @@ def advised_poses(
     """Suggested poses, computed once for a calibration and cached; none if the linearised problem has no solution.
 
     Args:
-        record: of the hand-eye calibration.
+        hand_eye: the hand-eye calibration.
+        camera: the calibrated camera.
         captures: the board images that it used.
+        board: the calibration board.
         arm: model name; poses that it does not reach are left out, where its kinematics are known.
+        data: the data folder, in which the result is cached.
         key: of the calibration, such as its file's hash.
     """
 
     def make() -> bytes:
         try:
-            found = _advise(record, CameraModel.from_record(dict(camera)), captures, board, arm)
+            found = _advise(hand_eye, CameraModel.from_record(camera.plain()), captures, board, arm)
         except (OrthocaptureError, np.linalg.LinAlgError):
             found = ()
-        return json.dumps([asdict(pose) for pose in found]).encode()
+        return _KEPT.dump_json(found)
 
-    kept: list[dict[str, Any]] = json.loads(cached(data, f"board poses {key}", ".json", make).read_bytes())
-    return tuple(PoseAdvice(**pose) for pose in kept)
+    return _KEPT.validate_json(cached(data, f"board poses {key}", ".json", make).read_bytes())
 
 
 def _advise(
-    record: Mapping[str, Any],
+    hand_eye: HandEye,
     camera: CameraModel,
     captures: Sequence[ViewpointCaptured],
     board: BoardSection,
     arm: str,
 ) -> tuple[PoseAdvice, ...]:
-    best = record["arm_correction"] or record
+    best, correction = hand_eye.best, hand_eye.arm_correction
     T_base_flange = np.array([capture.T_base_flange for capture in captures])
     joints = np.array([capture.joints_rad for capture in captures])
-    if record["arm_correction"]:
-        T_base_flange = corrected_T_base_flange(joints, T_base_flange, read_arm_correction(best).correction)
-    sigma_px = float(record.get("corner_sigma_px") or 0.1)
+    if correction is not None:
+        arm_errors = read_arm_correction(correction.plain()).correction
+        T_base_flange = corrected_T_base_flange(joints, T_base_flange, arm_errors)
+    sigma_px = hand_eye.corner_sigma_px or _USUAL_CORNER_PX
     model = known_arm(arm) if arm else None
 
     def reachable(target: Transform) -> bool:
@@ -116,7 +125,7 @@ def _advise(
     suggested = suggest_board_poses(
         _answer(best), T_base_flange, points, camera, corner_sigma_px=sigma_px, count=POSES, reachable=reachable
     )
-    T_board_base = inverse(np.array(best["T_base_board"]))
+    T_board_base = inverse(np.array(best.T_base_board))
     middle = points.mean(axis=0)
     out: list[PoseAdvice] = []
     for pose in suggested:
@@ -138,20 +147,24 @@ def _advise(
     return tuple(out)
 
 
-def _answer(record: Mapping[str, Any]) -> HandEyeAnswer:
-    residuals = {name: np.array(list(values.values())) for name, values in record["residuals"].items()}
+def _answer(best: HandEye | ArmAnswer) -> HandEyeAnswer:
+    sigma, noise, residuals = best.sigma, best.robot_noise, best.residuals
     return HandEyeAnswer(
-        T_flange_camera=np.array(record["T_flange_camera"]),
-        T_base_board=np.array(record["T_base_board"]),
-        sigma_mm=record["sigma"]["mm"],
-        sigma_deg=record["sigma"]["deg"],
-        covariance=np.array(record["sigma"]["covariance"]),
+        T_flange_camera=np.array(best.T_flange_camera),
+        T_base_board=np.array(best.T_base_board),
+        sigma_mm=_known(sigma.mm),
+        sigma_deg=_known(sigma.deg),
+        covariance=np.array(sigma.covariance),
         camera_share=np.zeros((6, 6)),  # it is part of the covariance, and is not needed separately here
         formal_covariance=None,
-        robot_noise_mm=record["robot_noise"]["mm"],
-        robot_noise_deg=record["robot_noise"]["deg"],
-        residual_mm=residuals["mm"],
-        residual_deg=residuals["deg"],
-        held_out_mm=residuals["held_out_mm"],
-        held_out_deg=residuals["held_out_deg"],
+        robot_noise_mm=_known(noise.mm),
+        robot_noise_deg=_known(noise.deg),
+        residual_mm=np.array(list(residuals.mm.values())),
+        residual_deg=np.array(list(residuals.deg.values())),
+        held_out_mm=np.array(list(residuals.held_out_mm.values())),
+        held_out_deg=np.array(list(residuals.held_out_deg.values())),
     )
+
+
+def _known(value: float | None) -> float:
+    return math.nan if value is None else value

@@ -99,11 +99,12 @@ def _advice(site: Site, log: RunRecord, found: Calibration) -> dict[str, object]
     from service.web.calibration.board_advice import advised_poses, empty_regions  # noqa: PLC0415
     from service.web.record.planned_poses import recorded_rig  # noqa: PLC0415
 
-    regions = [] if found.intrinsics is None else empty_regions(found.intrinsics["coverage"]["corners"])
+    coverage = None if found.intrinsics is None else found.intrinsics.coverage
+    regions = [] if coverage is None else empty_regions(coverage.corners)
     board = log.protocol.board
     if found.hand_eye is None or found.best is None or board is None or found.artefact is None:
         return {"regions": regions, "poses": ()}
-    used = set(found.best["residuals"]["mm"])
+    used = set(found.best.residuals.mm)
     poses = advised_poses(
         found.hand_eye,
         found.camera,

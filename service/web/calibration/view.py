@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Any
+
+from pydantic import BaseModel
 
 from service.core.protocol.models import Step
 from service.core.records.events import ArtefactRef, DeviceOpened, OperatorAction, View
 from service.core.run.state import StepState
+from service.jobs.calibration import calibrate
+from service.jobs.calibration.records import ArmAnswer, HandEye, Intrinsics, Residuals
+from service.jobs.records import Camera
 from service.run_record import RunRecord
+from service.steps.kinds.calibration import Params
 from service.web.page.charts import Dots, HeatMap, VectorField, dots, heat_map, vector_field
 from service.web.record.board_images import BoardUse, board_use
-from service.web.record.images import captures_of
+from service.web.record.images import StatedCamera, captures_of, stated_camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,20 +44,20 @@ class Calibration:
 
     Attributes:
         steps: those that solved something, in order.
-        intrinsics: `intrinsics_record`; None: not solved yet.
-        camera: fx … k6, width, height.
-        hand_eye: `hand_eye_record`; None: not solved yet.
-        best: the answer that the registration uses: the arm's correction where there is one, else `hand_eye`.
+        camera: with its distortion.
+        intrinsics: what is known of the camera beside its parameters; None: not solved yet.
+        hand_eye: None: not solved yet.
+        best: the answer that the registration uses: with the arm's correction where there is one.
         captures: the board images, of the step whose images were used.
         artefact: calibration.json of the last step.
         states: of all steps of the run.
     """
 
     steps: tuple[tuple[Step, StepState], ...]
-    camera: Mapping[str, float]
-    intrinsics: Mapping[str, Any] | None
-    hand_eye: Mapping[str, Any] | None
-    best: Mapping[str, Any] | None
+    camera: Camera
+    intrinsics: Intrinsics | None
+    hand_eye: HandEye | None
+    best: HandEye | ArmAnswer | None
     captures: tuple[View, ...]
     artefact: ArtefactRef | None
     robots: tuple[str, ...]
@@ -79,64 +84,75 @@ def calibration_of(log: RunRecord) -> Calibration | None:
     ]
     if not solved:
         return None
-    intrinsics: Mapping[str, Any] | None = None
-    hand_eye: Mapping[str, Any] | None = None
-    camera: Mapping[str, float] = {}
-    captures: list[View] = []
-    robots: tuple[str, ...] = ()
-    for step, state in solved:
-        details: Mapping[str, Any] = state.result["details"]
-        camera = state.result["camera"]
-        source = step.params.model_dump().get("images_of") or step.id
-        mine = [c.payload for c in captures_of(log, source) if c.replaced is None]
-        captures = mine or captures
-        if details.get("intrinsics"):
-            intrinsics = details["intrinsics"]
-        if state.result.get("hand_eye"):
-            hand_eye, robots = state.result["hand_eye"], tuple(state.result.get("robots", ()))
-    best = None if hand_eye is None else hand_eye["arm_correction"] or hand_eye
+    answers = [calibrate.KIND.read_answer(state.result) for _, state in solved]
+    intrinsics = [answer.details.intrinsics for answer in answers if answer.details.intrinsics is not None]
+    hand_eyes = [
+        (answer.hand_eye, _Robots.model_validate(state.result).robots)
+        for answer, (_, state) in zip(answers, solved, strict=True)
+        if answer.hand_eye is not None
+    ]
+    captures = [found for step, _ in solved if (found := _board_images(log, step))]
+    hand_eye, robots = hand_eyes[-1] if hand_eyes else (None, ())
     files = [ref for ref in solved[-1][1].artefacts if ref.kind == "calibration"]
     return Calibration(
-        tuple(solved), camera, intrinsics, hand_eye, best, tuple(captures), files[-1] if files else None, robots,
-        log.state.steps,
-    )  # fmt: skip
+        steps=tuple(solved),
+        camera=answers[-1].camera,
+        intrinsics=intrinsics[-1] if intrinsics else None,
+        hand_eye=hand_eye,
+        best=None if hand_eye is None else hand_eye.best,
+        captures=captures[-1] if captures else (),
+        artefact=files[-1] if files else None,
+        robots=robots,
+        states=log.state.steps,
+    )
+
+
+class _Robots(BaseModel):
+    """The devices whose flange carried the camera, in the result of a calibration step."""
+
+    robots: tuple[str, ...] = ()
+
+
+def _board_images(log: RunRecord, step: Step) -> tuple[View, ...]:
+    """The valid board images that a calibration step used: its own, or those of an earlier step."""
+    source = step.params_as(Params).images_of or step.id
+    return tuple(capture.payload for capture in captures_of(log, source) if capture.replaced is None)
 
 
 def charts_of(calibration: Calibration) -> Charts | None:
     """The charts of the intrinsics; None if they are not solved."""
     record = calibration.intrinsics
-    if record is None:
+    if record is None or record.coverage is None or record.residuals is None or record.uncertainty is None:
         return None
-    size = int(calibration.camera["width"]), int(calibration.camera["height"])
-    uncertainty = record["uncertainty"]
-    validation: Mapping[str, Any] = record["cross_validation"] or {}
-    per_image: list[tuple[str, Sequence[float | None]]] = [("in the fit", record["per_view_rms_px"])]
-    if validation:
-        per_image.append(("held out, five folds", validation["five_fold_view_px"]))
-        per_image.append(("held out, one at a time", validation["leave_one_out_view_px"]))
+    size = calibration.camera.width, calibration.camera.height
+    uncertainty, validation = record.uncertainty, record.cross_validation
+    per_image: list[tuple[str, Sequence[float | None]]] = [("in the fit", record.per_view_rms_px)]
+    if validation is not None:
+        per_image.append(("held out, five folds", validation.five_fold_view_px))
+        per_image.append(("held out, one at a time", validation.leave_one_out_view_px))
     gate = _limit(calibration, "rms_px")
     return Charts(
-        coverage=heat_map(record["coverage"]["corners"], size, title="Board corners in each cell of the image"),
+        coverage=heat_map(record.coverage.corners, size, title="Board corners in each cell of the image"),
         residuals=vector_field(
-            record["residuals"]["mean_px"],
-            record["residuals"]["corners"],
+            record.residuals.mean_px,
+            record.residuals.corners,
             size,
             title="Mean residual of the corners in each cell",
         ),
         per_image=dots(
-            record["images"],
+            record.images,
             per_image,
             title="Residual of each image, rms, px",
             limit=gate,
             limit_text="" if gate is None else f"limit of the whole: {gate:g} px",
         ),
         sigma_px=heat_map(
-            uncertainty["sigma_px"], size, title="Uncertainty of a projected point, px", unit="px", digits=3,
+            uncertainty.sigma_px, size, title="Uncertainty of a projected point, px", unit="px", digits=3,
             logarithmic=True, every=4,
         ),
         sigma_mm=heat_map(
-            uncertainty["sigma_mm"], size,
-            title=f"Uncertainty at {uncertainty['distance_m']:.2f} m, where the specimen lies, mm",
+            uncertainty.sigma_mm, size,
+            title=f"Uncertainty at {uncertainty.distance_m:.2f} m, where the specimen lies, mm",
             unit="mm", digits=4, logarithmic=True, every=4,
         ),
     )  # fmt: skip
@@ -147,10 +163,11 @@ def hand_eye_chart(calibration: Calibration) -> Dots | None:
     best = calibration.best
     if best is None:
         return None
-    names = list(best["residuals"]["mm"])
+    residuals = best.residuals
+    names = list(residuals.mm)
     values: list[tuple[str, Sequence[float | None]]] = [
-        ("in the fit", [best["residuals"]["mm"][name] for name in names]),
-        ("held out", [best["residuals"]["held_out_mm"][name] for name in names]),
+        ("in the fit", [residuals.mm[name] for name in names]),
+        ("held out", [residuals.held_out_mm[name] for name in names]),
     ]
     gate = _limit(calibration, "hand_eye_held_out_mm")
     limit_text = "" if gate is None else f"limit of the median held out: {gate:g} mm"
@@ -159,23 +176,26 @@ def hand_eye_chart(calibration: Calibration) -> Dots | None:
 
 def image_rows(calibration: Calibration) -> list[ImageRow]:
     """Every board image with its residuals, unused images first."""
-    record, best = calibration.intrinsics or {}, calibration.best or {}
-    names: list[str] = record.get("images", [])
-    validation: Mapping[str, Any] = record.get("cross_validation") or {}
+    record = calibration.intrinsics or Intrinsics()
+    validation = record.cross_validation
 
-    def by_image(values: Sequence[float | None] | None) -> dict[str, float | None]:
-        return dict(zip(names, values, strict=False)) if values else {}
+    def by_image(values: Sequence[float | None]) -> dict[str, float | None]:
+        return dict(zip(record.images, values, strict=False))
 
-    rms = by_image(record.get("per_view_rms_px"))
-    five, one = by_image(validation.get("five_fold_view_px")), by_image(validation.get("leave_one_out_view_px"))
-    left: Mapping[str, Mapping[str, float]] = best.get("residuals", {})
+    rms = by_image(record.per_view_rms_px)
+    five = by_image(() if validation is None else validation.five_fold_view_px)
+    one = by_image(() if validation is None else validation.leave_one_out_view_px)
+    residuals = Residuals(held_out_mm={}, held_out_deg={}) if calibration.best is None else calibration.best.residuals
     rows = [
         ImageRow(
-            name,
-            rms.get(name),
-            five.get(name),
-            one.get(name),
-            *(left.get(key, {}).get(name) for key in ("mm", "deg", "held_out_mm", "held_out_deg")),
+            name=name,
+            rms_px=rms.get(name),
+            five_fold_px=five.get(name),
+            leave_one_out_px=one.get(name),
+            residual_mm=residuals.mm.get(name),
+            residual_deg=residuals.deg.get(name),
+            held_out_mm=residuals.held_out_mm.get(name),
+            held_out_deg=residuals.held_out_deg.get(name),
             sha256=capture.artefacts[0].sha256,
             step=capture.step,
             use=board_use(calibration.states[capture.step], capture),
@@ -190,7 +210,7 @@ def held_out_mm(calibration: Calibration) -> tuple[float, float] | None:
     """Median and maximum error of the board's position by images that the hand-eye calibration did not use, mm."""
     if calibration.best is None:
         return None
-    values = list(calibration.best["residuals"]["held_out_mm"].values())
+    values = list(calibration.best.residuals.held_out_mm.values())
     return median(values), max(values)
 
 
@@ -233,7 +253,7 @@ class Certificate:
         stops: troubles of the robot or camera since.
     """
 
-    camera: Mapping[str, Any]
+    camera: StatedCamera
     camera_model: str
     robots: tuple[tuple[str, str, str], ...]
     environment: Mapping[str, float]
@@ -244,10 +264,14 @@ class Certificate:
     stops: tuple[str, ...]
 
 
-_STATED = (
-    "model", "body_serial", "lens", "lens_serial", "focal_length_mm", "aperture_f", "exposure_s", "iso", "focus_mode",
-    "focus_distance_m", "width", "height",
-)  # fmt: skip
+def _later_checks(log: RunRecord, calibrated: set[str]) -> list[LaterCheck]:
+    """The steps outside the calibration that compared their images with it."""
+    steps = [(step, log.state.steps[step.id]) for step in log.protocol.steps if step.id not in calibrated]
+    return [
+        LaterCheck(step.title, len(done.captured), int(done.measures["optics_departures"]))
+        for step, done in steps
+        if "optics_departures" in done.measures
+    ]
 
 
 def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
@@ -263,11 +287,6 @@ def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
         and event.payload.step in ids
         and state.steps[event.payload.step].signed
     ]
-    checks = [
-        LaterCheck(step.title, len(done.captured), int(done.measures["optics_departures"]))
-        for step, done in ((s, state.steps[s.id]) for s in log.protocol.steps)
-        if step.id not in ids and "optics_departures" in done.measures
-    ]
     passed = None
     if there.passed_seq:
         passed = (there.passed_seq, there.passed_sha256, log.events[there.passed_seq - 1].at_utc)
@@ -279,16 +298,16 @@ def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
         if isinstance(event.payload, DeviceOpened)
     }
     models = [str(identity.get("model", "")) for identity in known.values() if identity.get("kind") == "camera"]
-    stated = dict.fromkeys(_STATED) | ({} if first is None else first.camera)  # imported images state what they do
+    stated = StatedCamera() if first is None else stated_camera(first)
     robots = [(name, known.get(name, {})) for name in calibration.robots]
     return Certificate(
         stated,
-        models[-1] if models else str(stated["model"] or ""),
+        models[-1] if models else stated.model or "",
         tuple((name, str(about.get("model", "")), str(about.get("serial", ""))) for name, about in robots),
         {} if first is None else first.environment,
         state.operator,
         passed,
         tuple({s.step: s for s in signatures}.values()),
-        tuple(checks),
+        tuple(_later_checks(log, ids)),
         tuple(stops),
     )

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -16,11 +16,12 @@ from service.core.records.events import OperatorAction, ViewpointCaptured
 from service.core.run.actions import refuse
 from service.core.run.state import StepState
 from service.core.units import mm, mrad
+from service.jobs.calibration import calibrate
 from service.jobs.capture import live_summary, live_view
 from service.run_record import RunRecord
 from service.steps.notes import motion_plan, suggested_views
 from service.web.record.board_images import board_use, board_uses
-from service.web.record.images import Capture, captures_of, last_failures
+from service.web.record.images import Capture, captures_of, last_failures, stated_camera
 from service.web.record.planned_poses import Vector, nominal_T_flange_camera, place, planned_viewpoints
 
 ViewState = Literal["done", "departs", "unused", "next", "open", "again", "failed", "skipped", "left_out"]
@@ -190,10 +191,10 @@ def verdicts_of(log: RunRecord, step: Step, capture: Capture, others: Sequence[C
 def _board(log: RunRecord, step: Step, capture: Capture) -> Verdict:
     """Whether the calibration uses an image of the board."""
     use, name = board_use(log.state.steps[step.id], capture.payload), capture.payload.viewpoint
-    details: Any = log.state.steps[step.id].result.get("details", {})
-    intrinsics = details.get("intrinsics") or {}
-    if use.used and "per_view_rms_px" in intrinsics:
-        rms = dict(zip(intrinsics["images"], intrinsics["per_view_rms_px"], strict=True))[name]
+    result = log.state.steps[step.id].result
+    intrinsics = calibrate.KIND.read_answer(result).details.intrinsics if result else None
+    if use.used and intrinsics is not None and intrinsics.per_view_rms_px:
+        rms = dict(zip(intrinsics.images, intrinsics.per_view_rms_px, strict=True))[name]
         return Verdict("Board", True, "Found", f"corners {rms:.3f} px rms against the calibration")
     return Verdict("Board", use.used, use.word, use.why)
 
@@ -250,8 +251,8 @@ def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
 
     settings = payload.verdicts.get("settings")
     words = {None: "not judged", True: "As wanted", False: "Differ"}
-    camera = payload.camera
-    figures = _settings(camera.get("aperture_f"), camera.get("exposure_s"), camera.get("iso"))
+    camera = stated_camera(payload)
+    figures = _settings(camera.aperture_f, camera.exposure_s, camera.iso)
     demanded = protocol.camera
     limit = ""
     if demanded is not None:
@@ -264,13 +265,13 @@ def _small(value: float) -> str:
     return "< 0.0001" if value < 1e-4 else f"{value:.4f}"
 
 
-def _settings(aperture_f: object, exposure_s: object, iso: object) -> str:
+def _settings(aperture_f: float | None, exposure_s: float | None, iso: float | None) -> str:
     parts: list[str] = []
-    if isinstance(aperture_f, (int, float)):
+    if aperture_f is not None:
         parts.append(f"f/{aperture_f:g}")
-    if isinstance(exposure_s, (int, float)) and exposure_s > 0:
+    if exposure_s is not None and exposure_s > 0:
         parts.append(f"1/{1 / exposure_s:.0f} s" if exposure_s < 0.5 else f"{exposure_s:g} s")
-    if isinstance(iso, (int, float)):
+    if iso is not None:
         parts.append(f"ISO {iso:.0f}")
     return " · ".join(parts)
 

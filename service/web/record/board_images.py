@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from service.core.records.events import Event, View
 from service.core.run.state import RunState, StepState
+from service.jobs.calibration import board_view, calibrate
+from service.jobs.calibration.records import Intrinsics
+from service.jobs.looks import image_of
+from service.steps.notes import board_plans
 
 BOARD_IMAGE = "board_image"
 _INSTEAD = "another pose was taken instead"
@@ -44,16 +47,19 @@ def board_use(state: StepState, view: View) -> BoardUse:
     """Whether one image of a step is used."""
     sha256, name = view.artefacts[0].sha256, view.viewpoint
     looks = [job for job in state.jobs.values() if job.kind == "board_view"]
-    look = next((job for job in looks if job.arguments["image"]["sha256"] == sha256), None)
-    details: Any = state.result.get("details", {})
-    intrinsics = details.get("intrinsics") or {}
-    solved, why = set(intrinsics.get("images", ())), _reasons(state, details)
-    excluded = {entry["image"] for entry in intrinsics.get("excluded", ())}
+    look = next((job for job in looks if image_of(job).sha256 == sha256), None)
+    answer = calibrate.KIND.read_answer(state.result) if state.result else None
+    intrinsics = Intrinsics() if answer is None else answer.details.intrinsics or Intrinsics()
+    solved, why = set(intrinsics.images), _reasons(state, answer)
+    excluded = {entry.image for entry in intrinsics.excluded}
     if name in solved and name not in excluded:
         return BoardUse(True, "Used", why.get(name, ""))
-    unseen = look is not None and look.status == "finished" and not look.result.get("seen")
+    found = None
+    if look is not None and look.status == "finished":
+        found = board_view.KIND.read_answer(look.result)
+    unseen = found is not None and not found.seen
     departs = [key for key, passed in view.verdicts.items() if not passed]
-    reason = why.get(name) or (_plain(str(look.result.get("reason", ""))) if unseen and look is not None else "")
+    reason = why.get(name) or (_plain(found.reason) if found is not None and not found.seen else "")
     if not reason and departs:
         reason = f"{' and '.join(departs)} not as required"
     if not reason and look is not None and look.status == "failed":
@@ -72,14 +78,17 @@ def unused_count(run: RunState, events: Sequence[Event], step: str) -> int:
     return sum(use.used is False for use in board_uses(run, events, step).values())
 
 
-def _reasons(state: StepState, details: Mapping[str, Any]) -> dict[str, str]:
+def _reasons(state: StepState, answer: calibrate.Answer | None) -> dict[str, str]:
     """Reasons against using an image, by viewpoint."""
-    intrinsics, hand_eye = details.get("intrinsics") or {}, state.result.get("hand_eye") or {}
-    why = dict.fromkeys(map(str, details.get("views_without_board", ())), "no board was found in it")
-    why |= {str(entry["image"]): str(entry["reason"]) for entry in intrinsics.get("excluded", ())}
-    why |= {str(name): str(reason) for name, reason in hand_eye.get("excluded", {}).items()}
-    for note in state.notes:  # why other poses were planned
-        why |= {str(n): f"{r} ({_INSTEAD})" for n, r in note.data.get("instead_of", {}).items()}
+    why: dict[str, str] = {}
+    if answer is not None:
+        details, hand_eye = answer.details, answer.hand_eye
+        why |= dict.fromkeys(details.views_without_board, "no board was found in it")
+        if details.intrinsics is not None:
+            why |= {entry.image: entry.reason for entry in details.intrinsics.excluded}
+        why |= {} if hand_eye is None else hand_eye.excluded
+    for plan in board_plans(state):  # why other poses were planned
+        why |= {name: f"{reason} ({_INSTEAD})" for name, reason in plan.instead_of.items()}
     return {name: _plain(reason) for name, reason in why.items()}
 
 

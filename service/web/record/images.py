@@ -5,10 +5,36 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from pydantic import BaseModel, ConfigDict
+
 from service.core.records.events import View, ViewpointFailed
 from service.core.run.state import JobState, StepState, Superseded
 from service.jobs.looks import image_of
 from service.run_record import RunRecord
+
+
+class StatedCamera(BaseModel):
+    """Camera, lens and settings as a photograph states them; None where it does not."""
+
+    model_config = ConfigDict(frozen=True)
+
+    model: str | None = None
+    body_serial: str | None = None
+    lens: str | None = None
+    lens_serial: str | None = None
+    focal_length_mm: float | None = None
+    aperture_f: float | None = None
+    exposure_s: float | None = None
+    iso: float | None = None
+    focus_mode: str | None = None
+    focus_distance_m: float | None = None
+    width: int | None = None
+    height: int | None = None
+
+
+def stated_camera(view: View) -> StatedCamera:
+    """What the photograph of a view states about the camera."""
+    return StatedCamera.model_validate(view.camera)
 
 
 @dataclass(frozen=True, slots=True)
