@@ -48,7 +48,7 @@ def ours(a: Array, b: Array) -> Array:
 
 def scipy_tree(a: Array, b: Array) -> Array:
     """The same by SciPy on all cores."""
-    return np.array([np.mean(cKDTree(y).query(x, workers=-1)[0]) for x, y in ((a, b), (b, a))])
+    return np.array([np.mean(cKDTree(y).query(x, workers=-1)[0]) for x, y in ((a, b), (b, a))], dtype=np.float64)
 
 
 def pykdtree_tree(a: Array, b: Array) -> Array:
