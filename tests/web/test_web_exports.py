@@ -23,6 +23,7 @@ from service.store.verification.verify import verify
 from service.web.audit.exports import MEANINGS
 from tests.support.pages.web import Browser, WebSite, password_of, web_site
 from tests.support.runs.bench_run import PROTOCOL
+from tests.support.runs.registration_record import CAMERA
 from tests.support.runs.reported_run import T_SCAN_CAMERA, record_reported_run
 
 NEEDS_RELEASE = PROTOCOL.replace("steps:", "release: second_person\nsteps:", 1)
@@ -188,7 +189,7 @@ def test_a_data_set_leaves_with_all_that_belongs_to_it(
     for name, sha256 in described["image_sha256"].items():
         assert hashlib.sha256(files[f"images/{name}"]).hexdigest() == sha256
         assert sha256 in recorded, "of the attempt that counts"
-    assert json.loads(files["camera.json"])["fx"] == 2033.77
+    assert json.loads(files["camera.json"])["fx"] == CAMERA["fx"], "the camera that was registered"
     (tmp_path / "poses.csv").write_bytes(files["poses.csv"])
     poses = read_poses_csv(tmp_path / "poses.csv")
     assert np.allclose(poses["v002.jpg"], T_SCAN_CAMERA)

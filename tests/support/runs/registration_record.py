@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-_CAMERA = {
+CAMERA = {
     "width": 1280, "height": 853, "fx": 1000.0, "fy": 1000.0, "cx": 640.0, "cy": 426.0,
     "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
 }  # fmt: skip
@@ -16,7 +16,7 @@ def registration_record(poses: str, **more: Any) -> dict[str, Any]:
     """One with the identity for every transform; `more` replaces or adds fields."""
     record: dict[str, Any] = {
         "poses": poses,
-        "camera": _CAMERA,
+        "camera": CAMERA,
         "outlines": "0" * 64,
         "full_camera": None,
         "T_world_scan": np.eye(4).tolist(),
