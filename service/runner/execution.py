@@ -19,8 +19,6 @@ from service.runner.operator import Operator
 from service.steps import step_kinds
 from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
 
-_WRITE_NOTHING = ("checklist", "timed_application")  # step kinds that may run when the disk is full
-
 
 @dataclass(frozen=True)
 class StepExecution:
@@ -44,7 +42,7 @@ class StepExecution:
             self.devices.let_move(LeaveToMove(leave.seq, leave.by, self.run.follower.leave_not_before_s))
         try:
             checkpoint()
-            if step.kind not in _WRITE_NOTHING:
+            if step.needs_disk:
                 self.disk.require()
             outcome = step_kinds()[step.kind].execute(context, step.params)
         except StepInterruptedError as interruption:

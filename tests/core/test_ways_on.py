@@ -21,7 +21,7 @@ from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
 from service.core.records.events import OperatorAction, OperatorVerb
 from service.core.recovery.policy import NEEDS_A_PERSON
 from service.core.recovery.ways_on import WayOn, takes_words, ways_on
-from service.core.recovery.words import AGAIN, REMEDIES
+from service.core.recovery.words import REMEDIES
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.runner.operator import AnswerBy
@@ -240,7 +240,6 @@ def test_every_error_of_a_device_and_every_kind_of_step_has_words() -> None:
     for name in (*REMEDIES, *NEEDS_A_PERSON):
         assert hasattr(device_errors, name) or hasattr(core_errors, name)
         assert name in REMEDIES
-    assert set(AGAIN) <= set(step_kinds())
 
 
 def test_status_lists_them_for_other_programs(begin: Callable[[Fakes, Walker], Bench], tmp_path: Path) -> None:

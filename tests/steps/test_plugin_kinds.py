@@ -17,6 +17,7 @@ PLUGIN = '''
 
 from typing import Annotated
 
+from service.core.protocol.step_params import StepParams
 from service.core.records.base import Record
 from service.jobs.kind import JobKind, JobRecord
 from service.steps.context import Announcement, JobRequest, StepKind, StepOutcome
@@ -48,7 +49,7 @@ WEIGH = JobKind(
 )
 
 
-class Params(Record):
+class Params(StepParams):
     """How often it is weighed."""
 
     times: int = 3

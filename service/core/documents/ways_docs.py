@@ -10,7 +10,7 @@ from service.core.protocol.models import Gate, Protocol, Step
 from service.core.records.events import GateVerdict
 from service.core.recovery.policy import recovery_policy
 from service.core.recovery.ways_on import WayOn, planned_views, takes_words, ways_on
-from service.core.recovery.words import AGAIN, OTHERWISE, REMEDIES
+from service.core.recovery.words import REMEDIES
 from service.core.run.fold import initial_state
 from service.core.run.lifecycle import state_name
 from service.core.run.state import Failure, RunState, StepState
@@ -82,7 +82,7 @@ def _failures(protocol: Protocol, step: Step) -> Iterator[tuple[str, RunState]]:
         if gates:
             verdicts = tuple(_failed(gate) for gate in gates[:1])
             yield f"{name}, such as {gates[0].measure}", change(at, step.id, verdicts=verdicts)
-    again = AGAIN.get(step.kind, OTHERWISE)
+    again = step.repeated
     device = "UnreadableFileError" if step.kind.endswith("_import") else "DeviceFaultError"
     errors = ((device, "a device fails", again.device), ("ComputeError", "a computation fails", again.computes))
     for error, what, possible in errors:

@@ -21,6 +21,7 @@ from pydantic import (
 
 from service.core.errors import ProtocolError
 from service.core.protocol.rules import rule_violations
+from service.core.protocol.step_params import MovingParams, RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.core.recovery.reasons import Reasons
 from service.core.run.lifecycle import RESERVED_STEP_IDS
@@ -167,15 +168,6 @@ class StepFields(Record):
     simulated_hands: tuple[HandAction, ...] = ()  # ignored on a real rig
 
 
-class MovingParams(Record):
-    """Base of the params of a step kind that moves the robot; such a step never begins without a person."""
-
-    @property
-    def moves_robot(self) -> bool:
-        """Whether the step moves the robot with these params."""
-        return True
-
-
 class Step(StepFields):
     """One step of the procedure; `params` is an instance of its kind's Params model."""
 
@@ -185,6 +177,16 @@ class Step(StepFields):
     def moves_robot(self) -> bool:
         """Whether the robot moves during this step; confirming it takes a held button or two pedal presses."""
         return isinstance(self.params, MovingParams) and self.params.moves_robot
+
+    @property
+    def repeated(self) -> RepeatedStep:
+        """What trying this step again means."""
+        return self.params.repeated if isinstance(self.params, StepParams) else StepParams.repeated
+
+    @property
+    def needs_disk(self) -> bool:
+        """Whether this step stores files."""
+        return not isinstance(self.params, StepParams) or self.params.needs_disk
 
     @property
     def begins_confirmed(self) -> bool:

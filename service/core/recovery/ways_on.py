@@ -12,7 +12,7 @@ from service.core.gates.acceptance import acceptance_refusal, demanded_role
 from service.core.gates.dependence import dependent_steps, used_steps
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import OperatorVerb
-from service.core.recovery.words import AGAIN, OTHERWISE, REMEDIES, UNKNOWN_REMEDY, RepeatedStep
+from service.core.recovery.words import REMEDIES, UNKNOWN_REMEDY
 from service.core.run.actions import redo_refusal, skip_refusal, unmet_requirements
 from service.core.run.state import RunState, StepState
 from service.core.run.state_transitions import seconds_between
@@ -59,7 +59,7 @@ def ways_on(protocol: Protocol, state: RunState) -> tuple[WayOn, ...]:
         found.append(_skip(protocol, state))
     else:
         again, redos = _again(protocol, state, trouble), _redos(protocol, state, step)
-        same = trouble == "gates" and (_again_of(step).same or _all_taken(step, state.step))
+        same = trouble == "gates" and (step.repeated.same or _all_taken(step, state.step))
         found = [*redos, again] if same else [again, *redos]
         found += [_accept(protocol, state)] if trouble == "gates" else []
         found.append(_skip(protocol, state))
@@ -104,7 +104,7 @@ def takes_words(minutes: float | None) -> str:
 
 def _again(protocol: Protocol, state: RunState, trouble: Trouble) -> WayOn:
     step, now = protocol.step(state.current), state.step
-    words = str(now.mend.get("advice") or (_WITH_WHAT_IS_THERE if _all_taken(step, now) else _again_of(step).words))
+    words = str(now.mend.get("advice") or (_WITH_WHAT_IS_THERE if _all_taken(step, now) else step.repeated.words))
     if not now.mend and trouble == "failure" and now.failure is not None:
         words = f"{REMEDIES.get(now.failure.error, UNKNOWN_REMEDY)}; then try again"
     mended = len(now.mend.get("viewpoints", ())) + int(now.mend.get("images", 0))
@@ -129,14 +129,10 @@ def _all_taken(step: Step, now: StepState) -> bool:
     return not now.mend and 0 < planned_views(step) <= len(now.captured)
 
 
-def _again_of(step: Step) -> RepeatedStep:
-    return AGAIN.get(step.kind, OTHERWISE)
-
-
 def _redos(protocol: Protocol, state: RunState, step: Step) -> list[WayOn]:
     """Redo this step or an earlier one that it uses: first those that change the figures, then the nearest."""
     used = sorted(used_steps(protocol, step), key=protocol.index, reverse=True)
-    used.sort(key=lambda name: _again_of(protocol.step(name)).same and not protocol.step(name).irreversible)
+    used.sort(key=lambda name: protocol.step(name).repeated.same and not protocol.step(name).irreversible)
     begun = [name for name in used if state.steps[name].phase != "pending"]
     afresh = [step.id] if state.step.captured or step.irreversible else []
     return [_redo(protocol, state, name) for name in (*afresh, *begun)]

@@ -1,45 +1,8 @@
-"""Words for the ways on: what repeating each kind of step means, and what to do about each class of error."""
+"""Words for the ways on: what to do about each class of error."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-
-
-@dataclass(frozen=True, slots=True)
-class RepeatedStep:
-    """What trying a kind of step again means after its figures were outside their limits.
-
-    Attributes:
-        words: what to do, and what happens then.
-        same: whether it gives the same figures unless a step it depends on is done again.
-        device: whether a device can fail during the step.
-        computes: whether a computation can fail during the step.
-    """
-
-    words: str
-    same: bool = False
-    device: bool = True
-    computes: bool = True
-
-
-OTHERWISE = RepeatedStep("Put right what the figures show, then try this step again")
-AGAIN: Mapping[str, RepeatedStep] = {
-    "checklist": RepeatedStep("Do the open items, tick them, and confirm again", device=False, computes=False),
-    "layout_check": RepeatedStep("Move the spheres as it says, then take another photograph"),
-    "ct_import": RepeatedStep("Put another series into the CT folder and import it"),
-    "calibration": RepeatedStep("Take the board images that are missing and compute again; the others are kept"),
-    "viewpoint_capture": RepeatedStep("Take the views that are missing or would help; the others are kept"),
-    "manual_capture": RepeatedStep("Take the images that are missing or would help; the others are kept"),
-    "scan_import": RepeatedStep("Scan again, export the scan, and import it"),
-    "timed_application": RepeatedStep(
-        "Judge it again as it is; the time since the coating runs on", same=True, device=False, computes=False
-    ),
-    "registration": RepeatedStep("Compute it again; the same images give the same figures", same=True, device=False),
-    "evaluation": RepeatedStep(
-        "Compute it again; the same registration gives the same figures", same=True, device=False
-    ),
-}
 
 # Error class → what a person does before trying again. Every class in drivers/errors.py has an entry.
 REMEDIES: Mapping[str, str] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -11,7 +11,7 @@ from pydantic import model_validator
 from service.compute.calibration.board.board import Board
 from service.core.errors import ConfigurationError
 from service.core.jobs.references import Reference
-from service.core.protocol.models import MovingParams
+from service.core.protocol.step_params import MovingParams, RepeatedStep
 from service.core.records.events import Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
@@ -31,6 +31,8 @@ _FEWEST_KNOWN = 3  # images of the whole board needed before images of a part of
 
 class Params(MovingParams):
     """Which board images are taken, and what is computed from them."""
+
+    repeated: ClassVar = RepeatedStep("Take the board images that are missing and compute again; the others are kept")
 
     solve: tuple[Literal["intrinsics", "hand_eye"], ...]  # what is computed
     board_poses: BoardPoses | None = None  # images whose poses the software plans

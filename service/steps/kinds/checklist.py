@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
+from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.steps.context import Announcement, StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, MeasureRecord
 
 
-class Params(Record):
+class Params(StepParams):
     """No parameters: the items are in the step's checklist."""
+
+    repeated: ClassVar = RepeatedStep("Do the open items, tick them, and confirm again", device=False, computes=False)
+    needs_disk: ClassVar = False
 
 
 class Measures(MeasureRecord):

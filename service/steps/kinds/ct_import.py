@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from drivers.interfaces import CtSource
+from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, Record
 from service.core.units import metres, mm
 from service.jobs.surfaces import ct_surface, locate_spheres
@@ -15,8 +16,10 @@ from service.steps.layouts import layout_uncertainties
 from service.steps.measures import Count, Measure, SphereMeasures
 
 
-class Params(Record):
+class Params(StepParams):
     """What to expect from the CT suite."""
+
+    repeated: ClassVar = RepeatedStep("Put another series into the CT folder and import it")
 
     source: Literal["dicom", "mesh"] = "dicom"  # mesh: segmented by other software (Mimics STL)
     threshold_hu: float = -450.0  # half way between air and tissue or plastic: unbiased surfaces

@@ -7,10 +7,11 @@ It evaluates the registrations that have arrived; a later one is evaluated when 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from service.core.errors import ConfigurationError
 from service.core.jobs.references import Reference
+from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.core.units import metres
 from service.jobs.registration import evaluate, register
@@ -21,8 +22,12 @@ from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, Reg
 from service.steps.poses.registration_jobs import recorded_registration_jobs
 
 
-class Params(Record):
+class Params(StepParams):
     """Where the control spheres were photographed and measured."""
+
+    repeated: ClassVar = RepeatedStep(
+        "Compute it again; the same registration gives the same figures", same=True, device=False
+    )
 
     registration: str  # step whose registrations are evaluated
     images_of: tuple[str, ...]  # capture steps that show the control spheres

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from service.core.errors import ConfigurationError, DataError
 from service.core.protocol.models import CameraSection
+from service.core.protocol.step_params import StepParams
 from service.core.records.events import ArtefactRef, Record, ViewImported
 from service.core.records.import_list import ImportedFile, ImportedView, ImportList, PhotographRole
 from service.steps.capture.optics import departing_images, optics_departures
@@ -17,7 +18,7 @@ from service.store.records import NewArtefact
 _KINDS = {"calibration": "board_image", "image": "image", "control_image": "control_image"}
 
 
-class Params(Record):
+class Params(StepParams):
     """Which photographs of the import."""
 
     photographs: PhotographRole  # part of the import

@@ -5,12 +5,13 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
 from drivers.errors import ReleasedElsewhereError
 from service.core.gates.verdict import evaluate_gates
+from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, GateVerdict, Record
 from service.core.units import metres
 from service.jobs.surfaces import layout
@@ -35,8 +36,10 @@ _SIDES: tuple[tuple[str, str], ...] = (
 )
 
 
-class Params(Record):
+class Params(StepParams):
     """How many photographs are taken, and how."""
+
+    repeated: ClassVar = RepeatedStep("Move the spheres as it says, then take another photograph")
 
     photographs: int = 1  # in the first attempt; the camera is moved in between
     most_photographs: int = 5  # most of one layout, while the measures are not certain enough for a decision

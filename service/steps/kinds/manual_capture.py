@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -14,6 +14,7 @@ from service.core.errors import ConfigurationError
 from service.core.gates.verdict import evaluate_gates
 from service.core.jobs.keys import key_stem
 from service.core.jobs.references import Each, Reference, jobs_of, resolve
+from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import Record, ViewHeld
 from service.core.run.state import JobState
 from service.core.units import metres, rad_of_mrad
@@ -58,8 +59,10 @@ class Ring(Record):
         ]
 
 
-class Params(Record):
+class Params(StepParams):
     """What the images are for, and where they should be taken from."""
+
+    repeated: ClassVar = RepeatedStep("Take the images that are missing or would help; the others are kept")
 
     purpose: Literal["dataset", "control", "calibration"]  # what the images are for
     hemisphere: Annotated[tuple[Ring, ...], Field(min_length=1)]  # where images are to be taken from

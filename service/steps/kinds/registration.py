@@ -7,12 +7,13 @@ seconds. The others are computed while the run goes on (service/steps/poses/regi
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import field_validator
 
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.jobs.keys import arguments_name
+from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
@@ -41,8 +42,12 @@ class StructureFromMotion(Record):
     neighbours: int = 12  # images that each image is matched with, chosen by the robot's poses
 
 
-class Params(Record):
+class Params(StepParams):
     """Which images, which scan, which camera poses."""
+
+    repeated: ClassVar = RepeatedStep(
+        "Compute it again; the same images give the same figures", same=True, device=False
+    )
 
     images_of: tuple[str, ...]  # capture steps with the images
     control_images_of: tuple[str, ...] = ()  # capture steps that see the control spheres, for the evaluation too

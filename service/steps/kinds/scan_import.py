@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from service.core.jobs.references import Reference
+from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, Record
 from service.core.units import metres
 from service.jobs.surfaces import locate_spheres
@@ -16,8 +17,10 @@ from service.steps.layouts import layout_uncertainties
 from service.steps.measures import Count, Measure, SphereMeasures
 
 
-class Params(Record):
+class Params(StepParams):
     """What the scan must contain."""
+
+    repeated: ClassVar = RepeatedStep("Scan again, export the scan, and import it")
 
     spheres: int  # number of spheres in the scan
     wait_s: float = 1800.0  # longest wait until the export is complete

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
+from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.steps.context import Announcement, StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, MeasureRecord
 
 
-class Params(Record):
+class Params(StepParams):
     """What is applied and how long it lasts."""
+
+    repeated: ClassVar = RepeatedStep(
+        "Judge it again as it is; the time since the coating runs on", same=True, device=False, computes=False
+    )
+    needs_disk: ClassVar = False
 
     product: str  # what is applied
     sublimates_after_s: float  # time until it has disappeared

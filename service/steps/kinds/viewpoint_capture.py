@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from service.compute.planning.motion_plan import Order
-from service.core.protocol.models import MovingParams
+from service.core.protocol.step_params import MovingParams, RepeatedStep
 from service.core.records.events import Record
 from service.steps.capture.live_numbers import Live, LiveAnalysis
 from service.steps.capture.optics import departing_images, optics_departures
@@ -22,6 +22,8 @@ from service.steps.poses.front_end import EarlyFeatures
 
 class Params(MovingParams):
     """Which viewpoints, what the images are for, and what is computed from them during the capture."""
+
+    repeated: ClassVar = RepeatedStep("Take the views that are missing or would help; the others are kept")
 
     purpose: Literal["dataset", "control"]  # what the images are for
     viewpoints: tuple[ViewpointSet, ...]  # where the images are taken from

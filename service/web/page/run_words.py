@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.core.gates.verdict import Standing, figure, standing
-from service.core.protocol.models import MovingParams, Protocol, Step
+from service.core.protocol.models import Protocol, Step
 from service.core.records.events import GateVerdict
 from service.core.recovery.ways_on import WayOn, planned_sets, planned_views
 from service.core.run.decide import AskOperator
@@ -61,7 +61,7 @@ def will_happen(step: Step, now: StepState) -> tuple[str, str]:
     before = BeforeStep(step.title, left, station_of(step))
     said = kind.words(step.params, before) if kind is not None and kind.words is not None else None
     if said is None:
-        moves = isinstance(step.params, MovingParams) and step.params.moves_robot
+        moves = step.moves_robot
         begin = f"begin {step.title[:1].lower()}{step.title[1:]}"
         said = Announcement(begin, ROBOT_MOVES) if moves else Announcement(begin)
     return f"Confirm: {said.does}", said.below

@@ -8,7 +8,8 @@ from typing import Any
 
 from pydantic import Field
 
-from service.core.protocol.models import LoadedProtocol, MovingParams, Protocol, parse_protocol
+from service.core.protocol.models import LoadedProtocol, Protocol, parse_protocol
+from service.core.protocol.step_params import MovingParams
 from service.core.records.events import (
     ArtefactRef,
     Event,

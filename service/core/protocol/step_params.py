@@ -1,0 +1,46 @@
+"""Params of steps: the bases that tell the core what it must know of a step kind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from service.core.records.base import Record
+
+
+@dataclass(frozen=True, slots=True)
+class RepeatedStep:
+    """What trying a kind of step again means after its figures were outside their limits.
+
+    Attributes:
+        words: what to do, and what happens then.
+        same: whether it gives the same figures unless a step it depends on is done again.
+        device: whether a device can fail during the step.
+        computes: whether a computation can fail during the step.
+    """
+
+    words: str
+    same: bool = False
+    device: bool = True
+    computes: bool = True
+
+
+class StepParams(Record):
+    """Base of the params of every step kind.
+
+    Attributes:
+        repeated: what trying such a step again means.
+        needs_disk: whether such a step stores files; the others also run when the disk is full.
+    """
+
+    repeated: ClassVar[RepeatedStep] = RepeatedStep("Put right what the figures show, then try this step again")
+    needs_disk: ClassVar[bool] = True
+
+
+class MovingParams(StepParams):
+    """Base of the params of a step kind that moves the robot; such a step never begins without a person."""
+
+    @property
+    def moves_robot(self) -> bool:
+        """Whether the robot moves during this step with these params."""
+        return True
