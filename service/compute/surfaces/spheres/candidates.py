@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from service.compute.surfaces.spheres.tukey import Band, Surface, TukeyStep, fit_centre
 from service.compute.surfaces.surfels import Surfels, grid_keys, summed
 from service.core.geometry import Array
 
@@ -17,6 +18,8 @@ _MAX_CANDIDATES = 600
 _APART = 0.4  # of candidates, in radii
 _HOOD = 1.35  # radius around a candidate in which the sphere's surface is searched for, in radii
 _MIN_COSINE = 0.7  # between normal and radius; below it, a surfel is not on the sphere
+_MIN_SURFELS = 5  # of a fit
+_STEPS = 15
 _BAND = 0.05  # of the coarse fit, in radii; surfels have little noise left
 _FLANK = 0.12  # in radii beyond that, where another shape would continue smoothly
 _FLANK_COSINE = 0.88
@@ -75,36 +78,25 @@ def vote_peaks(patches: Surfels, radius: float) -> Array:
 def rough_centre(patches: Surfels, tree: cKDTree, start: Array, radius: float, min_coverage: float) -> Array | None:
     """Known-radius fit to the surfels near `start`, as a centre (3,); None if they are not a sphere."""
     hood = np.asarray(tree.query_ball_point(start, _HOOD * radius), dtype=np.int64)
-    if len(hood) < 5:
+    if len(hood) < _MIN_SURFELS:
         return None
     points, normals, area = patches.position[hood], patches.normal[hood], patches.area[hood]
-    centre, band = start, 0.3 * radius
-    unit, residual, weights = np.zeros_like(points), np.zeros(len(points)), np.zeros(len(points))
-    for _ in range(15):
-        ray = points - centre
-        distance = np.linalg.norm(ray, axis=1)
-        unit = ray / np.maximum(distance, 1e-300)[:, None]
-        residual = distance - radius
-        eligible = (np.abs(residual) < band) & (np.abs(np.sum(unit * normals, axis=1)) > _MIN_COSINE)
-        if np.count_nonzero(eligible) < 5:
+
+    def narrowed(at: TukeyStep, half_width: float) -> float | None:
+        if np.linalg.norm(at.step) < 1e-4 * radius and half_width <= 1.001 * _BAND * radius:
             return None
-        weights = np.where(eligible, (1 - (residual / band) ** 2) ** 2, 0.0) * area
-        weighted = unit * weights[:, None]
-        H = weighted.T @ unit
-        if np.linalg.eigvalsh(H)[0] < 1e-3 * np.trace(H):
-            return None
-        step = np.linalg.solve(H, weighted.T @ residual)
-        centre = centre + step
-        if np.linalg.norm(centre - start) > radius:
-            return None
-        done = np.linalg.norm(step) < 1e-4 * radius and band <= 1.001 * _BAND * radius
-        if done:
-            break
-        band = max(_BAND * radius, 0.7 * band)
+        return max(_BAND * radius, 0.7 * half_width)
+
+    first = Band(0.3 * radius, _MIN_COSINE, _MIN_SURFELS)
+    fitted = fit_centre(Surface(points, normals, area), start, radius, first, narrowed, reach=radius, most=_STEPS)
+    if fitted is None:
+        return None
+    centre, band, at = fitted.centre, fitted.half_width, fitted.last
+    residual, weights = at.residual, at.weights
     inlier = weights > 0
     coverage = float(np.sum(area[inlier])) / (4 * np.pi * radius**2)
     beyond = (np.abs(residual) >= band) & (np.abs(residual) < band + _FLANK * radius)
-    beyond &= np.abs(np.sum(unit * normals, axis=1)) > _FLANK_COSINE
+    beyond &= at.cosine > _FLANK_COSINE
     rms = float(np.sqrt(np.sum(weights * residual**2) / np.sum(weights)))
     ends = float(np.sum(area[beyond])) <= _MOST_FLANK * float(np.sum(area[inlier]))
     round_enough = rms <= _ROUGH_RMS * radius or coverage >= _WELL_COVERED

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compute.surfaces.spheres.tukey import Band, Surface, TukeyStep, fit_centre
 from service.compute.surfaces.surfels import summed
 from service.core.geometry import Array
 
@@ -18,6 +19,7 @@ _FLANK = 0.12  # beyond the inliers, in radii, where a surface of another shape 
 _FLANK_COSINE = 0.88
 _PATCH = 0.27  # cell over which residuals are averaged, in radii
 _MOST_PATCHES = 70
+_STEPS = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,34 +94,21 @@ class SphereFit:
 def fit_sphere(samples: Samples, start: Array, radius: float, band: float) -> SphereFit | None:
     """Tukey fit with known radius from a centre that is good to `band`; None if too few inliers remain."""
     points, area = samples.points, samples.weight
-    centre = start.copy()
-    weights = np.zeros(len(points))
-    unit, residual, cosine = np.zeros_like(points), np.zeros(len(points)), np.zeros(len(points))
-    # Reweighting, not least squares with a fixed cost: the band shrinks with the residuals until both settle.
-    for _ in range(40):
-        ray = points - centre
-        distance = np.linalg.norm(ray, axis=1)
-        unit = ray / np.maximum(distance, 1e-300)[:, None]
-        residual = distance - radius
-        cosine = np.abs(np.sum(unit * samples.normals, axis=1))
-        eligible = (np.abs(residual) < band) & (cosine > _MIN_COSINE)
-        if np.count_nonzero(eligible) < MIN_SAMPLES:
-            return None
-        weights = np.where(eligible, (1 - (residual / band) ** 2) ** 2, 0.0) * area
-        weighted = unit * weights[:, None]
-        H = weighted.T @ unit
-        if np.linalg.eigvalsh(H)[0] < 1e-3 * np.trace(H):
-            return None
-        step = np.linalg.solve(H, weighted.T @ residual)
-        centre = centre + step
-        if np.linalg.norm(centre - start) > 0.5 * radius:
-            return None
+
+    def narrowed(at: TukeyStep, half_width: float) -> float | None:
         # Tukey's constant for 95 % efficiency; the floor keeps a perfect mesh from losing its vertices.
-        spread = 1.4826 * float(np.median(np.abs(residual[eligible])))
+        spread = 1.4826 * float(np.median(np.abs(at.residual[at.eligible])))
         target = max(4.685 * spread, 5e-3 * radius)
-        if np.linalg.norm(step) < 1e-7 * radius and target >= 0.95 * band:
-            break
-        band = float(np.clip(target, 0.6 * band, band))
+        if np.linalg.norm(at.step) < 1e-7 * radius and target >= 0.95 * half_width:
+            return None
+        return float(np.clip(target, 0.6 * half_width, half_width))
+
+    surface, first = Surface(points, samples.normals, area), Band(band, _MIN_COSINE, MIN_SAMPLES)
+    fitted = fit_centre(surface, start, radius, first, narrowed, reach=0.5 * radius, most=_STEPS)
+    if fitted is None:
+        return None
+    centre, band, at = fitted.centre, fitted.half_width, fitted.last
+    unit, residual, cosine, weights = at.unit, at.residual, at.cosine, at.weights
     inlier = weights > 0
     u, r, w = unit[inlier], residual[inlier], weights[inlier]
     beyond = (np.abs(residual) >= band) & (np.abs(residual) < band + _FLANK * radius) & (cosine > _FLANK_COSINE)
