@@ -66,7 +66,7 @@ def test_the_hand_covers_the_hemisphere_in_spite_of_its_mistakes(run: dict[str, 
 def test_every_image_that_was_not_used_says_why(run: dict[str, Any]) -> None:
     refused = [line for line in run["told"].splitlines() if "not used: " in line]
     assert len(refused) >= 2
-    assert any("ISO 200; wanted are" in line for line in refused)
+    assert any("ISO 200; required are" in line for line in refused)
     assert run["told"].count("next: ") >= 19
 
 
