@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -202,7 +203,7 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture store gc --data runs": succeeds,
     "python -m bench.real_data --data DIR": says_how_to_get_the_data,
 }
-# Commands that take minutes or a whole rig, with the test that runs them.
+# Commands that take minutes, a whole rig or a network, with the test of what they run, at a smaller size if need be.
 RUN_ELSEWHERE = {
     "orthocapture compare RUN OTHER --data runs": (
         "tests/audit/test_runs_beside_runs.py::test_two_runs_side_by_side_in_the_terminal"
@@ -239,8 +240,8 @@ RUN_ELSEWHERE = {
     ),
     "orthocapture demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     "make demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
-    'python -m pip install ".[fuzz]"': (
-        "tests/torture/test_torture_fuzz.py::test_every_parser_refuses_bad_input_as_people_can_understand"
+    'python -m pip install ".[fuzz]"': (  # needs a package index, which tests have not
+        "tests/system/test_docs.py::test_the_extras_that_documents_install_are_declared"
     ),
     "make torture-crash": (
         "tests/torture/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
@@ -376,6 +377,13 @@ def test_commands_are_found_in_blocks_tables_and_text() -> None:
     )
     text += "```yaml\nmake: no\n```\n| a | `orthocapture status latest` |\n"
     assert commands_of(text) == ["ls -l", "find .    -name x", "make it so", "orthocapture status latest"]
+
+
+def test_the_extras_that_documents_install_are_declared() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    named = {name for text in RUN_ELSEWHERE for name in re.findall(r'pip install "\.\[(\w+)\]"', text)}
+    assert named
+    assert named <= set(project["optional-dependencies"])
 
 
 def test_test_files_and_the_marker_are_there() -> None:
