@@ -16,11 +16,10 @@ from service.core.records.events import OperatorAction, ViewpointCaptured
 from service.core.run.actions import refuse
 from service.core.run.state import StepState
 from service.core.units import mm, mrad
-from service.jobs.calibration import calibrate
 from service.jobs.capture import live_summary, live_view
 from service.run_record import RunRecord
 from service.steps.notes import motion_plan, suggested_views
-from service.web.record.board_images import board_use, board_uses
+from service.web.record.board_images import board_use, board_uses, calibration_in
 from service.web.record.images import Capture, captures_of, last_failures, stated_camera
 from service.web.record.planned_poses import Vector, nominal_T_flange_camera, place, planned_viewpoints
 
@@ -191,8 +190,8 @@ def verdicts_of(log: RunRecord, step: Step, capture: Capture, others: Sequence[C
 def _board(log: RunRecord, step: Step, capture: Capture) -> Verdict:
     """Whether the calibration uses an image of the board."""
     use, name = board_use(log.state.steps[step.id], capture.payload), capture.payload.viewpoint
-    result = log.state.steps[step.id].result
-    intrinsics = calibrate.KIND.read_answer(result).details.intrinsics if result else None
+    answer = calibration_in(log.state.steps[step.id])
+    intrinsics = None if answer is None else answer.details.intrinsics
     if use.used and intrinsics is not None and intrinsics.per_view_rms_px:
         rms = dict(zip(intrinsics.images, intrinsics.per_view_rms_px, strict=True))[name]
         return Verdict("Board", True, "Found", f"corners {rms:.3f} px rms against the calibration")

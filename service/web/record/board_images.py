@@ -43,12 +43,18 @@ def board_uses(run: RunState, events: Sequence[Event], step: str) -> Mapping[str
     return {sha256: board_use(state, view) for sha256, view in images.items()}
 
 
+def calibration_in(state: StepState) -> calibrate.Answer | None:
+    """What a step has calibrated; None if its result is not there yet, or of another kind, as of imported images."""
+    solved = any(job.kind == calibrate.KIND.name for job in state.jobs.values())
+    return calibrate.KIND.read_answer(state.result) if solved and state.result else None
+
+
 def board_use(state: StepState, view: View) -> BoardUse:
     """Whether one image of a step is used."""
     sha256, name = view.artefacts[0].sha256, view.viewpoint
     looks = [job for job in state.jobs.values() if job.kind == "board_view"]
     look = next((job for job in looks if image_of(job).sha256 == sha256), None)
-    answer = calibrate.KIND.read_answer(state.result) if state.result else None
+    answer = calibration_in(state)
     intrinsics = Intrinsics() if answer is None else answer.details.intrinsics or Intrinsics()
     solved, why = set(intrinsics.images), _reasons(state, answer)
     excluded = {entry.image for entry in intrinsics.excluded}
