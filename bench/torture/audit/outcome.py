@@ -23,6 +23,7 @@ from service.store.database.engine import database_path
 from service.store.signatures import log as signature_log
 from service.store.signatures.log import Line
 from service.store.verification import chain_checks as audit_checks
+from service.store.verification import file_checks
 from service.store.verification import search_checks as audit_words
 from service.store.verification import signature_checks as audit_signatures
 from service.store.verification import verify as audit
@@ -95,11 +96,12 @@ def quickened(*, files_stay: bool, database_stays: bool = False) -> Generator[No
         content = path.read_bytes()
         return _digest(content), len(content)
 
-    file_state, unlisted = vars(audit)["_file_state"], vars(audit)["_unlisted"]
+    file_state: Any = vars(file_checks)["_file_state"]
     with ExitStack() as stack:
         if files_stay:
-            stack.enter_context(patch.object(audit, "_file_state", functools.cache(file_state)))
-            stack.enter_context(patch.object(audit, "_unlisted", functools.cache(unlisted)))
+            stack.enter_context(patch.object(file_checks, "_file_state", functools.cache(file_state)))
+            unlisted = functools.cache(file_checks.unlisted_files)
+            stack.enter_context(patch.object(audit, "unlisted_files", unlisted))
         stack.enter_context(patch.object(audit, "word_faults", _remembered_words(database_stays=database_stays)))
         gc.disable()
         stack.callback(gc.enable)
@@ -109,7 +111,7 @@ def quickened(*, files_stay: bool, database_stays: bool = False) -> Generator[No
             (Line, "signed_by", functools.cache(Line.signed_by)),
             (signature_log, "_line", functools.cache(vars(signature_log)["_line"])),
             (database, "_engine", functools.cache(vars(database)["_engine"])),
-            (audit, "hash_file", file_hash),
+            (file_checks, "hash_file", file_hash),
         ):
             stack.enter_context(patch.object(target, name, new))
         yield
