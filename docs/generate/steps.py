@@ -45,11 +45,16 @@ def steps_text(protocols: Mapping[str, Protocol]) -> str:
             lines += [f"Example: step `{step.id}` of `{file}`.", ""]
         lines += ["### Params", "", docstring(kind.params), "", *field_table(kind.params), ""]
         lines += ["### Measures", "", *_measures(kind), ""]
-        lines += ["### Result", "", docstring(kind.result), "", *field_table(kind.result), ""]
+        lines += ["### Result", "", docstring(kind.result), "", *_result_table(kind), ""]
         records_below(kind.params, below)
     lines += ["## Records of the params", ""]
     lines += record_sections(below)
     return _unique_headings("\n".join(lines))
+
+
+def _result_table(kind: StepKind[Any]) -> list[str]:
+    """The table of a result; the records in it are those of jobs, and described there."""
+    return [line.replace("](#", "](jobs.md#") for line in field_table(kind.result)]
 
 
 def _unique_headings(text: str) -> str:

@@ -8,22 +8,43 @@ with the smallest predicted error is shown (`best_registration`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TypeVar
 
+from pydantic import ValidationError
+
+from service.core.errors import IntegrityError
 from service.core.jobs.priorities import lane_of
 from service.core.protocol.models import Protocol
 from service.core.results.arrival import late_words
 from service.core.run.state import JobState, RunState
+from service.jobs.kind import JobRecord
 from service.jobs.registration import evaluate, register
 from service.jobs.registration.evaluate import ErrorBudget, Row
-from service.jobs.registration.register import Registration
+from service.jobs.registration.register import Registration, Registrations
+
+_R = TypeVar("_R", bound=JobRecord)
 
 
-def last_result(protocol: Protocol, state: RunState, kind: str) -> Mapping[str, Any]:
-    """The Result, as plain data, of the last step of this kind that has one; empty if there is none."""
-    results = (state.steps[step.id].result for step in reversed(protocol.steps) if step.kind == kind)
-    return next((result for result in results if result), {})
+def last_result(protocol: Protocol, state: RunState, kind: str, record: type[_R]) -> _R | None:
+    """The result of the last step of a kind that has one, read as `record`; None if there is none.
+
+    Raises:
+        IntegrityError: the recorded result is not such a record.
+    """
+    steps = (step.id for step in reversed(protocol.steps) if step.kind == kind)
+    last = next((step for step in steps if state.steps[step].result), None)
+    return None if last is None else result_of_step(state, last, record)
+
+
+def result_of_step(state: RunState, step: str, record: type[_R]) -> _R:
+    """The result of a step, read as `record`. Raises IntegrityError where it is not such a record."""
+    try:
+        return record.model_validate(state.steps[step].result)
+    except ValidationError as error:
+        first = error.errors()[0]
+        path = "/".join(map(str, first["loc"]))
+        raise IntegrityError(f"the result of step {step}: {path}: {first['msg']}") from error
 
 
 def registration_name(record: Registration) -> str:
@@ -35,8 +56,8 @@ def registration_name(record: Registration) -> str:
 
 def registrations(protocol: Protocol, state: RunState) -> dict[str, Registration]:
     """Every registration record by its name: those in the step's result, then those that arrived later."""
-    records: Mapping[str, Any] = last_result(protocol, state, "registration").get("registrations", {})
-    found = {name: register.KIND.read_answer(record) for name, record in records.items()}
+    result = last_result(protocol, state, "registration", Registrations)
+    found = {} if result is None else dict(result.registrations)
     for _, job in _finished(protocol, state, "registration", register.KIND.name) if found else ():
         answer = register.KIND.read_answer(job.result)
         found.setdefault(registration_name(answer), answer)
@@ -99,8 +120,8 @@ def _sizes(rows: Iterable[Row]) -> list[str]:
 
 def budgets(protocol: Protocol, state: RunState) -> dict[str, ErrorBudget]:
     """The error budget of each registration, by its name."""
-    records = last_result(protocol, state, "evaluation")
-    found = evaluate.KIND.read_answer(records).budgets if records else {}
+    result = last_result(protocol, state, "evaluation", evaluate.Answer)
+    found = {} if result is None else result.budgets
     for _, job in later_evaluations(protocol, state):
         found = {**evaluate.KIND.read_answer(job.result).budgets, **found}
     return found
@@ -140,8 +161,8 @@ def better_later(protocol: Protocol, state: RunState) -> Row | None:
 
 def signed_rows(protocol: Protocol, state: RunState) -> list[Row]:
     """The rows of the table that the evaluation step made: those that were judged and signed."""
-    result = last_result(protocol, state, "evaluation")
-    return list(evaluate.KIND.read_answer(result).table) if result else []
+    result = last_result(protocol, state, "evaluation", evaluate.Answer)
+    return [] if result is None else list(result.table)
 
 
 def _error_mm(row: Row) -> float:

@@ -23,10 +23,9 @@ from service.dataset.registrations import (
     own_registration,
     registrations,
 )
-from service.jobs.records import Point
+from service.jobs.records import Point, SpheresFound
 from service.jobs.registration.evaluate import ErrorBudget, Row
 from service.jobs.registration.register import Registration
-from service.jobs.surfaces import locate_spheres
 from service.store.store import Store
 
 
@@ -48,10 +47,6 @@ class RunSummary:
     state: RunState
     events: Sequence[Event]
     store: ArtefactReader
-
-    def result(self, kind: str) -> Mapping[str, Any]:
-        """The Result of the last passed step of a kind; empty if there is none."""
-        return last_result(self.protocol, self.state, kind)
 
     def registrations(self) -> Mapping[str, Registration]:
         """Registrations by name, including those that arrived after the step's decision."""
@@ -90,8 +85,8 @@ class RunSummary:
 
     def scan_spheres_m(self) -> tuple[Point, ...]:
         """Sphere centres of the registered scan in its own frame; empty before the scan was imported."""
-        result = self.result("scan_import")
-        return locate_spheres.KIND.read_answer(result).spheres_m if result else ()
+        result = last_result(self.protocol, self.state, "scan_import", SpheresFound)
+        return () if result is None else result.spheres_m
 
     def scan_mesh(self) -> tuple[Array, Any]:
         """Vertices (V, 3) in metres and faces (F, 3) of the registered scan that was imported last."""

@@ -63,7 +63,7 @@ def test_a_run_is_exported_recorded_and_still_verifies(recorded: Path, tmp_path:
     assert described["masks"].startswith("13 spheres; posts are not masked")  # its scan was cut to the spheres
     # The spheres are in the images where pycolmap projects them: they differ from what surrounds them.
     model = pycolmap.Reconstruction(str(out / "sparse" / "0"))
-    spheres = np.array(run.summary().result("scan_import")["spheres_m"])
+    spheres = np.array(run.summary().scan_spheres_m())
     views = {view.file: view for view in dataset.views}
     for image in model.images.values():
         for centre in spheres:
@@ -76,7 +76,7 @@ def test_the_masks_cover_the_spheres_that_the_photographs_show(recorded: Path) -
     """Within the mask of a sphere the colour differs from that around it: mask, pose and pixels belong together."""
     run = read_run(recorded, "latest")
     dataset, radius_m = data_set_of(run.summary()), metres(run.protocol.spheres.radius_mm)
-    spheres = run.summary().result("scan_import")["spheres_m"]
+    spheres = run.summary().scan_spheres_m()
     contrast: list[float] = []
     for view in dataset.views:
         saturation = cv2.cvtColor(dataset.pixels.colours(view), cv2.COLOR_BGR2HSV)[..., 1].astype(np.float64)

@@ -212,8 +212,8 @@ def true_error_mm(data: Path, run: str, photographer: Photographer) -> float:
     """Error of the registration at the centre of the spheres, against the true camera poses."""
     with Store.open(data) as store:
         summary = summarise(store, run, recorded_run(store, run)[0])
-        cameras = summary.result("registration")["registrations"]["colmap"]["T_scan_camera"]
-        centre = np.array(summary.result("scan_import")["spheres_m"]).mean(axis=0)
+        cameras = summary.registrations()["colmap"].T_scan_camera
+        centre = np.array(summary.scan_spheres_m()).mean(axis=0)
     T_scan_world = inverse(photographer.T_world_scan)
     true = np.array([T_scan_world @ photographer.T_world_camera[name] for name in cameras])
     return 1e3 * true_error_m(np.array(list(cameras.values())), true, centre)

@@ -21,7 +21,9 @@ from service.dataset.control_spheres import control_centres
 from service.dataset.export import described_run
 from service.dataset.posed.pixels import Photographs
 from service.dataset.posed.records import DataSet, Mesh, View
+from service.dataset.registrations import result_of_step
 from service.dataset.summary import RunSummary
+from service.jobs.records import SpheresFound
 from service.jobs.registration.register import Registration
 
 _POINTS = 2000  # of the mesh, by which the sparse views are chosen
@@ -141,13 +143,9 @@ def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ..
     """Centres of the control spheres, which the images show and the scan does not."""
     evaluation = next((step for step in reversed(summary.protocol.steps) if step.kind == "evaluation"), None)
     before = None if evaluation is None else evaluation.params.model_dump().get("control_scan")
-    if before is None:
+    if before is None or not summary.state.steps[before].result:
         return ()
-    scan, control = (
-        tuple((float(x), float(y), float(z)) for x, y, z in result["spheres_m"])
-        for result in (summary.result("scan_import"), summary.state.steps[before].result)
-    )
-    return control_centres(scan, control)
+    return control_centres(summary.scan_spheres_m(), result_of_step(summary.state, before, SpheresFound).spheres_m)
 
 
 def _posts(balls: Sequence[Ball], mesh: Mesh, views: Sequence[View]) -> tuple[Post, ...]:

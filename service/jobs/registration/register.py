@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pydantic import Field
+
 from service.jobs.kind import JobKind, JobRecord
 from service.jobs.records import Camera, Hash, Matrix
 from service.jobs.registration.detect_spheres import SceneArguments
@@ -56,6 +58,12 @@ class Registration(JobRecord):
     covariance: Matrix
     components: dict[str, Matrix]
     leave_one_out: LeaveOneOut | None = None
+
+
+class Registrations(JobRecord):
+    """The registrations in the result of a registration step, by name."""
+
+    registrations: dict[str, Registration] = Field(default_factory=dict[str, Registration])
 
 
 KIND = JobKind(

@@ -18,7 +18,8 @@ from service.core.records.events import Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
 from service.jobs.records import Mounting, Photograph
-from service.jobs.registration import detect_spheres
+from service.jobs.registration import detect_spheres, register
+from service.jobs.registration.register import Registration
 from service.jobs.surfaces import locate_spheres
 from service.jobs.words import term
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
@@ -99,7 +100,7 @@ class Result(Record):
     """The registrations that the step was judged by, by source and resolution; the outlines at full size."""
 
     outlines_sha256: str
-    registrations: dict[str, dict[str, Any]]
+    registrations: dict[str, Registration]
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
@@ -187,10 +188,10 @@ def _outcome(found: RegistrationJobs) -> StepOutcome:
     measures = Measures.read(outlines.measures).model_copy(update={"registrations": registrations})
     result = Result(
         outlines_sha256=outlines.artefacts[0].sha256,
-        registrations={name: dict(job.result) for name, job in found.arrived.items()},
+        registrations={name: register.KIND.read_answer(job.result) for name, job in found.arrived.items()},
     )
     artefacts = tuple(ref for _, job in done for ref in job.artefacts)
-    return StepOutcome(measures, artefacts, result.model_dump(mode="json"))
+    return StepOutcome(measures, artefacts, result.model_dump(mode="json", exclude_unset=True))
 
 
 KIND = StepKind(
