@@ -12,10 +12,14 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
+
 from bench.soak.fit import Took
 from bench.soak.sparse import SparseFiles, sparse_photograph
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import ViewpointCaptured
+from service.jobs.capture import live_view
+from service.jobs.records import Camera, Limits, Photograph
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
@@ -25,6 +29,7 @@ from tests.support.runs.bench_run import PROTOCOL, Bench
 
 STEP = "capture"
 TIMED = 200  # viewpoints before each size that are recorded with every fsync and timed
+_STATION = "station_1"
 _POSES = 4  # poses per log; a real one has a hundred, which would only cost disk space here
 _RIG = """\
 name: large
@@ -131,9 +136,7 @@ class LargeRecord:
         )
         rows = [NewArtefact(ref, device, step, 1, name) for ref, device in ((image, "camera"), (log, "robot"))]
         store.record(self.run_id, [captured], actor="runner", artefacts=rows)
-        looked = NewJob(
-            "live_view", step, 1, f"{step}/1/live_view/{name}", {"image": {"viewpoint": name, "sha256": image.sha256}}
-        )
+        looked = NewJob("live_view", step, 1, f"{step}/1/live_view/{name}", _arguments(name, image.sha256).plain())
         store.record(self.run_id, [], actor="runner", jobs=[looked])
         job = store.claim_job("worker", 60.0)
         assert job is not None
@@ -144,7 +147,22 @@ class LargeRecord:
         store.finish_job(
             job,
             measures={"spheres_seen": 10.0, "edge_width_px": 2.5, "outline_rms_px": 0.2, "clipped_fraction": 0.0},
-            result={"viewpoint": name},
+            result=live_view.Answer(viewpoint=name, station=_STATION).plain(),
             duration_s=0.1,
             artefacts=[NewArtefact(answer, "worker", step, 1, name)],
         )
+
+
+def _arguments(viewpoint: str, sha256: str) -> live_view.Arguments:
+    """Of a job that nobody computes: as many numbers as a real one has."""
+    return live_view.Arguments(
+        camera=Camera(width=960, height=640, fx=1400.0, fy=1400.0, cx=480.0, cy=320.0, k1=-0.06, k2=0.02),
+        T_flange_camera=tuple(map(tuple, np.eye(4).tolist())),
+        hand_eye_covariance=tuple(map(tuple, (1e-8 * np.eye(6)).tolist())),
+        arm_sigma_m=1e-4,
+        arm_sigma_rad=1e-4,
+        spheres_m=tuple((0.1 * k, 0.1, 0.1) for k in range(10)),
+        radius_m=0.015,
+        limits=Limits(min_views=3, max_angle_deg=60.0, max_distance_m=0.8),
+        image=Photograph(viewpoint=viewpoint, sha256=sha256, station=_STATION),
+    )
