@@ -13,6 +13,7 @@ from service.core.run.state import JobState, StepState
 from service.jobs.calibration import calibrate
 from service.jobs.capture import hand_board, hand_view
 from service.jobs.kind import JobKind, JobRecord
+from service.jobs.looks import image_of
 from service.jobs.records import ArmCorrection, Mounting, ParameterCovariance, Photograph
 from service.steps.context import StepContext
 
@@ -134,7 +135,7 @@ def held_views(context: StepContext, step_id: str) -> dict[str, hand_view.Answer
     """
     names = (hand_view.KIND.name, hand_board.KIND.name)
     done = [j for j in context.evidence.jobs(step_id) if j.kind in names and j.status == "finished"]
-    looks = {str(job.arguments["image"]["sha256"]): hand_view.KIND.read_answer(job.result) for job in done}
+    looks = {image_of(job).sha256: hand_view.KIND.read_answer(job.result) for job in done}
     refined = hand_view.KIND.read_answer(done[-1].result).T_scene_cameras if done else {}
     return {
         sha256: look

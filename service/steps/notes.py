@@ -9,6 +9,8 @@ from service.jobs.capture.live_summary import Suggestion
 from service.jobs.records import Matrix
 
 BOARD_POSES, MOTION_PLAN, SUGGESTION = "board_poses", "motion_plan", "suggested_viewpoints"
+SPOILT = "spoilt images"  # images that a retry of the step repeats
+DEPARTING = "images depart from the calibration"
 
 
 class _NoteRecord(BaseModel):
@@ -84,10 +86,22 @@ class SuggestedViews(_NoteRecord):
     viewpoints: tuple[Suggestion, ...]
 
 
+class ImagesToRepeat(_NoteRecord):
+    """Images that were not good enough; `attempt` is that of the step, None in notes of early versions.
+
+    A note with `advice` also stopped the capture.
+    """
+
+    viewpoints: tuple[str, ...] = ()
+    attempt: int | None = None
+    advice: str | None = None
+
+
 class Mending(_NoteRecord):
-    """What would bring the present attempt of a step within its limits; only the numbers of views are shown."""
+    """What would bring the present attempt of a step within its limits; pages show only the numbers of views."""
 
     advice: str = ""
+    hands: tuple[dict[str, object], ...] = ()  # what the simulated technician does
     viewpoints: tuple[object, ...] = ()
     poses: tuple[object, ...] = ()
 
@@ -106,6 +120,11 @@ def motion_plan(state: StepState) -> MotionPlan:
 def suggested_views(state: StepState) -> tuple[SuggestedViews, ...]:
     """The suggestions of a step, oldest first."""
     return tuple(SuggestedViews.model_validate(note.data) for note in state.notes if note.note == SUGGESTION)
+
+
+def images_to_repeat(state: StepState, note: str) -> tuple[ImagesToRepeat, ...]:
+    """The notes SPOILT or DEPARTING of a step, oldest first."""
+    return tuple(ImagesToRepeat.model_validate(found.data) for found in state.notes if found.note == note)
 
 
 def mending(state: StepState) -> Mending:

@@ -22,6 +22,14 @@ class Answer(JobRecord):
     black: bool = False
 
 
+class Corners(JobRecord):
+    """The file of an answer: the image's size, and the board's corners that it shows, by index and in pixels."""
+
+    size: tuple[int, int]
+    indices: tuple[int, ...]
+    corners: tuple[tuple[float, float], ...]
+
+
 KIND = JobKind(
     name="board_view",
     arguments=Arguments,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from typing import TypedDict
 
@@ -12,6 +11,7 @@ from service.compute.calibration.board.board import Board, BoardView
 from service.core.records.events import ViewpointCaptured
 from service.core.run.state import JobState
 from service.jobs.calibration import board_view
+from service.jobs.looks import image_of
 from service.jobs.records import ImageFile
 from service.steps.capture.spoilt import ImageSharpness, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.context import JobRequest, StepContext
@@ -42,7 +42,7 @@ class BoardLooks:
 
     def begin(self) -> None:
         """Enqueue the search of every new image. Returns at once."""
-        begun = {job.arguments["image"]["sha256"] for job in self._jobs(self.context.step.id)}
+        begun = {image_of(job).sha256 for job in self._jobs(self.context.step.id)}
         for capture in self.context.evidence.captures(self.context.step.id):
             sha256 = capture.artefacts[0].sha256
             if sha256 not in begun:
@@ -105,15 +105,14 @@ class BoardLooks:
         return [job for job in self.context.evidence.jobs(step) if job.kind == "board_view"]
 
     def _by_image(self, step: str) -> dict[str, JobState]:
-        return {str(j.arguments["image"]["sha256"]): j for j in self._jobs(step) if j.status != "enqueued"}
+        return {image_of(j).sha256: j for j in self._jobs(step) if j.status != "enqueued"}
 
     def _looked_at(self, step: str) -> list[ImageSharpness]:
         """The sharpness of the searched images, in the order of capture."""
         jobs = self._by_image(step)
         ordered = [jobs.get(capture.artefacts[0].sha256) for capture in self.context.evidence.captures(step)]
-        return [
-            ImageSharpness.of(j, int(j.result["size"][0])) for j in ordered if j is not None and "size" in j.result
-        ]
+        done = [(j, _answer_of(j)) for j in ordered if j is not None and j.status == "finished"]
+        return [ImageSharpness.of(j, black=answer.black, width=answer.size[0]) for j, answer in done]
 
     def _look(self, capture: ViewpointCaptured, job: JobState) -> SearchedBoardImage:
         sha256 = capture.artefacts[0].sha256
@@ -122,21 +121,25 @@ class BoardLooks:
         return self._read[sha256]
 
     def _as_read(self, capture: ViewpointCaptured, job: JobState) -> SearchedBoardImage:
-        if job.status == "failed" or not job.result.get("seen"):
-            why = job.message if job.status == "failed" else str(job.result.get("reason", "not searched"))
-            return SearchedBoardImage(capture, False, why)
+        if job.status == "failed":
+            return SearchedBoardImage(capture, False, job.message)
+        answer = _answer_of(job)
+        if not answer.seen:
+            return SearchedBoardImage(capture, False, answer.reason)
         ref = job.artefacts[0]
-        record = json.loads(self.context.evidence.path(ref).read_bytes())
-        view = BoardView(np.array(record["indices"], dtype=np.int64), np.array(record["corners"], dtype=np.float64))
-        return SearchedBoardImage(
-            capture, True, "", ref.sha256, view, (int(record["size"][0]), int(record["size"][1]))
-        )
+        found = board_view.Corners.model_validate_json(self.context.evidence.path(ref).read_bytes())
+        view = BoardView(np.array(found.indices, dtype=np.int64), np.array(found.corners, dtype=np.float64))
+        return SearchedBoardImage(capture, True, "", ref.sha256, view, found.size)
 
     def _tell(self, look: SearchedBoardImage) -> None:
         sha256 = look.capture.artefacts[0].sha256
         if sha256 not in self._told:
             self._told.add(sha256)
             self.context.tell(f"{look.capture.viewpoint}: not used, {look.reason}")
+
+
+def _answer_of(job: JobState) -> board_view.Answer:
+    return board_view.KIND.read_answer(job.result)
 
 
 class BoardFields(TypedDict):

@@ -20,13 +20,14 @@ from service.core.run.state import JobState
 from service.core.units import metres, rad_of_mrad
 from service.jobs.calibration import calibrate
 from service.jobs.capture import live_summary, live_view
+from service.jobs.looks import image_of
 from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Photograph, Point
 from service.jobs.surfaces import coverage_points, locate_spheres
 from service.steps.capture.plan.viewpoints import Viewpoint
-from service.steps.capture.spoilt import SPOILT, ImageSharpness, row_to_stop_for, stop_for_lens, why_spoilt
+from service.steps.capture.spoilt import ImageSharpness, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import artefact_of, earlier_answer, mounting_of, robot_pose_of
-from service.steps.notes import SUGGESTION, suggested_views
+from service.steps.notes import SPOILT, SUGGESTION, mending, suggested_views
 
 ERROR, COVERAGE = "predicted_target_error_mm", "specimen_coverage"
 
@@ -90,7 +91,7 @@ class LiveAnalysis:
 
     def look(self) -> None:
         """Enqueue the job on every new image, and tell the numbers of earlier ones. Returns at once."""
-        begun = {job.arguments["image"]["sha256"] for job in self._jobs("live_view")}
+        begun = {image_of(job).sha256 for job in self._jobs("live_view")}
         for capture in self.context.evidence.captures(self.context.step.id):
             sha256 = capture.artefacts[0].sha256
             if sha256 in begun or not all(capture.verdicts.values()):
@@ -206,9 +207,9 @@ class LiveAnalysis:
         # Pages show the newest note with advice, so it must hold everything that the confirmation does.
         both = f"{retakes}. {advice}" if retakes else advice
         # This note replaces that of the retakes, so it repeats what has to be done for them.
-        mend = self.context.evidence.state().steps[self.context.step.id].mend if retakes else {}
+        hands = mending(self.context.evidence.state().steps[self.context.step.id]).hands if retakes else ()
         views = [view.plain() for view in suggestions]
-        self.context.note(SUGGESTION, advice=both, viewpoints=views, images=again, hands=list(mend.get("hands", ())))
+        self.context.note(SUGGESTION, advice=both, viewpoints=views, images=again, hands=list(hands))
 
     def _gate(self, measure: str) -> Gate | None:
         return next((gate for gate in self.context.step.gates if gate.measure == measure), None)
@@ -227,7 +228,7 @@ class LiveAnalysis:
         hashes = [capture.artefacts[0].sha256 for capture in captures]
         jobs = jobs_of(state)
         done = [job for job in jobs.values() if job.kind == "live_view" and job.status == "finished"]
-        by_image = {job.arguments["image"]["sha256"]: job for job in done}
+        by_image = {image_of(job).sha256: job for job in done}
         mine = [by_image[sha256] for sha256 in hashes if sha256 in by_image]
         files = tuple(job.artefacts[0].sha256 for job in mine)
         keys = tuple(key_stem(state, step, "live_view") for step in steps)
@@ -239,11 +240,14 @@ class LiveAnalysis:
 
     def _looked_at(self, *steps: str) -> list[ImageSharpness]:
         """The sharpness of the images of these steps whose job has finished, in the order of capture."""
-        by_image = {j.arguments["image"]["sha256"]: j for j in self._jobs("live_view") if j.status == "finished"}
+        by_image = {image_of(j).sha256: j for j in self._jobs("live_view") if j.status == "finished"}
         captures = [capture for step in steps for capture in self.context.evidence.captures(step)]
         hashes = [capture.artefacts[0].sha256 for capture in captures]
         width = self.shared.camera.width
-        return [ImageSharpness.of(by_image[sha256], width) for sha256 in hashes if sha256 in by_image]
+        jobs = [by_image[sha256] for sha256 in hashes if sha256 in by_image]
+        return [
+            ImageSharpness.of(job, black=live_view.KIND.read_answer(job.result).black, width=width) for job in jobs
+        ]
 
     def _surface(self) -> str | None:
         done = [job for job in self._jobs("coverage_points") if job.status == "finished"]
@@ -283,8 +287,8 @@ def seen_words(seen: float, expected: float | None) -> str:
 def describe_view(job: JobState) -> str:
     """One line on one image: `v1_005: 9/10 spheres, 0.18 px, predicted error 0.210 mm, coverage 74 %`."""
     if job.status == "failed":
-        return f"{job.arguments['image']['viewpoint']}: could not be analysed: {job.message}"
-    m = job.measures
+        return f"{image_of(job).viewpoint}: could not be analysed: {job.message}"
+    m, answer = job.measures, live_view.KIND.read_answer(job.result)
     parts = [seen_words(m["spheres_seen"], m.get("spheres_expected"))]
     if "outline_rms_px" in m:
         parts.append(f"{m['outline_rms_px']:.2f} px")
@@ -292,9 +296,9 @@ def describe_view(job: JobState) -> str:
         parts.append(f"predicted error {m[ERROR]:.3f} mm")
     if COVERAGE in m:
         parts.append(f"coverage {100 * m[COVERAGE]:.0f} %")
-    if job.result.get("reason"):
-        parts.append(str(job.result["reason"]))
-    return f"{job.result['viewpoint']}: {', '.join(parts)}"
+    if answer.reason:
+        parts.append(answer.reason)
+    return f"{answer.viewpoint}: {', '.join(parts)}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from typing import Any
 from service.compute.calibration.intrinsics.optics import Optics, OpticsDeparture, compare_optics, summary
 from service.core.records.events import View
 from service.steps.context import StepContext
+from service.steps.notes import DEPARTING
 
 _STATED = (
     "width", "height", "focal_length_mm", "aperture_f", "focus_distance_m", "focus_mode", "focus_position", "lens",
@@ -40,7 +41,7 @@ def optics_departures(
     departures = compare_optics([_optics(c) for c in reference], [_optics(c) for c in mine]).departures
     if departures and not quiet:
         context.note(
-            "images depart from the calibration",
+            DEPARTING,
             departures=[str(departure) for departure in departures],
             attempt=context.attempt,
             viewpoints=sorted({departure.image for departure in departures}),

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from service.core.gates.verdict import describe, evaluate_gates
 from service.steps.capture.spoilt import CLEAN, spoilt_before
 from service.steps.context import StepContext
+from service.steps.notes import DEPARTING, images_to_repeat
 
-DEPARTING = "images depart from the calibration"  # name of the note
 #: Measure of how images were taken → what a person should do before images are taken again.
 TAKEN_AGAIN: Mapping[str, str] = {
     "viewpoints_captured": "find out why the arm could not reach the missing viewpoints",
@@ -22,10 +22,11 @@ TAKEN_AGAIN: Mapping[str, str] = {
 def to_take_again(context: StepContext) -> set[str]:
     """SHA-256 of images that departed from the calibration's optics, or were spoilt, in an earlier attempt."""
     captures = context.evidence.captures(context.step.id)
-    notes = [note.data for note in context.state.notes if note.note == DEPARTING and "attempt" in note.data]
-    if not notes or notes[-1]["attempt"] >= context.attempt:
+    notes = images_to_repeat(context.state, DEPARTING)
+    attempts = [(note.attempt, set(note.viewpoints)) for note in notes if note.attempt is not None]
+    if not attempts or attempts[-1][0] >= context.attempt:
         return spoilt_before(context)
-    departed, attempt = set(notes[-1]["viewpoints"]), notes[-1]["attempt"]
+    attempt, departed = attempts[-1]
     departing = {c.artefacts[0].sha256 for c in captures if c.viewpoint in departed and c.attempt <= attempt}
     return departing | spoilt_before(context)
 

@@ -8,9 +8,10 @@ from typing import Any
 
 from service.core.errors import ImagesSpoiltError
 from service.core.run.state import JobState
+from service.jobs.looks import image_of
 from service.steps.context import StepContext
+from service.steps.notes import SPOILT, images_to_repeat
 
-SPOILT = "spoilt images"  # name of the note from which a retry takes the images to repeat
 CLEAN: list[dict[str, Any]] = [{"action": "clean_lens"}]  # for the simulated technician
 IN_A_ROW = 3  # so many spoilt images have a common cause
 _MOST_STOPS = 2  # of one step; after that, only the gates judge the images
@@ -38,11 +39,10 @@ class ImageSharpness:
     width: int
 
     @classmethod
-    def of(cls, job: JobState, width: int) -> ImageSharpness:
-        """From the answer of a finished job on one image."""
-        image = job.arguments["image"]
-        edge_px = job.measures.get("image_edge_px")
-        return cls(image["viewpoint"], image["sha256"], edge_px, bool(job.result.get("black")), width)
+    def of(cls, job: JobState, *, black: bool, width: int) -> ImageSharpness:
+        """From a finished job on one image, with what its answer says of the image."""
+        image = image_of(job)
+        return cls(image.viewpoint, image.sha256, job.measures.get("image_edge_px"), black, width)
 
 
 def why_spoilt(images: Sequence[ImageSharpness], others: Sequence[ImageSharpness] = ()) -> dict[str, str]:
@@ -77,13 +77,12 @@ def last_in_a_row(images: Sequence[ImageSharpness], reasons: Mapping[str, str]) 
 def spoilt_before(context: StepContext) -> set[str]:
     """SHA-256 of images that were spoilt in an earlier attempt and have not been taken again yet."""
     captures = context.evidence.captures(context.step.id)
-    notes = [note.data for note in context.state.notes if note.note == SPOILT]
     return {
         capture.artefacts[0].sha256
-        for note in notes
-        if note["attempt"] < context.attempt
+        for note in images_to_repeat(context.state, SPOILT)
+        if note.attempt is not None and note.attempt < context.attempt
         for capture in captures
-        if capture.viewpoint in note["viewpoints"] and capture.attempt <= note["attempt"]
+        if capture.viewpoint in note.viewpoints and capture.attempt <= note.attempt
     }
 
 
@@ -104,7 +103,7 @@ def row_to_stop_for(
 
 def may_stop(context: StepContext) -> bool:
     """Whether spoilt images may still stop the step: not again and again, for then a person has seen them."""
-    return sum(note.note == SPOILT and "advice" in note.data for note in context.state.notes) < _MOST_STOPS
+    return sum(note.advice is not None for note in images_to_repeat(context.state, SPOILT)) < _MOST_STOPS
 
 
 def stop_for_lens(context: StepContext, row: Sequence[ImageSharpness]) -> None:

@@ -20,6 +20,7 @@ from service.core.run.state import JobState
 from service.core.units import metres, rad_of_mrad
 from service.jobs.calibration import calibrate
 from service.jobs.capture import hand_board, hand_view
+from service.jobs.looks import image_of
 from service.jobs.records import Point
 from service.jobs.surfaces import coverage_points, layout
 from service.steps.capture.exposure import wanted_settings
@@ -87,7 +88,7 @@ def failure_words(job: JobState) -> str:
             "coverage cannot pass: finish with the images so far, and the step offers what can be done"
         )
     return (
-        f"{job.arguments['image']['viewpoint']} could not be analysed: {why}. It stays in the evidence but is not "
+        f"{image_of(job).viewpoint} could not be analysed: {why}. It stays in the evidence but is not "
         "used: take it again from the same place"
     )
 
@@ -250,11 +251,11 @@ class _Guide:
             request = JobRequest.of(coverage_points.KIND, arguments, references)
             self.context.evidence.enqueue(request, "specimen")
         done = self._answers()
-        self._say(str(done[-1].result["words"]) if done else str(self.shared.fields["first_words"]))
+        self._say(_answer_of(done[-1]).words if done else str(self.shared.fields["first_words"]))
 
     def look(self) -> None:
         """Tell the result of the last image, and enqueue the job for the next one. Returns at once."""
-        jobs = {str(job.arguments["image"]["sha256"]): job for job in self._jobs()}
+        jobs = {image_of(job).sha256: job for job in self._jobs()}
         for view in self._views():
             job = jobs.get(view.artefacts[0].sha256)
             if job is None:
@@ -293,7 +294,7 @@ class _Guide:
     def outcome(self) -> StepOutcome:
         """The outcome of the step."""
         found = held_views(self.context, self.context.step.id)
-        failed = {j.arguments["image"]["sha256"]: j.message for j in self._jobs() if j.status == "failed"}
+        failed = {image_of(j).sha256: j.message for j in self._jobs() if j.status == "failed"}
         used: list[str] = []
         not_used: dict[str, str] = {}
         for view in self._views():
@@ -315,7 +316,7 @@ class _Guide:
             names = ("images_used", "hemisphere_coverage", "coverage", ERROR, COVERAGE)
             measures |= {name: last[name] for name in names if name in last}
         measures["images_not_used"] = measures["images_taken"] - measures["images_used"]
-        used = {str(job.arguments["image"]["sha256"]) for job in done if job.result["used"]}
+        used = {image_of(job).sha256 for job in done if _answer_of(job).used}
         departures = optics_departures(
             self.context, [view for view in views if view.artefacts[0].sha256 in used], quiet=True
         )
@@ -382,9 +383,9 @@ class _Guide:
         if job.status == "failed":
             self.context.tell(failure_words(job))
             done = self._answers()
-            self._say_next(str(done[-1].result["words"]) if done else str(self.shared.fields["first_words"]))
+            self._say_next(_answer_of(done[-1]).words if done else str(self.shared.fields["first_words"]))
             return
-        m, result = job.measures, job.result
+        m, answer = job.measures, _answer_of(job)
         parts = [f"{m['images_used']:.0f} used", f"hemisphere {100 * m['hemisphere_coverage']:.0f} %"]
         if "spheres_seen" in m:
             parts.insert(0, seen_words(m["spheres_seen"], m["spheres_expected"]))
@@ -395,9 +396,9 @@ class _Guide:
         for name, word in ((COVERAGE, "specimen"), ("coverage", "frame")):
             if name in m:
                 parts.append(f"{word} {100 * m[name]:.0f} %")
-        verdict = "" if result["used"] else f" not used: {result['why']}."
-        self.context.tell(f"{result['viewpoint']}:{verdict} {', '.join(parts)}")
-        self._say_next(str(result["words"]))
+        verdict = "" if answer.used else f" not used: {answer.why}."
+        self.context.tell(f"{answer.viewpoint}:{verdict} {', '.join(parts)}")
+        self._say_next(answer.words)
 
     def _say_next(self, words: str) -> None:
         """Say where to go, unless the images suffice or another image (as from a memory card) waits for its job."""
@@ -407,6 +408,11 @@ class _Guide:
 
     def _say(self, words: str) -> None:
         self.context.tell(f"next: {words}")
+
+
+def _answer_of(job: JobState) -> hand_view.Answer:
+    """The answer of either kind of job: both answer alike."""
+    return hand_view.KIND.read_answer(job.result)
 
 
 KIND = StepKind(
