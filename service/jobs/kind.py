@@ -68,16 +68,32 @@ class JobKind(Generic[A, R]):
 
     def read_arguments(self, recorded: Mapping[str, Any], jobs: Jobs = _NO_JOBS) -> A:
         """The arguments of a recorded job of any version. Raises IntegrityError."""
-        return self._read(self.arguments, resolve(recorded, jobs), "arguments")
+        return _read(self.arguments, resolve(recorded, jobs), f"the arguments of a job {self.name}")
 
     def read_answer(self, recorded: Mapping[str, Any]) -> R:
         """The answer of a recorded job of any version. Raises IntegrityError."""
-        return self._read(self.answer, recorded, "answer")
+        return _read(self.answer, recorded, f"the answer of a job {self.name}")
 
-    def _read(self, model: type[_T], data: Mapping[str, Any], what: str) -> _T:
-        try:
-            return model.model_validate(data)
-        except ValidationError as error:
-            first = error.errors()[0]
-            path = "/".join(map(str, first["loc"]))
-            raise IntegrityError(f"the {what} of a job {self.name}: {path}: {first['msg']}") from error
+
+def read_part(part: type[_T], recorded: Mapping[str, Any], jobs: Jobs = _NO_JOBS) -> _T:
+    """Some fields of a job's recorded arguments; references in its other fields are not resolved.
+
+    Args:
+        part: a record with only these fields.
+        recorded: arguments of a job of any kind that has them, and of any version.
+        jobs: of the run, for references.
+
+    Raises:
+        IntegrityError: the arguments do not have these fields, or a reference has no value.
+    """
+    fields = {name: resolve(recorded[name], jobs) for name in part.model_fields if name in recorded}
+    return _read(part, fields, "the arguments of a job")
+
+
+def _read(model: type[_T], data: Mapping[str, Any], what: str) -> _T:
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        path = "/".join(map(str, first["loc"]))
+        raise IntegrityError(f"{what}: {path}: {first['msg']}") from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.jobs.kind import JobKind, NoAnswer
+from service.jobs.kind import JobKind, JobRecord, NoAnswer
 from service.jobs.records import ImageFile, ImagesCamera
 
 
@@ -14,11 +14,15 @@ class FrontEndArguments(ImagesCamera):
     effort: dict[str, Any]
 
 
-class Arguments(FrontEndArguments):
+class ImagesToMatch(JobRecord):
     """The images, and the viewpoints that they are to be matched with as soon as those have features."""
 
     images: tuple[ImageFile, ...]
     match_with: tuple[str, ...] = ()
+
+
+class Arguments(ImagesToMatch, FrontEndArguments):
+    """Images, their camera and the effort."""
 
 
 KIND = JobKind(

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from service.jobs.kind import JobKind, NoAnswer
+from service.jobs.kind import JobKind, JobRecord, NoAnswer
 from service.jobs.poses.features import FrontEndArguments
 from service.jobs.records import Hash
 
 
-class Arguments(FrontEndArguments):
+class PairsToMatch(JobRecord):
     """Features by viewpoint, and the pairs to match."""
 
     features: dict[str, Hash]
     pairs: tuple[tuple[str, str], ...]
+
+
+class Arguments(PairsToMatch, FrontEndArguments):
+    """Pairs of images, their camera and the effort."""
 
 
 KIND = JobKind(

@@ -7,10 +7,18 @@ from service.core.jobs.priorities import LATER, WAITED
 from service.core.jobs.references import Reference
 from service.core.protocol.models import Protocol, Step
 from service.core.run.state import RunState
+from service.jobs.kind import JobRecord
 from service.steps.context import JobRequest
 from service.steps.poses.front_end import early_matches
 from service.steps.poses.registration_jobs import Task, name_of, recorded_registration_jobs
+from service.steps.poses.sources import evaluated_step
 from service.store.records import NewJob
+
+
+class _Evaluated(JobRecord):
+    """The registrations of an evaluation job by name, as recorded: values or references."""
+
+    registrations: dict[str, object]
 
 
 def evaluation_tasks(protocol: Protocol, state: RunState, step: Step) -> dict[str, Task]:
@@ -19,12 +27,13 @@ def evaluation_tasks(protocol: Protocol, state: RunState, step: Step) -> dict[st
         return {}
     own = [j for j in state.steps[step.id].jobs.values() if j.kind == "evaluate" and j.priority == WAITED]
     newest = max(own, key=lambda job: job.enqueued_seq, default=None)
-    found = recorded_registration_jobs(protocol, state, protocol.step(step.params.model_dump()["registration"]))
+    found = recorded_registration_jobs(protocol, state, protocol.step(evaluated_step(step)))
     if newest is None or newest.status != "finished" or found is None:
         return {}
     tasks: dict[str, Task] = {}
+    evaluated = _Evaluated.model_validate(newest.arguments).registrations
     for name, job in found.arrived.items():
-        if name not in newest.arguments["registrations"]:
+        if name not in evaluated:
             arguments = {**newest.arguments, "registrations": {name: Reference(job.job, "result").record()}}
             key = f"{name}-{name_of(newest)}"
             request = JobRequest("evaluate", arguments, LATER, 2)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,18 +18,22 @@ from service.core.errors import ConfigurationError
 from service.core.geometry import Transform
 from service.core.jobs.keys import job_key
 from service.core.jobs.priorities import EARLY
-from service.core.jobs.references import Jobs, resolve
+from service.core.jobs.references import Jobs
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import ViewpointCaptured
 from service.core.run.state import JobState, RunState
 from service.jobs.calibration import calibrate
+from service.jobs.kind import read_part
 from service.jobs.poses import features, match
-from service.jobs.records import ImageFile
+from service.jobs.poses.features import FrontEndArguments
+from service.jobs.records import Camera, ImageFile
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import EarlierAnswer, earlier_answer
+from service.steps.poses.sources import WantedRegistrations
 from service.store.records import NewJob
 
+T = TypeVar("T")
 _SOURCES_OF_IMAGES = frozenset({"colmap", "glomap", "hybrid", "triangulated"})
 IMAGES_A_JOB, PAIRS_A_JOB = 8, 100  # in the jobs that complete them
 
@@ -50,24 +54,24 @@ class EarlyFeatures:
         registration = _registration_of(context.protocol, context.step.id)
         if registration is None:
             return None
-        params = registration.params.model_dump(mode="json")
+        wanted = WantedRegistrations.of(registration.params)
         try:
-            camera = earlier_answer(context, params["calibration"], calibrate.KIND)
+            camera = earlier_answer(context, wanted.calibration, calibrate.KIND)
         except ConfigurationError:
             return None
-        effort = params["structure_from_motion"]
+        effort = wanted.structure_from_motion
         options = SfmOptions(**effort)
         nominal = context.devices.nominal_T_flange_camera()
         neighbours: dict[str, list[str]] = {}
         for station in dict.fromkeys(v.station for v in plan):
             poses = {v.name: v.T_base_camera for v in plan if v.station == station}
-            poses |= _taken(context, registration, station, nominal)
+            poses |= _taken(context, wanted, station, nominal)
             for a, b in pairs_of(poses, poses, options):
                 neighbours.setdefault(a, []).append(b)
                 neighbours.setdefault(b, []).append(a)
         begun = cls(context, camera, effort, neighbours)
         jobs = context.evidence.jobs(context.step.id)
-        begun.asked = {job.arguments["images"][0]["sha256"] for job in jobs if job.kind == "features"}
+        begun.asked = {_image_of(job).sha256 for job in jobs if job.kind == "features"}
         return begun
 
     def look(self) -> None:
@@ -91,17 +95,17 @@ def _registration_of(protocol: Protocol, capture: str) -> Step | None:
     """The step that will register the images of a capture by their features."""
     for step in protocol.steps:
         if step.kind == "registration":
-            params = step.params.model_dump(mode="json")
-            images = (*params["images_of"], *params["control_images_of"])
-            if capture in images and _SOURCES_OF_IMAGES.intersection(params["poses"]):
+            wanted = WantedRegistrations.of(step.params)
+            if capture in wanted.captures and _SOURCES_OF_IMAGES.intersection(wanted.poses):
                 return step
     return None
 
 
-def _taken(context: StepContext, registration: Step, station: str, nominal: Transform) -> dict[str, Transform]:
+def _taken(
+    context: StepContext, wanted: WantedRegistrations, station: str, nominal: Transform
+) -> dict[str, Transform]:
     """Approximate T_base_camera of the images of earlier steps at a station, by viewpoint."""
-    params = registration.params.model_dump(mode="json")
-    earlier = [s for s in (*params["images_of"], *params["control_images_of"]) if s != context.step.id]
+    earlier = [step for step in wanted.captures if step != context.step.id]
     captures = [c for step in earlier for c in context.evidence.captures(step) if isinstance(c, ViewpointCaptured)]
     return {c.viewpoint: np.array(c.T_base_flange) @ nominal for c in captures if c.station == station}
 
@@ -114,22 +118,22 @@ def early_matches(protocol: Protocol, state: RunState) -> list[NewJob]:
     for step in protocol.steps:
         for job in state.steps[step.id].jobs.values():
             if job.kind == "features" and job.priority == EARLY and job.status == "finished":
-                found[job.arguments["images"][0]["viewpoint"]] = (step.id, job)
+                found[_image_of(job).viewpoint] = (step.id, job)
             elif job.kind == "match" and job.priority == EARLY:
-                pairs_done |= {(a, b) for a, b in job.arguments["pairs"]}
+                pairs_done |= set(read_part(match.PairsToMatch, job.arguments).pairs)
                 matched.add(job.idempotency_key.split("/")[3])
     jobs: list[NewJob] = []
     for name, (step_id, job) in found.items():
         sha256 = job.artefacts[0].sha256
-        if sha256 in matched or not job.arguments["match_with"]:
+        if sha256 in matched:
             continue
-        there = [other for other in job.arguments["match_with"] if other in found]
+        there = [other for other in _asked_of(job).match_with if other in found]
         pairs = sorted({(min(name, other), max(name, other)) for other in there} - pairs_done)
         pairs_done |= set(pairs)
         if not pairs:
             continue
         named = {n: found[n][1].artefacts[0].sha256 for pair in pairs for n in pair}
-        shared = {key: job.arguments[key] for key in ("camera", "effort")}
+        shared = {key: job.arguments[key] for key in ("camera", "effort")}  # references stay references
         arguments = {**shared, "features": named, "pairs": [list(pair) for pair in pairs]}
         key = job_key(state, step_id, "match", sha256)
         attempt = state.steps[step_id].attempt
@@ -149,28 +153,42 @@ class EarlyJobs:
 
     def matching(self, features: Mapping[str, str]) -> list[JobState]:
         """The jobs that matched exactly these features; `features` maps viewpoints to hashes of files."""
-        return [job for job in self.matches if job.arguments["features"].items() <= features.items()]
+        return [
+            job
+            for job in self.matches
+            if read_part(match.PairsToMatch, job.arguments).features.items() <= features.items()
+        ]
 
 
-def found_early(state: RunState, jobs: Jobs, camera: Mapping[str, Any], effort: Mapping[str, Any]) -> EarlyJobs:
+def found_early(state: RunState, jobs: Jobs, camera: Camera, effort: Mapping[str, Any]) -> EarlyJobs:
     """The jobs that computed features and matches with this camera and effort while the images arrived."""
     early = EarlyJobs()
     for step in state.steps.values():
         for job in step.jobs.values():
             if job.priority != EARLY or job.kind not in ("features", "match"):
                 continue
-            if job.status == "failed" or job.arguments["effort"] != effort:
+            if job.status == "failed":
                 continue
-            if resolve(job.arguments["camera"], jobs) != camera:
+            shared = read_part(FrontEndArguments, job.arguments, jobs)
+            if shared.effort != effort or shared.camera.plain() != camera.plain():
                 continue
             if job.kind == "features":
-                early.features[job.arguments["images"][0]["sha256"]] = job
+                early.features[_image_of(job).sha256] = job
             else:
                 early.matches.append(job)
     return early
 
 
-def chunks(items: Iterable[Any], size: int) -> list[list[Any]]:
+def _asked_of(job: JobState) -> features.ImagesToMatch:
+    return read_part(features.ImagesToMatch, job.arguments)
+
+
+def _image_of(job: JobState) -> ImageFile:
+    """The image of an early job on features, which has only one."""
+    return _asked_of(job).images[0]
+
+
+def chunks(items: Iterable[T], size: int) -> list[list[T]]:
     """The items in order, in lists of at most `size`."""
     listed = list(items)
     return [listed[i : i + size] for i in range(0, len(listed), size)]

@@ -20,7 +20,10 @@ from service.core.jobs.references import Reference, jobs_of, resolve
 from service.core.protocol.models import Protocol, Step
 from service.core.run.state import JobState, RunState
 from service.jobs import job_kinds
-from service.jobs.records import Photograph
+from service.jobs.kind import JobRecord, read_part
+from service.jobs.poses.features import ImagesToMatch
+from service.jobs.poses.match import PairsToMatch
+from service.jobs.records import ImageFile, ImagesCamera, Photograph
 from service.steps.context import JobRequest
 from service.steps.poses.front_end import IMAGES_A_JOB, PAIRS_A_JOB, EarlyJobs, chunks, found_early
 from service.steps.poses.sources import PLANNED, QUICK, WantedRegistrations, decisive, posed
@@ -78,6 +81,24 @@ def registration_jobs(
     return RegistrationJobs(tuple(plan.tasks.values()), tasks_for, arrived, plan.failed)
 
 
+class _Images(JobRecord):
+    """The images of a job's arguments."""
+
+    images: tuple[Photograph, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Model:
+    """Files with camera poses and, of structure from motion, the tracks."""
+
+    model: str
+    tracks: str | None = None
+
+    def fields(self) -> dict[str, str]:
+        """As arguments of the next jobs."""
+        return {"model": self.model} if self.tracks is None else {"model": self.model, "tracks": self.tracks}
+
+
 @dataclass
 class _Plan:
     """Plans the jobs from the images to each registration, as far as the results they need are there."""
@@ -108,20 +129,20 @@ class _Plan:
     def _no_reduction(self, size: str) -> str:
         """Why a size does not reduce the photographs, or "": a protocol serves cameras of any resolution."""
         width, height = _pixels(size)
-        camera = resolve(self.outlines.arguments["camera"], self.jobs)
+        camera = read_part(ImagesCamera, self.outlines.arguments, self.jobs).camera
         # Otherwise one side at least would be cropped at full scale.
-        if width < camera["width"] and height < camera["height"]:
+        if width < camera.width and height < camera.height:
             return ""
-        return f"{width} × {height} does not reduce photographs of {camera['width']:g} × {camera['height']:g} px"
+        return f"{width} × {height} does not reduce photographs of {camera.width} × {camera.height} px"
 
     def _registered(self, source: str, size: str) -> JobState | None:
         search = self._arguments(size)
         shared = {key: value for key, value in search.items() if key not in ("detector", "colour")}
-        if not posed(map(Photograph.model_validate, search["images"])):
+        if not posed(read_part(_Images, search).images):
             first = self._model(self._mapper(""), size, shared)  # spheres are searched where poses predict them
             if first is None:
                 return None
-            search["model"] = first["model"]
+            search |= {"model": first.model}
         detected = self._need("detect_spheres", "", size, search)
         if detected is None:
             return None
@@ -132,17 +153,17 @@ class _Plan:
         model = self._model(self._mapper(source), size, shared)
         if model is not None and source == "hybrid":
             # It starts from one reconstruction and adds the robot and the spheres.
-            adjusted = self._need("hybrid", source, size, {**markers, **model})
-            model = None if adjusted is None else {"model": adjusted.artefacts[0].sha256}
-        return None if model is None else self._need("register", source, size, {**markers, **model})
+            adjusted = self._need("hybrid", source, size, {**markers, **model.fields()})
+            model = None if adjusted is None else _Model(adjusted.artefacts[0].sha256)
+        return None if model is None else self._need("register", source, size, {**markers, **model.fields()})
 
     def _mapper(self, source: str) -> str:
         """The mapper of a source; a source without its own uses a mapper that another wanted source needs anyway."""
         wanted = [mapper for other, mapper in _MAPPERS.items() if other in self.wanted.poses]
         return _MAPPERS.get(source) or next(iter(wanted), "incremental")
 
-    def _model(self, mapper: str, size: str, shared: Mapping[str, Any]) -> dict[str, str] | None:
-        """Poses and tracks of structure from motion, as arguments of the next jobs; None until they are computed."""
+    def _model(self, mapper: str, size: str, shared: Mapping[str, Any]) -> _Model | None:
+        """Poses and tracks of structure from motion; None until they are computed."""
         known = next((source for source in reversed(QUICK) if source in self.wanted.poses), None)
         prior = None
         if known is not None:
@@ -154,40 +175,44 @@ class _Plan:
         pieces = self._pieces(size, shared, prior)
         if pieces is None:
             return None
-        arguments = {**shared, **pieces, "mappers": [mapper], "effort": dict(self.wanted.effort)}
-        arguments["prior"] = None if prior is None else prior.record()
+        arguments = {
+            **shared,
+            **pieces,
+            "mappers": [mapper],
+            "effort": self.wanted.structure_from_motion,
+            "prior": None if prior is None else prior.record(),
+        }
         made = self._need("structure_from_motion", mapper, size, arguments)
         if made is None:
             return None
         refs = {ref.original_name: ref.sha256 for ref in made.artefacts}
-        return {"model": refs[f"{mapper}.json"], "tracks": refs[f"{mapper}_tracks.npz"]}
+        return _Model(refs[f"{mapper}.json"], refs[f"{mapper}_tracks.npz"])
 
     def _pieces(self, size: str, shared: Mapping[str, Any], prior: Reference | None) -> dict[str, Any] | None:
         """Features and matches as arguments, with those computed while the images arrived; None until all exist."""
-        effort = dict(self.wanted.effort)
-        common = {"camera": shared["camera"], "effort": effort}
-        common |= {name: shared[name] for name in _REDUCED if name in shared}
-        images = [{"viewpoint": image["viewpoint"], "sha256": image["sha256"]} for image in shared["images"]]
-        early = (
-            EarlyJobs() if size else found_early(self.state, self.jobs, resolve(shared["camera"], self.jobs), effort)
-        )
+        effort = self.wanted.structure_from_motion
+        common = {**_copied(shared, "camera"), "effort": effort, **_copied(shared, *_REDUCED)}
+        images = read_part(_Images, shared).images
+        camera = read_part(ImagesCamera, shared, self.jobs).camera
+        early = EarlyJobs() if size else found_early(self.state, self.jobs, camera, effort)
         jobs: list[JobState | None] = [
-            early.features[image["sha256"]] for image in images if image["sha256"] in early.features
+            early.features[image.sha256] for image in images if image.sha256 in early.features
         ]
-        rest = [image for image in images if image["sha256"] not in early.features]
+        rest = [image for image in images if image.sha256 not in early.features]
         for some in chunks(rest, IMAGES_A_JOB):
-            what = arguments_name({"images": [image["sha256"] for image in some]})
-            jobs.append(self._need("features", what, size, {**common, "images": some}))
+            what = arguments_name({"images": [image.sha256 for image in some]})
+            files = [ImageFile(viewpoint=image.viewpoint, sha256=image.sha256).plain() for image in some]
+            jobs.append(self._need("features", what, size, {**common, "images": files}))
         made = [job for job in jobs if job is not None and job.status == "finished"]
         if len(made) < len(jobs):
             return None
         by_image: dict[str, str] = {}
         for job in made:
-            these = zip(job.arguments["images"], job.artefacts, strict=True)
-            by_image |= {image["sha256"]: ref.sha256 for image, ref in these}
-        features = {image["viewpoint"]: by_image[image["sha256"]] for image in images}
+            these = zip(read_part(ImagesToMatch, job.arguments).images, job.artefacts, strict=True)
+            by_image |= {image.sha256: ref.sha256 for image, ref in these}
+        features = {image.viewpoint: by_image[image.sha256] for image in images}
         matched: list[JobState | None] = [*early.matching(features)]
-        done = {(a, b) for job in early.matching(features) for a, b in job.arguments["pairs"]}
+        done = {pair for job in early.matching(features) for pair in read_part(PairsToMatch, job.arguments).pairs}
         known = {} if prior is None else {name: np.array(T) for name, T in resolve(prior.record(), self.jobs).items()}
         left = [pair for pair in pairs_of(features, known or None, SfmOptions(**effort)) if pair not in done]
         for pairs in chunks(left, PAIRS_A_JOB):
@@ -225,6 +250,11 @@ class _Plan:
         request = JobRequest(kind, arguments, self._priority, job_kinds()[kind].version)
         self.tasks.setdefault((kind, name), Task(name, request, job))
         return job if job is not None and job.status == "finished" else None
+
+
+def _copied(arguments: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    """Those of the recorded arguments that exist; references stay references."""
+    return {name: arguments[name] for name in names if name in arguments}
 
 
 def _pixels(size: str) -> tuple[int, int]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any, Literal, cast
+from collections.abc import Iterable
+from typing import Any, Literal
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 
 from service.core.protocol.models import Protocol, Step
 from service.jobs.records import Photograph
@@ -23,22 +22,38 @@ QUICK = ("robot", "robot_corrected", "spheres")  # computed in seconds, from the
 _BY_PREFERENCE = ("robot_corrected", "robot", "spheres", "triangulated", "colmap", "glomap", "hybrid")
 
 
-@dataclass(frozen=True, slots=True)
-class WantedRegistrations:
-    """The registrations that the parameters of a registration step ask for."""
+class WantedRegistrations(BaseModel):
+    """The registrations that the parameters of a registration step ask for, and the images that they use.
 
+    Attributes:
+        images_of: capture steps.
+        control_images_of: capture steps that see the control spheres.
+        calibration: the step with the intrinsics.
+        poses: sources.
+        reduced: sizes of reduced images, such as 1920x1080.
+        reduced_poses: sources for the reduced images.
+        structure_from_motion: SfmOptions.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    images_of: tuple[str, ...]
+    control_images_of: tuple[str, ...]
+    calibration: str
     poses: tuple[str, ...]
-    reduced: tuple[str, ...]  # sizes of reduced images, such as 1920x1080
+    reduced: tuple[str, ...]
     reduced_poses: tuple[str, ...]
-    effort: Mapping[str, Any]  # of structure from motion
+    structure_from_motion: dict[str, Any]
 
     @classmethod
     def of(cls, params: BaseModel) -> WantedRegistrations:
         """Those of a registration step with these params."""
-        fields = params.model_dump(mode="json")
-        names = ("poses", "reduced", "reduced_poses")
-        poses, reduced, reduced_poses = (tuple(cast("list[str]", fields[name])) for name in names)
-        return cls(poses, reduced, reduced_poses, fields["structure_from_motion"])
+        return cls.model_validate(params.model_dump(mode="json"))
+
+    @property
+    def captures(self) -> tuple[str, ...]:
+        """All capture steps whose images are used."""
+        return (*self.images_of, *self.control_images_of)
 
     @property
     def registrations(self) -> dict[str, tuple[str, str]]:
@@ -50,14 +65,28 @@ class WantedRegistrations:
 def decisive(protocol: Protocol, step: Step) -> tuple[str, ...]:
     """The registrations that a registration step waits for: those that gates name, and those that take seconds."""
     names = WantedRegistrations.of(step.params).registrations
-    judging = [
-        s for s in protocol.steps if s.kind == "evaluation" and s.params.model_dump()["registration"] == step.id
-    ]
-    measures = [gate.measure for s in (step, *judging) for gate in s.gates]
+    measures = [gate.measure for s in (step, *evaluations_of(protocol, step)) for gate in s.gates]
     waited = {name for measure in measures for name in _named(measure, names)} | {n for n in names if n in QUICK}
     if not waited:
         waited = {next((name for name in _BY_PREFERENCE if name in names), next(iter(names)))}
     return tuple(name for name in names if name in waited)
+
+
+class _EvaluationParams(BaseModel):
+    """The parameter of an evaluation step that names what it evaluates."""
+
+    registration: str
+
+
+def evaluated_step(evaluation: Step) -> str:
+    """The registration step that an evaluation step evaluates."""
+    return _EvaluationParams.model_validate(evaluation.params.model_dump()).registration
+
+
+def evaluations_of(protocol: Protocol, registration: Step) -> tuple[Step, ...]:
+    """The evaluation steps of a registration step."""
+    every = (step for step in protocol.steps if step.kind == "evaluation")
+    return tuple(step for step in every if evaluated_step(step) == registration.id)
 
 
 def _named(measure: str, names: Iterable[str]) -> list[str]:

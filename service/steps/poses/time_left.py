@@ -12,12 +12,14 @@ from datetime import datetime
 from typing import Any
 
 from service.core.jobs.priorities import WAITED
-from service.core.jobs.references import Jobs, jobs_of, resolve
+from service.core.jobs.references import Jobs, jobs_of
 from service.core.protocol.models import Protocol, Step
-from service.core.run.state import JobState, RunState
+from service.core.run.state import RunState
+from service.jobs.kind import JobRecord, read_part
+from service.jobs.records import Camera, ImageFile
 from service.steps.poses.due_jobs import evaluation_tasks
 from service.steps.poses.registration_jobs import RegistrationJobs, Task, recorded_registration_jobs
-from service.steps.poses.sources import WantedRegistrations
+from service.steps.poses.sources import WantedRegistrations, evaluations_of
 
 _NAMES = {
     "robot": "robot poses as reported",
@@ -86,13 +88,44 @@ def missing_results(
     for step in protocol.steps if state.status != "aborted" else ():  # nothing follows in an aborted run
         found = recorded_registration_jobs(protocol, state, step)
         if found is not None:
-            evaluation = next((s for s in protocol.steps if _evaluates(s, step)), None)
+            evaluation = next(iter(evaluations_of(protocol, step)), None)
             left += _left_of(protocol, state, step, evaluation, found, _JobTimes(state, started_utc, now_utc, cores))
     return sorted(left, key=lambda one: one.seconds)
 
 
-def _evaluates(step: Step, registration: Step) -> bool:
-    return step.kind == "evaluation" and step.params.model_dump()["registration"] == registration.id
+class _Work(JobRecord):
+    """The arguments of a job, of any kind, that its duration depends on."""
+
+    poses: str = ""
+    mappers: tuple[str, ...] = ()
+    images: tuple[ImageFile, ...] = ()
+    pairs: tuple[tuple[str, str], ...] = ()
+
+    def count(self, kind: str) -> int:
+        """Number of images, or of pairs."""
+        return len(self.pairs if kind == "match" else self.images)
+
+    def size(self, kind: str) -> float:
+        """The number, weighted by their pixels for jobs whose duration depends on them."""
+        return self.count(kind)
+
+
+class _Search(_Work):
+    """The same for a job that searches whole images."""
+
+    camera: Camera | None = None
+    reduced_to: tuple[int, int] | None = None
+
+    def size(self, kind: str) -> float:
+        """The number, weighted by their pixels."""
+        if self.camera is None:
+            return self.count(kind)
+        width, height = self.reduced_to or (self.camera.width, self.camera.height)
+        return self.count(kind) * width * height / _PIXELS
+
+
+def _work(kind: str, arguments: Mapping[str, Any], jobs: Jobs) -> _Work:
+    return read_part(_Search if kind in _BY_PIXELS else _Work, arguments, jobs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,41 +142,28 @@ class _JobTimes:
         job = task.job
         if job is not None and job.status != "enqueued":
             return 0.0
-        expected_s = self.expected_s(task.request.kind, task.request.arguments)
+        kind = task.request.kind
+        expected_s = self.expected_s(kind, _work(kind, task.request.arguments, jobs_of(self.state)))
         begun = None if job is None else self.started_utc.get(job.job)
         if begun is None:
             return expected_s
         gone_s = (datetime.fromisoformat(self.now_utc) - datetime.fromisoformat(begun)).total_seconds()
         return max(expected_s - gone_s, 0.1 * expected_s)
 
-    def expected_s(self, kind: str, arguments: Mapping[str, Any]) -> float:
+    def expected_s(self, kind: str, work: _Work) -> float:
         """Expected duration of a job, from the jobs of its kind in this run if there are any."""
-        done = [
-            job for step in self.state.steps.values() for job in step.jobs.values() if _tells_of(job, kind, arguments)
-        ]
         jobs = jobs_of(self.state)
-        size = _size(kind, arguments, jobs)
-        if done:
-            return size * sum(job.duration_s for job in done) / sum(_size(kind, job.arguments, jobs) for job in done)
-        return size * _GUESS_S.get(kind, 0.0) / (self.cores if kind in _SEVERAL_CORES else 1)
+        ended = [job for job in jobs.values() if job.kind == kind and job.status == "finished"]
+        done = [(job, _work(kind, job.arguments, jobs)) for job in ended]
+        like = [(job, other) for job, other in done if _tells_of(other, work) and other.count(kind) > 0]
+        if like:
+            spent_s = sum(job.duration_s for job, _ in like)
+            return work.size(kind) * spent_s / sum(other.size(kind) for _, other in like)
+        return work.size(kind) * _GUESS_S.get(kind, 0.0) / (self.cores if kind in _SEVERAL_CORES else 1)
 
 
-def _tells_of(job: JobState, kind: str, arguments: Mapping[str, Any]) -> bool:
-    same = all(job.arguments.get(name) == arguments.get(name) for name in ("poses", "mappers"))
-    return job.kind == kind and job.status == "finished" and same and _count(kind, job.arguments) > 0
-
-
-def _size(kind: str, arguments: Mapping[str, Any], jobs: Jobs) -> float:
-    """Number of images or pairs, weighted by their pixels for jobs whose duration depends on them."""
-    camera = resolve(arguments.get("camera"), jobs) if kind in _BY_PIXELS else None
-    if camera is None:
-        return _count(kind, arguments)
-    width, height = arguments.get("reduced_to") or (camera["width"], camera["height"])
-    return _count(kind, arguments) * width * height / _PIXELS
-
-
-def _count(kind: str, arguments: Mapping[str, Any]) -> int:
-    return len(arguments.get("pairs" if kind == "match" else "images", ()))
+def _tells_of(done: _Work, work: _Work) -> bool:
+    return (done.poses, done.mappers) == (work.poses, work.mappers)
 
 
 def _left_of(
@@ -160,6 +180,7 @@ def _left_of(
     free_s = [0.0] * clock.cores
     ready_s: dict[tuple[str, str], float] = {}
     left: list[PendingResult] = []
+    first = read_part(_Work, found.tasks[0].request.arguments) if found.tasks else _Work()
     for name, (source, size) in wanted.registrations.items():
         what = _NAMES.get(source, source) + (f" at {size.replace('x', ' × ')}" if size else "")
         if name in found.failed:
@@ -181,12 +202,10 @@ def _left_of(
             at_s = max(at_s, ready_s[key])
         last = steps[-1].request if steps else None
         if last is not None and name not in found.arrived:
-            images = found.tasks[0].request.arguments["images"]
-            at_s += sum(
-                clock.expected_s(kind, {"images": images, "poses": source}) for kind in _rest(source, last.kind)
-            )
+            rest = _Work(images=first.images, poses=source)
+            at_s += sum(clock.expected_s(kind, rest) for kind in _rest(source, last.kind))
         if evaluation is not None and any(task.request.priority != WAITED for task in steps):
-            at_s += clock.expected_s("evaluate", found.tasks[0].request.arguments)
+            at_s += clock.expected_s("evaluate", first)
         left.append(PendingResult(name, what, at_s))
     return left
 
