@@ -82,7 +82,7 @@ steps:
     sign: true
 """
 IMAGES = [{"viewpoint": "v0", "sha256": "0" * 64, "station": "station_1", "T_base_flange": [[1.0, 0, 0, 0]] * 4}]
-CAMERA = {"width": 1920, "height": 1280}
+CAMERA = {"width": 1920, "height": 1280, "fx": 2000.0, "fy": 2000.0, "cx": 960.0, "cy": 640.0}
 _WIDTH, _HEIGHT = 960, 640  # of images of noise
 
 
