@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
+from pydantic import BaseModel, ValidationError
+
 from service.core.errors import ConfigurationError, IntegrityError
 from service.core.jobs.references import Each, Reference
 from service.core.records.events import ArtefactRef, View, ViewHeld, ViewpointCaptured
@@ -18,6 +20,7 @@ from service.jobs.records import ArmCorrection, Mounting, ParameterCovariance, P
 from service.steps.context import StepContext
 
 R = TypeVar("R", bound=JobRecord)
+M = TypeVar("M", bound=BaseModel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +69,19 @@ def result_of(context: StepContext, step_id: str) -> Mapping[str, Any]:
             remedy=f"Pass step {step_id!r} first, or correct the protocol",
         )
     return state.result
+
+
+def earlier_result(context: StepContext, step_id: str, model: type[M]) -> M:
+    """The Result of an earlier step of a known kind. Raises ConfigurationError if it has none, or another."""
+    result = result_of(context, step_id)
+    try:
+        return model.model_validate(result)
+    except ValidationError as error:
+        raise ConfigurationError(
+            f"step {context.step.id!r} cannot use the result of step {step_id!r}, a step of another kind",
+            where=f"step {context.step.id}",
+            remedy="Correct the protocol",
+        ) from error
 
 
 def artefact_of(context: StepContext, step_id: str, kind: str) -> ArtefactRef:
@@ -145,6 +161,12 @@ def held_views(context: StepContext, step_id: str) -> dict[str, hand_view.Answer
     }
 
 
+class _CarriedBy(BaseModel):
+    """The part of a calibration step's Result that no job computes: the robots that carried the camera."""
+
+    robots: tuple[str, ...]
+
+
 @dataclass(frozen=True, slots=True)
 class CameraMounting:
     """How the camera was mounted on the arm, and the references that are recorded in its place."""
@@ -164,7 +186,7 @@ def mounting_of(context: StepContext, step_id: str, stations: Iterable[str]) -> 
     references = {"T_flange_camera": found.reference("T_flange_camera")}
     if correction is None:
         return CameraMounting(Mounting(T_flange_camera=found.answer.T_flange_camera, arm_correction=None), references)
-    robots = set(result_of(context, step_id)["robots"])
+    robots = set(earlier_result(context, step_id, _CarriedBy).robots)
     mine = tuple(sorted({station for station in stations if context.devices.layout(station).robot in robots}))
     mounting = Mounting(
         T_flange_camera=found.answer.T_flange_camera,

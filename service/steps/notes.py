@@ -47,10 +47,22 @@ class BoardPrediction(_NoteRecord):
 
 
 class BoardPlan(_NoteRecord):
-    """Planned board images; `instead_of` has the reasons why earlier images are replaced, by viewpoint."""
+    """Planned board images.
 
+    Attributes:
+        why: the poses were planned: first, start, rest, replacement or mend.
+        attempt: of the step.
+        poses: in the order of capture.
+        prediction: of what they will give.
+        from_images: number of images from which camera, mount and board were known.
+        instead_of: reasons why earlier images are replaced, by viewpoint.
+    """
+
+    why: str = ""
+    attempt: int = 0
     poses: tuple[BoardPose, ...]
     prediction: BoardPrediction
+    from_images: int = 0
     instead_of: dict[str, str] = Field(default_factory=dict[str, str])
 
 

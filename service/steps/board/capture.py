@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from service.compute.planning.motion_plan import able_postures
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.text.counts import counted
+from service.jobs.records import Camera
 from service.steps.board.looks import BoardLooks, SearchedBoardImage
 from service.steps.board.plan import (
     START,
@@ -32,7 +32,7 @@ from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.capture.retakes import to_take_again
 from service.steps.capture.views import CaptureTask, capture_viewpoints
 from service.steps.context import StepContext
-from service.steps.notes import BOARD_POSES
+from service.steps.notes import BOARD_POSES, BoardPlan, BoardPose, board_plans
 
 _MOST_FIRST = 4  # tries to get a first image that shows the board
 _MOVED_M = 0.01  # a board found farther than this from its earlier place has been moved
@@ -52,18 +52,17 @@ class BoardCapture:
     board: Board
     solve: tuple[str, ...]
     given: tuple[Viewpoint, ...] = ()  # poses of the protocol; only replacements are planned then
-    camera: Mapping[str, float] | None = None  # calibrated by an earlier step
+    camera: Camera | None = None  # calibrated by an earlier step
     earlier: str | None = None  # step whose board images show where board and mount are
     _known: BoardKnowledge | None = None
-    _notes: list[Mapping[str, Any]] = field(default_factory=list[Mapping[str, Any]])
+    _plans: list[BoardPlan] = field(default_factory=list[BoardPlan])
     _replaced: int = 0  # in this attempt
 
     def __post_init__(self) -> None:
         self._mount = self.context.devices.nominal_T_flange_camera()
-        self._notes = [note.data for note in self.context.state.notes if note.note == BOARD_POSES]
-        self._replaced = sum(
-            len(n["poses"]) for n in self._notes if n["why"] == "replacement" and n["attempt"] == self.context.attempt
-        )
+        self._plans = list(board_plans(self.context.state))
+        mine = [plan for plan in self._plans if plan.attempt == self.context.attempt]
+        self._replaced = sum(len(plan.poses) for plan in mine if plan.why == "replacement")
         self._looks = BoardLooks(self.context, self.board, self.earlier)
 
     # --- the loop ---
@@ -89,15 +88,15 @@ class BoardCapture:
 
     def _recorded(self) -> tuple[Viewpoint, ...]:
         return tuple(
-            Viewpoint(str(pose["viewpoint"]), self.wanted.station, np.array(pose["T_base_camera"]))
-            for note in self._notes
-            for pose in note["poses"]
+            Viewpoint(pose.viewpoint, self.wanted.station, np.array(pose.T_base_camera))
+            for plan in self._plans
+            for pose in plan.poses
         )
 
     def _more(self, looks: Sequence[SearchedBoardImage]) -> tuple[Viewpoint, ...]:
         """Plan the poses to add now; none if no image is missing, or no more may be replaced."""
         seen = [look for look in looks if look.seen]
-        planned = sum(len(n["poses"]) for n in self._notes if n["why"] != "replacement")
+        planned = self._planned()
         if self.given or planned >= self.wanted.count:
             missing = len(self.given) + planned - len(seen)
             missing = min(missing, self.wanted.replacements - self._replaced)
@@ -120,8 +119,12 @@ class BoardCapture:
             return self._plan("start", START - planned, looks)
         return self._rest(looks)
 
+    def _planned(self) -> int:
+        """Number of poses planned so far, without replacements."""
+        return sum(len(plan.poses) for plan in self._plans if plan.why != "replacement")
+
     def _rest(self, looks: Sequence[SearchedBoardImage]) -> tuple[Viewpoint, ...]:
-        planned = sum(len(n["poses"]) for n in self._notes if n["why"] != "replacement")
+        planned = self._planned()
         return self._plan("rest", self.wanted.count - planned, looks)
 
     # --- planning ---
@@ -169,26 +172,24 @@ class BoardCapture:
             return ()
         prediction = prediction_record(found.prediction)
         words = describe_prediction(prediction, self.solve)
-        data: dict[str, Any] = {
-            "why": why,
-            "attempt": self.context.attempt,
-            "poses": [
-                {"viewpoint": v.name, "T_base_camera": [[round(float(x), 9) for x in row] for row in v.T_base_camera]}
-                for v in poses
-            ],
-            "prediction": prediction.model_dump(mode="json"),
-            "from_images": known.measured,
-        }
+        names = poses[0].name if len(poses) == 1 else f"{poses[0].name} … {poses[-1].name}"
+        advice = {} if advise is None else {"advice": advise(len(poses), names, words)}
+        text = advice.get("advice", f"{counted(len(poses), 'board pose')} ({_WORDS[why]}): {words}")
+        instead = {}
         if why == "replacement":
-            data["instead_of"] = {look.capture.viewpoint: look.reason for look in looks if not look.seen}
+            instead = {"instead_of": {look.capture.viewpoint: look.reason for look in looks if not look.seen}}
             self._replaced += len(poses)
-        text = f"{counted(len(poses), 'board pose')} ({_WORDS[why]}): {words}"
-        if advise is not None:
-            names = poses[0].name if len(poses) == 1 else f"{poses[0].name} … {poses[-1].name}"
-            text = data["advice"] = advise(len(poses), names, words)
-        self.context.note(BOARD_POSES, text=text, **data)
+        plan = BoardPlan(
+            why=why,
+            attempt=self.context.attempt,
+            poses=tuple(_planned_pose(viewpoint) for viewpoint in poses),
+            prediction=prediction,
+            from_images=known.measured,
+            **instead,
+        )
+        self.context.note(BOARD_POSES, text=text, **plan.model_dump(mode="json", exclude_unset=True), **advice)
         self.context.tell(text)
-        self._notes.append(data)
+        self._plans.append(plan)
         return poses
 
     def planner(self, known: BoardKnowledge, *, coverage: float) -> Planner:
@@ -240,7 +241,7 @@ class BoardCapture:
         if self.camera is None:
             camera, focal = nominal_camera(self.context.devices.lens(), size)
         else:
-            camera, focal = CameraModel.from_record(dict(self.camera)), 0.002
+            camera, focal = CameraModel.from_record(self.camera.plain()), 0.002
         layout = self.context.devices.layout(self.wanted.station)
         nominal = nominal_board(self.wanted, self.board, layout, self._mount, camera, focal)
         calibrated = self.camera is not None
@@ -305,6 +306,11 @@ _WORDS: Mapping[Why, str] = {
     "replacement": "instead of images without a board",
     "mend": "to pass the gates",
 }
+
+
+def _planned_pose(viewpoint: Viewpoint) -> BoardPose:
+    rows = tuple(tuple(round(float(x), 9) for x in row) for row in viewpoint.T_base_camera)
+    return BoardPose(viewpoint=viewpoint.name, T_base_camera=rows)
 
 
 def _refine(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -10,12 +9,10 @@ from pydantic import model_validator
 
 from service.compute.calibration.board.board import Board
 from service.core.errors import ConfigurationError
-from service.core.jobs.references import Reference
 from service.core.protocol.step_params import MovingParams, RepeatedStep
 from service.core.records.events import Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
-from service.jobs.records import Camera
 from service.steps.board.capture import BoardCapture
 from service.steps.board.looks import board_arguments
 from service.steps.board.mend import mend_calibration
@@ -23,7 +20,7 @@ from service.steps.board.plan import BoardPoses
 from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.capture.plan.viewpoints import ViewpointSet, plan_viewpoints
 from service.steps.context import ROBOT_MOVES, Announcement, JobRequest, JobResult, StepContext, StepKind, StepOutcome
-from service.steps.inputs import captured_images, earlier_answer, result_of
+from service.steps.inputs import EarlierAnswer, captured_images, earlier_answer
 from service.steps.measures import CaptureMeasures, Count, FineMm, Measure, Mm, Px, Share
 
 _FEWEST_KNOWN = 3  # images of the whole board needed before images of a part of it are used
@@ -150,19 +147,19 @@ def board_of_protocol(context: StepContext) -> Board:
     return Board(board.columns, board.rows, metres(board.square_mm))
 
 
-def _camera(context: StepContext, params: Params) -> Mapping[str, float] | None:
-    """Intrinsics of an earlier step, if this one does not solve them."""
+def _camera(context: StepContext, params: Params) -> EarlierAnswer[calibrate.Answer] | None:
+    """The answer with the intrinsics of an earlier step, if this one does not solve them."""
     if "intrinsics" in params.solve:
         return None
     if params.intrinsics_of is None:
         raise ConfigurationError(
             "hand-eye needs intrinsics", where=f"step {context.step.id}", remedy="Name the step in intrinsics_of"
         )
-    return result_of(context, params.intrinsics_of)["camera"]
+    return earlier_answer(context, params.intrinsics_of, calibrate.KIND)
 
 
 def _board_capture(
-    context: StepContext, params: Params, board: Board, camera: Mapping[str, float] | None
+    context: StepContext, params: Params, board: Board, camera: EarlierAnswer[calibrate.Answer] | None
 ) -> BoardCapture:
     given = tuple(
         viewpoint
@@ -170,7 +167,8 @@ def _board_capture(
         for viewpoint in plan_viewpoints(viewpoint_set, context.devices.layout(viewpoint_set.station))
     )
     wanted = params.board_poses or _as_board_poses(params.viewpoints)
-    return BoardCapture(context, wanted, board, params.solve, given, camera, params.intrinsics_of)
+    known = None if camera is None else camera.answer.camera
+    return BoardCapture(context, wanted, board, params.solve, given, known, params.intrinsics_of)
 
 
 def _as_board_poses(sets: tuple[ViewpointSet, ...]) -> BoardPoses:
@@ -191,7 +189,7 @@ def _solve(
     context: StepContext,
     params: Params,
     board: Board,
-    camera: Mapping[str, float] | None,
+    camera: EarlierAnswer[calibrate.Answer] | None,
     capture: BoardCapture | None,
 ) -> JobResult:
     images = captured_images(context, [params.images_of or context.step.id])
@@ -201,11 +199,9 @@ def _solve(
         solve=params.solve,
         images=tuple(images),
         **board_arguments(board),
-        camera=None if camera is None else Camera.model_validate(camera),
+        camera=None if camera is None else camera.answer.camera,
     )
-    references: dict[str, Reference | None] = {}
-    if camera is not None and params.intrinsics_of is not None:
-        references["camera"] = earlier_answer(context, params.intrinsics_of, calibrate.KIND).reference("camera")
+    references = {} if camera is None else {"camera": camera.reference("camera")}
     if capture is not None:
         corners = tuple(looks[image.sha256].corners_sha256 if image.sha256 in looks else None for image in images)
         known = capture.knowledge() if None in corners else None

@@ -6,7 +6,6 @@ It evaluates the registrations that have arrived; a later one is evaluated when 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 from service.core.errors import ConfigurationError
@@ -17,9 +16,12 @@ from service.core.units import metres
 from service.jobs.registration import evaluate, register
 from service.jobs.surfaces import locate_spheres
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
-from service.steps.inputs import captured_images, earlier_answer, result_of
+from service.steps.inputs import captured_images, earlier_answer, earlier_result
+from service.steps.kinds import registration
 from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures
 from service.steps.poses.registration_jobs import recorded_registration_jobs
+
+_SCAN, _CONTROL, _CT = "scan", "control_scan", "ct"  # fields of the job's arguments
 
 
 class Params(StepParams):
@@ -65,14 +67,14 @@ class Result(Record):
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Let the worker evaluate every registration that has arrived on the control spheres."""
-    registered: Mapping[str, Any] = result_of(context, params.registration)["registrations"]
+    registered = earlier_result(context, params.registration, registration.Result).registrations
     registrations = {name: register.KIND.read_answer(record) for name, record in registered.items()}
     references: dict[str, Reference | None] = {}
     found = recorded_registration_jobs(context.protocol, context.run, context.protocol.step(params.registration))
     arrived = {} if found is None else found.arrived
     registrations |= {name: register.KIND.read_answer(job.result) for name, job in arrived.items()}
     references |= {f"registrations/{name}": Reference(job.job, "result") for name, job in arrived.items()}
-    scans = {"scan": params.scan, "control_scan": params.control_scan, "ct": params.ct}
+    scans = {_SCAN: params.scan, _CONTROL: params.control_scan, _CT: params.ct}
     measured = {
         name: None
         if step is None or step in context.run.skipped
@@ -81,7 +83,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     }
     references |= {name: found.reference("") for name, found in measured.items() if found is not None}
     spheres = {name: None if found is None else found.answer for name, found in measured.items()}
-    scan = spheres["scan"]
+    scan = spheres[_SCAN]
     if scan is None:
         raise ConfigurationError(
             "an evaluation needs the registered scan",
@@ -92,8 +94,8 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         images=tuple(captured_images(context, params.images_of)),
         registrations=registrations,
         scan=scan,
-        control_scan=spheres["control_scan"],
-        ct=spheres["ct"],
+        control_scan=spheres[_CONTROL],
+        ct=spheres[_CT],
         radius_m=metres(context.protocol.spheres.radius_mm),
     )
     (answer,) = context.evidence.run_jobs(JobRequest.of(evaluate.KIND, arguments, references))

@@ -12,7 +12,8 @@ from service.core.units import metres
 from service.jobs.surfaces import locate_spheres
 from service.steps.arrivals import keep_mesh, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
-from service.steps.inputs import earlier_answer, result_of
+from service.steps.inputs import earlier_answer, earlier_result
+from service.steps.kinds import timed_application
 from service.steps.layouts import layout_uncertainties
 from service.steps.measures import Count, Measure, SphereMeasures
 
@@ -72,8 +73,8 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     measures = {name: value for name, value in found.items() if name in Measures.declared()}  # a driver may find more
     measures["faces"] = float(len(scan.mesh.faces))
     if params.application is not None:
-        applied = float(result_of(context, params.application)["applied_monotonic_s"])
-        measures["since_application_min"] = (context.monotonic_s() - applied) / 60
+        applied_s = earlier_result(context, params.application, timed_application.Result).applied_monotonic_s
+        measures["since_application_min"] = (context.monotonic_s() - applied_s) / 60
     mesh, kept = keep_mesh(context, scan, device="scanner", kind="scan_mesh")
     arguments, references = _arguments(context, params, mesh)
     (answer,) = context.evidence.run_jobs(JobRequest.of(locate_spheres.KIND, arguments, references))

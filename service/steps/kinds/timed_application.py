@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
+from pydantic import BaseModel
+
 from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.steps.context import Announcement, StepContext, StepKind, StepOutcome
@@ -30,6 +32,12 @@ class Measures(MeasureRecord):
     applications: Annotated[Count, "times that the product was applied"] = None
 
 
+class _Applied(BaseModel):
+    """The note that the product was applied; notes on other things do not have the time."""
+
+    applied_monotonic_s: float | None = None
+
+
 class Result(Record):
     """When the coating was applied (host's monotonic clock), and its times."""
 
@@ -41,8 +49,9 @@ class Result(Record):
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Start the timer at the operator's confirmation, and wait for the coating to settle."""
-    earlier = [note.data for note in context.state.notes if "applied_monotonic_s" in note.data]
-    applied = float(earlier[0]["applied_monotonic_s"]) if earlier else context.monotonic_s()
+    notes = [_Applied.model_validate(note.data) for note in context.state.notes]
+    earlier = [note.applied_monotonic_s for note in notes if note.applied_monotonic_s is not None]
+    applied = earlier[0] if earlier else context.monotonic_s()
     if not earlier:  # after a restart, the timer goes on
         context.note(
             f"{params.product} applied: scan within {params.scan_within_s / 60:.0f} min, "
