@@ -17,7 +17,6 @@ from service.jobs.registration import evaluate, register
 from service.jobs.surfaces import locate_spheres
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, earlier_answer, earlier_result
-from service.steps.kinds import registration
 from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures
 from service.steps.poses.registration_jobs import recorded_registration_jobs
 
@@ -67,8 +66,7 @@ class Result(Record):
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Let the worker evaluate every registration that has arrived on the control spheres."""
-    registered = earlier_result(context, params.registration, registration.Result).registrations
-    registrations = {name: register.KIND.read_answer(record) for name, record in registered.items()}
+    registrations = dict(earlier_result(context, params.registration, register.Registrations).registrations)
     references: dict[str, Reference | None] = {}
     found = recorded_registration_jobs(context.protocol, context.run, context.protocol.step(params.registration))
     arrived = {} if found is None else found.arrived
