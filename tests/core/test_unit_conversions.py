@@ -12,7 +12,6 @@ _UNITS = "service/core/units.py"
 _ALLOWED = {
     "1e-06 * np.eye(6)": "damping of a least-squares step",
     "1e-06 * np.eye(2)": "damping of a least-squares step",
-    "0.001 * np.trace(H)": "limit of an eigenvalue, relative to the others",
     "1000 * result.coverage": "a share in tenths of a percent, to be rounded down",
 }
 
