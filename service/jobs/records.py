@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from service.jobs.kind import JobRecord
@@ -9,6 +10,16 @@ from service.jobs.kind import JobRecord
 Matrix = tuple[tuple[float, ...], ...]  # row by row
 Point = tuple[float, float, float]
 Hash = str  # SHA-256 of an artefact
+
+
+def matrix(rows: Iterable[Iterable[float]]) -> Matrix:
+    """The rows of an array as a record holds them."""
+    return tuple(tuple(float(value) for value in row) for row in rows)
+
+
+def matrices(arrays: Mapping[str, Iterable[Iterable[float]]]) -> dict[str, Matrix]:
+    """Arrays by name as a record holds them."""
+    return {name: matrix(rows) for name, rows in arrays.items()}
 
 
 class Camera(JobRecord):

@@ -12,6 +12,11 @@ def camera_of(record: Camera) -> CameraModel:
     return CameraModel.from_record(record.plain())
 
 
+def camera_record(camera: CameraModel) -> Camera:
+    """The record of a camera model."""
+    return Camera.model_validate(camera.record())
+
+
 def camera_used(arguments: ImagesCamera) -> CameraModel:
     """The camera at the size of the images that a job uses."""
     camera = camera_of(arguments.camera)

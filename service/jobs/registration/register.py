@@ -19,11 +19,11 @@ class Arguments(SceneArguments):
 
 
 class LeaveOneOut(JobRecord):
-    """`[radial error (mm), reprojection error (px)]` of each sphere predicted from the others, and the means."""
+    """The mean errors of spheres predicted from the others; of each, radial (mm), reprojection (px), and images."""
 
     mean_radial_error_mm: float
     mean_reprojection_error_px: float
-    spheres: dict[str, tuple[float, ...]]
+    spheres: dict[str, tuple[float | int, ...]]
 
 
 class Registration(JobRecord):
@@ -39,6 +39,8 @@ class Registration(JobRecord):
         rms_px: of the outlines that were used.
         T_world_station: by station.
         T_scan_camera: by viewpoint.
+        T_scan_camera_given: of corrected poses of the arm, before the outlines refined them.
+        covariance_given: (6, 6) of T_world_scan with these; both are set for corrected poses of the arm only.
         excluded: outlines left out as outliers, in words.
         covariance: (6, 6) of T_world_scan, m and rad.
         components: terms whose sum is the covariance.
@@ -54,6 +56,8 @@ class Registration(JobRecord):
     rms_px: float
     T_world_station: dict[str, Matrix]
     T_scan_camera: dict[str, Matrix]
+    T_scan_camera_given: dict[str, Matrix] | None = None
+    covariance_given: Matrix | None = None
     excluded: tuple[str, ...] = ()
     covariance: Matrix
     components: dict[str, Matrix]

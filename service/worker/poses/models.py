@@ -6,11 +6,9 @@ import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from service.compute.markers.archive import outline_from_record
 from service.compute.poses.files.pose_covariance import blocks
 from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.poses.sfm.estimate import SfmModel, reconstruct, reconstruct_from
@@ -21,12 +19,13 @@ from service.core.geometry import Array
 from service.core.units import mm
 from service.jobs.poses import hybrid as hybrid_job
 from service.jobs.poses import structure_from_motion as sfm_job
-from service.jobs.records import Hash, Photograph
+from service.jobs.records import Hash, Photograph, matrices, matrix
 from service.worker.camera import camera_used
 from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.front_end import read_features, read_matches
 from service.worker.poses.photographs import photographs
 from service.worker.poses.robot_poses import robot_camera_poses
+from service.worker.registration.outlines import read_outlines
 
 
 def structure_from_motion(context: JobContext[sfm_job.Arguments]) -> JobAnswer:
@@ -114,7 +113,6 @@ def hybrid(context: JobContext[hybrid_job.Arguments]) -> JobAnswer:
     model = context.input_json(arguments.model)["T_world_camera"]
     images = [image for image in arguments.images if image.viewpoint in model]
     names = [image.viewpoint for image in images]
-    found = context.input_json(arguments.outlines)
     stations = sorted({image.station for image in images})
     context.progress("hybrid poses", 0, 1)
     # Intrinsics stay fixed: overlays and control spheres use the calibrated ones, which must fit the poses.
@@ -127,7 +125,7 @@ def hybrid(context: JobContext[hybrid_job.Arguments]) -> JobAnswer:
             names=names,
         ),
         _unpacked(context.input(arguments.tracks).read_bytes(), names),
-        [[outline_from_record(record, camera) for record in found[name]] for name in names],
+        read_outlines(context.input_json, arguments.outlines, images, camera),
         ScanSpheres(
             np.array(arguments.spheres_m), arguments.radius_m, covariance_m2=np.array(arguments.sphere_covariance_m2)
         ),
@@ -138,7 +136,7 @@ def hybrid(context: JobContext[hybrid_job.Arguments]) -> JobAnswer:
         "robot_sigma_mm": mm(answer.sigma_robot_m or 0.0),
         "robot_sigma_deg": float(np.degrees(answer.sigma_robot_rad or 0.0)),
     }
-    ref = context.keep_json(_record(answer, names, stations), kind="hybrid_poses", name="hybrid_poses.json")
+    ref = context.keep_json(_record(answer, names, stations).plain(), kind="hybrid_poses", name="hybrid_poses.json")
     return JobAnswer(measures, (ref,))
 
 
@@ -146,21 +144,21 @@ def _held(images: Sequence[Photograph]) -> bool:
     return any(image.T_scene_camera is not None for image in images)
 
 
-def _record(answer: HybridPoses, names: list[str], stations: list[str]) -> dict[str, Any]:
-    return {
-        "T_world_camera": {name: T.tolist() for name, T in zip(names, answer.T_world_camera, strict=True)},
-        "pose_covariance": {name: C.tolist() for name, C in zip(names, answer.scan_pose_covariance, strict=True)},
-        "pose_covariance_frame": "scan",
-        "T_world_scan": answer.T_world_scan.tolist(),
-        "T_world_station": {stations[g]: T.tolist() for g, T in answer.T_world_group.items()},
-        "scan_covariance": answer.scan_covariance.tolist(),
-        "predicted_error_mm": mm(answer.sigma_at_m(answer.centre_scan_m)),
-        "sigma_track_px": answer.sigma_track_px,
-        "sphere_factor": answer.sphere_factor,
-        "sigma_robot_m": answer.sigma_robot_m,
-        "sigma_robot_rad": answer.sigma_robot_rad,
-        "chi2": answer.chi2,
-    }
+def _record(answer: HybridPoses, names: list[str], stations: list[str]) -> hybrid_job.HybridModel:
+    return hybrid_job.HybridModel(
+        T_world_camera=matrices(dict(zip(names, answer.T_world_camera, strict=True))),
+        pose_covariance=matrices(dict(zip(names, answer.scan_pose_covariance, strict=True))),
+        pose_covariance_frame="scan",
+        T_world_scan=matrix(answer.T_world_scan),
+        T_world_station={stations[g]: matrix(T) for g, T in answer.T_world_group.items()},
+        scan_covariance=matrix(answer.scan_covariance),
+        predicted_error_mm=mm(answer.sigma_at_m(answer.centre_scan_m)),
+        sigma_track_px=answer.sigma_track_px,
+        sphere_factor=answer.sphere_factor,
+        sigma_robot_m=answer.sigma_robot_m,
+        sigma_robot_rad=answer.sigma_robot_rad,
+        chi2=answer.chi2,
+    )
 
 
 def _packed(model: SfmModel, joint_pose_covariance: Array) -> bytes:

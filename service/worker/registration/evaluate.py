@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import cv2
@@ -24,7 +24,6 @@ from service.compute.evaluation.error_budget import (
 )
 from service.compute.images.files import read_image
 from service.compute.images.resolution import resample
-from service.compute.markers.archive import outline_from_record
 from service.compute.markers.records import SphereOutline
 from service.compute.overlay import draw_overlay
 from service.compute.pipeline import Detection
@@ -42,6 +41,7 @@ from service.jobs.registration import evaluate as job
 from service.jobs.registration.register import Registration
 from service.worker.camera import camera_of
 from service.worker.job import JobAnswer, JobContext
+from service.worker.registration.outlines import read_outlines
 
 _COMMON = ("common", "intrinsics")  # components that move all spheres equally
 
@@ -77,9 +77,9 @@ def evaluate(context: JobContext[job.Arguments]) -> JobAnswer:
     table: list[job.Row] = []
     budgets: dict[str, job.ErrorBudget] = {}
     pictures: dict[str, Callable[[], list[ArtefactRef]]] = {}
-    found: dict[str, Any] = {}
+    read = cache(context.input_json)  # registrations share their file of outlines
     for name, record in arguments.registrations.items():
-        registered = _registered(context, name, record, measured, radius_m, found)
+        registered = _registered(arguments, name, record, measured, read)
         budget = _budget(registered, measured, radius_m)
         budgets[name] = job.ErrorBudget.model_validate(budget.as_json())
         table.append(_row(registered, budget, _errors(registered, measured, radius_m)))
@@ -198,29 +198,25 @@ def _spheres(found: SpheresFound) -> MeasuredSpheres:
 
 
 def _registered(
-    context: JobContext[job.Arguments],
+    arguments: job.Arguments,
     name: str,
     record: Registration,
     measured: _MeasuredSpheres,
-    radius_m: float,
-    found: dict[Hash, Any],
+    read: Callable[[Hash], Any],
 ) -> _Registered:
     camera = camera_of(record.camera)
-    sha256 = record.outlines
-    if sha256 not in found:
-        found[sha256] = context.input_json(sha256)
     cameras = record.T_scan_camera
-    images = [image for image in context.arguments.images if image.viewpoint in cameras]
+    images = [image for image in arguments.images if image.viewpoint in cameras]
     if not images:
         raise ComputeError(f"registration {name!r} has a pose for none of the control images")
-    outlines = [[outline_from_record(r, camera) for r in found[sha256][image.viewpoint]] for image in images]
+    outlines = read_outlines(read, record.outlines, images, camera)
     T_scan_camera = np.array([cameras[image.viewpoint] for image in images])
     n = len(measured.scan.centres_m)
     centres = np.vstack([measured.scan.centres_m, measured.control.centres_m])
     markers: list[Assignment] = []
     controls: list[Assignment] = []
     for mine, T in zip(outlines, T_scan_camera, strict=True):
-        pairs = paired(mine, inverse(T), centres, radius_m, camera, CONTROL_GATE).items()
+        pairs = paired(mine, inverse(T), centres, arguments.radius_m, camera, CONTROL_GATE).items()
         markers.append(Assignment({outline: m for outline, m in pairs if m < n}, inverse(T)))
         controls.append(Assignment({outline: m - n for outline, m in pairs if m >= n}, inverse(T)))
     return _Registered(name, record, camera, images, outlines, T_scan_camera, markers, controls)

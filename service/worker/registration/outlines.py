@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
-from service.compute.markers.archive import outline_record
+from service.compute.camera_model import CameraModel
+from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.detectors import options_for
+from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.image_files import LocatedOutlines, detect_all, locate_outlines, searched_whole
 from service.compute.markers.search.paper_files import detect_file_by_masks
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
-from service.jobs.records import Photograph
+from service.jobs.records import Hash, Photograph
 from service.jobs.registration import detect_spheres as job
 from service.worker.camera import camera_used
 from service.worker.job import JobAnswer, JobContext
@@ -41,6 +44,14 @@ def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:
         "images_searched_whole": float(located.count("searched")),
     }
     return JobAnswer(measures, (ref,))
+
+
+def read_outlines(
+    read: Callable[[Hash], Any], outlines: Hash, images: Sequence[Photograph], camera: CameraModel
+) -> list[list[SphereOutline]]:
+    """The outlines in each image, from the file that `detect_spheres` wrote; `read` gives the content of a file."""
+    found = read(outlines)
+    return [[outline_from_record(record, camera) for record in found[image.viewpoint]] for image in images]
 
 
 def _posed(context: JobContext[job.Arguments]) -> tuple[Sequence[Photograph], Array | None]:

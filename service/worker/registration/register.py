@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import leave_one_out
 from service.compute.evaluation.closure import Alignment
-from service.compute.markers.archive import outline_from_record
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import register_images
 from service.compute.registration.joint_poses import with_joint_pose_covariance
@@ -19,14 +17,16 @@ from service.compute.registration.result import RegistrationResult
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, inverse
+from service.core.geometry import Array, Transform, inverse
 from service.core.units import mm
-from service.jobs.records import ParameterCovariance, Photograph
+from service.jobs.poses.hybrid import HybridModel
+from service.jobs.records import ParameterCovariance, Photograph, matrices, matrix
 from service.jobs.registration import register as job
-from service.worker.camera import camera_reduced, camera_used
+from service.worker.camera import camera_record, camera_reduced, camera_used
 from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.models import joint_pose_covariance
 from service.worker.poses.robot_poses import robot_camera_poses
+from service.worker.registration.outlines import read_outlines
 
 _PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")  # of the lens, in the order of the solver
 
@@ -42,21 +42,16 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
     spheres = ScanSpheres(np.array(arguments.spheres_m), arguments.radius_m, covariance_m2=covariance_m2)
     solved = register_images(images.outlines, posed, spheres)
     answer = solved.registration
-    placed, components = _placed(context, images, answer)
+    placed = _placed(context, images, answer)
+    components = placed.components
     if (lens := _intrinsics_covariance(arguments)) is not None:
         settings = RegistrationSettings(intrinsics_covariance=lens)
         uncertain = register_images(images.outlines, posed, spheres, settings, assignments=solved.assignments)
-        components["intrinsics"] = _added(answer, uncertain.registration, refined=refined)
+        components = components | {"intrinsics": _added(answer, uncertain.registration, refined=refined)}
     covariance = np.sum(list(components.values()), axis=0)
     left_out = _leave_one_out(answer, refined=refined)
-    result = {
-        **_solution(arguments, images, answer),
-        **placed,
-        "covariance": covariance.tolist(),
-        "components": {name: C.tolist() for name, C in components.items()},
-        "leave_one_out": left_out,
-    }
-    alignment = Alignment(np.array(result["T_world_scan"]), covariance)
+    record = _record(arguments, images, answer, _Judged(placed, components, covariance, left_out))
+    alignment = Alignment(placed.T_world_scan, covariance)
     centre_m = np.array(arguments.spheres_m).mean(axis=0)
     measures = {
         "rms_px": answer.rms_px,
@@ -67,10 +62,10 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
         "predicted_error_mm": mm(float(np.sqrt(np.trace(alignment.covariance_at_m2(centre_m[None])[0])))),
     }
     if left_out is not None:
-        measures["leave_one_out_mm"] = left_out["mean_radial_error_mm"]
-    record = {**result, **_residuals(answer, images.names)}
-    ref = context.keep_json(record, kind="registration", name=f"{source}.json")
-    return JobAnswer(measures, (ref,), job.Registration.model_validate(result))
+        measures["leave_one_out_mm"] = left_out.mean_radial_error_mm
+    kept = {**record.plain(), **_residuals(answer, images.names)}
+    ref = context.keep_json(kept, kind="registration", name=f"{source}.json")
+    return JobAnswer(measures, (ref,), record)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,10 +90,10 @@ class _PosedImages:
     def names(self) -> list[str]:
         return [image.viewpoint for image in self.images]
 
-    def cameras(self, T_scan_camera: Array) -> dict[str, list[list[float]]]:
+    def known(self, T_scan_camera: Array) -> dict[str, Transform]:
         """The poses that are known, by image."""
         pairs = zip(self.names, T_scan_camera, strict=True)
-        return {name: T.tolist() for name, T in pairs if np.isfinite(T).all()}
+        return {name: T for name, T in pairs if np.isfinite(T).all()}
 
     def station(self, group: int) -> str:
         """The station whose images form a group."""
@@ -120,68 +115,113 @@ def _posed_images(context: JobContext[job.Arguments]) -> _PosedImages:
         poses = np.array([model[image.viewpoint] for image in images])
         groups = [0] * len(images)
     camera = camera_used(arguments)
-    found = context.input_json(arguments.outlines)
-    outlines = [[outline_from_record(r, camera) for r in found[image.viewpoint]] for image in images]
+    outlines = read_outlines(context.input_json, arguments.outlines, images, camera)
     return _PosedImages(images, poses, groups, camera, outlines)
 
 
-def _solution(arguments: job.Arguments, images: _PosedImages, answer: RegistrationResult) -> dict[str, Any]:
-    full = camera_reduced(arguments)
-    return {
-        "poses": arguments.poses,
-        "camera": images.camera.record(),
-        "outlines": arguments.outlines,
-        "full_camera": None if full is None else full.record(),
-        "scale": answer.scale,
-        "rms_px": answer.rms_px,
-        "excluded": [f"{images.names[r.image]}, sphere {r.marker}: {r.reason}" for r in answer.excluded],
-    }
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    """Where the scan and the cameras are.
+
+    Attributes:
+        T_world_scan: the registration.
+        T_world_station: by station.
+        T_scan_camera: by image.
+        components: (6, 6) each, of the covariance of T_world_scan.
+        given: (T_scan_camera by image, (6, 6) covariance) before the outlines refined the arm's corrected poses;
+            None for other poses.
+    """
+
+    T_world_scan: Transform
+    T_world_station: Mapping[str, Transform]
+    T_scan_camera: Mapping[str, Transform]
+    components: dict[str, Array]
+    given: tuple[Mapping[str, Transform], Array] | None = None
 
 
-def _placed(
-    context: JobContext[job.Arguments], images: _PosedImages, answer: RegistrationResult
-) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Where the scan and the cameras are, and the (6, 6) components of the covariance of T_world_scan."""
+def _placed(context: JobContext[job.Arguments], images: _PosedImages, answer: RegistrationResult) -> _Placed:
     arguments = context.arguments
     stated = answer
     if arguments.tracks is not None:
         joint = joint_pose_covariance(context.input(arguments.tracks).read_bytes(), images.names)
         stated = with_joint_pose_covariance(answer, joint)
-    components = {name: np.asarray(C, dtype=np.float64)[:6, :6] for name, C in stated.components.items()}
-    cameras = images.cameras(answer.T_scan_camera)
-    placed: dict[str, Any] = {
-        "T_world_scan": answer.T_world_scan.tolist(),
-        "T_world_station": {images.station(g): T.tolist() for g, T in answer.T_world_group.items()},
-        "T_scan_camera": cameras,
-    }
+    placed = _Placed(
+        answer.T_world_scan,
+        {images.station(g): T for g, T in answer.T_world_group.items()},
+        images.known(answer.T_scan_camera),
+        {name: np.asarray(C, dtype=np.float64)[:6, :6] for name, C in stated.components.items()},
+    )
     if arguments.poses == "robot_corrected":
         # The outlines measure the error of a single pose of the arm (some 0.3 mm) better than the arm itself.
-        placed["T_scan_camera_given"] = cameras
-        placed["T_scan_camera"] = images.cameras(answer.T_scan_camera_refined)
-        placed["covariance_given"] = answer.covariance[:6, :6].tolist()
-        components = answer.refined_components()
+        return replace(
+            placed,
+            T_scan_camera=images.known(answer.T_scan_camera_refined),
+            components=answer.refined_components(),
+            given=(placed.T_scan_camera, answer.covariance[:6, :6]),
+        )
     if arguments.poses == "hybrid" and arguments.model is not None:
         # These poses were adjusted together with the spheres: only that adjustment knows the scan's covariance.
-        adjusted = context.input_json(arguments.model)
-        T_scan_world = inverse(np.array(adjusted["T_world_scan"]))
-        placed |= {key: adjusted[key] for key in ("T_world_scan", "T_world_station")}
+        adjusted = HybridModel.model_validate(context.input_json(arguments.model))
+        T_world_scan = np.array(adjusted.T_world_scan)
+        T_scan_world = inverse(T_world_scan)
         pairs = zip(images.names, images.poses, strict=True)
-        placed["T_scan_camera"] = {name: (T_scan_world @ T).tolist() for name, T in pairs}
-        components = {"adjustment": np.array(adjusted["scan_covariance"])[:6, :6], "spheres": components["spheres"]}
-    return placed, components
+        own = {"adjustment": np.array(adjusted.scan_covariance)[:6, :6], "spheres": placed.components["spheres"]}
+        return _Placed(
+            T_world_scan,
+            {station: np.array(T) for station, T in adjusted.T_world_station.items()},
+            {name: T_scan_world @ T for name, T in pairs},
+            own,
+        )
+    return placed
 
 
-def _leave_one_out(answer: RegistrationResult, *, refined: bool) -> dict[str, Any] | None:
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """Where scan and cameras are, and how well that is known."""
+
+    placed: _Placed
+    components: Mapping[str, Array]
+    covariance: Array
+    left_out: job.LeaveOneOut | None
+
+
+def _record(
+    arguments: job.Arguments, images: _PosedImages, answer: RegistrationResult, judged: _Judged
+) -> job.Registration:
+    placed, full = judged.placed, camera_reduced(arguments)
+    record = job.Registration(
+        poses=arguments.poses,
+        camera=camera_record(images.camera),
+        outlines=arguments.outlines,
+        full_camera=None if full is None else camera_record(full),
+        T_world_scan=matrix(placed.T_world_scan),
+        scale=answer.scale,
+        rms_px=answer.rms_px,
+        T_world_station=matrices(placed.T_world_station),
+        T_scan_camera=matrices(placed.T_scan_camera),
+        excluded=tuple(f"{images.names[r.image]}, sphere {r.marker}: {r.reason}" for r in answer.excluded),
+        covariance=matrix(judged.covariance),
+        components=matrices(judged.components),
+        leave_one_out=judged.left_out,
+    )
+    if placed.given is None:
+        return record
+    cameras, covariance = placed.given
+    given = {"T_scan_camera_given": matrices(cameras), "covariance_given": matrix(covariance)}
+    return record.model_copy(update=given)
+
+
+def _leave_one_out(answer: RegistrationResult, *, refined: bool) -> job.LeaveOneOut | None:
     """Errors of each sphere predicted from the others; None if a station sees too few spheres for that."""
     try:
         left_out = leave_one_out(answer, refined=refined)
     except ComputeError:
         return None
-    return {
-        "mean_radial_error_mm": left_out.mean_radial_error_mm,
-        "mean_reprojection_error_px": left_out.mean_reprojection_error_px,
-        "spheres": {str(m): list(row) for m, row in left_out.per_sphere().items()},
-    }
+    return job.LeaveOneOut(
+        mean_radial_error_mm=left_out.mean_radial_error_mm,
+        mean_reprojection_error_px=left_out.mean_reprojection_error_px,
+        spheres={str(m): row for m, row in left_out.per_sphere().items()},
+    )
 
 
 def _added(exact: RegistrationResult, uncertain: RegistrationResult, *, refined: bool) -> Array:
@@ -211,7 +251,7 @@ def _intrinsics_covariance(arguments: job.Arguments) -> Array | None:
     return out
 
 
-def _residuals(answer: RegistrationResult, names: Sequence[str]) -> dict[str, Any]:
+def _residuals(answer: RegistrationResult, names: Sequence[str]) -> dict[str, object]:
     return {
         "residuals": [
             {"image": names[r.image], "marker": r.marker, "rms_px": r.rms_px, "excluded": r.excluded}
