@@ -138,10 +138,33 @@ class MeasuredSphere(JobRecord):
     radius_residual_mm: float | None = None  # fitted radius minus the known one
 
 
+class SphereChange(JobRecord):
+    """A sphere in two measurements, by its numbers, and how far apart they place it, in the frame of the first."""
+
+    reference: int
+    sphere: int
+    difference_mm: Point
+    sigma_mm: float
+    z: float
+    moved: bool
+
+
+class LoopClosure(JobRecord):
+    """Two measurements of the same spheres; rms and χ² are of the spheres that did not move."""
+
+    T_reference_mesh: Matrix
+    chi2_per_dof: float
+    rms_mm: float
+    sigma_rms_mm: float
+    spheres: tuple[SphereChange, ...]
+
+
 class SphereDetails(JobRecord):
-    """Details on the spheres of a mesh."""
+    """Details on the spheres of a mesh; with an earlier measurement of them, how they moved since."""
 
     spheres: tuple[MeasuredSphere, ...] = ()
+    T_reference_mesh: Matrix | None = None
+    loop_closure: LoopClosure | None = None
     layout: dict[str, Any] | None = None  # near-symmetries (service/compute/layout/ambiguity.py)
 
 

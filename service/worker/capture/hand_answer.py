@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from service.compute.planning.hand_guidance import Place, level_frame, same_view
 from service.core.geometry import Array, Transform, inverse
 from service.jobs.capture import hand_view as job
 from service.jobs.capture.hand_view import HeldArguments
+from service.jobs.records import Matrix, Point, matrices, matrix
 from service.worker.capture.hand_guide import Guide
 from service.worker.capture.held_images import HandheldImage
 from service.worker.capture.scene import CaptureScene
@@ -64,14 +65,16 @@ def answer_to(
         information=found.information,
         seen=scene.seen_from(T),
         cells=found.cells,
-        reading=None if found.reading is None else found.reading.record(),
+        reading=found.reading,
         spheres_m=scene.spheres_m,
     )
     good = [*used, new] if new.used and T is not None else used
     guide = Guide(arguments, scene, new, earlier, good)
     measures = {**found.measures, **guide.totals()}
     ref = context.keep_json(new.plain(rough=arguments.rough), kind="hand_view", name=f"{new.viewpoint}.hand.json")
-    answer = job.Answer.model_validate({**_result(guide, why), **_refined(guide, used)})
+    answer = _result(guide, why)
+    if arguments.rough:
+        answer = _refined(answer, guide, used)
     return JobAnswer({k: v for k, v in measures.items() if np.isfinite(v)}, (ref,), answer)
 
 
@@ -83,34 +86,36 @@ def _level(found: NewImage, earlier: Sequence[HandheldImage]) -> Transform | Non
     return level
 
 
-def _result(guide: Guide, why: str) -> dict[str, Any]:
+def _result(guide: Guide, why: str) -> job.Answer:
     new, done = guide.new, guide.done()
     next_words, target = guide.next_place()
     T, level = new.T_scene_camera, new.T_scene_level
     cells = [view.cells for view in guide.good if view.cells.size]
-    return {
-        "viewpoint": new.viewpoint,
-        "used": new.used,
-        "why": why,
-        "words": next_words,
-        "target": None if target is None else _listed(target),
-        "T_scene_camera": None if T is None else T.tolist(),
-        "T_level_camera": None if T is None or level is None else (inverse(level) @ T).tolist(),
-        "places": [{**_listed(place), "done": place.name in done} for place in guide.places()],
-        "cells": np.sum(cells, axis=0).tolist() if new.cells.size else [],
-    }
+    return job.Answer(
+        viewpoint=new.viewpoint,
+        used=new.used,
+        why=why,
+        words=next_words,
+        target=None if target is None else job.ShownPlace(name=target.name, T_level_camera=_pose(target)),
+        T_scene_camera=None if T is None else matrix(T),
+        T_level_camera=None if T is None or level is None else matrix(inverse(level) @ T),
+        places=tuple(
+            job.ShownPlace(name=place.name, T_level_camera=_pose(place), done=place.name in done)
+            for place in guide.places()
+        ),
+        cells=np.sum(cells, axis=0).tolist() if new.cells.size else (),
+    )
 
 
-def _refined(guide: Guide, used: Sequence[HandheldImage]) -> dict[str, Any]:
-    """The spheres and all camera poses, where the images themselves determine the spheres."""
-    if not guide.arguments.rough:
-        return {}
-    poses = {v.viewpoint: v.T_scene_camera.tolist() for v in [*used, guide.new] if v.T_scene_camera is not None}
-    return {"spheres_m": guide.scene.spheres_m.tolist(), "T_scene_cameras": poses}
+def _refined(answer: job.Answer, guide: Guide, used: Sequence[HandheldImage]) -> job.Answer:
+    """With the spheres and all camera poses, which the images themselves determine."""
+    poses = {v.viewpoint: v.T_scene_camera for v in [*used, guide.new] if v.T_scene_camera is not None}
+    spheres_m: tuple[Point, ...] = tuple((float(x), float(y), float(z)) for x, y, z in guide.scene.spheres_m)
+    return answer.model_copy(update={"spheres_m": spheres_m, "T_scene_cameras": matrices(poses)})
 
 
-def _listed(place: Place) -> dict[str, Any]:
-    return {"name": place.name, "T_level_camera": place.T_level_camera.tolist()}
+def _pose(place: Place) -> Matrix:
+    return matrix(place.T_level_camera)
 
 
 def _repeats(T: Transform | None, used: Sequence[HandheldImage]) -> str:

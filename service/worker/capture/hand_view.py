@@ -86,11 +86,7 @@ def _measures(view: HandView) -> dict[str, float]:
 
 
 def _readings(earlier: Sequence[HandheldImage]) -> list[Reading]:
-    return [
-        Reading.read(e.viewpoint, e.T_scene_camera, e.reading)
-        for e in earlier
-        if e.used and e.reading is not None and e.T_scene_camera is not None
-    ]
+    return [e.reading for e in earlier if e.used and e.reading is not None]
 
 
 def _eye(pose: Transform | None) -> Array:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compute.capture.hand_bundle import Reading
 from service.core.geometry import Array, Transform
 from service.jobs.capture.hand_view import HeldArguments
 from service.worker.capture.scene import CaptureScene
@@ -41,12 +41,12 @@ class HandheldImage:
     information: Array = field(repr=False)
     seen: NDArray[np.bool_] = field(repr=False)
     cells: NDArray[np.int64] = field(repr=False)
-    reading: Mapping[str, Any] | None = field(repr=False)
+    reading: Reading | None = field(repr=False)
     spheres_m: Array | None = field(repr=False)
 
-    def plain(self, *, rough: bool) -> dict[str, Any]:
+    def plain(self, *, rough: bool) -> dict[str, object]:
         """The view as it is written into its file; with `rough`, the spheres too."""
-        record: dict[str, Any] = {
+        record: dict[str, object] = {
             "viewpoint": self.viewpoint,
             "used": self.used,
             "T_scene_camera": None if self.T_scene_camera is None else self.T_scene_camera.tolist(),
@@ -56,7 +56,7 @@ class HandheldImage:
             "cells": self.cells.tolist(),
         }
         if rough:
-            record["reading"] = self.reading
+            record["reading"] = None if self.reading is None else self.reading.record()
             record["spheres_m"] = None if self.spheres_m is None else self.spheres_m.tolist()
         return record
 
@@ -70,6 +70,7 @@ def _read(context: JobContext[_H], sha256: str, scene: CaptureScene) -> Handheld
     data = context.input_json(sha256)
     bits = np.unpackbits(np.frombuffer(base64.b64decode(data["seen"]), np.uint8))
     T, level = (None if data[key] is None else np.array(data[key]) for key in ("T_scene_camera", "T_scene_level"))
+    reading = data.get("reading")
     visible = bits[: scene.n_points].astype(bool)
     if len(bits) < scene.n_points:  # the surface was not ready yet
         visible = scene.seen_from(T)
@@ -81,6 +82,6 @@ def _read(context: JobContext[_H], sha256: str, scene: CaptureScene) -> Handheld
         information=np.array(data["information"]),
         seen=visible,
         cells=np.array(data["cells"], dtype=np.int64),
-        reading=data.get("reading"),
+        reading=None if reading is None or T is None else Reading.read(data["viewpoint"], T, reading),
         spheres_m=None if data.get("spheres_m") is None else np.array(data["spheres_m"]),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,7 @@ class LiveRecord:
     T_base_scan: Transform | None  # as the images up to this one determined it
     seen: NDArray[np.bool_]
 
-    def plain(self, sha256: str) -> dict[str, Any]:
+    def plain(self, sha256: str) -> dict[str, object]:
         """The record as it is written, with the hash of the photograph."""
         return {
             "viewpoint": self.viewpoint,

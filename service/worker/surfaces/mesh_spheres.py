@@ -16,7 +16,8 @@ from service.compute.surfaces.spheres.mesh_spheres import locate_spheres as find
 from service.compute.surfaces.spheres.records import sphere_record
 from service.core.geometry import Array
 from service.core.units import mm
-from service.jobs.records import SpheresFound
+from service.jobs.records import LoopClosure as LoopClosureRecord
+from service.jobs.records import MeasuredSphere, SphereChange, SphereDetails, SpheresFound, matrix
 from service.jobs.surfaces import ct_surface as ct_job
 from service.jobs.surfaces import locate_spheres as locate_job
 from service.worker.job import JobAnswer, JobContext
@@ -54,41 +55,40 @@ def _search(arguments: ct_job.Arguments | locate_job.Arguments, vertices_m: Arra
         "sphere_rms_max_mm": mm(max(s.rms_m for s in spheres)),
         "sphere_sigma_max_mm": mm(max(float(np.sqrt(np.trace(s.covariance))) for s in spheres)),
     }
-    details: dict[str, Any] = {"spheres": [sphere_record(s) for s in spheres]}
+    details = SphereDetails(spheres=tuple(MeasuredSphere.model_validate(sphere_record(s)) for s in spheres))
     if layout is not None:
         measures |= layout_measures(layout)
-        details["layout"] = layout_record(layout)
+        details = details.model_copy(update={"layout": layout_record(layout)})
     if isinstance(arguments, locate_job.Arguments) and arguments.reference_m is not None:
         reference = np.array(arguments.reference_m)
         match = match_constellations(reference, centres)
         measures["spheres_compared"] = float(len(match.pairs))
         measures["sphere_change_rms_mm"] = mm(match.rms_m)
         measures["sphere_change_max_mm"] = mm(float(match.residuals_m.max()))
-        details["T_reference_mesh"] = match.T_a_b.tolist()
+        details = details.model_copy(update={"T_reference_mesh": matrix(match.T_a_b)})
         if arguments.reference_covariances_m2 is not None:
             closure = close_loop(reference, np.array(arguments.reference_covariances_m2), centres, covariances, match)
             measures["spheres_moved"] = float(len(closure.moved))
             measures["loop_closure_chi2"] = closure.chi2_per_dof
-            details["loop_closure"] = _closure_record(closure)
-    found = {"spheres_m": centres.tolist(), "details": details}
-    return JobAnswer(measures, (), SpheresFound.model_validate(found))
+            details = details.model_copy(update={"loop_closure": _closure_record(closure)})
+    return JobAnswer(measures, (), SpheresFound(spheres_m=centres.tolist(), details=details))
 
 
-def _closure_record(closure: LoopClosure) -> dict[str, Any]:
-    return {
-        "T_reference_mesh": closure.T_a_b.tolist(),
-        "chi2_per_dof": closure.chi2_per_dof,
-        "rms_mm": mm(closure.rms_m),
-        "sigma_rms_mm": mm(closure.sigma_rms_m),
-        "spheres": [
-            {
-                "reference": s.pair[0],
-                "sphere": s.pair[1],
-                "difference_mm": mm(s.difference_m).tolist(),
-                "sigma_mm": mm(s.sigma_m),
-                "z": s.z,
-                "moved": s.moved,
-            }
+def _closure_record(closure: LoopClosure) -> LoopClosureRecord:
+    return LoopClosureRecord(
+        T_reference_mesh=matrix(closure.T_a_b),
+        chi2_per_dof=closure.chi2_per_dof,
+        rms_mm=mm(closure.rms_m),
+        sigma_rms_mm=mm(closure.sigma_rms_m),
+        spheres=tuple(
+            SphereChange(
+                reference=s.pair[0],
+                sphere=s.pair[1],
+                difference_mm=mm(s.difference_m).tolist(),
+                sigma_mm=mm(s.sigma_m),
+                z=s.z,
+                moved=s.moved,
+            )
             for s in closure.spheres
-        ],
-    }
+        ),
+    )
