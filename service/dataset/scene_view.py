@@ -102,8 +102,8 @@ def viewing_frame(scene: Scene) -> Transform:
     return inverse(transform(rotation, centre))
 
 
-def scene_figure(scene: Scene) -> dict[str, Any]:
-    """The figure as plotly's plain data, in millimetres of the viewing frame.
+def scene_json(scene: Scene) -> str:
+    """The figure as plotly's JSON, in millimetres of the viewing frame; escaped for a script element.
 
     plotly places its camera relative to the box of the axes: the box is scaled to one unit per metre.
     """
@@ -115,7 +115,7 @@ def scene_figure(scene: Scene) -> dict[str, Any]:
         extent.add(points)
         return points
 
-    data: list[dict[str, Any]] = []
+    data: list[dict[str, object]] = []
     if scene.mesh is not None:
         data.append(_mesh(in_view_mm(scene.mesh.points_m), scene.mesh))
     for kind in KIND_NAMES:
@@ -133,12 +133,7 @@ def scene_figure(scene: Scene) -> dict[str, Any]:
         in_view_mm(np.array([T[:3, 3] for T in mine]))
         if station in scene.bases:
             data.append(_base(in_view_mm(scene.bases[station][None, :3, 3]), station, colour))
-    return {"data": data, "layout": _layout(extent)}
-
-
-def figure_json(figure: Mapping[str, Any]) -> str:
-    """The figure for a script element of type application/json; escaped so that it cannot close that element."""
-    text = json.dumps(figure, allow_nan=False, separators=(",", ":"))
+    text = json.dumps({"data": data, "layout": _layout(extent)}, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -165,8 +160,8 @@ class _Extent:
 # --- pieces -----------------------------------------------------------------------------------------------------
 
 
-def _mesh(points: Array, mesh: SceneMesh) -> dict[str, Any]:
-    trace: dict[str, Any] = {
+def _mesh(points: Array, mesh: SceneMesh) -> dict[str, object]:
+    trace: dict[str, object] = {
         "type": "mesh3d",
         "name": "surface",
         **_xyz(points),
@@ -183,7 +178,7 @@ def _mesh(points: Array, mesh: SceneMesh) -> dict[str, Any]:
     }
 
 
-def _spheres(centres: Array, spheres: Sequence[SceneSphere], radius: float) -> list[dict[str, Any]]:
+def _spheres(centres: Array, spheres: Sequence[SceneSphere], radius: float) -> list[dict[str, object]]:
     ball, faces = unit_ball()
     points = (centres[:, None] + PROUD * radius * ball[None]).reshape(-1, 3)
     triangles = (np.arange(len(centres))[:, None, None] * len(ball) + faces[None]).reshape(-1, 3)
@@ -212,8 +207,8 @@ def _spheres(centres: Array, spheres: Sequence[SceneSphere], radius: float) -> l
     ]
 
 
-def _cameras(scene: Scene, station: str, to_view: Transform, colour: str, symbol: str) -> list[dict[str, Any]]:
-    out: list[dict[str, Any]] = []
+def _cameras(scene: Scene, station: str, to_view: Transform, colour: str, symbol: str) -> list[dict[str, object]]:
+    out: list[dict[str, object]] = []
     for poses, what, opacity, filled in (
         (scene.cameras, "cameras", 1.0, symbol),
         (scene.planned, "planned", 0.45, f"{symbol}-open"),
@@ -233,7 +228,7 @@ def _cameras(scene: Scene, station: str, to_view: Transform, colour: str, symbol
     return out
 
 
-def _base(at: Array, station: str, colour: str) -> dict[str, Any]:
+def _base(at: Array, station: str, colour: str) -> dict[str, object]:
     return {
         "type": "scatter3d",
         "mode": "markers+text",
@@ -246,7 +241,7 @@ def _base(at: Array, station: str, colour: str) -> dict[str, Any]:
     }
 
 
-def _scale_bar(centre: Array) -> dict[str, Any]:
+def _scale_bar(centre: Array) -> dict[str, object]:
     x, y, z = (float(v) for v in centre[0])
     ends = [[x - 0.5 * BAR_MM, y - 300, z - 60], [x + 0.5 * BAR_MM, y - 300, z - 60]]
     return {
@@ -261,7 +256,7 @@ def _scale_bar(centre: Array) -> dict[str, Any]:
     }
 
 
-def _layout(extent: _Extent) -> dict[str, Any]:
+def _layout(extent: _Extent) -> dict[str, object]:
     ranges = dict(zip("xyz", extent.ranges(), strict=True))
     axes = {f"{a}axis": {"visible": False, "showspikes": False, "range": ends} for a, ends in ranges.items()}
     return {
@@ -308,7 +303,7 @@ def unit_ball() -> tuple[Array, NDArray[np.int64]]:
     return points, np.array(faces)
 
 
-def _xyz(points: Array) -> dict[str, Any]:
+def _xyz(points: Array) -> dict[str, object]:
     return {axis: _packed(points[:, k].astype(np.float32)) for k, axis in enumerate("xyz")}
 
 

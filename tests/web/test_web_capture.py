@@ -17,7 +17,7 @@ import pytest
 from bench.soak.large_record import LargeRecord
 from service.core.geometry import apply, inverse, look_at
 from service.core.records.events import StepNote, ViewpointFailed
-from service.dataset.scene_view import Scene, SceneSphere, figure_json, scene_figure, viewing_frame
+from service.dataset.scene_view import Scene, SceneSphere, scene_json, viewing_frame
 from service.steps.context import StationLayout
 from service.web.calibration.board_advice import empty_regions
 from service.web.capture.plan_drawing import WIDTH, plan_drawing
@@ -244,16 +244,17 @@ def test_the_view_is_upright_with_the_first_robot_in_front() -> None:
     assert np.linalg.det(to_view[:3, :3]) == pytest.approx(1.0)
     assert np.allclose(apply(to_view, base[None, :3, 3]), [[0.0, -0.8, 0.0]], atol=1e-6)
     assert np.allclose(to_view @ turn, inverse(inverse(to_view @ turn)), atol=1e-9)
-    figure = scene_figure(scene)
+    figure = json.loads(scene_json(scene))
     ranges = [figure["layout"]["scene"][f"{a}axis"]["range"] for a in "xyz"]
     assert figure["layout"]["scene"]["aspectratio"]["y"] == pytest.approx((ranges[1][1] - ranges[1][0]) / 1000)
     assert ranges[1][0] < -800
 
 
 def test_nothing_in_a_figure_ends_its_element() -> None:
-    text = figure_json({"name": "</script><script>alert(1)</script>&"})
+    label = "</script><script>alert(1)</script>&"
+    text = scene_json(Scene({}, {}, [SceneSphere(label, "control", (0.0, 0.0, 0.0))]))
     assert "<" not in text
-    assert json.loads(text)["name"].startswith("</script>")
+    assert label in [name for trace in json.loads(text)["data"] for name in trace.get("text", ())]
 
 
 # --- calibration -------------------------------------------------------------------------------------------------

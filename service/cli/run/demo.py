@@ -9,10 +9,11 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -43,6 +44,7 @@ from service.core.units import mm
 from service.dataset.export import export_dataset
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary, summarise
+from service.jobs.registration.evaluate import Row
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
@@ -69,7 +71,7 @@ def demo_command(
     with reporting_errors(json), sigterm_like_ctrl_c():
         folder = out.resolve() / time.strftime("%Y%m%d-%H%M%S")
         with _simulated_rig(folder / "rig", scene, image_width, host or free_address()) as ready:
-            rig = load_rig(Path(ready["rig"]))
+            rig = load_rig(ready.rig)
             loaded = load_protocol(shipped_protocols() / "demo.yaml", params_models())
             data = folder / "data"
             with Store.open(data) as store:
@@ -80,29 +82,29 @@ def demo_command(
         with Store.open(data) as store, progress_bar(quiet=json) as progress:
             summary = summarise(store, run_id, loaded.protocol)
             audit = verify(data, run_id, progress)
-            truth = true_errors_mm(summary, Path(ready["truth"]))
+            truth = true_errors_mm(summary, ready.truth)
             report = folder / "report.html"
             write_html(report_content(read_run(data, run_id), audit, true_error_mm=truth), report)
             dataset = folder / "dataset"
             export_dataset(summary, dataset, not_in_yet(summary.protocol, summary.state, summary.events))
-            table = [{**row.plain(), "true_error_mm": truth[row.poses]} for row in summary.table()]
+            rows = summary.table()
             database = str(store.database_path)
-    result = {
-        "run": run_id,
-        "data_dir": str(data),
-        "database": database,
-        "artefacts": str(data / "artefacts"),
-        "dataset": str(dataset),
-        "report": str(report),
-        "audit_ok": audit.ok,
-        "duration_s": round(time.monotonic() - started_s, 1),
-        "table": table,
-        "table_note": shared_adjustment_note(summary.protocol, summary.state),
-    }
+    result = _Result(
+        run=run_id,
+        data_dir=str(data),
+        database=database,
+        artefacts=str(data / "artefacts"),
+        dataset=str(dataset),
+        report=str(report),
+        audit_ok=audit.ok,
+        duration_s=round(time.monotonic() - started_s, 1),
+        table_note=shared_adjustment_note(summary.protocol, summary.state),
+    )
     if json:
-        print_json(result)
+        table = [{**row.plain(), "true_error_mm": truth[row.poses]} for row in rows]
+        print_json({**asdict(result), "table": table})
     else:
-        _print(result)
+        _print(result, rows, truth)
     if not audit.ok:
         raise typer.Exit(1)
 
@@ -157,8 +159,16 @@ def _is_free(address: str, port: int) -> bool:
     return True
 
 
+@dataclass(frozen=True, slots=True)
+class _SimulatedRig:
+    """Files of a simulated rig: its rig file, and the truth about its scene."""
+
+    rig: Path
+    truth: Path
+
+
 @contextmanager
-def _simulated_rig(folder: Path, scene: int, image_width: int, host: str) -> Generator[dict[str, Any]]:
+def _simulated_rig(folder: Path, scene: int, image_width: int, host: str) -> Generator[_SimulatedRig]:
     """Run a simulated rig process around one scene until the end of this block."""
     folder.mkdir(parents=True)
     command = [
@@ -179,7 +189,7 @@ def _simulated_rig(folder: Path, scene: int, image_width: int, host: str) -> Gen
             process.stdout.close()
 
 
-def _ready(process: subprocess.Popen[str], log: Path, *, timeout_s: float) -> dict[str, Any]:
+def _ready(process: subprocess.Popen[str], log: Path, *, timeout_s: float) -> _SimulatedRig:
     assert process.stdout is not None
     with selectors.DefaultSelector() as selector:
         selector.register(process.stdout, selectors.EVENT_READ)
@@ -188,26 +198,50 @@ def _ready(process: subprocess.Popen[str], log: Path, *, timeout_s: float) -> di
         raise OrthocaptureError(
             "the simulated rig did not start", where=str(log), remedy="Read that log; is another rig running?"
         )
-    return json_module.loads(line)
+    said = json_module.loads(line)
+    return _SimulatedRig(Path(said["rig"]), Path(said["truth"]))
 
 
-def _print(result: Mapping[str, Any]) -> None:
+@dataclass(frozen=True, slots=True)
+class _Result:
+    """What the demonstration made, and how long it took."""
+
+    run: str
+    data_dir: str
+    database: str
+    artefacts: str
+    dataset: str
+    report: str
+    audit_ok: bool
+    duration_s: float
+    table_note: str
+
+
+def _print(result: _Result, rows: Sequence[Row], true_error_mm: Mapping[str, float]) -> None:
     error_console.print()
     table = Table(title="Registration error on the control spheres", title_justify="left")
     table.add_column("camera poses")
     for heading in ("mean radial error (mm)", "mean reprojection error (px)", "true error (mm)"):
         table.add_column(heading, justify="right")
-    for row in result["table"]:
+    for row in rows:
+        reprojection_px = row.mean_reprojection_error_px
         table.add_row(
-            row["poses"],
-            f"{row['mean_radial_error_mm']:.3f}",
-            f"{row['mean_reprojection_error_px']:.2f}",
-            f"{row['true_error_mm']:.3f}",
+            row.poses,
+            f"{row.mean_radial_error_mm:.3f}",
+            "" if reprojection_px is None else f"{reprojection_px:.2f}",
+            f"{true_error_mm[row.poses]:.3f}",
         )
     print_table(table)
-    if result["table_note"]:
-        console.print(escape(result["table_note"]))
-    for name in ("run", "database", "artefacts", "dataset", "report"):
-        console.print(f"{name:<10} {result[name]}")
-    console.print(f"{'audit':<10} {'verified' if result['audit_ok'] else 'FAILED'}")
-    console.print(f"{'took':<10} {result['duration_s']:.0f} s")
+    if result.table_note:
+        console.print(escape(result.table_note))
+    made = {
+        "run": result.run,
+        "database": result.database,
+        "artefacts": result.artefacts,
+        "dataset": result.dataset,
+        "report": result.report,
+    }
+    for name, place in made.items():
+        console.print(f"{name:<10} {place}")
+    console.print(f"{'audit':<10} {'verified' if result.audit_ok else 'FAILED'}")
+    console.print(f"{'took':<10} {result.duration_s:.0f} s")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import getpass
 import hashlib
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.markup import escape
@@ -181,31 +182,45 @@ def _run_of(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, ag
 # --- what is shown ----------------------------------------------------------------------------------------------
 
 
-def listing_record(listing: ImportList) -> dict[str, Any]:
+def listing_record(listing: ImportList) -> dict[str, object]:
     """The import list as plain data, for JSON output."""
     return {
         "folder": listing.folder,
-        "photographs": {role: photographs_record(listing, role) for role in _PARTS if listing.holds(role)},
+        "photographs": {role: asdict(_photographs(listing, role)) for role in _PARTS if listing.holds(role)},
         "files": {role: [file.model_dump() for file in files] for role, files in listing.files.items()},
         "left_out": [one.model_dump() for one in listing.left_out],
     }
 
 
-def photographs_record(listing: ImportList, role: PhotographRole) -> dict[str, Any]:
-    """Counts, cameras, lenses, dates and sizes of the photographs with this role, as plain data."""
+@dataclass(frozen=True, slots=True)
+class _Photographs:
+    """Counts, cameras, lenses, dates (EXIF; "" if not stated) and sizes of the photographs with one role."""
+
+    count: int
+    raw_files: int
+    cameras: list[str]
+    lenses: list[str]
+    focal_lengths_mm: list[float]
+    sizes: list[str]
+    first: str
+    last: str
+    bytes: int
+
+
+def _photographs(listing: ImportList, role: PhotographRole) -> _Photographs:
     views = listing.of(role)
     times = sorted(str(view.camera["exif_time"]) for view in views if view.camera.get("exif_time"))
-    return {
-        "count": len(views),
-        "raw_files": sum(len(view.raws) for view in views),
-        "cameras": _stated(views, ("make", "model", "body_serial")),
-        "lenses": _stated(views, ("lens", "lens_serial")),
-        "focal_lengths_mm": sorted({v.camera["focal_length_mm"] for v in views if "focal_length_mm" in v.camera}),
-        "sizes": sorted({f"{v.camera.get('width')} × {v.camera.get('height')}" for v in views}),
-        "first": times[0] if times else "",
-        "last": times[-1] if times else "",
-        "bytes": sum(file.size_bytes for view in views for file in (view.photograph, *view.raws)),
-    }
+    return _Photographs(
+        count=len(views),
+        raw_files=sum(len(view.raws) for view in views),
+        cameras=_stated(views, ("make", "model", "body_serial")),
+        lenses=_stated(views, ("lens", "lens_serial")),
+        focal_lengths_mm=sorted({v.camera["focal_length_mm"] for v in views if "focal_length_mm" in v.camera}),
+        sizes=sorted({f"{v.camera.get('width')} × {v.camera.get('height')}" for v in views}),
+        first=times[0] if times else "",
+        last=times[-1] if times else "",
+        bytes=sum(file.size_bytes for view in views for file in (view.photograph, *view.raws)),
+    )
 
 
 def _stated(views: Sequence[ImportedView], names: Sequence[str]) -> list[str]:
@@ -220,12 +235,12 @@ def _show(listing: ImportList) -> None:
     for role, words in _PARTS.items():
         if not listing.holds(role):
             continue
-        found = photographs_record(listing, role)
-        raws = f" + {found['raw_files']} raw" if found["raw_files"] else ""
-        optics = "; ".join(dict.fromkeys([*found["cameras"], *found["lenses"]]))
-        dates = _dates(found["first"], found["last"])
-        size = f"{megabytes(found['bytes']):.1f}"
-        table.add_row(words, f"{found['count']}{raws}", escape(optics), ", ".join(found["sizes"]), dates, size)
+        found = _photographs(listing, role)
+        raws = f" + {found.raw_files} raw" if found.raw_files else ""
+        optics = "; ".join(dict.fromkeys([*found.cameras, *found.lenses]))
+        dates = _dates(found.first, found.last)
+        size = f"{megabytes(found.bytes):.1f}"
+        table.add_row(words, f"{found.count}{raws}", escape(optics), ", ".join(found.sizes), dates, size)
     for role, files in listing.files.items():
         size = f"{megabytes(sum(file.size_bytes for file in files)):.1f}"
         name = "DICOM series" if role == "ct" else Path(files[0].path).name

@@ -28,9 +28,18 @@ class Arguments(BoardSize):
 
 
 class CalibrationDetails(JobRecord):
-    """Details on the images and, if they were solved, the intrinsics."""
+    """Details on the images and, if they were solved, the intrinsics.
+
+    Attributes:
+        views_without_board: images that were not used.
+        partial_views: number of corners in each image of a part of the board; like `reasons` only with `known`.
+        reasons: why images were not used.
+        intrinsics: if they were solved.
+    """
 
     views_without_board: tuple[str, ...] = ()
+    partial_views: dict[str, int] | None = None
+    reasons: dict[str, str] | None = None
     intrinsics: Intrinsics | None = None
 
 

@@ -55,15 +55,13 @@ def scene(request: Request, site: CurrentSite, run_id: RunId) -> HTMLResponse:
 @router.get("/runs/{run_id}/scene/frame", name="scene_frame", dependencies=[Depends(requires("read"))])
 def scene_frame(request: Request, site: CurrentSite, run_id: RunId, theme: Theme = "auto") -> HTMLResponse:
     """The 3D view alone, for the sandboxed frame."""
-    from service.dataset.scene_view import figure_json, scene_figure  # noqa: PLC0415 - as above
+    from service.dataset.scene_view import scene_json  # noqa: PLC0415 - as above
     from service.web.scene.data import scene_of, with_mesh  # noqa: PLC0415
 
     log = site.run(run_id)
     now = scene_of(log)
-    figure = scene_figure(with_mesh(now, log, site.data))
+    figure = scene_json(with_mesh(now, log, site.data))
     views = sorted(now.scene.bases)
-    response = render(
-        request, "scene/frame.html.j2", figure=figure_json(figure), theme=theme, stations=views, title="Scene in 3D"
-    )
+    response = render(request, "scene/frame.html.j2", figure=figure, theme=theme, stations=views, title="Scene in 3D")
     response.headers.update(FRAME_HEADERS)
     return response

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from typing import Any
 
 import cv2
 import numpy as np
@@ -47,8 +45,9 @@ def board_view(context: JobContext[job.Arguments]) -> JobAnswer:
         bright = float(np.percentile(grey, 1)) > _WHITE
         reason = "the image is black" if quality.black else "the image is white" if bright else plain_reason(error)
         return JobAnswer(measures, (), answer(reason))
-    record = {"size": list(size), "indices": view.indices.tolist(), "corners": np.round(view.corners, 4).tolist()}
-    ref = context.keep_json(record, kind="board_corners", name=f"{image.viewpoint}.corners.json")
+    corners = np.round(view.corners, 4).tolist()
+    record = job.Corners(size=size, indices=view.indices.tolist(), corners=corners)
+    ref = context.keep_json(record.plain(), kind="board_corners", name=f"{image.viewpoint}.corners.json")
     return JobAnswer(measures | {"corners": float(len(view.indices))}, (ref,), answer())
 
 
@@ -57,10 +56,10 @@ def plain_reason(error: ComputeError) -> str:
     return error.what.partition(" (searched")[0]
 
 
-def read_corners(record: Mapping[str, Any]) -> BoardImage:
+def read_corners(record: job.Corners) -> BoardImage:
     """The board in an image, from the file of `board_view`."""
-    indices, corners = np.array(record["indices"], dtype=np.int64), np.array(record["corners"], dtype=np.float64)
-    return BoardImage((record["size"][0], record["size"][1]), BoardView(indices, corners))
+    indices, corners = np.array(record.indices, dtype=np.int64), np.array(record.corners, dtype=np.float64)
+    return BoardImage(record.size, BoardView(indices, corners))
 
 
 def boards_of(
@@ -89,7 +88,8 @@ def boards_of(
         )
     )
     found = tuple(
-        searched[k] if sha256 is None else read_corners(context.input_json(sha256)) for k, sha256 in enumerate(looked)
+        searched[k] if sha256 is None else read_corners(job.Corners.model_validate(context.input_json(sha256)))
+        for k, sha256 in enumerate(looked)
     )
     if arguments.known is None or board.pattern != "checkerboard":
         return found, {}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -24,9 +23,10 @@ from service.compute.calibration.intrinsics.validation import (
 from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.jobs.calibration import calibrate as job
+from service.jobs.calibration.records import HandEye, Intrinsics
 from service.jobs.records import Photograph
 from service.worker.calibration.board_view import board_of, boards_of
-from service.worker.camera import camera_of
+from service.worker.camera import camera_of, camera_record
 from service.worker.job import JobAnswer, JobContext
 
 
@@ -41,31 +41,42 @@ def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
     seen = usable.indices
     missed = [names[k] for k in usable.excluded]
     measures: dict[str, float] = {"views": float(len(seen)), "views_without_board": float(len(missed))}
-    details: dict[str, Any] = {"views_without_board": missed}
+    details = job.CalibrationDetails(views_without_board=tuple(missed))
     if arguments.known is not None:
         measures["views_partial"] = float(len(parts))
-        details["partial_views"] = {names[k]: count for k, count in parts.items()}
-        details["reasons"] = {names[k]: reason for k, reason in usable.excluded.items()}
+        details = job.CalibrationDetails(
+            views_without_board=tuple(missed),
+            partial_views={names[k]: count for k, count in parts.items()},
+            reasons={names[k]: reason for k, reason in usable.excluded.items()},
+        )
     if "intrinsics" in arguments.solve:
-        camera, intrinsics_measures, details["intrinsics"] = _intrinsics(usable, board, names)
+        camera, intrinsics_measures, intrinsics = _intrinsics(usable, board, names)
+        details = details.model_copy(update={"intrinsics": intrinsics})
         measures |= intrinsics_measures
     elif arguments.camera is not None:
         camera = camera_of(arguments.camera)
     else:
         raise DataError("a hand-eye calibration alone needs the camera's intrinsics")
-    result: dict[str, Any] = {"camera": camera.record(), "details": details}
+    answer = job.Answer(camera=camera_record(camera), details=details)
     if "hand_eye" in arguments.solve:
-        answer, hand_eye_measures = _hand_eye(images, usable, board, camera)
-        result |= answer
+        hand_eye, hand_eye_measures = _hand_eye(images, usable, board, camera)
+        answer = job.Answer(
+            camera=answer.camera,
+            details=details,
+            T_flange_camera=hand_eye.T_flange_camera,
+            T_base_board=hand_eye.T_base_board,
+            hand_eye=hand_eye,
+        )
         measures |= hand_eye_measures
-    ref = context.keep_json({**result, "measures": measures}, kind="calibration", name="calibration.json")
-    return JobAnswer(measures, (ref,), job.Answer.model_validate(result))
+    kept = {**answer.plain(), "measures": measures}
+    ref = context.keep_json(kept, kind="calibration", name="calibration.json")
+    return JobAnswer(measures, (ref,), answer)
 
 
 def _hand_eye(
     images: Sequence[Photograph], usable: UsableViews, board: Board, camera: CameraModel
-) -> tuple[dict[str, Any], dict[str, float]]:
-    """The fields of the answer with the whole record, and measures."""
+) -> tuple[HandEye, dict[str, float]]:
+    """The whole record of the hand-eye calibration, and measures."""
     used = [images[i] for i in usable.indices]
     T_base_flange = np.array([image.T_base_flange for image in used])
     T_camera_board = np.array([locate_view(view, board, camera)[0] for view in usable.views])
@@ -82,12 +93,7 @@ def _hand_eye(
         T_board_turned=board.half_turn(),
     )
     record = hand_eye_record(solved, [image.viewpoint for image in used])
-    answer = {
-        "T_flange_camera": record["T_flange_camera"],
-        "T_base_board": record["T_base_board"],
-        "hand_eye": record,
-    }
-    return answer, _hand_eye_measures(solved)
+    return HandEye.model_validate(record), _hand_eye_measures(solved)
 
 
 def _hand_eye_measures(solved: HandEyeResult) -> dict[str, float]:
@@ -114,7 +120,7 @@ def _hand_eye_measures(solved: HandEyeResult) -> dict[str, float]:
 
 def _intrinsics(
     usable: UsableViews, board: Board, names: Sequence[str]
-) -> tuple[CameraModel, dict[str, float], dict[str, Any]]:
+) -> tuple[CameraModel, dict[str, float], Intrinsics]:
     """The camera, measures, and the whole record of the calibration (`intrinsics_record`)."""
     solved = calibrate_intrinsics(usable.views, board, usable.size)
     validation = cross_validate(solved) if len(solved.views) >= MIN_VIEWS_TO_VALIDATE else None
@@ -141,4 +147,4 @@ def _intrinsics(
     if validation is not None:
         measures["five_fold_rms_px"] = validation.five_fold_rms_px
         measures["leave_one_out_rms_px"] = validation.leave_one_out_rms_px
-    return solved.camera, measures, record
+    return solved.camera, measures, Intrinsics.model_validate(record)
