@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from pydantic import Field
+
 from service.jobs.kind import JobKind, JobRecord
 from service.jobs.records import Hash, Point
 
@@ -25,11 +27,20 @@ class Arguments(JobRecord):
     control: int = 0
 
 
+class SphereMove(JobRecord):
+    """A move of a sphere, in words and between places in the photograph, as fractions of its width and height."""
+
+    words: str
+    old_place: tuple[float, float] = Field(validation_alias="from")
+    new_place: tuple[float, float] = Field(validation_alias="to")
+    higher_mm: float
+
+
 class LayoutDetails(JobRecord):
     """Near-symmetries (service/compute/layout/ambiguity.py), and the moves that would resolve them."""
 
     problems: tuple[str, ...] = ()
-    moves: tuple[dict[str, Any], ...] = ()
+    moves: tuple[dict[str, Any], ...] = ()  # SphereMove reads them; its fields cannot be named as they are recorded
 
 
 class Answer(JobRecord):

@@ -173,8 +173,10 @@ class BoardCapture:
         prediction = prediction_record(found.prediction)
         words = describe_prediction(prediction, self.solve)
         names = poses[0].name if len(poses) == 1 else f"{poses[0].name} … {poses[-1].name}"
-        advice = {} if advise is None else {"advice": advise(len(poses), names, words)}
-        text = advice.get("advice", f"{counted(len(poses), 'board pose')} ({_WORDS[why]}): {words}")
+        text = f"{counted(len(poses), 'board pose')} ({_WORDS[why]}): {words}"
+        if advise is not None:
+            text = advise(len(poses), names, words)
+        advice = {} if advise is None else {"advice": text}
         instead = {}
         if why == "replacement":
             instead = {"instead_of": {look.capture.viewpoint: look.reason for look in looks if not look.seen}}

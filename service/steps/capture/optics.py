@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pydantic import BaseModel
+
 from service.compute.calibration.intrinsics.optics import Optics, OpticsDeparture, compare_optics, summary
 from service.core.records.events import View
 from service.steps.context import StepContext
@@ -55,13 +57,22 @@ def departing_images(departures: Sequence[OpticsDeparture]) -> int:
     return len({departure.image for departure in departures})
 
 
+class _CalibrationParams(BaseModel):
+    """What a calibration step solves, and the step whose images it uses if not its own."""
+
+    solve: tuple[str, ...]
+    images_of: str | None = None
+
+
 def _calibration_images(context: StepContext) -> tuple[View, ...]:
     ids = [step.id for step in context.protocol.steps]
     until = ids.index(context.step.id) + 1
     for step in reversed(context.protocol.steps[:until]):
-        params = step.params.model_dump()
-        if step.kind == "calibration" and "intrinsics" in params["solve"]:
-            images = context.evidence.captures(params["images_of"] or step.id)
+        if step.kind != "calibration":
+            continue
+        params = _CalibrationParams.model_validate(step.params.model_dump())
+        if "intrinsics" in params.solve:
+            images = context.evidence.captures(params.images_of or step.id)
             if images:
                 return images
     return ()

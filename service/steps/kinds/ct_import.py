@@ -9,6 +9,7 @@ from drivers.interfaces import CtSource
 from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, Record
 from service.core.units import metres, mm
+from service.jobs.records import SpheresFound
 from service.jobs.surfaces import ct_surface, locate_spheres
 from service.steps.arrivals import keep, keep_array, keep_mesh, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
@@ -48,7 +49,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     request, kept, measures = (_mesh if params.source == "mesh" else _series)(context, params)
     (answer,) = context.evidence.run_jobs(request)
     result = Result.model_validate(answer.result)
-    uncertainties = layout_uncertainties(result.details["layout"]) if "layout" in result.details else {}
+    uncertainties = layout_uncertainties(SpheresFound.model_validate(answer.result).details.layout)
     measured = Measures.read({**measures, **answer.measures})
     return StepOutcome(measured, kept + answer.artefacts, result.model_dump(mode="json"), uncertainties)
 

@@ -90,7 +90,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     judged = evaluate_gates(
         context.step, context.attempt, answer.measures, context.run.skipped, uncertainties
     ).verdicts
-    _advise(context, judged, result.details, images, params)
+    _advise(context, judged, layout.KIND.read_answer(answer.result).details, images, params)
     measures = Measures.read(answer.measures)
     return StepOutcome(measures, (*kept, *answer.artefacts), result.model_dump(mode="json"), uncertainties)
 
@@ -130,7 +130,7 @@ def _photographs(context: StepContext, images: list[dict[str, Any]], wait_s: flo
 def _advise(
     context: StepContext,
     verdicts: Sequence[GateVerdict],
-    details: Mapping[str, Any],
+    details: layout.LayoutDetails,
     images: Sequence[Mapping[str, Any]],
     params: Params,
 ) -> None:
@@ -143,13 +143,13 @@ def _advise(
     if not bad and len(images) < params.most_photographs:
         _ask_for_photograph(context, len(images), unseen=unseen)
         return
-    moves = details["moves"]
+    moves = [layout.SphereMove.model_validate(move) for move in details.moves]
     if not moves:
-        remedy = "; ".join(details["problems"]) or "the photographs do not decide it"
+        remedy = "; ".join(details.problems) or "the photographs do not decide it"
         advice = f"{remedy[0].upper()}{remedy[1:]}. Set the spheres up less regularly and photograph them anew"
         context.note(MOVE_WANTED, advice=advice)
     else:
-        steps = "; then ".join(str(move["words"]) for move in moves)
+        steps = "; then ".join(move.words for move in moves)
         advice = (
             f"{steps}. The picture of this step shows the spheres with their numbers, and arrows. Then hold the "
             "camera nearly above the scene again and confirm"
@@ -170,13 +170,13 @@ def _ask_for_photograph(context: StepContext, taken: int, *, unseen: bool) -> No
     context.tell(advice)
 
 
-def _move_hand(move: Mapping[str, Any]) -> dict[str, Any]:
+def _move_hand(move: layout.SphereMove) -> dict[str, Any]:
     """For the simulated technician, who is told the sphere's place in the photograph, as a person is."""
     return {
         "action": "move_sphere",
-        "from": move["from"],
-        "to": move["to"],
-        "higher_m": metres(move["higher_mm"]),
+        "from": list(move.old_place),
+        "to": list(move.new_place),
+        "higher_m": metres(move.higher_mm),
     }
 
 

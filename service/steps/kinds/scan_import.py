@@ -9,6 +9,7 @@ from service.core.jobs.references import Reference
 from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, Record
 from service.core.units import metres
+from service.jobs.records import SpheresFound
 from service.jobs.surfaces import locate_spheres
 from service.steps.arrivals import keep_mesh, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
@@ -79,7 +80,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     arguments, references = _arguments(context, params, mesh)
     (answer,) = context.evidence.run_jobs(JobRequest.of(locate_spheres.KIND, arguments, references))
     result = Result.model_validate(answer.result)
-    uncertainties = layout_uncertainties(result.details["layout"]) if "layout" in result.details else {}
+    uncertainties = layout_uncertainties(SpheresFound.model_validate(answer.result).details.layout)
     return StepOutcome(
         Measures.read({**measures, **answer.measures}),
         kept + answer.artefacts,
