@@ -22,7 +22,7 @@ class ImagesToMatch(JobRecord):
 
 
 class Arguments(ImagesToMatch, FrontEndArguments):
-    """Images, their camera and the effort."""
+    """The images, and the viewpoints that they are to be matched with as soon as those have features."""
 
 
 KIND = JobKind(

@@ -15,7 +15,7 @@ class PairsToMatch(JobRecord):
 
 
 class Arguments(PairsToMatch, FrontEndArguments):
-    """Pairs of images, their camera and the effort."""
+    """Features by viewpoint, and the pairs to match."""
 
 
 KIND = JobKind(
