@@ -19,6 +19,8 @@ from service.core.records.events import (
 )
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
+from service.jobs.calibration import board_view, calibrate
+from service.jobs.records import Camera
 from service.store.store import Store
 from tests.support.rig.bench_rig import answer
 from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, KilledError, begin_run
@@ -36,6 +38,8 @@ CALIBRATION = """\
           arcs: [{tilt_deg: 20, azimuth_from_deg: 0, azimuth_to_deg: 0, count: 1, distance_m: 0.6}]
     gates: [{measure: rms_px, max: 0.5}]
 """
+NO_BOARD = board_view.Answer(viewpoint="b1", size=(640, 426), seen=False, reason="no board").plain()
+SOLVED = calibrate.Answer(camera=Camera(width=640, height=426, fx=930.0, fy=930.0, cx=320.0, cy=213.0)).plain()
 
 
 @pytest.fixture
@@ -62,14 +66,13 @@ def test_a_failed_job_shows_the_workers_reason_and_a_repeated_step_enqueues_it_a
         if job is None:
             return
         if job.kind == "board_view":
-            bench.store.finish_job(job, measures={}, duration_s=0.1, result={"seen": False, "reason": "no board"})
+            bench.store.finish_job(job, measures={}, duration_s=0.1, result=NO_BOARD)
         elif not bench.payloads(StepNote)[1:]:
             bench.store.fail_job(job, OSError("no memory"), retry=True)  # the store records it and retries
         elif not bench.payloads(JobFailed):
             bench.store.fail_job(job, ComputeError("the board is seen in no image"), retry=False)
         else:
-            result = {"camera": {"fx": 1.0}, "details": {}}
-            bench.store.finish_job(job, measures={"rms_px": 0.2}, duration_s=1.0, result=result)
+            bench.store.finish_job(job, measures={"rms_px": 0.2}, duration_s=1.0, result=SOLVED)
 
     def again(question: AskOperator, _state: RunState) -> OperatorAction:
         assert "the board is seen in no image" in question.text
@@ -94,10 +97,9 @@ def test_what_a_worker_has_computed_is_not_computed_again_after_a_crash(begin: C
     def work_and_die(_what: str) -> None:
         job = bench.store.claim_job("worker 1", 30)
         if job is not None and job.kind == "board_view":
-            bench.store.finish_job(job, measures={}, duration_s=0.1, result={"seen": False, "reason": "no board"})
+            bench.store.finish_job(job, measures={}, duration_s=0.1, result=NO_BOARD)
         elif job is not None:
-            result = {"camera": {"fx": 1.0}, "details": {}}
-            bench.store.finish_job(job, measures={"rms_px": 0.2}, duration_s=1.0, result=result)
+            bench.store.finish_job(job, measures={"rms_px": 0.2}, duration_s=1.0, result=SOLVED)
             raise KilledError
 
     bench.operator.on_show = work_and_die
