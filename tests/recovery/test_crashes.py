@@ -39,7 +39,8 @@ CALIBRATION = """\
     gates: [{measure: rms_px, max: 0.5}]
 """
 NO_BOARD = board_view.Answer(viewpoint="b1", size=(640, 426), seen=False, reason="no board").plain()
-SOLVED = calibrate.Answer(camera=Camera(width=640, height=426, fx=930.0, fy=930.0, cx=320.0, cy=213.0)).plain()
+_CAMERA = Camera(width=640, height=426, fx=930.0, fy=930.0, cx=320.0, cy=213.0)
+SOLVED = calibrate.Answer(camera=_CAMERA, details=calibrate.CalibrationDetails()).plain()
 
 
 @pytest.fixture
@@ -86,7 +87,7 @@ def test_a_failed_job_shows_the_workers_reason_and_a_repeated_step_enqueues_it_a
     assert look.job_kind == "board_view"
     assert first.arguments == second.arguments
     assert first.idempotency_key != second.idempotency_key
-    assert state.steps["intrinsics"].result["camera"] == {"fx": 1.0}
+    assert state.steps["intrinsics"].result["camera"] == SOLVED["camera"]
     assert bench.captured() == [*VIEWS, "b001"]
     bench.must_verify()
 
