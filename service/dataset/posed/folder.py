@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import hashlib
 import json
-import os
 import shutil
 from collections.abc import Callable, Generator
 from pathlib import Path
 
 from service.core.errors import ConfigurationError, DataError
+from service.store.durable_effects import DurableFiles
+from service.store.files.artefacts import hash_file
 
 _PART = ".part"  # ends the name of an unfinished file or folder
 _ABOUT = ".export"  # ends the name of the file beside it that says what is being written, and locks it
+_DISK = DurableFiles()
 SUMS = "SHA256SUMS"
 
 
@@ -27,7 +28,7 @@ class ExportFolder:
 
     def file(self, name: str, make: Callable[[], bytes]) -> None:
         """Write a file, unless an interrupted export wrote it; `name` is relative, with `/`."""
-        self.written_by(name, lambda part: _write(part, make()))
+        self.written_by(name, lambda part: part.write_bytes(make()))
 
     def text(self, name: str, text: str) -> None:
         """Write a file of UTF-8 text."""
@@ -37,7 +38,7 @@ class ExportFolder:
         """Write a file of JSON."""
         self.text(name, json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
-    def written_by(self, name: str, write: Callable[[Path], None]) -> None:
+    def written_by(self, name: str, write: Callable[[Path], object]) -> None:
         """Let `write` make a file at a path beside it; it has its name only when it is whole.
 
         Raises:
@@ -52,7 +53,7 @@ class ExportFolder:
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f".{path.name}{_PART}")
         write(part)
-        _sync(part)
+        _DISK.sync_file(part)
         part.replace(path)
 
     def close(self) -> None:
@@ -65,14 +66,13 @@ class ExportFolder:
             if name not in self._written:
                 path.unlink()
                 continue
-            with path.open("rb") as file:
-                lines.append(f"{hashlib.file_digest(file, 'sha256').hexdigest()}  {name}\n")
+            lines.append(f"{hash_file(path)[0]}  {name}\n")
         sums = self._root / f".{SUMS}{_PART}"
-        _write(sums, "".join(lines).encode())
-        _sync(sums)
+        sums.write_bytes("".join(lines).encode())
+        _DISK.sync_file(sums)
         sums.replace(self._root / SUMS)
         for folder in (self._root, *(path for path in self._root.rglob("*") if path.is_dir())):
-            _sync(folder)
+            _DISK.sync_directory(folder)
 
 
 @contextlib.contextmanager
@@ -120,7 +120,7 @@ def export_folder(
         leaving(root / SUMS)
         root.replace(target)
         about.unlink()
-    _sync(target.parent)
+    _DISK.sync_directory(target.parent)
 
 
 def _begin(root: Path, about: Path, identity: str) -> None:
@@ -132,15 +132,3 @@ def _begin(root: Path, about: Path, identity: str) -> None:
         shutil.rmtree(root)
     root.mkdir()
     about.write_text(identity, encoding="utf-8")
-
-
-def _write(path: Path, data: bytes) -> None:
-    path.write_bytes(data)
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

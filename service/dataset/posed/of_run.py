@@ -74,7 +74,7 @@ def data_set_of(summary: RunSummary, not_in_yet: Sequence[str] = (), *, personal
     masks = _masked(balls, posts)
     hashes = {view.file: files[view.name][1] for view in views}
     return DataSet(
-        identity=_identity(summary, own, hashes),
+        identity=_identity(summary, own, registered, hashes),
         simulated=simulated,
         statement={**described_run(summary, own, not_in_yet), "masks": masks, "image_sha256": hashes},
         views=views,
@@ -195,8 +195,7 @@ def _sees(view: View, mesh: Mesh) -> np.ndarray[tuple[int, ...], np.dtype[np.boo
     return inside[:, 0] & inside[:, 1] & (before[:, 2] > 0)
 
 
-def _identity(summary: RunSummary, own: str, hashes: dict[str, str]) -> str:
-    registered = summary.registrations()[own].model_dump(mode="json")
+def _identity(summary: RunSummary, own: str, registered: Registration, hashes: dict[str, str]) -> str:
     scan = summary.artefacts("scan_mesh")[-1].sha256
-    inputs = json.dumps([own, registered, hashes, scan], sort_keys=True)
+    inputs = json.dumps([own, registered.model_dump(mode="json"), hashes, scan], sort_keys=True)
     return f"{summary.run_id} {hashlib.sha256(inputs.encode()).hexdigest()}"
