@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 
@@ -21,9 +20,8 @@ from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.jobs.calibration import board_view, calibrate
 from service.jobs.records import Camera
-from service.store.store import Store
 from tests.support.rig.bench_rig import answer
-from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, KilledError, begin_run
+from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, KilledError
 
 CALIBRATION = """\
   - id: intrinsics
@@ -41,17 +39,6 @@ CALIBRATION = """\
 NO_BOARD = board_view.Answer(viewpoint="b1", size=(640, 426), seen=False, reason="no board").plain()
 _CAMERA = Camera(width=640, height=426, fx=930.0, fy=930.0, cx=320.0, cy=213.0)
 SOLVED = calibrate.Answer(camera=_CAMERA, details=calibrate.CalibrationDetails()).plain()
-
-
-@pytest.fixture
-def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
-    with Store.open(tmp_path / "data") as store:
-        yield lambda text: begin_run(store, text, tmp_path)
-
-
-@pytest.fixture
-def bench(begin: Callable[[str], Bench]) -> Bench:
-    return begin(PROTOCOL)
 
 
 # --- bad days --------------------------------------------------------------------------------------------

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 
@@ -21,9 +20,8 @@ from service.core.records.events import (
 )
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
-from service.store.store import Store
 from tests.support.rig.bench_rig import answer, other_settings
-from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, begin_run, say
+from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, say
 
 LAYOUT = """\
   - id: layout
@@ -33,17 +31,6 @@ LAYOUT = """\
     gates: [{measure: spheres_seen, min: 10}]
     recovery: {retries: 2, wait_s: 0}
 """
-
-
-@pytest.fixture
-def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
-    with Store.open(tmp_path / "data") as store:
-        yield lambda text: begin_run(store, text, tmp_path)
-
-
-@pytest.fixture
-def bench(begin: Callable[[str], Bench]) -> Bench:
-    return begin(PROTOCOL)
 
 
 def test_a_camera_that_fails_twice_is_reopened_and_loses_nothing(bench: Bench) -> None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
-
-import pytest
+from collections.abc import Callable
 
 from drivers.interfaces import SafetyState
 from service.core.records.events import (
@@ -16,21 +13,8 @@ from service.core.records.events import (
 )
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
-from service.store.store import Store
 from tests.support.rig.bench_rig import Answer
-from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, begin_run, say
-
-
-@pytest.fixture
-def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
-    with Store.open(tmp_path / "data") as store:
-        yield lambda text: begin_run(store, text, tmp_path)
-
-
-@pytest.fixture
-def bench(begin: Callable[[str], Bench]) -> Bench:
-    return begin(PROTOCOL)
-
+from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, say
 
 # --- pause, abort, redo, skip ----------------------------------------------------------------------------
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
-
 import pytest
 
 from service.core.errors import ConfigurationError, StoreError
@@ -19,18 +16,7 @@ from service.store.records import Checkpoint
 from service.store.signatures import timestamps as timestamping
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, begin_run
-
-
-@pytest.fixture
-def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
-    with Store.open(tmp_path / "data") as store:
-        yield lambda text: begin_run(store, text, tmp_path)
-
-
-@pytest.fixture
-def bench(begin: Callable[[str], Bench]) -> Bench:
-    return begin(PROTOCOL)
+from tests.support.runs.bench_run import VIEWS, Bench
 
 
 def test_a_run_goes_from_its_checklist_through_the_captures_to_its_end(bench: Bench) -> None:
