@@ -6,7 +6,7 @@ from functools import cache
 from typing import Any
 
 from service.core.declared_kinds import declared_kinds
-from service.core.records.events import Record
+from service.core.protocol.step_params import StepParams
 from service.steps.context import StepKind
 
 GROUP = "orthocapture.steps"  # entry points of plug-ins; each names a StepKind
@@ -23,6 +23,6 @@ def step_kinds() -> dict[str, StepKind[Any]]:
     return dict(sorted(kinds.items()))
 
 
-def params_models() -> dict[str, type[Record]]:
+def params_models() -> dict[str, type[StepParams]]:
     """The Params model of every step kind, for the protocol loader."""
     return {name: kind.params for name, kind in step_kinds().items()}

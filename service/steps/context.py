@@ -13,6 +13,7 @@ from service.core.jobs.priorities import WAITED
 from service.core.jobs.references import Each, Reference
 from service.core.protocol.models import Protocol as LabProtocol
 from service.core.protocol.models import Step
+from service.core.protocol.step_params import StepParams
 from service.core.records.events import ArtefactRef, Payload, Record, StepNote, Uncertainty, View
 from service.core.records.import_list import ImportList
 from service.core.run.decide import RunState, StepState
@@ -22,7 +23,7 @@ from service.rig import CollisionSection, LensSection, OpticsSection
 from service.steps.measures import MeasureRecord
 from service.store.records import NewArtefact
 
-P = TypeVar("P", bound=Record)
+P = TypeVar("P", bound=StepParams)
 A = TypeVar("A", bound=JobRecord)
 _NO_REFERENCES: Mapping[str, Reference | Each | None] = {}
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 
-from pydantic import BaseModel
-
 from service.core.gates.verdict import limits
 from service.core.protocol.models import Gate, Protocol, Step, protocol_json_schema
+from service.core.protocol.step_params import StepParams
 from service.core.run.lifecycle import ABORTED, COMPLETED, PAUSED, PHASES, SEPARATOR, STEP_RULES, transition_table
 
 
-def schema_text(params_models: Mapping[str, type[BaseModel]]) -> str:
+def schema_text(params_models: Mapping[str, type[StepParams]]) -> str:
     """The text of docs/reference/protocol.schema.json; `params_models` maps each step kind to its Params."""
     return json.dumps(protocol_json_schema(params_models), indent=2, ensure_ascii=False) + "\n"
 

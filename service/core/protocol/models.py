@@ -21,14 +21,14 @@ from pydantic import (
 
 from service.core.errors import ProtocolError
 from service.core.protocol.rules import rule_violations
-from service.core.protocol.step_params import MovingParams, RepeatedStep, StepParams
+from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.core.recovery.reasons import Reasons
 from service.core.run.lifecycle import RESERVED_STEP_IDS
 from service.core.text.checked_yaml import checked, decoded, did_you_mean, refuse
 from service.core.text.yaml_tree import Plain, Problem, YamlTree, field_name, parse_yaml
 
-ParamsT = TypeVar("ParamsT", bound=BaseModel)
+ParamsT = TypeVar("ParamsT", bound=StepParams)
 
 
 def _fraction(value: Any) -> Any:
@@ -171,22 +171,22 @@ class StepFields(Record):
 class Step(StepFields):
     """One step of the procedure; `params` is an instance of its kind's Params model."""
 
-    params: SerializeAsAny[BaseModel]
+    params: SerializeAsAny[StepParams]
 
     @property
     def moves_robot(self) -> bool:
         """Whether the robot moves during this step; confirming it takes a held button or two pedal presses."""
-        return isinstance(self.params, MovingParams) and self.params.moves_robot
+        return self.params.moves_robot
 
     @property
     def repeated(self) -> RepeatedStep:
         """What trying this step again means."""
-        return self.params.repeated if isinstance(self.params, StepParams) else StepParams.repeated
+        return self.params.repeated
 
     @property
     def needs_disk(self) -> bool:
         """Whether this step stores files."""
-        return not isinstance(self.params, StepParams) or self.params.needs_disk
+        return self.params.needs_disk
 
     @property
     def begins_confirmed(self) -> bool:
@@ -258,7 +258,7 @@ class _FileProtocol(ProtocolFields):
     steps: Annotated[tuple[_FileStep, ...], Field(min_length=1)]
 
 
-def load_protocol(path: Path, params_models: Mapping[str, type[BaseModel]]) -> LoadedProtocol:
+def load_protocol(path: Path, params_models: Mapping[str, type[StepParams]]) -> LoadedProtocol:
     """Read a protocol file; `params_models` maps every known step kind to its Params.
 
     Raises:
@@ -273,7 +273,7 @@ def load_protocol(path: Path, params_models: Mapping[str, type[BaseModel]]) -> L
     return parse_protocol(content, params_models, name=str(path))
 
 
-def parse_protocol(content: bytes, params_models: Mapping[str, type[BaseModel]], *, name: str) -> LoadedProtocol:
+def parse_protocol(content: bytes, params_models: Mapping[str, type[StepParams]], *, name: str) -> LoadedProtocol:
     """Read a protocol from a file's bytes (a recorded artefact, an editor's buffer).
 
     Args:
@@ -306,10 +306,10 @@ def parse_protocol(content: bytes, params_models: Mapping[str, type[BaseModel]],
 
 
 def _validate_params(
-    data: Mapping[str, Plain], models: Mapping[str, type[BaseModel]], tree: YamlTree, problems: list[Problem]
-) -> dict[int, BaseModel]:
+    data: Mapping[str, Plain], models: Mapping[str, type[StepParams]], tree: YamlTree, problems: list[Problem]
+) -> dict[int, StepParams]:
     """The params of every valid step by its index; appends what is wrong with the others to `problems`."""
-    params: dict[int, BaseModel] = {}
+    params: dict[int, StepParams] = {}
     steps = data.get("steps")
     for index, step in enumerate(steps if isinstance(steps, list) else []):
         if not isinstance(step, dict) or not isinstance(step.get("kind"), str):
@@ -334,7 +334,7 @@ def _refuse(problems: list[Problem], name: str) -> NoReturn:
     refuse(problems, what="protocol", name=name, remedy=remedy, error=ProtocolError)
 
 
-def protocol_json_schema(params_models: Mapping[str, type[BaseModel]]) -> dict[str, Any]:
+def protocol_json_schema(params_models: Mapping[str, type[StepParams]]) -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of a protocol file for editors, with the params of every step kind."""
     kinds: list[type[BaseModel]] = []
     for kind, model in sorted(params_models.items()):

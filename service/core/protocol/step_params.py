@@ -36,11 +36,16 @@ class StepParams(Record):
     repeated: ClassVar[RepeatedStep] = RepeatedStep("Put right what the figures show, then try this step again")
     needs_disk: ClassVar[bool] = True
 
+    @property
+    def moves_robot(self) -> bool:
+        """Whether the robot moves during this step with these params."""
+        return False
+
 
 class MovingParams(StepParams):
     """Base of the params of a step kind that moves the robot; such a step never begins without a person."""
 
     @property
     def moves_robot(self) -> bool:
-        """Whether the robot moves during this step with these params."""
+        """True, unless a step kind's own params say otherwise."""
         return True

@@ -9,14 +9,13 @@ from typing import Any
 from pydantic import Field
 
 from service.core.protocol.models import LoadedProtocol, Protocol, parse_protocol
-from service.core.protocol.step_params import MovingParams
+from service.core.protocol.step_params import MovingParams, StepParams
 from service.core.records.events import (
     ArtefactRef,
     Event,
     OperatorAction,
     OperatorVerb,
     Payload,
-    Record,
     RunStarted,
     StepMeasured,
     StepPassed,
@@ -27,7 +26,7 @@ from service.core.records.events import (
 from service.core.run.decide import AskOperator, Decision, RunState, advance, decide, evaluate_gates, initial_state
 
 
-class ChecklistParams(Record):
+class ChecklistParams(StepParams):
     """No parameters."""
 
 
@@ -38,7 +37,7 @@ class CaptureParams(MovingParams):
     distance_m: float = 0.6
 
 
-KINDS: dict[str, type[Record]] = {
+KINDS: dict[str, type[StepParams]] = {
     "checklist": ChecklistParams,
     "capture": CaptureParams,
     "spray": ChecklistParams,
