@@ -1,4 +1,4 @@
-"""Writes meshes with properties at their vertices as binary PLY files."""
+"""Meshes with properties at their vertices as binary PLY files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from service.compute.ground_truth.surface import Surface
 
-_NAMES = {"f": ("<f4", "float"), "u": ("u1", "uchar"), "b": ("u1", "uchar")}
+_STORED = {"f": "<f4", "u": "u1", "b": "u1"}
+_NAMES = {"<f4": "float", "<f8": "double", "|u1": "uchar"}
 
 
 def write_ply(
@@ -29,25 +30,36 @@ def write_ply(
         properties: for each name (V,) numbers: fractional ones are written as float, others as unsigned bytes.
         comments: lines for the header, in ASCII.
     """
-    columns = {name: surface.vertices_m[:, k] / metres_per_unit for k, name in enumerate(("x", "y", "z"))}
+    columns = {name: surface.vertices_m[:, k] / metres_per_unit for k, name in enumerate("xyz")}
     columns |= {name: np.asarray(values) for name, values in properties.items()}
-    kinds = {name: _NAMES[values.dtype.kind] for name, values in columns.items()}
-    vertex = np.zeros(len(surface.vertices_m), dtype=[(name, stored) for name, (stored, _) in kinds.items()])
+    stored = {name: values.astype(_STORED[values.dtype.kind]) for name, values in columns.items()}
+    path.write_bytes(ply_bytes(stored, surface.faces, comments))
+
+
+def ply_bytes(
+    columns: Mapping[str, NDArray[np.generic]], faces: NDArray[np.integer], comments: Sequence[str] = ()
+) -> bytes:
+    """A binary, little-endian PLY.
+
+    Args:
+        columns: for each property of the vertices, x, y and z first, (V,) float32, float64 or uint8.
+        faces: (F, 3).
+        comments: lines for the header, in ASCII.
+    """
+    kinds = {name: values.dtype.newbyteorder("<").str for name, values in columns.items()}
+    vertex = np.zeros(len(columns["x"]), dtype=list(kinds.items()))
     for name, values in columns.items():
         vertex[name] = values
-    face = np.zeros(len(surface.faces), dtype=[("count", "u1"), ("vertices", "<i4", 3)])
-    face["count"], face["vertices"] = 3, surface.faces
+    face = np.zeros(len(faces), dtype=[("count", "u1"), ("vertices", "<i4", 3)])
+    face["count"], face["vertices"] = 3, faces
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         *(f"comment {comment}" for comment in comments),
         f"element vertex {len(vertex)}",
-        *(f"property {told} {name}" for name, (_, told) in kinds.items()),
+        *(f"property {_NAMES[kind]} {name}" for name, kind in kinds.items()),
         f"element face {len(face)}",
         "property list uchar int vertex_indices",
         "end_header",
     ]
-    with path.open("wb") as stream:
-        stream.write(("\n".join(lines) + "\n").encode("ascii"))
-        stream.write(vertex.tobytes())
-        stream.write(face.tobytes())
+    return ("\n".join(lines) + "\n").encode("ascii") + vertex.tobytes() + face.tobytes()

@@ -6,21 +6,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compute.ground_truth.ply import ply_bytes
 from service.core.errors import DataError
 from service.core.geometry import Array
 
 
 def ply(vertices: Array, faces: NDArray[np.int64], comment: str) -> bytes:
     """A binary PLY with vertices (V, 3) in double precision and faces (F, 3), in the unit that they have."""
-    said = f"comment {comment}\n" if comment else ""
-    head = (
-        f"ply\nformat binary_little_endian 1.0\n{said}element vertex {len(vertices)}\n"
-        "property double x\nproperty double y\nproperty double z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    rows = np.empty(len(faces), dtype=[("n", "u1"), ("corners", "<i4", 3)])
-    rows["n"], rows["corners"] = 3, faces
-    return head.encode("ascii") + vertices.astype("<f8").tobytes() + rows.tobytes()
+    columns = {name: vertices[:, k].astype("<f8") for k, name in enumerate("xyz")}
+    return ply_bytes(columns, faces, [comment] if comment else [])
 
 
 def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:

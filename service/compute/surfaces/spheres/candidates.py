@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from service.compute.surfaces.spheres.tukey import Band, Surface, TukeyStep, fit_centre
+from service.compute.surfaces.spheres.tukey import Band, OrientedPoints, TukeyStep, fit_centre
 from service.compute.surfaces.surfels import Surfels, grid_keys, summed
 from service.core.geometry import Array
 
@@ -88,7 +88,9 @@ def rough_centre(patches: Surfels, tree: cKDTree, start: Array, radius: float, m
         return max(_BAND * radius, 0.7 * half_width)
 
     first = Band(0.3 * radius, _MIN_COSINE, _MIN_SURFELS)
-    fitted = fit_centre(Surface(points, normals, area), start, radius, first, narrowed, reach=radius, most=_STEPS)
+    fitted = fit_centre(
+        OrientedPoints(points, normals, area), start, radius, first, narrowed, reach=radius, most=_STEPS
+    )
     if fitted is None:
         return None
     centre, band, at = fitted.centre, fitted.half_width, fitted.last

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.surfaces.spheres.tukey import Band, Surface, TukeyStep, fit_centre
+from service.compute.surfaces.spheres.tukey import Band, OrientedPoints, TukeyStep, fit_centre
 from service.compute.surfaces.surfels import summed
 from service.core.geometry import Array
 
@@ -103,7 +103,7 @@ def fit_sphere(samples: Samples, start: Array, radius: float, band: float) -> Sp
             return None
         return float(np.clip(target, 0.6 * half_width, half_width))
 
-    surface, first = Surface(points, samples.normals, area), Band(band, _MIN_COSINE, MIN_SAMPLES)
+    surface, first = OrientedPoints(points, samples.normals, area), Band(band, _MIN_COSINE, MIN_SAMPLES)
     fitted = fit_centre(surface, start, radius, first, narrowed, reach=0.5 * radius, most=_STEPS)
     if fitted is None:
         return None

@@ -52,8 +52,8 @@ class TukeyStep:
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
-    """Samples of a surface.
+class OrientedPoints:
+    """Samples of a surface with their normals.
 
     Attributes:
         points: (N, 3), m.
@@ -76,7 +76,7 @@ class CentreFit:
 
 
 def fit_centre(
-    surface: Surface,
+    surface: OrientedPoints,
     start: Array,
     radius: float,
     band: Band,
@@ -113,7 +113,7 @@ def fit_centre(
     return None
 
 
-def _step(surface: Surface, centre: Array, radius: float, band: Band) -> TukeyStep | None:
+def _step(surface: OrientedPoints, centre: Array, radius: float, band: Band) -> TukeyStep | None:
     """Weighted Gauss–Newton step of the centre; None if too few samples lie in the band, or in too flat a cap."""
     ray = surface.points - centre
     distance = np.linalg.norm(ray, axis=1)
