@@ -7,9 +7,10 @@ import math
 import struct
 from typing import Any
 
+from service.compute.poses.files.pose_files import OPENGL
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder
-from service.dataset.posed.records import OPENGL, DataSet, View
+from service.dataset.posed.records import DataSet, View
 
 _FLOAT, _UNSIGNED = 5126, 5125  # component types
 _VERTICES, _INDICES = 34962, 34963  # targets of buffer views

@@ -16,9 +16,6 @@ from service.compute.pixels.splits import Splits
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # T_camera_openglcamera: x right, y up, z backward
-HALF_PIXEL = 0.5  # in formats whose first pixel has its corner, not its centre, at 0
-
 
 @dataclass(frozen=True, slots=True)
 class View:

@@ -21,7 +21,8 @@ from service.core.text.file_text import csv_rows
 
 _HEADER = ("image", "x", "y", "z", "qx", "qy", "qz", "qw")
 _UNIT = 1e-3  # tolerance of a quaternion's length from 1, so that files with four decimals pass
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # T_camera_openglcamera: x right, y up, z backward
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # T_camera_openglcamera: x right, y up, z backward
+HALF_PIXEL = 0.5  # in formats whose first pixel has its corner, not its centre, at 0
 
 
 def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Transform]:
@@ -183,7 +184,7 @@ def read_transforms_json(path: Path) -> dict[str, Transform]:
             raise DataError(f"transform_matrix is {matrix.shape}, not 4 × 4", where=where, remedy="correct the frame")
         if name in poses:
             raise DataError(f"image {name} has two poses", where=where, remedy="remove one of them")
-        poses[name] = transform(_rotation(matrix[:3, :3], where), matrix[:3, 3]) @ _OPENGL
+        poses[name] = transform(_rotation(matrix[:3, :3], where), matrix[:3, 3]) @ OPENGL
     return poses
 
 
@@ -205,31 +206,37 @@ def write_transforms_json(path: Path, camera: CameraModel, T_world_camera: Mappi
     Raises:
         DataError: the camera has rational distortion, which that format cannot hold.
     """
-    if camera.k4 or camera.k5 or camera.k6:
-        raise DataError(
-            "transforms.json cannot hold the rational distortion k4, k5, k6",
-            where=str(path),
-            remedy="calibrate with the model opencv4 or opencv5",
-        )
     document = {
         "camera_model": "OPENCV",
+        **transforms_intrinsics(camera, where=str(path), remedy="calibrate with the model opencv4 or opencv5"),
+        "frames": [
+            {"file_path": name, "transform_matrix": (T @ OPENGL).tolist()} for name, T in T_world_camera.items()
+        ],
+    }
+    path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+
+
+def transforms_intrinsics(camera: CameraModel, *, where: str = "", remedy: str) -> dict[str, float]:
+    """The keys of one camera in transforms.json; nerfstudio, like COLMAP, has the first pixel's corner at 0.
+
+    Raises:
+        DataError: the camera has the rational distortion k4, k5, k6, which the format cannot hold.
+    """
+    if camera.k4 or camera.k5 or camera.k6:
+        raise DataError("transforms.json cannot hold the rational distortion k4, k5, k6", where=where, remedy=remedy)
+    return {
         "w": camera.width,
         "h": camera.height,
         "fl_x": camera.fx,
         "fl_y": camera.fy,
-        # nerfstudio, like COLMAP, has the first pixel's corner at 0
-        "cx": camera.cx + 0.5,
-        "cy": camera.cy + 0.5,
+        "cx": camera.cx + HALF_PIXEL,
+        "cy": camera.cy + HALF_PIXEL,
         "k1": camera.k1,
         "k2": camera.k2,
         "p1": camera.p1,
         "p2": camera.p2,
         **({"k3": camera.k3} if camera.k3 else {}),
-        "frames": [
-            {"file_path": name, "transform_matrix": (T @ _OPENGL).tolist()} for name, T in T_world_camera.items()
-        ],
     }
-    path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
 
 
 # --- COLMAP ---------------------------------------------------------------------------------------------

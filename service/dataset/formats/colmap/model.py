@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
+from service.compute.poses.files.pose_files import HALF_PIXEL
 from service.core.geometry import Array, Transform, inverse
 from service.dataset.posed.folder import ExportFolder
-from service.dataset.posed.records import HALF_PIXEL, DataSet, View
+from service.dataset.posed.records import DataSet, View
 
 _MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4, "FULL_OPENCV": 6}
 README = """COLMAP model. {mark}

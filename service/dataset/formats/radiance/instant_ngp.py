@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from service.compute.poses.files.pose_files import OPENGL, transforms_intrinsics
 from service.core.errors import DataError
 from service.dataset.formats.colmap.model import write_images
-from service.dataset.formats.radiance.nerfstudio import intrinsics
+from service.dataset.formats.radiance.nerfstudio import PINHOLE_REMEDY
 from service.dataset.formats.radiance.unit_box import unit_box
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder
-from service.dataset.posed.records import OPENGL, DataSet, only_camera
+from service.dataset.posed.records import DataSet, only_camera
 
 
 def write(dataset: DataSet, folder: ExportFolder) -> None:
@@ -27,7 +28,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
         "transforms.json",
         {
             "simulated": dataset.simulated,
-            **intrinsics(camera),
+            **transforms_intrinsics(camera, remedy=PINHOLE_REMEDY),
             "aabb_scale": 1,
             "scale": box.scale,
             "offset": [0.5, 0.5, 0.5],

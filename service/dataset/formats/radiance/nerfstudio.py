@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.compute.camera_model import CameraModel
 from service.compute.pixels.coding import DEPTH_UNIT_MM, coded_depth
-from service.core.errors import DataError
+from service.compute.poses.files.pose_files import OPENGL, transforms_intrinsics
 from service.core.units import metres
 from service.dataset.formats.colmap.model import write_images
 from service.dataset.formats.meshes import mask_png, png
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder
-from service.dataset.posed.records import HALF_PIXEL, OPENGL, DataSet
+from service.dataset.posed.records import DataSet
+
+PINHOLE_REMEDY = "Choose a format with undistorted images"
 
 
 def write(dataset: DataSet, folder: ExportFolder) -> None:
@@ -30,7 +31,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
             "file_path": f"images/{view.file}",
             "depth_file_path": f"depth/{view.name}.png",
             "mask_path": f"masks/{view.name}.png",
-            **intrinsics(view.camera),
+            **transforms_intrinsics(view.camera, remedy=PINHOLE_REMEDY),
             "transform_matrix": (view.T_world_camera @ OPENGL).tolist(),
             "covariance": view.covariance.tolist(),
         }
@@ -54,32 +55,6 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
             f"masks/{view.name}.png",
             lambda view=view: mask_png(dataset.pixels.valid(view) & ~dataset.pixels.markers(view)),
         )
-
-
-def intrinsics(camera: CameraModel) -> dict[str, float]:
-    """Of one camera, whose first pixel has its corner at 0.
-
-    Raises:
-        DataError: the camera has the rational distortion k4, k5, k6.
-    """
-    if camera.k4 or camera.k5 or camera.k6:
-        raise DataError(
-            "transforms.json cannot hold the rational distortion k4, k5, k6",
-            remedy="Choose a format with undistorted images",
-        )
-    return {
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx + HALF_PIXEL,
-        "cy": camera.cy + HALF_PIXEL,
-        "k1": camera.k1,
-        "k2": camera.k2,
-        **({"k3": camera.k3} if camera.k3 else {}),
-        "p1": camera.p1,
-        "p2": camera.p2,
-    }
 
 
 KIND = Exporter("nerfstudio", "nerfstudio's transforms.json, with depth and masks", write)

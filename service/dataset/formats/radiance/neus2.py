@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from service.compute.poses.files.pose_files import HALF_PIXEL
 from service.dataset.formats.meshes import png
 from service.dataset.formats.radiance.unit_box import unit_box
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder
-from service.dataset.posed.records import HALF_PIXEL, DataSet, View, only_camera
+from service.dataset.posed.records import DataSet, View, only_camera
 
 
 def write(dataset: DataSet, folder: ExportFolder) -> None:
