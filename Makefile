@@ -93,8 +93,9 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m compileall -qq -j 0 -x '/include/' .venv/lib service drivers simulators
 	touch $(READY)
 
+# jsonpath-rw, which mlcroissant needs, is published as a source archive alone: plain Python, built with our setuptools.
 $(TOOLS): $(READY) constraints-dev.txt
-	$(PIP) --no-compile --only-binary :all: --require-hashes -r constraints-dev.txt
+	$(PIP) --no-compile --only-binary :all: --no-binary jsonpath-rw --no-build-isolation --require-hashes -r constraints-dev.txt
 	$(BIN)/python -m compileall -qq -j 0 -x '/include/' .venv/lib
 	touch $(TOOLS)
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from drivers.interfaces import RobotSample, SettleCriteria
 from service.core.geometry import Transform, transform
@@ -38,6 +37,8 @@ class PoseSpread:
 
 def pose_spread(samples: Sequence[RobotSample]) -> PoseSpread:
     """Compute the mean and the spread of the flange poses of at least one sample."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - half a second, which most commands do without
+
     T = np.stack([s.T_base_flange for s in samples])
     positions = T[:, :3, 3]
     rotations = Rotation.from_matrix(T[:, :3, :3])

@@ -34,7 +34,8 @@ from service.compute.planning.motion_plan import able_postures
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.protocol.models import Motion
 from service.rig import CollisionSection, LensSection
-from service.steps.board.plan import START, BoardPoses, PlannedBoard, Planner, Why, nominal_board, nominal_camera
+from service.steps.board.plan import START, PlannedBoard, Planner, Why, nominal_board, nominal_camera
+from service.steps.board.poses import BoardPoses
 from service.steps.capture.plan.planning import ArmAtStation, known_arm, usual_posture
 from service.steps.context import StationLayout
 from simulators.scene.world import SCENE_CENTRE_M, Scene, nominal_hand_eye

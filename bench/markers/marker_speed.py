@@ -51,7 +51,7 @@ def measure(folder: Path, most: int) -> dict[str, object]:
     camera = read_camera_json(folder / "camera.json")
     truth = json.loads((folder / "truth.json").read_text())
     known = read_spheres_json(folder / "spheres.json")
-    centres = np.vstack([known.registration_m, known.control_m])
+    centres = np.vstack([known.centres_m, known.control_m])
     files = sorted((folder / "images").glob("*.jpg"))[:most]
     names = [file.name for file in files]
     T_scan_world = inverse(np.array(truth["T_world_scan"]))

@@ -30,6 +30,7 @@ from tests.support.runs.attended import attended
 FOLDER = REPOSITORY / "docs" / "screens"
 PEOPLE: tuple[tuple[str, Role], ...] = (("tina", "technician"), ("sam", "supervisor"), ("otto", "auditor"))
 LIMIT_BYTES, QUALITY = 90_000, 80
+PENDING_TRIES = 600  # half a second each: a data set's pictures take a while
 STANDING = {
     "robot": "standing", "robot_name": "robot", "speed_fraction": 0.25, "camera_battery_fraction": 0.82,
     "light_lux": 812.0, "temperature_c": 21.4, "disk_free_bytes": 412_000_000_000,
@@ -54,6 +55,11 @@ SHOTS: tuple[tuple[str, str, str, str], ...] = (
     ("scene", "otto", "/runs/RUN_DONE/scene", "cameras, spheres, mesh and stations in one frame"),
     ("calibration", "otto", "/runs/RUN_DONE/calibration", "coverage, residuals and uncertainty of the calibration"),
     ("certificate", "otto", "/runs/RUN_DONE/calibration/certificate", "the certificate of a calibration"),
+    ("data-set", "otto", "/runs/RUN_DONE/dataset", "photograph and depth of a view of the data set"),
+    ("data-set-views", "otto", "/runs/RUN_DONE/dataset?split=sparse#views", "the views of a split, and their crops"),
+    ("data-set-coverage", "otto", "/runs/RUN_DONE/dataset#coverage", "how many views see each place of the surface"),
+    ("data-set-distances", "otto", "/runs/RUN_DONE/dataset#distances", "how far the CT is from the scan"),
+    ("exports-formats", "sam", "/runs/RUN_DONE/exports#format-title", "export of the data set in a format"),
     ("exports", "sam", "/runs/RUN_DONE/exports", "release by a second person, and what leaves the system"),
     ("compare", "sam", "/compare?run=RUN_DONE&run=RUN_WORK", "two runs side by side"),
     ("history", "sam", "/history", "calibration and accuracy over time"),
@@ -216,12 +222,16 @@ def prepare(shot: Screen, path: str) -> None:
         page.wait_for_timeout(2500)
     page.evaluate("scrollTo(0, 0)")
     pending = page.locator("[data-pending]")
-    for _ in range(20):
+    for _ in range(PENDING_TRIES):
         if pending.count() == 0:
             break
         page.wait_for_timeout(500)
         page.reload()
     page.wait_for_timeout(400)
+    part = path.partition("#")[2]
+    if part and part != "lock":
+        page.locator(f"#{part}").evaluate("e => e.scrollIntoView({ block: 'start', behavior: 'instant' })")
+        page.wait_for_timeout(3000)  # for the surfaces in its frames
     if path.endswith("#lock"):
         page.get_by_role("button", name="Lock").click()
         page.wait_for_timeout(300)

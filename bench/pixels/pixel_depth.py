@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from bench.machine import commit, machine
 from service.compute.camera_model import CameraModel
+from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.rays import pixel_rays
 from service.compute.pixels.render import seen, seen_rows
-from service.compute.pixels.surface import Surface
 from service.core.geometry import Array, Transform, look_at
 
 RESULTS = Path(__file__).parents[1] / "results"
@@ -53,7 +53,7 @@ def main() -> None:
     options = parser.parse_args()
     vertices, faces = relief(options.side)
     T = look_at(np.array([0.05, -0.1, 0.62]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
-    surface = Surface(vertices, faces)
+    surface = RayMesh(vertices, faces)
     scene = EmbreeScene()
     TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
     rows = {
@@ -65,7 +65,7 @@ def main() -> None:
     report(options, len(faces), rows, peak_gib)
 
 
-def speed(scene: Any, surface: Surface, camera: CameraModel, T: Transform, most: int) -> dict[str, float]:
+def speed(scene: Any, surface: RayMesh, camera: CameraModel, T: Transform, most: int) -> dict[str, float]:
     """Millions of rays per CPU second: embreex alone, and depth with normals, tile by tile in turn."""
     spent = dict.fromkeys(("raw", "raw_all_outputs", "ours"), 0.0)
     rays, count = pixel_rays(camera), 0
@@ -92,7 +92,7 @@ def speed(scene: Any, surface: Surface, camera: CameraModel, T: Transform, most:
     return {name: count / seconds / 1e6 for name, seconds in spent.items()} | {"rays": count}
 
 
-def whole_image_gib(surface: Surface, T: Transform) -> float:
+def whole_image_gib(surface: RayMesh, T: Transform) -> float:
     """Peak memory of this process after a whole image of depth and normals."""
     seen(surface, DISTORTED, T)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

@@ -25,7 +25,7 @@ from service.compute.evaluation.accuracy import true_error_m
 from service.compute.markers.search.image_files import detect_all
 from service.compute.pipeline import register_images
 from service.compute.poses.hybrid.estimate import hybrid_poses
-from service.compute.poses.sfm.estimate import SfmModel, reconstruct
+from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
 from service.compute.poses.sfm.options import Effort, Mapper, options_for
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, align_points, apply, inverse
@@ -65,12 +65,10 @@ def measure(capture: Capture, effort: Effort, workspace: Path) -> dict[str, dict
         before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
         models[source] = reconstruct(
             dict(zip(capture.names, capture.files, strict=True)),
-            capture.camera,
-            workspace,
+            SfmWorkspace(workspace, capture.camera, options),
             mapper,
             # The registered robot poses only select image pairs and initialise the triangulation.
             T_world_camera_prior=dict(zip(capture.names, solved.T_scan_camera, strict=True)),
-            options=options,
         )
         spent = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
         rows[source] = _timed(lambda m=models[source]: _from_model(capture, m, outlines, truth))

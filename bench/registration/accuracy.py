@@ -28,7 +28,7 @@ from service.compute.pipeline import PipelineResult, detect_all, register_images
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
 from service.compute.poses.files.pose_files import read_poses_csv
 from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
-from service.compute.poses.sfm.estimate import SfmModel, reconstruct
+from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
 from service.compute.poses.sfm.options import Effort, Mapper, options_for
 from service.compute.registration.cost import residuals
 from service.compute.registration.joint_poses import with_joint_pose_covariance
@@ -77,7 +77,7 @@ def read_capture(seed: int, folder: Path) -> Capture:
     scan = read_mesh_file(folder / "scan.ply", "mm")
     located = locate_spheres(scan.mesh.vertices_m, scan.mesh.faces, spheres.radius_m)
     found = np.array([s.centre_m for s in located])
-    chosen = _nearest(found, spheres.registration_m)
+    chosen = _nearest(found, spheres.centres_m)
     return Capture(
         seed=seed,
         folder=folder,
@@ -88,7 +88,7 @@ def read_capture(seed: int, folder: Path) -> Capture:
         stations=[order.index(station[file.name]) for file in files],
         registration_m=found[chosen],
         control_m=found[_nearest(found, spheres.control_m)],
-        true_registration_m=spheres.registration_m,
+        true_registration_m=spheres.centres_m,
         true_control_m=spheres.control_m,
         radius_m=spheres.radius_m,
         covariance_m2=np.array([located[k].covariance for k in chosen]),
@@ -112,7 +112,7 @@ class Reconstructions:
             prior = dict(zip(c.names, c.T_world_camera, strict=True))  # only selects which images are matched
             options = options_for(self._effort, c.camera)
             self._made[mapper] = reconstruct(
-                files, c.camera, self._folder, mapper, T_world_camera_prior=prior, options=options
+                files, SfmWorkspace(self._folder, c.camera, options), mapper, T_world_camera_prior=prior
             )
         return self._made[mapper]
 

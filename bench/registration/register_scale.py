@@ -66,14 +66,14 @@ def locate_and_register(folder: Path, count: int, workers: int) -> dict[str, obj
         located = locate_outlines(
             files,
             PosedImages(T_world_camera, camera),
-            ScanSpheres(known.registration_m, known.radius_m, control_m=known.control_m),
+            ScanSpheres(known.centres_m, known.radius_m, control_m=known.control_m),
             workers=workers,
         )
         middle = time.perf_counter()
         solved = register_images(
             located.outlines,
             PosedImages(T_world_camera, camera),
-            ScanSpheres(known.registration_m, known.radius_m, control_m=known.control_m),
+            ScanSpheres(known.centres_m, known.radius_m, control_m=known.control_m),
             assignments=located.assignments,
         )
         end = time.perf_counter()
@@ -96,7 +96,7 @@ def solve_only(folder: Path, count: int) -> dict[str, object]:
     poses = read_poses(folder / "poses.csv", [file.name for file in files])
     T_world_camera = np.array([poses[file.name] for file in files])
     located = locate_outlines(
-        files, PosedImages(T_world_camera, camera), ScanSpheres(known.registration_m, known.radius_m), workers=2
+        files, PosedImages(T_world_camera, camera), ScanSpheres(known.centres_m, known.radius_m), workers=2
     )
     assert located.assignments is not None
     pick = [i % len(files) for i in range(count)]
@@ -110,7 +110,7 @@ def solve_only(folder: Path, count: int) -> dict[str, object]:
     for label, given in (("propagated", assignments), ("identified", None)):
         begin = time.process_time()
         register_images(
-            outlines, PosedImages(many, camera), ScanSpheres(known.registration_m, known.radius_m), assignments=given
+            outlines, PosedImages(many, camera), ScanSpheres(known.centres_m, known.radius_m), assignments=given
         )
         timed[f"{label}_cpu_s"] = time.process_time() - begin
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

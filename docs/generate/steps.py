@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel
 
 from docs.generate.fields import docstring, field_table, record_sections, records_below
 from service.core.protocol.models import Protocol, Step
+from service.jobs import job_kinds
 from service.steps import step_kinds
 from service.steps.context import StepKind
 from service.steps.measures import Measure, RegistrationMeasures
@@ -53,8 +54,14 @@ def steps_text(protocols: Mapping[str, Protocol]) -> str:
 
 
 def _result_table(kind: StepKind[Any]) -> list[str]:
-    """The table of a result; the records in it are those of jobs, and described there."""
-    return [line.replace("](#", "](jobs.md#") for line in field_table(kind.result)]
+    """The table of a result; the records in it are those of jobs, and described there.
+
+    A job's whole answer is described under the name of its kind.
+    """
+    held = [get_args(field.annotation) or (field.annotation,) for field in kind.result.model_fields.values()]
+    jobs = [name for name, job in job_kinds().items() if any(job.answer in records for records in held)]
+    lines = [line.replace("](#", "](jobs.md#") for line in field_table(kind.result)]
+    return [line.replace("jobs.md#answer", f"jobs.md#{jobs[0]}") for line in lines] if jobs else lines
 
 
 def _unique_headings(text: str) -> str:

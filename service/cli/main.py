@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib.metadata import version
 from typing import Annotated, Any
@@ -12,35 +13,111 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-# Imported on demand, so that `status` need not load the numerics that `register` needs.
+
+@dataclass(frozen=True, slots=True)
+class _Command:
+    """Where a command is, and its line in the list of commands: the first paragraph of its own help."""
+
+    place: str
+    line: str
+
+
+# Imported on demand: `status` need not load the numerics that `register` needs, and `--help` none of them.
 _COMMANDS = {
-    "demo": "service.cli.run.demo:demo_command",
-    "serve": "service.cli.site.serve:serve_command",
-    "run": "service.cli.run.commands:run_command",
-    "resume": "service.cli.run.commands:resume_command",
-    "import": "service.cli.run.import_command:import_command",
-    "act": "service.cli.run.act:act_command",
-    "note": "service.cli.run.act:note_command",
-    "status": "service.cli.run.commands:status_command",
-    "runs": "service.cli.evidence.runs:runs_command",
-    "compare": "service.cli.evidence.runs:compare_command",
-    "history": "service.cli.evidence.runs:history_command",
-    "worker": "service.cli.site.worker:worker_command",
-    "doctor": "service.cli.site.doctor:doctor_command",
-    "calibrate": "service.cli.compute.calibrate:calibrate_app",
-    "sfm": "service.cli.compute.sfm:sfm_command",
-    "register": "service.cli.compute.register:register_command",
-    "spheres": "service.cli.compute.spheres:spheres_command",
-    "layout": "service.cli.compute.layout:layout_command",
-    "fuse": "service.cli.compute.fuse:fuse_command",
-    "evaluate": "service.cli.compute.evaluate:evaluate_app",
-    "simulate": "service.cli.site.simulate:simulate_command",
-    "audit": "service.cli.evidence.audit:audit_app",
-    "store": "service.cli.evidence.store:store_app",
-    "replay": "service.cli.evidence.replay:replay_command",
-    "export": "service.cli.evidence.export:export_command",
-    "protocol": "service.cli.site.protocol:protocol_app",
-    "plan": "service.cli.site.plan:plan_app",
+    "demo": _Command(
+        "service.cli.run.demo:demo_command",
+        "Run the demonstration protocol on a simulated rig and show the results. Takes a few minutes.",
+    ),
+    "serve": _Command(
+        "service.cli.site.serve:serve_command",
+        "Serve the guided screen and the audit. Runs continue when this command ends; stop them on the screen.",
+    ),
+    "run": _Command(
+        "service.cli.run.commands:run_command",
+        "Run a protocol step by step. Nothing moves before you have confirmed it.",
+    ),
+    "resume": _Command(
+        "service.cli.run.commands:resume_command",
+        "Continue a run after a crash, a power failure or a pause; nothing captured is lost or taken twice.",
+    ),
+    "import": _Command(
+        "service.cli.run.import_command:import_command",
+        "Import photographs, scan and CT that were captured earlier; register and evaluate them as a run.",
+    ),
+    "act": _Command(
+        "service.cli.run.act:act_command",
+        "Answer or stop a run that another terminal drives. A confirmation ticks the whole checklist.",
+    ),
+    "note": _Command(
+        "service.cli.run.act:note_command",
+        "Write a note on a step of a run, with or without a photograph. It is recorded and has no other effect.",
+    ),
+    "status": _Command("service.cli.run.status:status_command", "Show the state of a run: steps, gates, deviations."),
+    "runs": _Command(
+        "service.cli.evidence.runs:runs_command", "List the recorded runs, newest first: all, or those that match."
+    ),
+    "compare": _Command(
+        "service.cli.evidence.runs:compare_command",
+        "Compare two runs: protocol, gates, figures, accuracy, calibration, durations, deviations.",
+    ),
+    "history": _Command(
+        "service.cli.evidence.runs:history_command",
+        "Print calibration and accuracy over time for each camera, lens and arm, as CSV.",
+    ),
+    "worker": _Command(
+        "service.cli.site.worker:worker_command",
+        "Compute jobs: calibration, spheres, structure from motion, registration; one job per core at once.",
+    ),
+    "doctor": _Command(
+        "service.cli.site.doctor:doctor_command",
+        "Open every device of a rig; report versions, clock offsets, free space and problems.",
+    ),
+    "calibrate": _Command(
+        "service.cli.compute.calibrate:calibrate_app", "Calibrate a camera and its mounting from images of a board."
+    ),
+    "sfm": _Command(
+        "service.cli.compute.sfm:sfm_command",
+        "Estimate camera poses with fixed, calibrated intrinsics; use the model with register --estimate-scale.",
+    ),
+    "register": _Command(
+        "service.cli.compute.register:register_command",
+        "Register posed images with a scan by the spheres visible in both, and report the accuracy.",
+    ),
+    "spheres": _Command(
+        "service.cli.compute.spheres:spheres_command",
+        "Find every sphere of a given radius in a mesh or point cloud, with its covariance and fit.",
+    ),
+    "layout": _Command(
+        "service.cli.compute.layout:layout_command",
+        "Check how well the spheres can be told apart, and suggest which to move. Exit status 1: some must be moved.",
+    ),
+    "fuse": _Command(
+        "service.cli.compute.fuse:fuse_command",
+        "Fuse a CT mesh and a scan: the CT in the wound, the scan outside, blended between.",
+    ),
+    "evaluate": _Command(
+        "service.cli.compute.evaluate:evaluate_app", "Compare a reconstructed surface with the ground truth."
+    ),
+    "benchmark": _Command("service.cli.benchmark.group:benchmark_app", "Compare methods on an exported data set."),
+    "simulate": _Command(
+        "service.cli.site.simulate:simulate_command",
+        "Start a simulated device (ur, camera, scanner, ct, lightbox) or a whole rig, until it is terminated.",
+    ),
+    "audit": _Command(
+        "service.cli.evidence.audit:audit_app",
+        "Show, verify, sign, report and export the recorded evidence of a run.",
+    ),
+    "store": _Command("service.cli.evidence.store:store_app", "Maintain the folder that holds the evidence."),
+    "replay": _Command(
+        "service.cli.evidence.replay:replay_command",
+        "Compute calibration, registration and evaluation again from the recorded files, and compare.",
+    ),
+    "export": _Command(
+        "service.cli.evidence.export:export_command",
+        "Write the data set of a completed run in a format that others read: images, poses, depth, masks, mesh.",
+    ),
+    "protocol": _Command("service.cli.site.protocol:protocol_app", "Check a protocol file before it is used."),
+    "plan": _Command("service.cli.site.plan:plan_app", "Plan viewpoints, before and during a capture."),
 }
 _SETTINGS: dict[str, dict[str, Any]] = {
     "simulate": {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
@@ -55,11 +132,11 @@ class _Commands(TyperGroup):
         return list(_COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """The command of this name, or None."""
-        if cmd_name not in _COMMANDS:
-            return None
-        # Shell completion asks for names at every key press, and importing every command would take seconds.
-        return TyperCommand(cmd_name, callback=None) if ctx.resilient_parsing else _loaded(cmd_name)
+        """The name and the line of a command, for help and shell completion; None if there is no such command.
+
+        Importing every command would take seconds. The one that was typed comes from `resolve_command`.
+        """
+        return TyperCommand(cmd_name, help=_COMMANDS[cmd_name].line) if cmd_name in _COMMANDS else None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that was typed, imported; suggests a similar name if there is no such command."""
@@ -73,7 +150,7 @@ class _Commands(TyperGroup):
 
 
 def _loaded(name: str) -> Any:
-    module, _, attribute = _COMMANDS[name].partition(":")
+    module, _, attribute = _COMMANDS[name].place.partition(":")
     found = getattr(importlib.import_module(module), attribute)
     if isinstance(found, typer.Typer):
         group = typer.main.get_group(found)

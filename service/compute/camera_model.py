@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from service.core.geometry import Array
@@ -71,6 +70,8 @@ class CameraModel:
 
     def normalise(self, pixels: Array) -> Array:
         """Undistorted normalised coordinates (N, 2), at z = 1, of distorted pixels (N, 2)."""
+        import cv2  # noqa: PLC0415 - reading a record of a camera does not need it
+
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-12)
         points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         out = cv2.undistortPointsIter(points, self.matrix, self.distortion, np.eye(3), np.eye(3), criteria)

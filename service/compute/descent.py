@@ -1,4 +1,4 @@
-"""The loops of nonlinear least squares: Gauss–Newton and Levenberg–Marquardt.
+"""The loops of nonlinear least squares: Gauss–Newton, plain or with halved steps, and Levenberg–Marquardt.
 
 The problems differ in their weights and in what they eliminate, but share the loop.
 Source: Nocedal and Wright, Numerical Optimization, 10.3.
@@ -6,6 +6,7 @@ Source: Nocedal and Wright, Numerical Optimization, 10.3.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -29,7 +30,7 @@ def gauss_newton(
     *,
     most: int,
     settled: float,
-    size: Callable[[Array], float] = largest,
+    size: Callable[[StateT, Array], float] = lambda _state, step: largest(step),
 ) -> StateT:
     """Gauss–Newton: stop after a step smaller than `settled`, or after `most` steps, and return the state.
 
@@ -39,13 +40,13 @@ def gauss_newton(
         moved: the state after a step.
         most: largest number of steps.
         settled: size of a step at convergence, in the unit of `size`.
-        size: norm of a step.
+        size: norm of a step from a state; its largest coordinate by default.
     """
     state = start
     for _ in range(most):
         step = step_at(state)
-        state = moved(state, step)
-        if size(step) < settled:
+        before, state = state, moved(state, step)
+        if size(before, step) < settled:
             break
     return state
 
@@ -61,6 +62,9 @@ class Damping:
     most: float = 1e6  # above it, no step helps
 
 
+_HALVING = Damping(1.0, down=math.inf, up=2.0, least=1.0, most=1024.0)  # of the divisor of a step
+
+
 @dataclass(frozen=True, slots=True)
 class Descent(Generic[StateT]):
     """Result of a descent.
@@ -68,11 +72,13 @@ class Descent(Generic[StateT]):
     Attributes:
         state: the best state found.
         steps: number of steps tried.
+        settled: whether a step settled, before the steps ran out or none helped any more.
         stuck: whether the damping exceeded its limit, because no step helped any more.
     """
 
     state: StateT
     steps: int
+    settled: bool
     stuck: bool
 
 
@@ -104,11 +110,36 @@ def levenberg_marquardt(
         if taken:
             state, value = candidate, max(value / damping.down, damping.least)
         if last:
-            return Descent(state, step, stuck=False)
+            return Descent(state, step, settled=True, stuck=False)
         if taken:
             state = state if renewed is None else renewed(state)
         else:
             value *= damping.up
             if value > damping.most:
-                return Descent(state, step, stuck=True)
-    return Descent(state, most, stuck=False)
+                return Descent(state, step, settled=False, stuck=True)
+    return Descent(state, most, settled=False, stuck=False)
+
+
+def halved_gauss_newton(
+    start: StateT,
+    candidate_of: Callable[[StateT, float], StateT],
+    gain_of: Callable[[StateT, StateT], float],
+    settles: Callable[[StateT, StateT], bool],
+    *,
+    most: int,
+) -> Descent[StateT]:
+    """Gauss–Newton that halves a step, down to a thousandth, as long as it would increase the cost.
+
+    It is `levenberg_marquardt` with the step's divisor in place of the damping. Where some unknowns are eliminated
+    with a covariance of their own, damping would not shorten all in proportion.
+
+    Args:
+        start: initial state, with its cost and its Gauss–Newton step.
+        candidate_of: the same after a share (0 … 1] of a state's step.
+        gain_of: as for `levenberg_marquardt`.
+        settles: as for `levenberg_marquardt`.
+        most: largest number of steps tried.
+    """
+    return levenberg_marquardt(
+        start, lambda here, divisor: candidate_of(here, 1 / divisor), gain_of, settles, damping=_HALVING, most=most
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Mapping
 from importlib.metadata import entry_points
 from typing import Protocol, TypeVar
 
@@ -46,3 +47,22 @@ def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
             raise ConfigurationError(f"two kinds are called {one.name!r}", where=f"entry points {group}")
         kinds[one.name] = one
     return kinds
+
+
+def kind_named(name: str, known: Mapping[str, K], *, what: str, option: str) -> K:
+    """The kind of this name.
+
+    Args:
+        name: as it was typed.
+        known: the kinds by name.
+        what: a kind in words, such as `format`.
+        option: of the command line, at which the name was given.
+
+    Raises:
+        ConfigurationError: there is none of this name.
+    """
+    if name not in known:
+        raise ConfigurationError(
+            f"there is no {what} {name!r}", where=option, remedy=f"Choose one of {', '.join(sorted(known))}"
+        )
+    return known[name]

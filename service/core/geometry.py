@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 Transform = Array  # (4, 4), last row 0 0 0 1
@@ -13,9 +17,16 @@ Transform = Array  # (4, 4), last row 0 0 0 1
 def transform(rotation: Array | Rotation, translation_m: Array) -> Transform:
     """Build T_a_b from the rotation of b's axes in a and the position of b's origin in a (3,)."""
     T = np.eye(4)
-    T[:3, :3] = rotation.as_matrix() if isinstance(rotation, Rotation) else rotation
+    T[:3, :3] = rotation if isinstance(rotation, np.ndarray) else rotation.as_matrix()
     T[:3, 3] = translation_m
     return T
+
+
+def _rotations() -> type[Rotation]:
+    """SciPy's rotations, imported on first use: half a second, which most commands do without."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    return Rotation
 
 
 def inverse(T_a_b: Transform) -> Transform:
@@ -31,17 +42,17 @@ def apply(T_a_b: Transform, points_b: Array) -> Array:
 
 def from_rotation_vector(pose: Array) -> Transform:
     """T_a_b from a Universal Robots pose: (6,) x, y, z in metres and rotation vector in radians."""
-    return transform(Rotation.from_rotvec(pose[3:]), pose[:3])
+    return transform(_rotations().from_rotvec(pose[3:]), pose[:3])
 
 
 def to_rotation_vector(T_a_b: Transform) -> Array:
     """The (6,) pose x, y, z in metres and rotation vector in radians of T_a_b."""
-    return np.concatenate([T_a_b[:3, 3], Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec()])
+    return np.concatenate([T_a_b[:3, 3], _rotations().from_matrix(T_a_b[:3, :3]).as_rotvec()])
 
 
 def from_quaternion(translation_m: Array, quaternion_xyzw: Array) -> Transform:
     """T_a_b from (3,) position and (4,) scalar-last quaternion."""
-    return transform(Rotation.from_quat(quaternion_xyzw), translation_m)
+    return transform(_rotations().from_quat(quaternion_xyzw), translation_m)
 
 
 def skew(v: Array) -> Array:
@@ -55,7 +66,7 @@ def skew(v: Array) -> Array:
 
 def increment(T: Transform, d: Array, w: Array) -> Transform:
     """exp(w) R, t + d: the project's pose perturbation, in the axes of the outer frame."""
-    return transform(Rotation.from_rotvec(w).as_matrix() @ T[:3, :3], T[:3, 3] + d)
+    return transform(_rotations().from_rotvec(w).as_matrix() @ T[:3, :3], T[:3, 3] + d)
 
 
 def place_jacobian(turned: Array) -> Array:
@@ -73,7 +84,7 @@ def look_at(eye: Array, target: Array, up: Array) -> Transform:
 
 def rotation_angle_rad(T: Transform) -> float:
     """Angle of the rotation part in radians, 0 to pi."""
-    return float(Rotation.from_matrix(T[:3, :3]).magnitude())
+    return float(_rotations().from_matrix(T[:3, :3]).magnitude())
 
 
 def align_points(a: Array, b: Array, *, with_scale: bool = False) -> tuple[Transform, float]:

@@ -24,7 +24,6 @@ class LateResult:
     step: str
     name: str  # of the registration
     text: str
-    after_release: bool
 
 
 def late_results(protocol: Protocol, state: RunState) -> list[LateResult]:
@@ -42,7 +41,7 @@ def late_results(protocol: Protocol, state: RunState) -> list[LateResult]:
             if name not in known:
                 known.add(name)
                 text = f"{name}: {arrived(job)}. {_changed(row, mine)}"
-                found.append(LateResult(job.ended_seq, job.ended_utc, step, name, text, job.late_s is not None))
+                found.append(LateResult(job.ended_seq, job.ended_utc, step, name, text))
     return sorted(found, key=lambda result: result.seq)
 
 

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from service.core.errors import IntegrityError
 from service.core.jobs.priorities import lane_of
 from service.core.protocol.models import Protocol
+from service.core.protocol.step_params import Gives
 from service.core.results.arrival import late_words
 from service.core.run.state import JobState, RunState
 from service.jobs.kind import JobRecord
@@ -26,13 +27,13 @@ from service.jobs.registration.register import Registration, Registrations
 _R = TypeVar("_R", bound=JobRecord)
 
 
-def last_result(protocol: Protocol, state: RunState, kind: str, record: type[_R]) -> _R | None:
-    """The result of the last step of a kind that has one, read as `record`; None if there is none.
+def last_result(protocol: Protocol, state: RunState, gives: Gives, record: type[_R]) -> _R | None:
+    """The result of the last step that gives this and has one, read as `record`; None if there is none.
 
     Raises:
         IntegrityError: the recorded result is not such a record.
     """
-    steps = (step.id for step in reversed(protocol.steps) if step.kind == kind)
+    steps = (step.id for step in reversed(protocol.steps) if step.gives == gives)
     last = next((step for step in steps if state.steps[step].result), None)
     return None if last is None else result_of_step(state, last, record)
 
@@ -56,9 +57,9 @@ def registration_name(record: Registration) -> str:
 
 def registrations(protocol: Protocol, state: RunState) -> dict[str, Registration]:
     """Every registration record by its name: those in the step's result, then those that arrived later."""
-    result = last_result(protocol, state, "registration", Registrations)
+    result = last_result(protocol, state, "registrations", Registrations)
     found = {} if result is None else dict(result.registrations)
-    for _, job in _finished(protocol, state, "registration", register.KIND.name) if found else ():
+    for _, job in _finished(protocol, state, "registrations", register.KIND.name) if found else ():
         answer = register.KIND.read_answer(job.result)
         found.setdefault(registration_name(answer), answer)
     return found
@@ -120,7 +121,7 @@ def _sizes(rows: Iterable[Row]) -> list[str]:
 
 def budgets(protocol: Protocol, state: RunState) -> dict[str, ErrorBudget]:
     """The error budget of each registration, by its name."""
-    result = last_result(protocol, state, "evaluation", evaluate.Answer)
+    result = last_result(protocol, state, "accuracy", evaluate.Answer)
     found = {} if result is None else result.budgets
     for _, job in later_evaluations(protocol, state):
         found = {**evaluate.KIND.read_answer(job.result).budgets, **found}
@@ -161,7 +162,7 @@ def better_later(protocol: Protocol, state: RunState) -> Row | None:
 
 def signed_rows(protocol: Protocol, state: RunState) -> list[Row]:
     """The rows of the table that the evaluation step made: those that were judged and signed."""
-    result = last_result(protocol, state, "evaluation", evaluate.Answer)
+    result = last_result(protocol, state, "accuracy", evaluate.Answer)
     return [] if result is None else list(result.table)
 
 
@@ -176,12 +177,12 @@ def _predicted_m2(record: Registration) -> float:
 
 def later_evaluations(protocol: Protocol, state: RunState) -> list[tuple[str, JobState]]:
     """(step, job) of every evaluation of a registration that arrived after the evaluation step's own."""
-    jobs = _finished(protocol, state, "evaluation", evaluate.KIND.name)
+    jobs = _finished(protocol, state, "accuracy", evaluate.KIND.name)
     return [(step, job) for step, job in jobs if lane_of(job.priority) == "background"]
 
 
-def _finished(protocol: Protocol, state: RunState, step_kind: str, job_kind: str) -> Iterator[tuple[str, JobState]]:
+def _finished(protocol: Protocol, state: RunState, gives: Gives, job_kind: str) -> Iterator[tuple[str, JobState]]:
     for step in protocol.steps:
-        if step.kind == step_kind:
+        if step.gives == gives:
             jobs = state.steps[step.id].jobs.values()
             yield from ((step.id, job) for job in jobs if job.kind == job_kind and job.status == "finished")

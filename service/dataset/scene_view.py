@@ -37,6 +37,15 @@ class SceneSphere:
 
 
 @dataclass(frozen=True, slots=True)
+class MeshColours:
+    """What a surface is coloured by: `values` (V,), what they are, and plotly's template of the text at a vertex."""
+
+    values: Array = field(repr=False)
+    title: str
+    hover: str
+
+
+@dataclass(frozen=True, slots=True)
 class SceneMesh:
     """A surface decimated for display.
 
@@ -44,11 +53,20 @@ class SceneMesh:
         points_m: (V, 3).
         triangles: (F, 3).
         error_mm: (V,) predicted target registration error; None if unknown.
+        colours: something else to colour it by.
     """
 
     points_m: Array = field(repr=False)
     triangles: NDArray[np.int64] = field(repr=False)
     error_mm: Array | None = field(default=None, repr=False)
+    colours: MeshColours | None = None
+
+    @property
+    def coloured_by(self) -> MeshColours | None:
+        """Its colours; None for one colour."""
+        if self.colours is not None or self.error_mm is None:
+            return self.colours
+        return MeshColours(self.error_mm, "predicted error (mm)", "%{intensity:.4f} mm")
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,13 +186,14 @@ def _mesh(points: Array, mesh: SceneMesh) -> dict[str, object]:
         **{axis: _packed(mesh.triangles[:, k]) for k, axis in enumerate("ijk")},
         "lighting": {"ambient": 0.55, "diffuse": 0.8, "specular": 0.05},
     }
-    if mesh.error_mm is None:
+    colours = mesh.coloured_by
+    if colours is None:
         return trace | {"color": "#c9a58f", "hoverinfo": "skip"}
     return trace | {
-        "intensity": _packed(mesh.error_mm.astype(np.float32)),
+        "intensity": _packed(colours.values.astype(np.float32)),
         "colorscale": "Viridis",
-        "colorbar": {"title": {"text": "predicted error (mm)", "side": "right"}, "len": 0.6, "thickness": 14, "x": 1},
-        "hovertemplate": "%{intensity:.4f} mm<extra></extra>",
+        "colorbar": {"title": {"text": colours.title, "side": "right"}, "len": 0.6, "thickness": 14, "x": 1},
+        "hovertemplate": f"{colours.hover}<extra></extra>",
     }
 
 

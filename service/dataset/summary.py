@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from typing import Protocol as Interface
 
 import numpy as np
+from numpy.typing import NDArray
 
+from service.compute.ground_truth.ply import read_ply
+from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.protocol.models import Protocol
 from service.core.records.events import ArtefactRef, Event, JobFinished, RunStarted, View
 from service.core.run.fold import fold
 from service.core.run.state import RunState
+from service.core.units import metres
+from service.dataset.registered_scan import registered_scan
 from service.dataset.registrations import (
     better_later,
     budgets,
     evaluated,
-    last_result,
     own_registration,
     registrations,
+    result_of_step,
 )
 from service.jobs.records import Point, SpheresFound
 from service.jobs.registration.evaluate import ErrorBudget, Row
@@ -35,6 +40,16 @@ class ArtefactReader(Interface):
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
         """Path of an artefact's read-only file. Raises IntegrityError if missing or, with `verify`, if altered."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class GroundTruth:
+    """The mesh of the data set: what it is in words, its file, vertices (V, 3) in metres, faces (F, 3)."""
+
+    words: str
+    sha256: str
+    vertices_m: Array = field(repr=False)
+    faces: NDArray[np.int64] = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,15 +99,36 @@ class RunSummary:
         return [event.payload for event in self.events if isinstance(event.payload, JobFinished)]
 
     def scan_spheres_m(self) -> tuple[Point, ...]:
-        """Sphere centres of the registered scan in its own frame; empty before the scan was imported."""
-        result = last_result(self.protocol, self.state, "scan_import", SpheresFound)
-        return () if result is None else result.spheres_m
+        """Sphere centres of the registered scan in its own frame; empty before a scan was imported."""
+        step = registered_scan(self.protocol, self.state)
+        known = step and self.state.steps[step].result
+        return result_of_step(self.state, step, SpheresFound).spheres_m if known else ()
+
+    def scan_mesh_file(self) -> ArtefactRef | None:
+        """The file of the registered scan's mesh; None before it was imported."""
+        step = registered_scan(self.protocol, self.state)
+        kept = self.state.steps[step].artefacts if step else ()
+        return next((ref for ref in reversed(kept) if ref.kind == "scan_mesh"), None)
 
     def scan_mesh(self) -> tuple[Array, Any]:
-        """Vertices (V, 3) in metres and faces (F, 3) of the registered scan that was imported last."""
-        ref = self.artefacts("scan_mesh")[-1]
+        """Vertices (V, 3) in metres and faces (F, 3) of the registered scan. Raises DataError if there is none."""
+        ref = self.scan_mesh_file()
+        if ref is None:
+            raise DataError("the run has no scan", where=self.run_id, remedy="Import the scan")
         with np.load(self.store.artefact_path(ref.sha256), allow_pickle=False) as mesh:
             return mesh["vertices_m"], mesh["faces"]
+
+    def ground_truth(self) -> GroundTruth:
+        """The mesh of the data set, in the scan's frame: CT and scan fused if the run has that, else the scan."""
+        fused = self.artefacts("ground_truth_mesh")
+        if not fused:
+            vertices_m, faces = self.scan_mesh()
+            scan = self.scan_mesh_file()
+            sha256 = "" if scan is None else scan.sha256
+            return GroundTruth("scan", sha256, np.asarray(vertices_m, dtype=np.float64), faces.astype(np.int64))
+        columns, faces = read_ply(self.store.artefact_path(fused[-1].sha256))
+        vertices_mm = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        return GroundTruth("CT and scan, fused", fused[-1].sha256, metres(vertices_mm), faces)
 
 
 def summarise(store: Store, run_id: str, protocol: Protocol) -> RunSummary:

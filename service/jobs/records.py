@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
+from pydantic import Field
+
+from service.core.records.events import Uncertainty
 from service.jobs.kind import JobRecord
 
 Matrix = tuple[tuple[float, ...], ...]  # row by row
@@ -130,12 +132,27 @@ class Limits(JobRecord):
 
 
 class MeasuredSphere(JobRecord):
-    """A sphere found in a mesh; covariance of its centre in m²."""
+    """A sphere found in a mesh.
+
+    Attributes:
+        centre_m: in the mesh's frame.
+        covariance_m2: of the centre.
+        sigma_mm: root of the covariance's trace.
+        rms_mm: distance of the mesh's points from the sphere.
+        radius_residual_mm: fitted radius minus the known one.
+        radius_sigma_mm: standard deviation of `radius_residual_mm`.
+        coverage: share of the sphere's surface that the mesh has.
+        n_points: number of points that were used.
+    """
 
     centre_m: Point
     covariance_m2: Matrix
-    rms_mm: float  # distance of the mesh's points from the sphere
-    radius_residual_mm: float | None = None  # fitted radius minus the known one
+    sigma_mm: float | None = None
+    rms_mm: float
+    radius_residual_mm: float | None = None
+    radius_sigma_mm: float | None = None
+    coverage: float | None = None
+    n_points: int | None = None
 
 
 class SphereChange(JobRecord):
@@ -159,13 +176,49 @@ class LoopClosure(JobRecord):
     spheres: tuple[SphereChange, ...]
 
 
+class SphereConfusion(JobRecord):
+    """A wrong assignment of spheres that nearly fits, and its rms distance after the best rigid motion."""
+
+    spheres: tuple[int, ...]
+    taken_for: tuple[int, ...]
+    misfit_mm: float
+
+
+class JudgedLayout(JobRecord):
+    """How well the spheres of a layout can be told apart (service/compute/layout/ambiguity.py).
+
+    Attributes:
+        passed: nothing must be changed.
+        problems: what must be changed.
+        margin_mm: least misfit of a wrong assignment of four spheres.
+        margin_sigma_mm: its standard deviation.
+        bounds: uncertainty of each measure of the layout, mm.
+        margin_by_count_mm: least misfit by number of visible spheres.
+        worst: the assignments with the least misfit.
+        depth_mm: rms distance of the centres from their best plane.
+        extent_mm: rms distance of the centres from their mean.
+        largest_gap_deg: largest angle around the scene without a sphere.
+    """
+
+    passed: bool = False
+    problems: tuple[str, ...] = ()
+    margin_mm: float | None = None
+    margin_sigma_mm: float | None = None
+    bounds: dict[str, Uncertainty] = Field(default_factory=dict[str, Uncertainty])
+    margin_by_count_mm: dict[str, float] = Field(default_factory=dict[str, float])
+    worst: tuple[SphereConfusion, ...] = ()
+    depth_mm: float | None = None
+    extent_mm: float | None = None
+    largest_gap_deg: float | None = None
+
+
 class SphereDetails(JobRecord):
     """Details on the spheres of a mesh; with an earlier measurement of them, how they moved since."""
 
     spheres: tuple[MeasuredSphere, ...] = ()
     T_reference_mesh: Matrix | None = None
     loop_closure: LoopClosure | None = None
-    layout: dict[str, Any] | None = None  # near-symmetries (service/compute/layout/ambiguity.py)
+    layout: JudgedLayout | None = None
 
 
 class SpheresFound(JobRecord):

@@ -9,6 +9,7 @@ from functools import partial
 from drivers.errors import DeviceError
 from service.core.errors import OrthocaptureError
 from service.core.protocol.models import Protocol, Step
+from service.core.records.base import recorded
 from service.core.records.events import DeviceTrouble, Payload, StepFailed, StepMeasured
 from service.core.recovery.policy import recovery_policy
 from service.logs.where import at
@@ -86,7 +87,7 @@ class StepExecution:
                 attempt=attempt,
                 measures=outcome.measures.plain(),
                 artefacts=outcome.artefacts,
-                result=dict(outcome.result),
+                result={} if outcome.result is None else recorded(outcome.result),
                 uncertainties=dict(outcome.uncertainties),
             )
         )

@@ -43,6 +43,7 @@ from service.runner.clocks import ClockWatch
 from service.runner.disk import DiskWatch
 from service.runner.execution import StepExecution
 from service.runner.held_run import HeldRun, held_run
+from service.runner.memory import short_collections
 from service.runner.operator import AnswerBy, Operator
 from service.runner.pedal import Pedal
 from service.runner.sealing import Seal
@@ -83,7 +84,7 @@ class Runner:
         Raises LeaseHeldError if another runner drives the run, LeaseLostError if one has taken it over.
         """
         operator = self.operator
-        with held_run(self.store, self.run_id, self.protocol) as self._run:
+        with short_collections(), held_run(self.store, self.run_id, self.protocol) as self._run:
             self._seal = Seal(
                 self.store, self.run_id, self.authority, self.signature_copy, operator.busy, operator.tell
             )
@@ -177,7 +178,8 @@ class Runner:
                 return
             self.operator.attend("working", now, pedal_armed=False)
         if state.step.retry_granted:
-            self.operator.mend(decision.step, decision.attempt, state.step.mend.get("hands", ()))
+            hands = () if state.step.mend is None else state.step.mend.hands
+            self.operator.mend(decision.step, decision.attempt, hands)
         self._run.append(StepRetried(step=decision.step, attempt=decision.attempt, why=decision.why))
 
     def _ask(self, question: AskOperator, state: RunState) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 from typing import Protocol as Interface
 
 from service.core.records.events import OperatorAction
 from service.core.run.decide import AskOperator
+from service.core.run.noted import HandWork
 from service.core.run.state import RunState
 from service.monitor.snapshot import Doing
 
@@ -52,6 +53,6 @@ class Operator(Interface):
         """Called before a step begins, so that a simulated technician does what was confirmed as done."""
         ...
 
-    def mend(self, step: str, attempt: int, hands: Sequence[Mapping[str, Any]]) -> None:
+    def mend(self, step: str, attempt: int, hands: Sequence[HandWork]) -> None:
         """Called before a confirmed retry, so that a simulated technician does what the step has asked for."""
         ...

@@ -245,7 +245,7 @@ class StepOutcome:
 
     measures: MeasureRecord
     artefacts: tuple[ArtefactRef, ...] = ()
-    result: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    result: Record | None = None
     uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict[str, Uncertainty])  # of some measures
 
 
@@ -291,7 +291,8 @@ class StepKind(Generic[P]):
         registered_by: the step whose registrations the measures are of, where they are RegistrationMeasures; None:
             this step itself.
         words: what a person reads before confirming it.
-        drawing: shown beside the instructions (service/web/run/drawings) if the protocol names no other.
+        drawing: shown beside the instructions if the protocol names no other: the name of one in
+            service/web/run/drawings, or, for a kind of a plug-in, an SVG itself (`<svg …`).
     """
 
     name: str

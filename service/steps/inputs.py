@@ -38,7 +38,7 @@ class EarlierAnswer(Generic[R]):
 
 def earlier_answer(context: StepContext, step_id: str, kind: JobKind[Any, R]) -> EarlierAnswer[R]:
     """The result of an earlier step, as the answer of a kind of job. Raises ConfigurationError if it is not one."""
-    result = result_of(context, step_id)
+    result = _result_of(context, step_id)
     try:
         answer = kind.read_answer(result)
     except IntegrityError as error:
@@ -59,7 +59,7 @@ def answered_by(state: StepState) -> JobState | None:
     return None
 
 
-def result_of(context: StepContext, step_id: str) -> Mapping[str, Any]:
+def _result_of(context: StepContext, step_id: str) -> Mapping[str, Any]:
     """The Result of an earlier step, as plain data; ConfigurationError if it has none."""
     state = context.run.steps.get(step_id)
     if state is None or not state.result:
@@ -73,7 +73,7 @@ def result_of(context: StepContext, step_id: str) -> Mapping[str, Any]:
 
 def earlier_result(context: StepContext, step_id: str, model: type[M]) -> M:
     """The Result of an earlier step of a known kind. Raises ConfigurationError if it has none, or another."""
-    result = result_of(context, step_id)
+    result = _result_of(context, step_id)
     try:
         return model.model_validate(result)
     except ValidationError as error:
@@ -123,25 +123,24 @@ def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[Photo
 
 
 def _photograph(capture: View, step_id: str, look: hand_view.Answer | None) -> Photograph:
-    by_spheres = {} if look is None or look.T_scene_camera is None else {"T_scene_camera": look.T_scene_camera}
-    return Photograph.model_validate(
-        {
-            "name": f"{capture.viewpoint}.jpg",
-            "step": step_id,
-            "viewpoint": capture.viewpoint,
-            "station": capture.station,
-            "sha256": capture.artefacts[0].sha256,
-            **robot_pose_of(capture),
-            **by_spheres,
-        }
+    image = Photograph(
+        name=f"{capture.viewpoint}.jpg",
+        step=step_id,
+        viewpoint=capture.viewpoint,
+        station=capture.station,
+        sha256=capture.artefacts[0].sha256,
     )
+    by_robot = with_robot_pose(image, capture)
+    if look is None or look.T_scene_camera is None:
+        return by_robot
+    return by_robot.model_copy(update={"T_scene_camera": look.T_scene_camera})
 
 
-def robot_pose_of(view: View) -> dict[str, Any]:
-    """The robot's pose at a photograph, as fields of a Photograph; empty if no robot held the camera."""
+def with_robot_pose(photograph: Photograph, view: View) -> Photograph:
+    """The photograph with the robot's pose; as it is if no robot held the camera."""
     if isinstance(view, ViewpointCaptured):
-        return {"T_base_flange": view.T_base_flange, "joints_rad": view.joints_rad}
-    return {}
+        return photograph.model_copy(update={"T_base_flange": view.T_base_flange, "joints_rad": view.joints_rad})
+    return photograph
 
 
 def held_views(context: StepContext, step_id: str) -> dict[str, hand_view.Answer]:

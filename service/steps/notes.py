@@ -1,4 +1,4 @@
-"""Notes of steps that other steps and pages read, as typed records: planned poses, motions, suggestions, advice."""
+"""Notes of steps that other steps and pages read, as typed records: planned poses, suggestions, images to repeat."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from service.core.run.state import StepState
 from service.jobs.capture.live_summary import Suggestion
 from service.jobs.records import Matrix
 
-BOARD_POSES, MOTION_PLAN, SUGGESTION = "board_poses", "motion_plan", "suggested_viewpoints"
+BOARD_POSES, SUGGESTION = "board_poses", "suggested_viewpoints"
 SPOILT = "spoilt images"  # images that a retry of the step repeats
 DEPARTING = "images depart from the calibration"
 
@@ -66,31 +66,6 @@ class BoardPlan(_NoteRecord):
     instead_of: dict[str, str] = Field(default_factory=dict[str, str])
 
 
-class PlannedView(_NoteRecord):
-    """A viewpoint in a motion plan; `outcome` is refused where the arm cannot take it."""
-
-    viewpoint: str
-    outcome: str
-    reason: str = ""
-
-
-class PlannedStation(_NoteRecord):
-    """The viewpoints of one station, in the order of capture."""
-
-    views: tuple[PlannedView, ...]
-
-
-class MotionPlan(_NoteRecord):
-    """How the arm moves in a capture."""
-
-    stations: tuple[PlannedStation, ...] = ()
-
-    @property
-    def views(self) -> tuple[PlannedView, ...]:
-        """All viewpoints in the order of capture."""
-        return tuple(view for station in self.stations for view in station.views)
-
-
 class SuggestedViews(_NoteRecord):
     """What a capture found wanting, and the views that would help most."""
 
@@ -109,24 +84,9 @@ class ImagesToRepeat(_NoteRecord):
     advice: str | None = None
 
 
-class Mending(_NoteRecord):
-    """What would bring the present attempt of a step within its limits; pages show only the numbers of views."""
-
-    advice: str = ""
-    hands: tuple[dict[str, object], ...] = ()  # what the simulated technician does
-    viewpoints: tuple[object, ...] = ()
-    poses: tuple[object, ...] = ()
-
-
 def board_plans(state: StepState) -> tuple[BoardPlan, ...]:
     """The board images planned in a step, oldest plan first."""
     return tuple(BoardPlan.model_validate(note.data) for note in state.notes if note.note == BOARD_POSES)
-
-
-def motion_plan(state: StepState) -> MotionPlan:
-    """The newest motion plan of a step; empty without one."""
-    plans = [note.data for note in state.notes if note.note == MOTION_PLAN]
-    return MotionPlan.model_validate(plans[-1]) if plans else MotionPlan()
 
 
 def suggested_views(state: StepState) -> tuple[SuggestedViews, ...]:
@@ -137,8 +97,3 @@ def suggested_views(state: StepState) -> tuple[SuggestedViews, ...]:
 def images_to_repeat(state: StepState, note: str) -> tuple[ImagesToRepeat, ...]:
     """The notes SPOILT or DEPARTING of a step, oldest first."""
     return tuple(ImagesToRepeat.model_validate(found.data) for found in state.notes if found.note == note)
-
-
-def mending(state: StepState) -> Mending:
-    """The newest advice on the present attempt; empty without any."""
-    return Mending.model_validate(dict(state.mend))

@@ -7,11 +7,13 @@ from fastapi.staticfiles import StaticFiles
 
 import service.web.calibration.pages
 import service.web.capture.pages
+import service.web.dataset.pages
 import service.web.handheld.pages
 import service.web.home.pages
 import service.web.monitoring.pages
 import service.web.run.pages
 import service.web.scene.pages
+import service.web.scene.region
 from service.people.credentials.tries import failed_tries
 from service.web.audit import corrections, devices, exports, gates, overview, runs, signatures
 from service.web.capture import media
@@ -42,7 +44,9 @@ _ROUTERS: tuple[APIRouter, ...] = (
     service.web.handheld.pages.router,
     media.router,
     service.web.scene.pages.router,
+    service.web.scene.region.router,
     service.web.calibration.pages.router,
+    service.web.dataset.pages.router,
     runs.router,
     overview.router,
     corrections.router,
@@ -54,7 +58,7 @@ _ROUTERS: tuple[APIRouter, ...] = (
     exports.router,
     service.web.monitoring.pages.router,
 )
-_WITH_STATIC_FILES = ("audit", "calibration", "capture", "handheld", "home", "people", "run", "scene")
+_WITH_STATIC_FILES = ("audit", "calibration", "capture", "dataset", "handheld", "home", "people", "run", "scene")
 
 
 def create_app(site: Site) -> FastAPI:

@@ -20,8 +20,8 @@ from service.audit.overview.digest import Digest, digests
 from service.audit.overview.signatures import signatures as signatures_of
 from service.audit.provenance.drawing import draw
 from service.audit.provenance.graph import graphs, origin
-from service.audit.record import artefact_queries, queries
-from service.audit.record.queries import EventFilter, EventPage
+from service.audit.record import artefact_queries, event_rows, event_search, run_rows
+from service.audit.record.event_search import EventFilter, EventPage
 from service.core.errors import DataError
 from service.core.records.events import StepNote
 from service.core.run.fold import fold
@@ -149,7 +149,7 @@ def test_large_run_says_how_far_it_is_instead_of_waiting(store: Store, run: str)
 
 def page_of(store: Store, run: str, wanted: EventFilter, **where: int) -> EventPage:
     with store.database.reading() as connection:
-        return queries.events_page(connection, run, wanted, **where)
+        return event_search.events_page(connection, run, wanted, **where)
 
 
 def every_page(store: Store, run: str, wanted: EventFilter) -> list[int]:
@@ -204,23 +204,23 @@ def test_pages_go_back_the_way_they_came(store: Store, run: str) -> None:
 def test_no_filter_breaks_the_search(store: Store, run: str, q: str, step: str, after: int, before: int) -> None:
     page = page_of(store, run, EventFilter(q=q, step=step), after=after, before=before)
     assert page.count is not None
-    assert len(page.rows) <= queries.PAGE
+    assert len(page.rows) <= run_rows.PAGE
 
 
 def test_every_event_shows_its_content_and_its_hash_holds(store: Store, run: str) -> None:
     events = store.events(run)
     with store.database.reading() as connection:
         for seq in (1, 2, len(events) // 2, len(events)):
-            row = queries.one_event(connection, run, seq)
+            row = event_rows.one_event(connection, run, seq)
             event = events[seq - 1]
             assert (row.sha256, row.previous_sha256) == (event.sha256, event.previous_sha256)
-            assert queries.computed_sha256(run, row) == row.sha256
-            assert queries.seq_of_hash(connection, run, event.sha256) == seq
+            assert event_rows.computed_sha256(run, row) == row.sha256
+            assert event_rows.seq_of_hash(connection, run, event.sha256) == seq
             assert row.payload == event.payload.model_dump(mode="json")
-        assert queries.seq_of_hash(connection, run, "f" * 64) is None
+        assert event_rows.seq_of_hash(connection, run, "f" * 64) is None
         for seq in (0, -1, len(events) + 1, 10**30):
             with pytest.raises(UnknownRunError):
-                queries.one_event(connection, run, seq)
+                event_rows.one_event(connection, run, seq)
 
 
 def test_events_missing_from_the_index_are_told(tmp_path: Path) -> None:
@@ -301,7 +301,7 @@ def test_correction_keeps_the_original_and_reads_the_old_value_itself(tmp_path: 
         correct(store, run, of_seq=2, field="host", new="table 3", reason="again", actor="emmy")
         with store.database.reading() as connection:
             values = findings.corrected_values(connection, run)
-            original = queries.one_event(connection, run, 2)
+            original = event_rows.one_event(connection, run, 2)
         assert [(v.old, v.new, v.original, v.latest) for v in values] == [
             ("here", "table 2", "here", False),
             (1, 7, 1, True),

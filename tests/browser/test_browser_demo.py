@@ -17,7 +17,7 @@ import yaml
 from playwright.sync_api import Browser, Locator, Page, expect
 from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
-from tests.support.pages.browser import DESKTOP, PASSWORD, Screen, Served, add_people, chromium, screen, served
+from tests.support.pages.browser import DESKTOP, PASSWORD, Screen, Served, add_people, screen, served
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig
 
@@ -25,12 +25,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 MOST_MENDS = 4  # per step, as of the automatic operator
 PRESSED_IN_VAIN = 3  # in the whole run
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

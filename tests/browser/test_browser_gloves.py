@@ -20,7 +20,7 @@ from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
 from service.store.store import Store
-from tests.support.pages.browser import TABLET, Screen, Served, chromium, screen, served
+from tests.support.pages.browser import TABLET, Screen, Served, screen, served
 from tests.support.pages.shown_site import skip
 from tests.support.pages.web import password_of, web_site
 from tests.support.runs.at_the_table import STANDING, at_the_table, left_at, record
@@ -42,12 +42,6 @@ READ = """(badge) => {
     const enter = new KeyboardEvent("keydown", { key: "Enter", bubbles: true, cancelable: true });
     document.activeElement.dispatchEvent(enter);
 }"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

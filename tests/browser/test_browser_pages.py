@@ -81,7 +81,14 @@ PAGES: dict[str, tuple[tuple[Role | None, str], ...]] = {
     "/runs/{run_id}/scene": (("auditor", "/runs/{registered}/scene"),),
     "/runs/{run_id}/calibration": (("technician", "/runs/{calibrated}/calibration"),),
     "/runs/{run_id}/calibration/certificate": (("auditor", "/runs/{calibrated}/calibration/certificate"),),
-    "/runs/{run_id}/exports": (("supervisor", "/runs/{completed}/exports"),),
+    "/runs/{run_id}/dataset": (
+        ("technician", "/runs/{listing}/dataset"),
+        ("auditor", "/runs/{registered}/dataset"),  # whole ones: test_browser_dataset.py
+    ),
+    "/runs/{run_id}/exports": (
+        ("supervisor", "/runs/{completed}/exports"),
+        ("supervisor", "/runs/{registered}/exports"),
+    ),
     "/audit": (("auditor", "/audit"),),
     "/audit/runs/{run_id}": (("auditor", "/audit/runs/{completed}"), ("supervisor", "/audit/runs/{registered}")),
     "/audit/runs/{run_id}/gates": (("auditor", "/audit/runs/{completed}/gates"),),
@@ -115,6 +122,8 @@ NO_PAGES = {
     "/runs/{run_id}/images/{viewpoint}",
     "/runs/{run_id}/live-view",
     "/runs/{run_id}/exports/{file_name}",
+    "/runs/{run_id}/dataset/pictures/{name}",
+    "/runs/{run_id}/dataset/{figure}/frame",
 }
 STANDING = {"doing": "asking", "robot": "standing", "robot_name": "robot", "light_lux": 800.0}
 WORKING = {"doing": "working", "robot": "moving", "what": "image", "done": 1, "total": 4}

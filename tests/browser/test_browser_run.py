@@ -24,7 +24,6 @@ from tests.support.pages.browser import (
     Screen,
     Served,
     accessibility_faults,
-    chromium,
     screen,
     served,
 )
@@ -35,12 +34,6 @@ from tests.support.runs.short_protocol import short_protocol
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
 LONG_MS = 60_000
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

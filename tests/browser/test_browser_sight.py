@@ -9,18 +9,12 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from service.core.records.events import OperatorAction, StepFailed, StepStarted
-from tests.support.pages.browser import Served, chromium, served
+from tests.support.pages.browser import Served, served
 from tests.support.pages.shown_site import skip
 from tests.support.pages.web import web_site
 from tests.support.runs.at_the_table import at_the_table, record
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from playwright.sync_api import Browser, Locator, Page, expect
 
-from tests.support.pages.browser import PASSWORD, Screen, Served, add_people, chromium, screen, served
+from tests.support.pages.browser import PASSWORD, Screen, Served, add_people, screen, served
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, simulated_rig
 
@@ -98,12 +98,6 @@ class Tasks:
         self.measured[name] = person.clicks - clicks, person.fields - fields, round(seconds, 1)
         nexts = person.page.locator("main").get_by_role("button").or_(person.page.locator("main").get_by_role("link"))
         assert nexts.count(), f"{name} ends without a next action: {person.tablet.words()}"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from service.compute.calibration.board.board import half_turn
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.fit import Method
-from service.compute.calibration.hand_eye.placement import place_board
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, Transform, inverse, look_at, rotation_angle_rad, transform
+from service.core.geometry import Array, Transform, inverse, look_at, transform
 
 T_FLANGE_CAMERA = transform(Rotation.from_rotvec([0.02, -0.03, 1.55]), np.array([0.012, -0.055, 0.093]))
 T_BASE_BOARD = transform(Rotation.from_euler("xyz", [176, 3, 40], degrees=True), np.array([0.7, -0.1, 0.05]))
@@ -116,20 +115,3 @@ def test_data_that_do_not_belong_together_are_refused() -> None:
     boards[2, 0, 3] = np.nan
     with pytest.raises(DataError, match="finite"):
         calibrate_hand_eye(HandEyeViews(hands, boards))
-    with pytest.raises(DataError, match="do not match"):
-        place_board(hands[:0], boards[:0], T_FLANGE_CAMERA)
-
-
-def test_two_stations_are_joined_through_the_board() -> None:
-    T_base1_base2 = transform(Rotation.from_euler("z", 178, degrees=True), np.array([1.6, 0.02, -0.01]))
-    T_base2_board = inverse(T_base1_base2) @ T_BASE_BOARD
-    first = place_board(*_session(6, noise_mm=0.05, noise_deg=0.005), T_FLANGE_CAMERA)
-    second = place_board(
-        *_session(6, noise_mm=0.05, noise_deg=0.005, seed=1, T_base_board=T_base2_board), T_FLANGE_CAMERA
-    )
-    joined = first.T_base_board @ inverse(second.T_base_board)
-    offset = inverse(T_base1_base2) @ joined
-    assert np.linalg.norm(offset[:3, 3]) < 2e-4
-    assert np.degrees(rotation_angle_rad(offset)) < 0.02
-    assert 0 < first.sigma_mm < 0.1
-    assert first.residual_mm.shape == (6,)

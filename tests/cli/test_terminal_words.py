@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 from service.cli.common import print_table
 from service.cli.main import app
 from service.cli.run.demo import free_address
-from service.cli.run.hands import SimulatedHands
-from service.cli.run.operators import Display, TerminalOperator
+from service.cli.run.terminal.hands import SimulatedHands
+from service.cli.run.terminal.operators import Display, TerminalOperator
 from service.core.protocol.models import load_protocol
 from service.core.run.decide import AskOperator
 from service.jobs.words import term

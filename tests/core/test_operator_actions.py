@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.core.errors import IllegalTransitionError, IntegrityError
+from service.core.errors import IntegrityError
 from service.core.records.events import (
     ActionRefused,
     OperatorAction,
@@ -20,11 +20,10 @@ from service.core.run.decide import (
     Halt,
     RunStep,
     allowed_actions,
-    check_action,
     redoable_steps,
 )
 from tests.support.record.core import GOOD, TOY, Log, captured, imported, toy_protocol
-from tests.support.record.core_log import at_capture, at_scan, at_spray, failure, kinds, refused
+from tests.support.record.core_log import assert_refused, at_capture, at_scan, at_spray, failure, kinds, refused
 
 
 @pytest.fixture
@@ -53,8 +52,7 @@ def test_signatures_need_name_meaning_and_the_record() -> None:
     refused(log, "a record other than", action="sign", meaning="ok", signed_sha256="0" * 64)
     refused(log, "a name and a meaning", action="sign", meaning=" ", signed_sha256=target)
     refused(log, "pedal cannot sign", action="sign", meaning="ok", signed_sha256=target, via="pedal")
-    with pytest.raises(IllegalTransitionError, match="a name"):
-        check_action(log.protocol, log.state, OperatorAction(action="sign", meaning="m", signed_sha256=target), " ")
+    assert_refused(log, "a name", OperatorAction(action="sign", meaning="m", signed_sha256=target), " ")
     with pytest.raises(IntegrityError, match="nobody has signed"):
         log.append(StepPassed(step="capture", attempt=1))
     log.act("sign", actor="Grace", meaning="captured well", signed_sha256=target)

@@ -10,7 +10,6 @@ _POWERS = {1e-6, 1e-3, 1e3, 1e6, 1e9}
 _UNITS = "service/core/units.py"
 # Products with such a constant that convert nothing → what they are.
 _ALLOWED = {
-    "1e-06 * np.eye(6)": "damping of a least-squares step",
     "1e-06 * np.eye(2)": "damping of a least-squares step",
     "1000 * result.coverage": "a share in tenths of a percent, to be rounded down",
 }

@@ -18,9 +18,9 @@ from drivers.errors import DeviceFaultError
 from service.cli.main import app
 from service.core import errors as core_errors
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
-from service.core.records.events import OperatorAction, OperatorVerb
+from service.core.records.events import OperatorAction, OperatorVerb, StepNote
 from service.core.recovery.policy import NEEDS_A_PERSON
-from service.core.recovery.ways_on import WayOn, takes_words, ways_on
+from service.core.recovery.ways_on import WayOn, takes_words, view_s, ways_on
 from service.core.recovery.words import REMEDIES
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
@@ -31,6 +31,7 @@ from service.steps.measures import Count, MeasureRecord
 from service.store.store import Store
 from tests.support.record.core import GOOD, Log, toy_protocol
 from tests.support.record.core import TOY as TOY_TEXT
+from tests.support.record.core_log import at_capture
 from tests.support.rig.bench_rig import ScriptedOperator
 from tests.support.runs.bench_run import Bench, begin_run
 
@@ -262,6 +263,17 @@ def test_status_lists_them_for_other_programs(begin: Callable[[Fakes, Walker], B
     ways = json.loads(answer.stdout)["ways_on"]
     assert [way["verb"] for way in ways] == ["confirm", "accept", "skip", "abort"]
     assert all(way["available"] for way in ways)
+
+
+def test_before_two_views_are_taken_the_time_for_one_is_that_of_the_planned_motions() -> None:
+    log = at_capture()
+    log.begin()
+    assert view_s(log.protocol, log.state, log.protocol.step("capture")) is None
+    outcomes = ("feasible", "nudged", "refused")
+    views = [{"viewpoint": f"v{i}", "outcome": outcome, "reason": ""} for i, outcome in enumerate(outcomes)]
+    plan = {"stations": [{"station": "station_1", "order": "as_listed", "estimated_s": 30.0, "views": views}]}
+    log.append(StepNote(step="capture", attempt=1, note="motion_plan", data={"text": "planned", **plan}))
+    assert view_s(log.protocol, log.state, log.protocol.step("capture")) == 15.0
 
 
 def test_minutes_in_words() -> None:

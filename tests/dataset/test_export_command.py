@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import tarfile
+import shutil
 from pathlib import Path
 
 import cv2
@@ -18,27 +18,24 @@ from service.audit.record.run import read_run
 from service.cli.main import app
 from service.compute.pixels.masks import Ball, marker_mask
 from service.core.geometry import apply, increment, inverse
-from service.core.records.events import EvidenceExported
+from service.core.records.events import EvidenceExported, RunCompleted, RunReleased
 from service.core.units import metres
-from service.dataset.posed.of_run import control_spheres, data_set_of, pose_covariance, specimen_pixels, upwards
+from service.dataset.posed.of_run import control_spheres, data_set_of, specimen_pixels, upwards
 from service.dataset.posed.records import Mesh
+from service.dataset.posed.view_covariances import pose_covariance
+from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.record.store import tamper
 from tests.support.runs.bench_run import record_runs
-
-RECORDED = Path(__file__).parents[1] / "data" / "recorded" / "2026-11-23.tar.xz"
+from tests.support.runs.reported_run import record_reported_run
+from tests.support.runs.unpacked_run import unpack_recorded_run
 
 pytestmark = pytest.mark.timeout(300)
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("recorded")
-    with tarfile.open(RECORDED) as archive:
-        archive.extractall(folder, filter="data")
-    for path in (folder / "data" / "keys").rglob("*"):
-        path.chmod(0o600)
-    (folder / "data" / "keys").chmod(0o700)
-    return folder / "data"
+    return unpack_recorded_run(tmp_path_factory.mktemp("recorded"))
 
 
 def export(data: Path, *arguments: str) -> tuple[int, str]:
@@ -136,8 +133,61 @@ def test_an_export_of_altered_evidence_is_refused(recorded: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize(
+    "statement",
+    [
+        "DELETE FROM checkpoints",
+        "DELETE FROM checkpoints WHERE seq = (SELECT max(seq) FROM checkpoints)",
+        "UPDATE checkpoints SET signature = 'AAAA'",
+        "UPDATE events SET actor = 'Eve' WHERE seq = 3",
+    ],
+)
+def test_an_export_without_its_signatures_is_refused(recorded: Path, tmp_path: Path, statement: str) -> None:
+    shutil.copytree(recorded, tmp_path / "data")
+    tamper(tmp_path / "data", statement)
+    status, printed = export(tmp_path / "data", "--format", "gltf", "--out", str(tmp_path / "out"), "--json")
+    assert status != 0
+    assert json.loads(printed.splitlines()[-1])["error"]["kind"] == "IntegrityError"
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
+def test_an_export_without_the_second_persons_release_is_refused(tmp_path: Path) -> None:
+    run_id = record_reported_run(tmp_path, release="second_person", registered=True)
+    out = tmp_path / "out"
+    status, printed = export(tmp_path / "data", "--format", "gltf", "--out", str(out))
+    assert status != 0
+    assert "second person's release" in printed
+    assert not list(tmp_path.glob("*out*"))
+    with Store.open(tmp_path / "data") as store:
+        completed = next(e for e in store.events(run_id) if isinstance(e.payload, RunCompleted))
+        store.record(run_id, [RunReleased(meaning="read", signed_sha256=completed.sha256)], actor="Grace")
+    status, printed = export(tmp_path / "data", "--format", "gltf", "--out", str(out))
+    assert status == 0, printed
+    assert (out / "scene.glb").is_file()
+
+
+def test_what_the_options_state_stands_in_the_metadata(recorded: Path, tmp_path: Path) -> None:
+    out = tmp_path / "stated"
+    status, printed = export(
+        recorded,
+        *("--format", "gltf", "--out", str(out), "--title", "A spine", "--licence", "CC-BY-4.0"),
+        *("--ethics", "Waived, 2026-7", "--creator", "A. Name", "--creator", "B. Name", "--cite", "Name, 2026."),
+        *("--data-version", "2.1.0", "--anonymous"),
+    )
+    assert status == 0, printed
+    card = (out / "DATACARD.md").read_text(encoding="utf-8")
+    for words in ("# A spine", "CC-BY-4.0", "Waived, 2026-7", "A. Name, B. Name", "Name, 2026.", "Version 2.1.0"):
+        assert words in card
+    crate = json.loads((out / "ro-crate-metadata.json").read_text())
+    kinds = [entity["@type"] for entity in crate["@graph"]]
+    assert "Person" not in kinds
+    assert {e["serialNumber"] for e in crate["@graph"] if e["@type"] == "IndividualProduct"} == {""}
+    assert "serial number" not in card
+
+
+@pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (("--format", "gltf", "--data-version", "one"), "'one' is not a version"),
         (("--format", "nonsense"), "there is no format 'nonsense'"),
         (("--format", "gltf", "--crop", "wide"), "'wide' is not a size"),
         (("--format", "gltf", "--crop", "99999x10"), "does not fit"),

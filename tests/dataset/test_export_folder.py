@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from service.compute.camera_model import CameraModel
+from service.compute.images.files import read_image_of
 from service.compute.pixels.masks import hull_mask
 from service.core.errors import ConfigurationError, DataError
-from service.dataset.posed.exporter import exporter, write_data_set
+from service.dataset.posed.exporter import exporter, exporters, write_data_set
 from service.dataset.posed.folder import ExportFolder, export_folder
 from service.dataset.posed.pixels import cropped_data_set, undistorted_data_set
 from service.dataset.posed.records import DataSet, Pixels, View
@@ -172,6 +174,35 @@ def test_crops_show_the_specimen_without_markers_and_keep_their_geometry(dataset
         assert np.median(np.abs(error)[z > 0]) < 2.0
 
 
+@pytest.mark.parametrize("straight", [False, True])
+def test_an_image_is_decoded_once_for_all_its_crops(
+    dataset: DataSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, straight: bool
+) -> None:
+    decoded: list[Path] = []
+
+    def counted(path: Path, camera: CameraModel) -> NDArray[np.uint8]:
+        decoded.append(path)
+        return read_image_of(path, camera)
+
+    monkeypatch.setattr("service.dataset.posed.pixels.read_image_of", counted)
+    whole = undistorted_data_set(dataset) if straight else dataset
+    everywhere = cropped_data_set(
+        whole, lambda view: np.ones((view.camera.height, view.camera.width), bool), (40, 30), most=4
+    )
+    assert len(everywhere.views) > 2 * len(dataset.views)
+    write_data_set(everywhere, exporter("colmap"), tmp_path / "out")
+    assert len(decoded) == len(set(decoded)) == len(dataset.views)
+
+
 def test_a_data_set_without_room_for_a_crop_says_so(dataset: DataSet) -> None:
     with pytest.raises(DataError, match="without a sphere or post"):
         cropped_data_set(dataset, lambda view: np.zeros((view.camera.height, view.camera.width), bool), (64, 48))
+
+
+def test_progress_counts_every_file_up_to_its_total(dataset: DataSet, tmp_path: Path) -> None:
+    for name in exporters():
+        told: list[tuple[str, int, int]] = []
+        out = tmp_path / name
+        write_data_set(dataset, exporter(name), out, progress=lambda *what, told=told: told.append(what))
+        written = sum(1 for path in out.rglob("*") if path.is_file() and path.name != "SHA256SUMS")
+        assert told == [("writing", count, written) for count in range(1, written + 1)], name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import re
@@ -19,16 +20,16 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
+from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse
-from service.dataset.formats.radiance.unit_box import unit_box, world_of_neus2_mesh, world_of_ngp_mesh
 from service.dataset.posed.exporter import exporter, exporters, write_data_set
 from service.dataset.posed.pixels import undistorted_data_set
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, Mesh, View
 from tests.support.scenes.posed import posed_data_set, scene
 
 NAMES = {
     "colmap", "colmap-binary", "colmap-pinhole", "sugar", "eth3d", "nerfstudio", "instant-ngp", "neus2", "dtu", "bop",
-    "hdf5", "gltf",
+    "hdf5", "gltf", "plain", "matching",
 }  # fmt: skip
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 
@@ -107,6 +108,14 @@ def test_pycolmap_projects_points_to_their_pixels(
             assert picture.size == (camera.width, camera.height)
 
 
+@pytest.mark.parametrize("name", ["colmap", "colmap-pinhole", "sugar", "eth3d"])
+def test_an_image_name_that_colmaps_text_cannot_hold_is_refused(dataset: DataSet, tmp_path: Path, name: str) -> None:
+    first, *others = dataset.views
+    spaced = dataclasses.replace(dataset, views=(dataclasses.replace(first, name="view 1"), *others))
+    with pytest.raises(DataError, match=r"cannot hold image names with spaces.*view 1\.png"):
+        written(spaced, name, tmp_path)
+
+
 def test_the_undistorted_images_show_the_solid_where_pycolmap_projects_it(dataset: DataSet, tmp_path: Path) -> None:
     folder, shown = written(dataset, "colmap-pinhole", tmp_path), scene()
     model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
@@ -136,7 +145,11 @@ def test_the_points_of_sugar_are_in_the_scene_and_tell_nothing_of_the_surface(
 def test_eth3d_has_depth_and_scan(dataset: DataSet, pinholes: DataSet, tmp_path: Path) -> None:
     folder = written(dataset, "eth3d", tmp_path)
     model = pycolmap.Reconstruction(str(folder / "dslr_calibration_undistorted"))
-    assert len(model.images) == len(dataset.views)
+    images = {image.name: image for image in model.images.values()}
+    assert set(images) == {view.file for view in dataset.views}
+    for view in pinholes.views:
+        projected = np.array([images[view.file].project_point(point) for point in corners()])
+        assert np.abs(projected - 0.5 - truth_px(view)).max() < 0.01
     mesh = trimesh.load_mesh(folder / "dslr_scan_eval" / "scan1.ply")
     assert np.abs(mesh.bounds - scene().mesh.bounds).max() < 1e-12
     for view in pinholes.views:
@@ -183,15 +196,15 @@ def ngp_saved(stated: Any, points: Array) -> Array:
 
 
 def test_instant_ngp_sees_the_solid_in_its_cube_and_its_meshes_come_back(dataset: DataSet, tmp_path: Path) -> None:
-    stated = document(written(dataset, "instant-ngp", tmp_path) / "transforms.json")
-    box = unit_box(dataset.mesh)
+    folder = written(dataset, "instant-ngp", tmp_path)
+    stated, box = document(folder / "transforms.json"), document(folder / "unit_box.json")
     # The solid in the unit cube of Instant-NGP, found from the poses alone: where the rays of its corners meet.
     cube = np.array([_meeting(dataset, stated, k) for k in range(len(corners()))])
     assert ((cube > 0.0) & (cube < 1.0)).all()
-    world = world_of_ngp_mesh(ngp_saved(stated, cube), box)
-    assert np.abs(world - corners()).max() < 1e-6
+    saved = ngp_saved(stated, cube)
+    assert np.abs(saved[:, box["mesh_axes"]] + box["centre_m"] - corners()).max() < 1e-6
     # The solid has no symmetry: another order of the axes does not fit.
-    assert np.abs(ngp_saved(stated, cube) + box.centre_m - corners()).max() > 0.02
+    assert np.abs(saved + box["centre_m"] - corners()).max() > 0.02
 
 
 def test_neus2_sees_the_solid_in_its_cube_and_its_meshes_come_back(dataset: DataSet, tmp_path: Path) -> None:
@@ -201,7 +214,8 @@ def test_neus2_sees_the_solid_in_its_cube_and_its_meshes_come_back(dataset: Data
         frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])).tolist()
     cube = np.array([_meeting(pinholes, stated, k) for k in range(len(corners()))])
     assert ((cube > 0.0) & (cube < 1.0)).all()
-    assert np.abs(world_of_neus2_mesh(ngp_saved(stated, cube), unit_box(dataset.mesh)) - corners()).max() < 1e-6
+    box, saved = document(folder / "unit_box.json"), ngp_saved(stated, cube)
+    assert np.abs(saved[:, box["mesh_axes"]] + box["centre_m"] - corners()).max() < 1e-6
     image = picture(folder / stated["frames"][0]["file_path"])
     assert image.shape[2] == 4
     assert set(np.unique(image[..., 3])) == {0, 255}
@@ -245,7 +259,29 @@ def test_dtu_projections_and_masks(dataset: DataSet, pinholes: DataSet, tmp_path
             assert ((mask == 255) <= (pinholes.pixels.depth_m(view) > 0)).all()
 
 
-# --- BOP, HDF5, glTF --------------------------------------------------------------------------------------------
+# --- plain files, BOP, HDF5, glTF -------------------------------------------------------------------------------
+
+
+def test_plain_files_hold_camera_poses_mesh_and_the_photographs(dataset: DataSet, tmp_path: Path) -> None:
+    folder = written(dataset, "plain", tmp_path)
+    lens = document(folder / "camera.json")
+    K = np.array([[lens["fx"], 0, lens["cx"]], [0, lens["fy"], lens["cy"]], [0, 0, 1]])
+    distortion = np.array([lens.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")])
+    names = np.loadtxt(folder / "poses.csv", delimiter=",", skiprows=1, usecols=0, dtype=str)
+    poses = np.loadtxt(folder / "poses.csv", delimiter=",", skiprows=1, usecols=range(1, 8))
+    frames = {frame["file_path"]: frame for frame in document(folder / "transforms.json")["frames"]}
+    assert list(names) == [view.file for view in dataset.views]
+    for name, (*t, qx, qy, qz, qw), view in zip(names, poses, dataset.views, strict=True):
+        R = trimesh.transformations.quaternion_matrix([qw, qx, qy, qz])[:3, :3]
+        pixels = cv2.projectPoints(corners(), cv2.Rodrigues(R.T)[0], -R.T @ t, K, distortion)[0].reshape(-1, 2)
+        assert np.abs(pixels - truth_px(view)).max() < 0.01
+        same = np.array(frames[f"images/{name}"]["transform_matrix"])
+        assert np.abs(same[:3, :3] @ OPENCV_FROM_OPENGL - R).max() < 1e-9
+        assert np.abs(same[:3, 3] - t).max() < 1e-12
+        assert np.array_equal(picture(folder / "images" / name), dataset.pixels.colours(view))
+    mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    assert np.array_equal(np.asarray(mesh.vertices), dataset.mesh.vertices_m)
+    assert np.array_equal(np.asarray(mesh.faces), dataset.mesh.faces)
 
 
 def test_bop_model_projects_to_the_depth_image(dataset: DataSet, pinholes: DataSet, tmp_path: Path) -> None:
@@ -279,16 +315,33 @@ def test_the_loader_of_hdf5_needs_only_numpy_and_h5py(dataset: DataSet, tmp_path
     assert done.stdout.split() == [str(len(dataset.views)), "False"]
 
 
-def test_the_ten_lines_of_the_documents_project_the_mesh_into_the_image(dataset: DataSet, tmp_path: Path) -> None:
-    folder = written(dataset, "hdf5", tmp_path)
-    page = (Path(__file__).parents[2] / "docs" / "howto" / "data_set.md").read_text(encoding="utf-8")
+def test_the_ten_lines_of_the_documents_project_the_mesh_onto_the_image(dataset: DataSet, tmp_path: Path) -> None:
+    fine = scene().mesh
+    for _ in range(4):
+        fine = fine.subdivide()
+    vertices = np.asarray(fine.vertices)
+    dense = dataclasses.replace(dataset, mesh=Mesh(vertices, np.asarray(fine.faces, dtype=np.int64)))
+    folder = written(dense, "hdf5", tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "dataset.md").read_text(encoding="utf-8")
     (snippet,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    script = snippet + "np.savez('found.npz', pixels=pixels, shown=shown)\n"
+    assert len([line for line in snippet.splitlines() if line]) == 10
+    script = snippet + "np.savez('found.npz', pixels=pixels, shown=shown, colours=colours, image=view['image'])\n"
     subprocess.run([sys.executable, "-c", script], cwd=folder, env={}, check=True)
+    view = dataset.views[0]
     with np.load(folder / "found.npz") as found:
-        assert np.abs(found["pixels"] - truth_px(dataset.views[0])).max() < 0.01
-        assert found["shown"].any()
-        assert not found["shown"].all()  # some corners are behind the solid
+        pixels, shown, image = found["pixels"], found["shown"], found["image"][..., 2].astype(np.float64)
+        assert np.abs(pixels - view.camera.project(apply(inverse(view.T_world_camera), vertices))).max() < 0.01
+        assert 0.2 < np.mean(shown) < 0.8  # the rest is behind the solid
+        column, row = np.rint(pixels[shown]).astype(int).T
+        assert np.array_equal(found["colours"][:, 2], image[row, column])
+    # Where the photograph itself has the vertices: the shift that best explains their brightness.
+    slopes = np.stack([slope[row, column] for slope in np.gradient(image)[::-1]], axis=1)
+    smooth = np.linalg.norm(slopes, axis=1) < 8  # not at an edge of the solid
+    off = scene().tone(vertices[shown]) - image[row, column]
+    off -= np.sum(slopes * (pixels[shown] - np.stack([column, row], axis=1)), axis=1)
+    shift_px = np.linalg.lstsq(slopes[smooth], off[smooth], rcond=None)[0]
+    assert np.count_nonzero(smooth) > 300
+    assert np.abs(shift_px).max() < 0.5
 
 
 def test_hdf5_holds_image_depth_and_pose(dataset: DataSet, tmp_path: Path) -> None:
@@ -341,7 +394,10 @@ def says_simulated(path: Path) -> bool:
 
 
 #: Files that cannot say it: bare numbers, or a form of which every key is a number of an image.
-SILENT = ("*.bin", "scene_*.json", "models_info.json", "*.png", "SHA256SUMS", "loader.py", "*ground_truth_depth/*")
+SILENT = (
+    "*.bin", "scene_*.json", "models_info.json", "*.png", "SHA256SUMS", "loader.py", "*ground_truth_depth/*",
+    "camera.json", "poses.csv",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sorted(NAMES))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -43,7 +44,8 @@ def run(tmp_path: Path, ct_centres_m: Array, *more: object) -> Result:
 
 
 def test_the_command_fuses_measures_and_cuts_out_the_spheres(tmp_path: Path) -> None:
-    done = run(tmp_path, CENTRES_M, "--cut-posts-mm", "2", "--heat-map", tmp_path / "heat.ply", "--json")
+    done = run(tmp_path, CENTRES_M, "--cut-posts-mm", "2", "--heat-map", tmp_path / "heat.ply",
+               "--picture", tmp_path / "both.png", "--json")  # fmt: skip
     assert done.exit_code == 0, done.output
     record = json.loads(done.stdout)
     assert np.array(record["T_scan_ct"]) == pytest.approx(T_WORLD_CT, abs=2e-5)
@@ -61,6 +63,10 @@ def test_the_command_fuses_measures_and_cuts_out_the_spheres(tmp_path: Path) -> 
     flat = top & (np.hypot(p[:, 0], p[:, 1]) > 0.018)
     assert np.sqrt(np.mean((p[flat, 2] - height(p[flat, 0], p[flat, 1])) ** 2)) < 4e-5
     heat = trimesh.load_mesh(tmp_path / "heat.ply", process=False)
+    picture = cv2.imread(str(tmp_path / "both.png"))
+    assert picture is not None
+    assert picture.shape[1] > 2 * picture.shape[0]  # three views side by side
+    assert picture.std() > 10
     spread = np.linalg.norm(apply(T_WORLD_CT, np.zeros((1, 3))))
     assert np.all(np.linalg.norm(np.asarray(heat.vertices), axis=1) < spread + 0.2)
 

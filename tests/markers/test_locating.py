@@ -16,13 +16,14 @@ from service.compute.evaluation.accuracy import true_error_m
 from service.compute.images.files import read_image, read_reduced
 from service.compute.markers.cones import cone_of_sphere
 from service.compute.markers.detect import detect_spheres
+from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.anchors import spread_views
+from service.compute.markers.search.cone_pose import fit_pose
 from service.compute.markers.search.image_files import LocatedOutlines, detect_all, locate_outlines
 from service.compute.markers.search.predicted import (
     WIDE,
     Prediction,
-    fit_pose,
     locate_predicted,
     tone_of,
     visible_cones,
@@ -270,10 +271,10 @@ def test_pose_from_cones_in_spite_of_a_false_one(
     turn: tuple[float, float, float], shift: tuple[float, float, float], false: int
 ) -> None:
     true = inverse(look_at(np.array([0.1, -0.2, 0.62]), np.array([0, 0, 0.05]), np.array([0.0, 1, 0])))
-    cones = [cone_of_sphere(c, RADIUS_M) for c in apply(true, REGISTRATION_M)]
-    axes = np.array([c.axis for c in cones])
+    cones = ObservedCones.of(cone_of_sphere(c, RADIUS_M) for c in apply(true, REGISTRATION_M))
+    axes = cones.axes
     axes[false] += [0.01, -0.008, 0.0]
     axes[false] /= np.linalg.norm(axes[false])
     start = transform(Rotation.from_rotvec(turn), np.array(shift)) @ true
-    found = fit_pose(axes, np.array([c.half_angle_rad for c in cones]), REGISTRATION_M, RADIUS_M, start, 60)
+    found = fit_pose(cones, REGISTRATION_M, RADIUS_M, start, 60)
     assert np.linalg.norm(apply(found, REGISTRATION_M) - apply(true, REGISTRATION_M), axis=1).max() < 2e-4

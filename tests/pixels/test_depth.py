@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.coding import coded_depth, coded_normals, decoded_depth, decoded_normals
+from service.compute.pixels.coding import DEPTH_UNIT_MM, coded_depth
+from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.rays import pixel_rays
 from service.compute.pixels.render import seen, seen_rows
-from service.compute.pixels.surface import Surface
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, look_at
 
@@ -24,13 +23,13 @@ CAMERAS = [pytest.param(PINHOLE, id="pinhole"), pytest.param(DISTORTED, id="dist
 T_WORLD_CAMERA = look_at(np.array([0.1, -0.2, 0.7]), np.array([0.02, 0.01, 0.0]), np.array([0.0, 1.0, 0.0]))
 
 
-def square(half_m: float) -> Surface:
+def square(half_m: float) -> RayMesh:
     """The plane z = 0 of the world as two triangles."""
     corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * half_m
-    return Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    return RayMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def cap(radius_m: float, half_angle_rad: float, n: int) -> tuple[Surface, float]:
+def cap(radius_m: float, half_angle_rad: float, n: int) -> tuple[RayMesh, float]:
     """The top of a sphere at the origin, finely tessellated, and how far its faces lie inside the sphere at most."""
     angle = np.tan(np.linspace(-half_angle_rad, half_angle_rad, n))
     x, y = np.meshgrid(angle, angle)
@@ -40,7 +39,7 @@ def cap(radius_m: float, half_angle_rad: float, n: int) -> tuple[Surface, float]
     a, b, c, d = k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]
     faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (d, c, b))])
     edge_m = np.linalg.norm(points[faces[:, 1]] - points[faces[:, 2]], axis=1).max()
-    return Surface(points, faces), float(edge_m**2 / (6 * radius_m))
+    return RayMesh(points, faces), float(edge_m**2 / (6 * radius_m))
 
 
 def pixel_grid(camera: CameraModel) -> Array:
@@ -128,7 +127,7 @@ def test_any_plane_from_anywhere_far_from_the_origin(
     T = look_at(np.array(eye), np.array([0.05, 0.02, 0.0]), np.array([0.0, 1.0, 0.1]))
     moved = T.copy()
     moved[:3, 3] += away
-    depth = seen(Surface(corners, np.array([[0, 2, 1], [0, 2, 3]])), camera, moved).depth_m
+    depth = seen(RayMesh(corners, np.array([[0, 2, 1], [0, 2, 3]])), camera, moved).depth_m
     expected = plane_depth(camera, T)
     near = (expected > 0) & (expected < 4.0)
     assert np.abs(depth[near] / expected[near] - 1).max() < 1e-6
@@ -139,7 +138,7 @@ def test_the_nearest_surface_is_seen_whichever_way_its_faces_turn() -> None:
     vertices = np.concatenate([corners, corners + np.array([0, 0, 0.1])])
     faces = np.array([[0, 1, 2], [0, 2, 3], [6, 5, 4], [7, 6, 4]])
     T = look_at(np.array([0.0, 0.0, 0.6]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
-    image = seen(Surface(vertices, faces), PINHOLE, T)
+    image = seen(RayMesh(vertices, faces), PINHOLE, T)
     assert np.abs(image.depth_m - 0.5).max() < 1e-6
     assert np.abs(image.normal - [0, 0, -1]).max() < 1e-6
 
@@ -147,13 +146,13 @@ def test_the_nearest_surface_is_seen_whichever_way_its_faces_turn() -> None:
 def test_faces_without_area_do_not_matter() -> None:
     vertices = np.array([[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0], [0, 0, 0.3]])
     faces = np.array([[4, 4, 4], [0, 1, 2], [0, 4, 0], [0, 2, 3]])
-    image = seen(Surface(vertices, faces), PINHOLE, T_WORLD_CAMERA)
+    image = seen(RayMesh(vertices, faces), PINHOLE, T_WORLD_CAMERA)
     assert np.abs(image.depth_m / plane_depth(PINHOLE, T_WORLD_CAMERA) - 1).max() < 1e-6
 
 
 def test_a_mesh_without_faces_is_refused() -> None:
     with pytest.raises(DataError, match="no face with an area"):
-        Surface(np.zeros((3, 3)), np.empty((0, 3), dtype=np.int64))
+        RayMesh(np.zeros((3, 3)), np.empty((0, 3), dtype=np.int64))
 
 
 def test_a_distortion_that_folds_within_the_image_is_refused() -> None:
@@ -163,13 +162,8 @@ def test_a_distortion_that_folds_within_the_image_is_refused() -> None:
 
 def test_coded_depth_is_within_half_a_tenth_of_a_millimetre() -> None:
     depth_m = seen(square(0.2), PINHOLE, T_WORLD_CAMERA).depth_m
-    again = decoded_depth(coded_depth(depth_m))
+    again = coded_depth(depth_m) * (1e-3 * DEPTH_UNIT_MM)
     assert np.abs(again - depth_m).max() <= 0.5001e-4
     assert ((again > 0) == (depth_m > 0)).all()
     with pytest.raises(DataError, match=r"7.00 m does not fit into 16 bits"):
         coded_depth(np.full((2, 2), 7.0, dtype=np.float32))
-
-
-def test_coded_normals_come_back() -> None:
-    normal: NDArray[np.float32] = seen(square(0.2), PINHOLE, T_WORLD_CAMERA).normal
-    assert np.abs(decoded_normals(coded_normals(normal)) - normal).max() < 2e-5

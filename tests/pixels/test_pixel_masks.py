@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.crops import Crop, marker_free_crops
 from service.compute.pixels.masks import Ball, Post, marker_mask, posts_below
+from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.rays import pixel_rays
 from service.compute.pixels.render import depth_map, seen
 from service.compute.pixels.splits import splits
-from service.compute.pixels.surface import Surface
 from service.compute.pixels.undistort import pinhole_of, undistorted
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, apply, inverse, look_at
@@ -51,7 +51,7 @@ def test_an_undistorted_image_shows_each_ray_at_its_own_pixel(k1: float) -> None
 def test_depth_of_an_undistorted_image_belongs_to_its_own_pixels() -> None:
     """The two depths agree along the same ray, whichever camera took it."""
     corners = np.array([[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0]])
-    surface = Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    surface = RayMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     pinhole = pinhole_of(CAMERA)
     depth = depth_map(surface, pinhole, T)
     v, u = (k.ravel() for k in np.mgrid[10:110:7, 10:170:7])
@@ -64,7 +64,7 @@ def test_depth_of_an_undistorted_image_belongs_to_its_own_pixels() -> None:
 
 
 def covered(camera: CameraModel, mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
-    return seen(Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces)), camera, T).valid
+    return seen(RayMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)), camera, T).valid
 
 
 @pytest.mark.parametrize("camera", [CAMERA, pinhole_of(CAMERA)])
@@ -147,7 +147,7 @@ def test_the_camera_of_a_crop_projects_to_the_same_places() -> None:
 
 def test_depth_of_a_crop_is_that_of_the_image() -> None:
     corners = np.array([[-0.2, -0.2, 0], [0.2, -0.2, 0], [0.2, 0.2, 0.1], [-0.2, 0.2, 0]])
-    surface, crop = Surface(corners, np.array([[0, 1, 2], [0, 2, 3]])), Crop(40, 24, 90, 60)
+    surface, crop = RayMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), Crop(40, 24, 90, 60)
     whole, part = (depth_map(surface, camera, T) for camera in (CAMERA, crop.camera(CAMERA)))
     assert np.abs(part - whole[crop.slices]).max() < 1e-6
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from service.compute.descent import Damping, gauss_newton, levenberg_marquardt
+from service.compute.descent import Damping, gauss_newton, halved_gauss_newton, levenberg_marquardt
 from service.core.geometry import Array
 
 
@@ -91,3 +91,47 @@ def test_gauss_newton_stops_after_the_first_small_step_or_the_last_one() -> None
     steps.clear()
     gauss_newton(1.0, root_of_two, lambda x, step: x + float(step[0]), most=2, settled=0.0)
     assert len(steps) == 2
+
+
+@dataclass(frozen=True)
+class Arc:
+    """The residual arctan(x): from beyond 1.4, whole Gauss–Newton steps move ever farther from its zero."""
+
+    x: float
+
+    @property
+    def cost(self) -> float:
+        return math.atan(self.x) ** 2
+
+    def after(self, share: float) -> Arc:
+        return Arc(self.x - share * math.atan(self.x) * (1 + self.x**2))
+
+
+def test_a_step_that_overshoots_is_halved_and_the_next_one_is_tried_whole() -> None:
+    shares: list[float] = []
+
+    def after(here: Arc, share: float) -> Arc:
+        shares.append(share)
+        return here.after(share)
+
+    found = halved_gauss_newton(
+        Arc(3.0), after, lambda here, there: here.cost - there.cost, lambda _here, there: there.cost < 1e-24, most=20
+    )
+    assert found.settled
+    assert abs(found.state.x) < 1e-12
+    assert shares[:4] == [1.0, 0.5, 0.25, 1.0]
+
+
+def test_a_descent_tells_whether_it_settled_or_the_steps_ran_out() -> None:
+    found = halved_gauss_newton(
+        Arc(1.0), Arc.after, lambda here, there: here.cost - there.cost, lambda _here, _there: False, most=2
+    )
+    assert not found.settled
+    assert not found.stuck
+    assert found.steps == 2
+    start = Arc(1.0)
+    found = halved_gauss_newton(start, lambda _here, _share: Arc(9.0), lambda _here, _there: -1.0,
+                                lambda _here, _there: False, most=50)  # fmt: skip
+    assert found.stuck
+    assert found.state is start
+    assert found.steps == 11, "a share of a thousandth is the last that is tried"

@@ -23,12 +23,13 @@ from service.core.geometry import inverse
 from service.core.protocol.models import load_protocol
 from service.core.records.events import OperatorAction, RunStarted, ViewImported, ViewpointCaptured
 from service.core.records.import_list import FileRole, PhotographRole
-from service.dataset.export import export_dataset
+from service.dataset.posed.exporter import exporter, write_data_set
+from service.dataset.posed.of_run import data_set_of
 from service.dataset.summary import summarise
 from service.import_folder import find_places, import_rig, list_import
 from service.run_start import recorded_rig, recorded_run, start_run
 from service.steps import params_models
-from service.steps.kinds.image_import import settings_agree
+from service.steps.kinds.image_import import StatedSettings, settings_agree
 from service.store.database.engine import database_path
 from service.store.store import Store
 from service.store.verification.verify import verify
@@ -159,10 +160,10 @@ def test_a_dry_run_shows_and_records_nothing(folder: Path, tmp_path: Path) -> No
 
 def test_settings_are_judged_where_protocol_and_file_state_them() -> None:
     wanted = load_protocol(REPOSITORY / "protocols" / "demo.yaml", params_models()).protocol.camera
-    assert settings_agree({"aperture_f": 22.0, "exposure_s": 1 / 15, "iso": 100}, wanted) is True
-    assert settings_agree({"aperture_f": 8.0}, wanted) is False
-    assert settings_agree({"lens": "a lens"}, wanted) is None
-    assert settings_agree({"aperture_f": 8.0}, None) is None
+    assert settings_agree(StatedSettings(aperture_f=22.0, exposure_s=1 / 15, iso=100), wanted) is True
+    assert settings_agree(StatedSettings(aperture_f=8.0), wanted) is False
+    assert settings_agree(StatedSettings(), wanted) is None
+    assert settings_agree(StatedSettings(aperture_f=8.0), None) is None
 
 
 def test_the_list_is_the_rig_of_the_run_and_names_the_interrupted_one(folder: Path, tmp_path: Path) -> None:
@@ -256,7 +257,7 @@ def test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere(
         skipped = [p for p in payloads if isinstance(p, OperatorAction) and p.action == "skip"]
         assert [(p.step, p.reason) for p in skipped] == [("ct", "no CT series among the files")]
         summary = summarise(store, result["run"], recorded_run(store, result["run"])[0])
-        export_dataset(summary, tmp_path / "dataset")
+        write_data_set(data_set_of(summary), exporter("plain"), tmp_path / "dataset")
     assert true_error_mm(data, result["run"], photographer) < 0.3
     assert verify(data, result["run"]).ok
     says_so(data, result["run"], tmp_path)

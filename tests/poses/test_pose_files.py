@@ -19,12 +19,12 @@ from service.compute.camera_model import CameraModel
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json, write_camera_json
 from service.compute.poses.files.pose_files import (
     read_poses,
-    write_colmap_text,
     write_poses_csv,
     write_transforms_json,
 )
 from service.core.errors import DataError
 from service.core.geometry import Transform, transform
+from tests.support.scenes.colmap_model import write_colmap_text
 
 CAMERA = CameraModel(1536, 1024, 2150.5, 2152.25, 770.125, 508.5, -0.05, 0.04, 3e-4, -2e-4)
 CSV = "image,x,y,z,qx,qy,qz,qw\n"
@@ -70,8 +70,6 @@ def test_colmap_text_round_trip_and_convention(tmp_path: Path, capfd: pytest.Cap
     # COLMAP's pixel centres are at half-integers
     assert [float(v) for v in fields[6:8]] == [CAMERA.cx + 0.5, CAMERA.cy + 0.5]
     assert capfd.readouterr() == ("", "")
-    with pytest.raises(DataError, match="spaces"):
-        write_colmap_text(tmp_path / "other", CAMERA, {"a 1.jpg": np.eye(4)})
 
 
 def test_colmap_model_written_by_hand(tmp_path: Path) -> None:
@@ -211,7 +209,7 @@ def test_spheres_json(tmp_path: Path) -> None:
     path.write_text('{"radius_mm": 15, "registration_mm": [[1, 2, 3], [4, 5, 6]], "control_mm": []}')
     spheres = read_spheres_json(path)
     assert spheres.radius_m == pytest.approx(0.015)
-    np.testing.assert_allclose(spheres.registration_m, [[0.001, 0.002, 0.003], [0.004, 0.005, 0.006]])
+    np.testing.assert_allclose(spheres.centres_m, [[0.001, 0.002, 0.003], [0.004, 0.005, 0.006]])
     assert spheres.control_m.shape == (0, 3)
     for body, message in (
         ('{"radius_mm": 15}', "missing registration_mm"),

@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.sfm.estimate import SfmModel, reconstruct, reconstruct_from
+from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct, reconstruct_from
 from service.compute.poses.sfm.features import ImageFeatures, pack_matches, unpack_matches
-from service.compute.poses.sfm.front_end import FrontEnd, missing_pairs, pairs_of, pairs_with
+from service.compute.poses.sfm.front_end import FrontEnd, missing_pairs, pairs_of
 from service.compute.poses.sfm.options import SfmOptions
 from service.compute.poses.sfm.pairs import choose_pairs
 from service.core.errors import ComputeError, DataError
@@ -79,13 +79,12 @@ def test_both_mappers_share_features_and_find_the_poses(
     seen: list[tuple[str, int, int]] = []
     first = reconstruct(
         images,
-        camera,
-        tmp_path / "work",
+        SfmWorkspace(tmp_path / "work", camera, OPTIONS, lambda *step: seen.append(step)),
         T_world_camera_prior=prior,
-        options=OPTIONS,
-        progress=lambda *step: seen.append(step),
     )
-    second = reconstruct(images, camera, tmp_path / "work", "global", T_world_camera_prior=prior, options=OPTIONS)
+    second = reconstruct(
+        images, SfmWorkspace(tmp_path / "work", camera, OPTIONS), "global", T_world_camera_prior=prior
+    )
     for model in (first, second):
         assert set(model.T_world_camera) == set(views)
         assert model.missing == ("stray.png",)
@@ -120,15 +119,18 @@ def test_pieces_in_any_order_make_the_same_model(
         with FrontEnd(camera, OPTIONS, processes=1 + turn) as front:
             for name in order:
                 features[name] = ImageFeatures.from_bytes(front.extract_features(views[name][0]).to_bytes())
-                found = front.match_pairs(features, pairs_with(name, features, planned[: 5 * turn + 8]))
+                begun = [pair for pair in planned[: 5 * turn + 8] if name in pair and features.keys() >= set(pair)]
+                found = front.match_pairs(features, begun)
                 packed.append(pack_matches(found))
             early = [match for data in packed for match in unpack_matches(data)]
             late = missing_pairs(planned, early)
             assert len(late) + len(early) == len(planned)
             matches = front.match_pairs(features, late)
-        models.append(reconstruct_from(features, [*early, *matches], camera, tmp_path / str(turn), options=OPTIONS))
+        models.append(
+            reconstruct_from(features, [*early, *matches], SfmWorkspace(tmp_path / str(turn), camera, OPTIONS))
+        )
     images = {name: path for name, (path, _) in views.items()}
-    models.append(reconstruct(images, camera, tmp_path / "one", T_world_camera_prior=prior, options=OPTIONS))
+    models.append(reconstruct(images, SfmWorkspace(tmp_path / "one", camera, OPTIONS), T_world_camera_prior=prior))
     for model in models[1:]:
         for file in models[0].folder.iterdir():
             assert (model.folder / file.name).read_bytes() == file.read_bytes(), file.name
@@ -154,12 +156,9 @@ def test_rough_metric_poses_are_triangulated_and_adjusted(
     seen: list[tuple[str, int, int]] = []
     model = reconstruct(
         images,
-        camera,
-        tmp_path / "work",
+        SfmWorkspace(tmp_path / "work", camera, OPTIONS, lambda *step: seen.append(step)),
         "triangulated",
         T_world_camera_prior=start,
-        options=OPTIONS,
-        progress=lambda *step: seen.append(step),
     )
     assert model.missing == ("stray.png",)
     assert _rms_m(model, views) < 2.5e-4
@@ -171,7 +170,7 @@ def test_rough_metric_poses_are_triangulated_and_adjusted(
     assert adjusted == sorted(adjusted)
     assert adjusted[-1][0] == adjusted[-1][1]
     with pytest.raises(ComputeError, match="initial poses"):
-        reconstruct(images, camera, tmp_path / "work", "triangulated", options=OPTIONS)
+        reconstruct(images, SfmWorkspace(tmp_path / "work", camera, OPTIONS), "triangulated")
 
 
 def test_damaged_pieces_are_refused() -> None:
@@ -193,11 +192,11 @@ def test_wrong_size_or_broken_image_is_named(
     broken = tmp_path / "cut.jpg"
     broken.write_bytes(next(iter(images.values())).read_bytes()[:300])
     with pytest.raises(DataError, match=r"cut\.jpg"):
-        reconstruct({**images, "cut.jpg": broken}, camera, tmp_path / "a", options=OPTIONS)
+        reconstruct({**images, "cut.jpg": broken}, SfmWorkspace(tmp_path / "a", camera, OPTIONS))
     small = tmp_path / "small.png"
     cv2.imwrite(str(small), np.zeros((100, 150), dtype=np.uint8))
     with pytest.raises(DataError, match=r"small\.png"):
-        reconstruct({**images, "small.png": small}, camera, tmp_path / "b", options=OPTIONS)
+        reconstruct({**images, "small.png": small}, SfmWorkspace(tmp_path / "b", camera, OPTIONS))
 
 
 def test_unrelated_images_give_no_model(camera: CameraModel, tmp_path: Path) -> None:
@@ -207,14 +206,14 @@ def test_unrelated_images_give_no_model(camera: CameraModel, tmp_path: Path) -> 
         noise = np.random.default_rng(k).integers(0, 255, (camera.height, camera.width), dtype=np.uint8)
         cv2.imwrite(str(paths[-1]), cv2.GaussianBlur(noise, (0, 0), 3))
     with pytest.raises(ComputeError, match="registered 0 of 3"):
-        reconstruct(paths, camera, tmp_path / "work", options=OPTIONS)
+        reconstruct(paths, SfmWorkspace(tmp_path / "work", camera, OPTIONS))
 
 
 def test_missing_file_and_too_few_images(camera: CameraModel, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="does not exist"):
-        reconstruct([tmp_path / "nothing.jpg"], camera, tmp_path / "work")
+        reconstruct([tmp_path / "nothing.jpg"], SfmWorkspace(tmp_path / "work", camera))
     with pytest.raises(ComputeError, match="at least 3"):
-        reconstruct([], camera, tmp_path / "work")
+        reconstruct([], SfmWorkspace(tmp_path / "work", camera))
 
 
 def test_pairs_are_neighbours_and_connected() -> None:

@@ -23,8 +23,8 @@ from service.audit.record.run import read_run
 from service.audit.report.content import report_content
 from service.audit.report.output.html import render_html
 from service.cli.main import app
-from service.cli.run.hands import SimulatedHands
-from service.cli.run.operators import Display, TerminalOperator
+from service.cli.run.terminal.hands import SimulatedHands
+from service.cli.run.terminal.operators import Display, TerminalOperator
 from service.core.errors import ProtocolError
 from service.core.gates.dependence import dependent_steps, depends_on
 from service.core.protocol.models import load_protocol
@@ -34,7 +34,8 @@ from service.core.run.actions import allowed_actions, unmet_requirements
 from service.core.run.decide import AskOperator
 from service.core.run.fold import fold
 from service.core.run.state import RunState
-from service.dataset.export import export_dataset
+from service.dataset.posed.exporter import exporter, write_data_set
+from service.dataset.posed.of_run import data_set_of
 from service.monitor.devices import OpenDevices
 from service.monitor.reporter import Reporter
 from service.people.sessions import People
@@ -369,7 +370,7 @@ def test_report_data_set_and_bundle_say_it(accepted_run: tuple[Path, str]) -> No
     plain = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", shown))
     assert plain.index("gate accepted") < plain.index("redo")  # listed first among the deviations
     assert plain.count("Depends on an accepted gate: Evaluate: best_mean_radial_error_mm " + text) >= 2
-    export_dataset(run.summary(), folder / "dataset")
+    write_data_set(data_set_of(run.summary()), exporter("plain"), folder / "dataset")
     described = json.loads((folder / "dataset" / "dataset.json").read_text())
     assert described["accepted_gates"] == [f"Evaluate: best_mean_radial_error_mm {text}"]
     with Store.open(data) as store:

@@ -19,7 +19,8 @@ from service.cli.common import console
 from service.cli.main import app
 from service.core.gates.verdict import describe, describe_judged, figure, quantity, standing
 from service.core.records.events import GateVerdict, Uncertainty
-from service.dataset.export import export_dataset
+from service.dataset.posed.exporter import exporter, write_data_set
+from service.dataset.posed.of_run import data_set_of
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import WebSite, web_site
@@ -119,7 +120,8 @@ def test_the_command_shows_every_figure(undecided: tuple[Path, str], monkeypatch
 def test_the_data_set_tells_how_its_gates_stand(tmp_path: Path) -> None:
     bounds = (0.3, 0.38)
     run_id = record_reported_run(tmp_path, error_mm=0.34, error_bounds_mm=bounds, accepted_by="Emmy", registered=True)
-    export_dataset(read_run(tmp_path / "data", run_id).summary(), tmp_path / "out")
+    dataset = data_set_of(read_run(tmp_path / "data", run_id).summary())
+    write_data_set(dataset, exporter("plain"), tmp_path / "out")
     told = json.loads((tmp_path / "out" / "dataset.json").read_text())
     assert told["gates"]["evaluation"] == [f"best_mean_radial_error_mm {BOUNDED}, allowed ≤ 0.35: accepted"]
     assert told["gates"]["calibration"] == ["rms_px 0.030 px, 0.023 to 0.037, allowed ≤ 0.5: within"]

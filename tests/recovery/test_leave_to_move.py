@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import pytest
 
-from service.core.errors import IllegalTransitionError
 from service.core.records.events import OperatorAction, SessionStarted, StepFailed, StepStarted
 from service.core.recovery.policy import recovery_policy
-from service.core.run.decide import AskOperator, Retry, RunStep, check_action
+from service.core.run.decide import AskOperator, Retry, RunStep
 from tests.support.record.core import TOY, Log, captured, toy_protocol
+from tests.support.record.core_log import assert_refused
 
 CHECKED = TOY.replace("    title: Capture\n", "    title: Capture\n    checklist: [nobody in reach]\n")
 
@@ -131,8 +131,7 @@ def test_a_step_that_moves_nothing_goes_on_by_itself() -> None:
 
 def test_a_run_that_was_not_restarted_needs_no_second_confirmation() -> None:
     log = running()
-    with pytest.raises(IllegalTransitionError, match="nothing to confirm"):
-        check_action(log.protocol, log.state, OperatorAction(action="confirm", step="capture"), "Ada")
+    assert_refused(log, "nothing to confirm", OperatorAction(action="confirm", step="capture"), "Ada")
 
 
 def test_a_step_that_moves_the_robot_never_begins_by_itself() -> None:

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from service.cli.run.hands import SimulatedHands
-from service.cli.run.operators import AutomaticOperator, Display
+from service.cli.run.terminal.hands import SimulatedHands
+from service.cli.run.terminal.operators import AutomaticOperator, Display
 from service.core.errors import OrthocaptureError
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import OperatorAction, StepNote

@@ -24,6 +24,7 @@ from service.compute.registration.identification.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import apply, inverse, transform
+from service.worker.registration.evaluate import budget_record
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, exact_outlines, scene
 
 SIGMA_M = 0.02e-3
@@ -154,7 +155,7 @@ def test_stated_errors_that_are_too_small_are_called_so() -> None:
     budget = budget_of(1, stated_m=SIGMA_M / 5)
     camera_scan = next(o for o in budget.observations if o.name == "camera ↔ scan")
     assert "too small" in camera_scan.verdict
-    record = budget.as_json()
+    record = budget_record(budget).plain()
     assert record["total_mm"] == pytest.approx(1e3 * budget.total_m)
 
 

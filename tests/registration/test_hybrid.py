@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_covariance import CameraCovariance
+from service.compute.markers.observed_cones import ObservedCones
 from service.compute.poses.files.pose_covariance import similarity_covariance
-from service.compute.poses.hybrid.bundle import Data, Sigmas, SphereSightings, State, moved, width
+from service.compute.poses.hybrid.bundle import BundleState, Data, Sigmas, SphereSightings, moved, width
 from service.compute.poses.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses
 from service.compute.poses.hybrid.rows import linearise
 from service.compute.scene import PosedImages
@@ -214,9 +215,7 @@ def test_derivatives_of_every_component() -> None:
         sightings=SphereSightings(
             np.array([i for i, _ in found]),
             np.arange(6),
-            np.array([o.cone.axis for _, o in found]),
-            np.array([o.cone.frame() for _, o in found]),
-            np.array([o.cone.half_angle_rad for _, o in found]),
+            ObservedCones.of(o.cone for _, o in found),
             rng.normal(size=(6, 3, 3)) * 1e3,
         ),
         centres=REGISTRATION_M,
@@ -232,7 +231,7 @@ def test_derivatives_of_every_component() -> None:
     # scan coordinates, slightly off so that no residual is zero
     X = np.vstack([np.column_stack([rng.uniform(-0.2, 0.2, (len(made.tracks.points), 2)),
                                     rng.uniform(0, 0.1, len(made.tracks.points))]), REGISTRATION_M])  # fmt: skip
-    state = State(
+    state = BundleState(
         made.T_scan_camera, X + rng.normal(0, 1e-3, X.shape), made.T_scan_base, made.camera, rng.normal(size=6)
     )
     frame, points = rng.normal(0, 1e-6, width(state, data)), rng.normal(0, 1e-6, X.shape)

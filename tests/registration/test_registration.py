@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.compute.markers.cones import cone_of_sphere
+from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import Cost, PointCost, cone_residuals, residuals, residuals_and_derivative
+from service.compute.registration.cost import Cost, PointCost, residuals, residuals_and_derivative
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
@@ -74,15 +75,14 @@ def test_derivative_equals_numerical_differences(seed: int, cost: PointCost) -> 
 def test_derivative_of_a_cone_equals_numerical_differences(seed: int) -> None:
     rng = np.random.default_rng(seed)
     centres = np.column_stack([rng.uniform(-0.2, 0.2, 5), rng.uniform(-0.15, 0.15, 5), rng.uniform(0.4, 1.0, 5)])
-    cones = [cone_of_sphere(c + rng.normal(size=3) * 1e-3, RADIUS_M) for c in centres]
-    axes, half = np.array([c.axis for c in cones]), np.array([c.half_angle_rad for c in cones])
-    frames = np.array([c.frame()[:, :2] for c in cones])
-    _, D = cone_residuals(axes, frames, half, centres, RADIUS_M)
-    for j in range(3):
-        h = np.zeros(3)
-        h[j] = 1e-6
-        more, less = (cone_residuals(axes, frames, half, centres + s * h, RADIUS_M)[0] for s in (1, -1))
-        assert np.allclose(D[:, :, j], (more - less) / 2e-6, rtol=1e-5, atol=1e-6)
+    across = ObservedCones.of(cone_of_sphere(c + rng.normal(size=3) * 1e-3, RADIUS_M) for c in centres)
+    for cones in (across, ObservedCones.with_chords(across.axes, across.half_angles)):
+        _, D = cones.residuals(centres, RADIUS_M)
+        for j in range(3):
+            h = np.zeros(3)
+            h[j] = 1e-6
+            more, less = (cones.residuals(centres + s * h, RADIUS_M)[0] for s in (1, -1))
+            assert np.allclose(D[:, :, j], (more - less) / 2e-6, rtol=1e-5, atol=1e-6)
 
 
 @given(st.integers(0, 100_000))

@@ -148,6 +148,6 @@ def test_command_reads_clouds_and_writes_spheres(tmp_path: Path) -> None:
     arguments = ["spheres", "--mesh", str(cloud), "--radius-mm", "15", "--out", str(out), "--seeds", seeds, "--json"]
     answer = CliRunner().invoke(app, arguments)
     assert answer.exit_code == 0, answer.output
-    np.testing.assert_allclose(read_spheres_json(out).registration_m, centres, atol=8e-5)
+    np.testing.assert_allclose(read_spheres_json(out).centres_m, centres, atol=8e-5)
     details = json.loads(out.read_text())["details"]
     assert np.shape([d["covariance_m2"] for d in details]) == (6, 3, 3)

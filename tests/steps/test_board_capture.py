@@ -188,7 +188,7 @@ def test_a_smeared_lens_stops_the_capture_and_exactly_the_blurred_images_are_tak
 
     def clean(question: Any, state: Any) -> Any:
         asked.append(question.text)
-        assert state.step.mend["hands"] == [{"action": "clean_lens"}]
+        assert [work.action for work in state.step.mend.hands] == ["clean_lens"]
         cleaned_after.append(bench.rig.shutter.exposures)
         return answer(question, "confirm")
 

@@ -9,13 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.board.board import Board, BoardView
-from service.compute.calibration.board_poses.candidates import ViewRange, board_candidates
+from service.compute.calibration.board_poses.candidates import board_candidates
 from service.compute.calibration.board_poses.design import (
     NOTHING,
     CalibrationTargets,
-    as_taken,
+    DesignProblem,
     choose_poses,
-    predict,
 )
 from service.compute.calibration.board_poses.knowledge import (
     BoardKnowledge,
@@ -23,6 +22,7 @@ from service.compute.calibration.board_poses.knowledge import (
     nominal_knowledge,
     refined_knowledge,
 )
+from service.compute.calibration.board_poses.view_range import ViewRange
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics
 from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.camera_model import CameraModel
@@ -70,9 +70,9 @@ def test_every_planned_pose_holds_the_whole_board_within_the_tolerances(
 def test_a_design_covers_the_image_and_predicts_what_its_images_come_to() -> None:
     known = nominal(SMALL)
     candidates = board_candidates(known, BOARD, ViewRange(), APPROACH)
-    aims = CalibrationTargets(coverage=1.0, corner_sigma_px=0.05)
-    poses = choose_poses(candidates, 30, known, BOARD, aims)
-    prediction = predict(as_taken(known, BOARD, poses), known, BOARD, aims)
+    problem = DesignProblem(known, BOARD, CalibrationTargets(coverage=1.0, corner_sigma_px=0.05))
+    poses = choose_poses(problem, candidates, 30)
+    prediction = problem.predict(problem.as_taken(poses))
     assert prediction.images == len(poses) == 30
     assert prediction.coverage > 0.95
     assert prediction.tilt_deg > 30
@@ -84,18 +84,19 @@ def test_a_design_covers_the_image_and_predicts_what_its_images_come_to() -> Non
     reached = projection_uncertainty(solved, board_distance_m(solved)).worst_mm
     assert 0.5 < reached / prediction.uncertainty_mm < 2
     chosen_by_chance = candidates.T_base_camera[rng.permutation(len(candidates.T_base_camera))[:30]]
-    by_chance = predict(as_taken(known, BOARD, chosen_by_chance), known, BOARD, aims)
+    by_chance = problem.predict(problem.as_taken(chosen_by_chance))
     assert prediction.uncertainty_mm < by_chance.uncertainty_mm
 
 
 def test_what_the_arm_cannot_take_is_not_planned_and_enough_is_enough() -> None:
     known = nominal(SMALL)
     candidates = board_candidates(known, BOARD, ViewRange(), APPROACH)
-    near = choose_poses(candidates, 10, known, BOARD, AIMS, feasible=lambda T: T[0, 3] < MIDDLE[0])
+    problem = DesignProblem(known, BOARD, AIMS)
+    near = choose_poses(problem, candidates, 10, feasible=lambda T: T[0, 3] < MIDDLE[0])
     assert len(near) == 10
     assert (near[:, 0, 3] < MIDDLE[0]).all()
-    assert len(choose_poses(candidates, 10, known, BOARD, AIMS, feasible=lambda _T: False)) == 0
-    few = choose_poses(candidates, 10, known, BOARD, AIMS, enough=lambda p: p.images >= 4, taken=NOTHING)
+    assert len(choose_poses(problem, candidates, 10, feasible=lambda _T: False)) == 0
+    few = choose_poses(problem, candidates, 10, enough=lambda p: p.images >= 4, taken=NOTHING)
     assert len(few) == 4
 
 

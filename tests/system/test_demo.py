@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import socket
 import subprocess
 import time
@@ -17,7 +18,10 @@ import pytest
 import trimesh
 import yaml
 
+from service.audit.record.run import read_run
+from service.audit.replay.copied import CopiedResults
 from service.cli.run.demo import free_address
+from service.core.jobs.references import jobs_of, references_in
 from tests.support.processes.package import installed_package
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import RIG_LOCK, command, orthocapture
@@ -94,6 +98,25 @@ def test_data_set_is_in_one_frame(demo: dict[str, Any]) -> None:
     assert json.loads((folder / "dataset.json").read_text())["simulated"] is True
 
 
+def test_the_data_set_is_packaged_verified_and_recorded(demo: dict[str, Any]) -> None:
+    folder = Path(demo["dataset"])
+    done = subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=folder, check=False)
+    assert done.returncode == 0
+    assert demo["dataset_files"] == len((folder / "SHA256SUMS").read_text().splitlines())
+    card = (folder / "DATACARD.md").read_text(encoding="utf-8")
+    assert "SIMULATED" in card
+    assert "No ethics statement was given" in card
+    for name in ("croissant.json", "ro-crate-metadata.json", "views.csv"):
+        assert (folder / name).is_file()
+    answer = orthocapture("audit", "show", demo["run"], "--data", demo["data_dir"], "--json")
+    exported = [event for event in json.loads(answer.stdout)["events"] if event["kind"] == "evidence_exported"]
+    assert len(exported) == 1
+    # CT and scan agree where both show the specimen; the means hold what only one of them shows.
+    floor_mm = demo["chamfer_floor_mm"]
+    assert 0 < floor_mm < demo["ct_to_scan_median_mm"] < floor_mm + 0.5
+    assert demo["chamfer_mm"] == pytest.approx((demo["ct_to_scan_mm"] + demo["scan_to_ct_mm"]) / 2, abs=1e-3)
+
+
 def test_report_stands_alone(demo: dict[str, Any]) -> None:
     html = Path(demo["report"]).read_text()
     for text in ("Deviations", "colmap", "data:image/jpeg;base64", "plotly", "evidence verified", "simulated rig"):
@@ -117,9 +140,20 @@ def test_every_image_was_looked_at_while_the_specimen_was_there(demo: dict[str, 
     assert len(plans) == 4, "recorded before the first motion of each capture"
 
 
+def test_no_job_holds_a_copy_of_what_an_earlier_one_found(demo: dict[str, Any]) -> None:
+    run = read_run(Path(demo["data_dir"]), demo["run"])
+    jobs = sorted(jobs_of(run.state).values(), key=lambda job: job.enqueued_seq)
+    assert any(next(references_in(job.arguments), None) is not None for job in jobs)
+    earlier = CopiedResults()
+    for job in jobs:
+        assert earlier.as_references(job.arguments) == job.arguments, job.kind
+        earlier.add(job)
+
+
 def test_truth_never_enters_the_run(demo: dict[str, Any]) -> None:
     database = Path(demo["database"]).read_bytes()
-    assert b"truth" not in database
+    # The ground truth of a run is its mesh of CT and scan; the truth of the rig must not be there.
+    assert b"truth" not in re.sub(rb"ground[ _]truth", b"", database, flags=re.IGNORECASE)
 
 
 def test_sigterm_during_the_start_of_the_rig_leaves_nothing_behind(tmp_path: Path) -> None:

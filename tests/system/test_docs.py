@@ -234,9 +234,28 @@ RUN_ELSEWHERE = {
     "orthocapture fuse --ct ct.ply --scan scan.ply --radius-mm 15 --out truth.ply": (
         "tests/ground_truth/test_fuse_command.py::test_the_command_fuses_measures_and_cuts_out_the_spheres"
     ),
+    **dict.fromkeys(
+        (
+            "orthocapture export latest --format hdf5 --out dataset --data runs",
+            "orthocapture benchmark run dataset --method stereo --scenario dense --out benchmark",
+            "orthocapture benchmark run dataset --method stereo --scenario sparse --out benchmark",
+            "orthocapture benchmark run dataset --method neus2 --scenario dense --mesh 15000.obj --out benchmark",
+            "orthocapture benchmark table --out benchmark --markdown table.md --figure figure.png",
+        ),
+        "tests/benchmark/test_benchmark_command.py::test_methods_are_run_scored_and_put_into_the_table",
+    ),
     "orthocapture layout --spheres spheres.json": "tests/steps/test_layout.py::test_command",
     "orthocapture export latest --format colmap --out dataset --data runs": (
         "tests/dataset/test_export_command.py::test_a_run_is_exported_recorded_and_still_verifies"
+    ),
+    "orthocapture export latest --format matching --out pairs --data runs": (
+        "tests/matching/test_matching_export.py::test_corresponding_pixels_show_the_same_place"
+    ),
+    "orthocapture benchmark matching pairs --method sift --out matching": (
+        "tests/matching/test_benchmark.py::test_sift_finds_poses_and_fewer_matches_of_difficult_pairs"
+    ),
+    'pip install "kornia==0.9.0" "torch>=2.5.1"': (  # needs a package index, which tests have not
+        "tests/matching/test_methods.py::test_a_learned_method_says_what_to_install_and_which_file_to_give"
     ),
     "orthocapture demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     "make demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
@@ -392,12 +411,16 @@ def test_test_files_and_the_marker_are_there() -> None:
     assert '"slow: ' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 
 
+# Their snippets run in an exported data set: tests/dataset/test_formats.py, tests/matching/test_matching_export.py.
+_OF_EXPORTS = ("dataset.md", "matching.md")
+
+
 def test_snippets_of_python_run(site: Site) -> None:
     snippets = [
         block
         for document in DOCUMENTS
         for language, block in _FENCE.findall(document.read_text(encoding="utf-8"))
-        if language == "python" and document.name != "data_set.md"  # tests/dataset/test_formats.py runs that
+        if language == "python" and document.name not in _OF_EXPORTS
     ]
     assert snippets
     for snippet in snippets:

@@ -44,6 +44,26 @@ def test_every_step_item_and_limit_is_on_the_paper(tmp_path: Path, name: str) ->
         assert page.count("This cannot be undone.") == sum(step.irreversible for step in loaded.protocol.steps)
 
 
+@pytest.mark.parametrize(
+    ("name", "captures"),
+    [
+        ("exvivo_spine.yaml", ["Viewpoint capture at station 1", "Control capture at station 2"]),
+        ("handheld_spine.yaml", ["Photograph the specimen from all sides"]),
+    ],
+)
+def test_the_warning_names_the_captures_that_cannot_be_done_again(
+    tmp_path: Path, name: str, captures: list[str]
+) -> None:
+    with web_site(tmp_path) as web:
+        shutil.copy(PROTOCOLS / name, web.site.protocols)
+        page = words(web.browser("technician"), f"/protocols/{name}/checklist")
+    warnings = re.findall(r"None of these can be done again: ([^.]*)\.", page)
+    assert warnings
+    for warning in warnings:
+        assert set(captures) <= set(warning.split(", "))
+        assert "Photograph the calibration board" not in warning
+
+
 def test_a_run_has_that_of_its_own_protocol(tmp_path: Path) -> None:
     with web_site(tmp_path) as web:
         run_id = web.begin_run().run_id

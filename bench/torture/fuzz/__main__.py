@@ -63,8 +63,8 @@ def swept(
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         return {
             engine: Sweep(group, engine, Path(folder)).run(
-                target.name, inputs=options.inputs, seconds=share_s, seed=options.seed
-            )
+                {target.name: options.inputs}, seconds=share_s, seed=options.seed
+            )[target.name]
             for engine in with_engines
         }
 

@@ -218,7 +218,7 @@ def main() -> None:
     with atheris.instrument_imports(include=INSTRUMENTED) if atheris else contextlib.nullcontext():
         targets = targets_of(plan["group"])
     for target in targets:
-        share = plan["targets"].get(target.name) if plan["targets"] else plan["each"]
+        share = plan["targets"].get(target.name)
         if share is None:
             continue
         reader = Reader(target, slot, folder, set(plan["known"]))
@@ -228,8 +228,7 @@ def main() -> None:
             elif atheris is not None:
                 explore_by_coverage(reader, atheris, folder, seed=plan["seed"], seconds=share["seconds"])
             else:
-                inputs = max(2, round(share["inputs"] * (target.pace if plan["paced"] else 1.0)))
-                explore(reader, seed=plan["seed"], inputs=inputs, seconds=share["seconds"])
+                explore(reader, seed=plan["seed"], inputs=share["inputs"], seconds=share["seconds"])
         finally:
             reader.close()
 

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -82,30 +82,32 @@ class Sweep:
         self._environment = {**os.environ, "TMPDIR": str(folder / "tmp")}
         self.outcomes: dict[str, Outcome] = {}
 
-    def run_each(self, *, inputs: int, seconds: float, seed: int = 0) -> dict[str, Outcome]:
-        """Run all targets in one process, or in successive ones after a death: `inputs` times each target's pace."""
-        each = {"inputs": inputs, "seconds": seconds}
-        death = self._process({"targets": {}, "each": each, "paced": True, "seed": seed})
-        if death is not None:
-            self._keep(death)
-        return self.outcomes
+    def run(self, inputs: Mapping[str, int], *, seconds: float, seed: int = 0) -> dict[str, Outcome]:
+        """Run targets in one process, and in another after each death.
 
-    def run(self, target: str, *, inputs: int, seconds: float, seed: int = 0) -> Outcome:
-        """Run one target for a time or a number of inputs."""
-        outcome = self.outcomes.setdefault(target, Outcome())
+        Args:
+            inputs: the number of inputs for each target, by its name.
+            seconds: the time for each target.
+            seed: of hypothesis.
+        """
         began_s = time.monotonic()
         for start in range(_MOST_STARTS):
-            left = {"inputs": inputs - outcome.inputs, "seconds": seconds - (time.monotonic() - began_s)}
-            if left["inputs"] <= 0 or left["seconds"] <= 0:
+            left_s = len(inputs) * seconds - (time.monotonic() - began_s)
+            left = {name: count - self._outcome(name).inputs for name, count in inputs.items()}
+            share = {name: {"inputs": n, "seconds": min(seconds, left_s)} for name, n in left.items() if n > 0}
+            if left_s <= 0 or not share:
                 break
-            death = self._process({"targets": {target: left}, "each": None, "paced": False, "seed": seed + start})
+            death = self._process({"targets": share, "seed": seed + start})
             if death is None:
                 break
             self._keep(death)
-        return outcome
+        return self.outcomes
+
+    def _outcome(self, target: str) -> Outcome:
+        return self.outcomes.setdefault(target, Outcome())
 
     def _keep(self, death: _Death) -> None:
-        outcome = self.outcomes.setdefault(death.at.target, Outcome())
+        outcome = self._outcome(death.at.target)
         outcome.add(death.at.inputs, death.at.refused, death.at.spent_s, death.at.peak_kib)
         if death.fault not in self._known():
             outcome.findings.append(Finding(death.at.target, death.fault, self._reduced(death)))
@@ -183,7 +185,7 @@ class Sweep:
         ended: set[str] = set()
         for text in path.read_text().splitlines() if path.exists() else ():
             told: dict[str, Any] = json.loads(text)
-            outcome = self.outcomes.setdefault(told["target"], Outcome())
+            outcome = self._outcome(told["target"])
             if "fault" in told:
                 data = base64.b64decode(told["input"])
                 outcome.findings.append(Finding(told["target"], told["fault"], data, told["traceback"]))
@@ -191,7 +193,7 @@ class Sweep:
                 ended.add(told["target"])
                 outcome.add(*told["counts"])
         if at is not None and at.target and at.target not in ended:
-            self.outcomes.setdefault(at.target, Outcome()).add(at.inputs, at.refused, at.spent_s, at.peak_kib)
+            self._outcome(at.target).add(at.inputs, at.refused, at.spent_s, at.peak_kib)
 
     def _reduced(self, death: _Death) -> bytes:
         """Minimise the input at which a process died or hung."""
@@ -201,7 +203,7 @@ class Sweep:
         def shows(data: bytes) -> bool:
             (self._folder / "once").write_bytes(data)
             share = {"inputs": 1, "seconds": 1.0}
-            plan = {"targets": {death.at.target: share}, "each": None, "paced": False, "seed": 0, "engine": "once"}
+            plan = {"targets": {death.at.target: share}, "seed": 0, "engine": "once"}
             again = trial._process(plan)
             return again is not None and again.fault.split()[0] == kind
 

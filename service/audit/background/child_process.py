@@ -6,6 +6,7 @@ The child writes each change as a line of JSON (`report`), and the parent keeps 
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -19,6 +20,7 @@ from service.store.durable_effects import Clock, utc_text
 
 Progress = Callable[[str, int, int], None]  # activity, amount done, total
 _BETWEEN_REPORTS_S = 0.2
+STOPPED = 128 + signal.SIGTERM  # exit status of a child that was stopped and has cleared up
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +34,7 @@ class ChildState:
     total: int = 0
     problem: str = ""  # why there is no result
     remedy: str = ""
+    stopped: bool = False  # by a person
     result: Any = None  # plain data, once there is one
 
     @property
@@ -50,6 +53,7 @@ class ChildProcesses:
         self._clock = clock
         self._states: dict[str, ChildState] = {}
         self._threads: dict[str, Thread] = {}
+        self._running: dict[str, subprocess.Popen[str]] = {}
         self._lock = Lock()
 
     def state(self, run_id: str) -> ChildState | None:
@@ -81,6 +85,15 @@ class ChildProcesses:
         thread.start()
         return True
 
+    def stop(self, run_id: str) -> bool:
+        """Ask the running child to end (SIGTERM). Returns whether there was one."""
+        with self._lock:
+            process = self._running.get(run_id)
+            if process is None:
+                return False
+            process.terminate()
+            return True
+
     def wait(self, run_id: str, timeout_s: float) -> None:
         """Wait until the running child has ended."""
         thread = self._threads.get(run_id)
@@ -90,26 +103,44 @@ class ChildProcesses:
     def _follow(
         self, run_id: str, arguments: Sequence[str], begun: ChildState, keep: Callable[[ChildState], None] | None
     ) -> None:
-        ended = replace(begun, problem=f"the {self._name} ended without a result", remedy="Try again")
-        command = [sys.executable, "-m", self._module, *arguments]
         try:
-            with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-                assert process.stdout is not None  # a pipe was asked for
-                for line in process.stdout:
-                    told = replace(begun, **json.loads(line))
-                    if told.pending:
-                        self._set(run_id, told)
-                    else:
-                        ended = told
+            ended = self._heard(run_id, arguments, begun)
             if keep is not None and not ended.problem:
                 keep(ended)
         except (OSError, ValueError, TypeError) as error:
             ended = replace(begun, problem=f"the {self._name} could not be done: {error}", remedy="Try again")
         self._set(run_id, ended)
 
+    def _heard(self, run_id: str, arguments: Sequence[str], begun: ChildState) -> ChildState:
+        """Run the child and listen to it until it has ended. Raises OSError, ValueError, TypeError."""
+        ended = replace(begun, problem=f"the {self._name} ended without a result", remedy="Try again")
+        command = [sys.executable, "-m", self._module, *arguments]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+            assert process.stdout is not None  # a pipe was asked for
+            with self._lock:
+                self._running[run_id] = process
+            try:
+                for line in process.stdout:
+                    told = replace(begun, **json.loads(line))
+                    if told.pending:
+                        self._set(run_id, told)
+                    else:
+                        ended = told
+            finally:
+                with self._lock:
+                    del self._running[run_id]
+        if ended.result is None and process.returncode in (STOPPED, -signal.SIGTERM):
+            return replace(begun, stopped=True, problem=f"the {self._name} was stopped")
+        return ended
+
     def _set(self, run_id: str, state: ChildState) -> None:
         with self._lock:
             self._states[run_id] = state
+
+
+def ends_tidily_when_stopped() -> None:
+    """In a child process: SIGTERM ends it as an exception does, so that it removes what it began."""
+    signal.signal(signal.SIGTERM, lambda _number, _frame: sys.exit(STOPPED))
 
 
 def report(work: Callable[[Progress], Any], *, outlives_parent: bool) -> None:

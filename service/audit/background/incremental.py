@@ -13,7 +13,7 @@ from typing import Generic, Protocol, Self, TypeVar
 
 from sqlalchemy import text
 
-from service.audit.record.queries import head
+from service.audit.record.run_rows import head
 from service.store.store import Store
 
 WAIT_S = 0.08  # how long a page waits before it says "being computed"

@@ -22,19 +22,18 @@ from service.core.records.events import (
     ViewpointCaptured,
 )
 from service.core.records.import_list import imported_sentence
-from service.store.events import references
+from service.dataset.package.crate_entities import (
+    CONTEXT,
+    anchor,
+    descriptor,
+    device,
+    file_entity,
+    person,
+    software,
+)
+from service.store.events import canonical, references
 from service.store.records import Artefact
 
-METADATA = "ro-crate-metadata.json"
-_CONTEXT = ["https://w3id.org/ro/crate/1.1/context", {"sha256": "https://w3id.org/ro/terms/workflow-run#sha256"}]
-_FORMATS = {
-    "jsonl": "application/x-ndjson",
-    "json": "application/json",
-    "yaml": "application/yaml",
-    "txt": "text/plain",
-    "py": "text/x-python",
-    "html": "text/html",
-}
 _DESCRIPTIONS = {
     "README.txt": "How to read and verify this bundle",
     "events.jsonl": "The run's chain of events: one canonical JSON record a line",
@@ -51,23 +50,27 @@ _DESCRIPTIONS = {
 }
 
 
-def crate(run: BundledRun, files: Sequence[ManifestEntry]) -> dict[str, Any]:
-    """The metadata as plain data. `files`: those in the bundle, which lacks recorded files if it has hashes alone."""
+def crate_json(run: BundledRun, files: Sequence[ManifestEntry]) -> bytes:
+    """The metadata as canonical JSON. `files`: those in the bundle, which may lack recorded files."""
     described = _artefact_entities(run.artefacts, {item.path for item in files})
     ids = {artefact.ref.sha256: entity["@id"] for artefact, entity in described}
-    own = [_file_entity(item) for item in files if not item.path.startswith("artefacts/")]
+    own = [
+        file_entity(item.path, item.sha256, item.size_bytes, _DESCRIPTIONS.get(item.path, ""))
+        for item in files
+        if not item.path.startswith("artefacts/")
+    ]
     parts = [*own, *(entity for _, entity in described)]
     named = sorted({*run.state.people, *filter(None, (run.root.operator, run.state.released_by))})
-    people = [_person(name, run.full_names) for name in named]
+    people = [person(name, run.full_names) for name in named]
     devices = list(_devices(run.events))
     actions = [*_captures(run.events, ids, {d["@id"] for d in devices}), *_jobs(run.events, ids)]
     dataset = _dataset(run) | {
-        "author": [{"@id": person["@id"]} for person in people],
+        "author": [{"@id": one["@id"]} for one in people],
         "hasPart": [{"@id": part["@id"]} for part in parts if part["@type"] == "File"],
         "mentions": [{"@id": item["@id"]} for item in (*(p for p in parts if p["@type"] != "File"), *actions)],
     }
     graph = [*_about(run.root, dataset), *people, *devices, *parts, *actions]
-    return {"@context": _CONTEXT, "@graph": graph}
+    return canonical({"@context": CONTEXT, "@graph": graph}).encode()
 
 
 def _dataset(run: BundledRun) -> dict[str, Any]:
@@ -94,12 +97,7 @@ def _dataset(run: BundledRun) -> dict[str, Any]:
 def _about(root: RunStarted, dataset: dict[str, Any]) -> list[dict[str, Any]]:
     """The metadata file, the data set, the rights and the software, in the order of the graph."""
     return [
-        {
-            "@id": METADATA,
-            "@type": "CreativeWork",
-            "conformsTo": {"@id": "https://w3id.org/ro/crate/1.1"},
-            "about": {"@id": "./"},
-        },
+        descriptor(),
         dataset,
         {
             "@id": "#rights",
@@ -107,25 +105,8 @@ def _about(root: RunStarted, dataset: dict[str, Any]) -> list[dict[str, Any]]:
             "name": "Rights",
             "description": "This bundle grants none; ask the site that made it.",
         },
-        {
-            "@id": "#software",
-            "@type": "SoftwareApplication",
-            "name": "orthocapture",
-            "softwareVersion": root.software.get("orthocapture", "unknown"),
-        },
+        software(root.software.get("orthocapture", "unknown")),
     ]
-
-
-def _file_entity(item: ManifestEntry) -> dict[str, Any]:
-    return {
-        "@id": item.path,
-        "@type": "File",
-        "name": item.path,
-        "description": _DESCRIPTIONS.get(item.path, ""),
-        "encodingFormat": _FORMATS.get(item.path.rpartition(".")[2], "application/octet-stream"),
-        "contentSize": str(item.size_bytes),
-        "sha256": item.sha256,
-    }
 
 
 def _artefact_entities(artefacts: Iterable[Artefact], present: set[str]) -> list[tuple[Artefact, dict[str, Any]]]:
@@ -148,17 +129,6 @@ def _artefact_entities(artefacts: Iterable[Artefact], present: set[str]) -> list
     return list(found.values())
 
 
-def _person(account: str, full_names: Mapping[str, str]) -> dict[str, Any]:
-    """By full name; the account, as the records have it, is the other name."""
-    person = {"@id": _anchor("person", account), "@type": "Person", "name": full_names.get(account) or account}
-    return person if person["name"] == account else person | {"alternateName": account}
-
-
-def _anchor(kind: str, name: str) -> str:
-    """An identifier within the crate that is a valid URI reference."""
-    return f"#{kind}-" + "".join(c if c.isascii() and c.isalnum() else f"_{ord(c):x}_" for c in name)
-
-
 def _devices(events: Sequence[Event]) -> Iterable[dict[str, Any]]:
     """Every device as it first answered."""
     opened: dict[str, DeviceOpened] = {}
@@ -168,19 +138,13 @@ def _devices(events: Sequence[Event]) -> Iterable[dict[str, Any]]:
     known = bodies(events)
     for name, payload in opened.items():
         identity = recorded_report(payload.report).identity
-        yield {
-            "@id": _anchor("device", name),
-            "@type": "IndividualProduct",
-            "name": name,
-            "description": f"{identity.model} {identity.firmware}".strip(),
-            "serialNumber": known.shown(identity),
-            # As its connection states it, where photographs state the body's own: one camera.
-            **({"identifier": identity.serial} if known.shown(identity) != identity.serial else {}),
-        }
+        entity = device(name, identity.model, identity.firmware, known.shown(identity))
+        # As its connection states it, where photographs state the body's own: one camera.
+        yield entity | ({"identifier": identity.serial} if known.shown(identity) != identity.serial else {})
 
 
 def _captures(events: Sequence[Event], ids: Mapping[str, str], devices: set[str]) -> Iterable[dict[str, Any]]:
-    camera = _anchor("device", "camera")
+    camera = anchor("device", "camera")
     for event in events:
         payload = event.payload
         if isinstance(payload, (ViewpointCaptured, ViewHeld)):
@@ -198,7 +162,7 @@ def _captures(events: Sequence[Event], ids: Mapping[str, str], devices: set[str]
                 "@type": "CreateAction",
                 "name": f"Import of {payload.file_name} as {payload.viewpoint} in {payload.step}",
                 "description": "How the photograph was captured is not in evidence.",
-                "agent": {"@id": _anchor("person", payload.imported_by)},
+                "agent": {"@id": anchor("person", payload.imported_by)},
                 "instrument": [{"@id": "#software"}],
                 "endTime": event.at_utc,
                 "result": _links(payload.artefacts, ids),
@@ -214,7 +178,7 @@ def _jobs(events: Sequence[Event], ids: Mapping[str, str]) -> Iterable[dict[str,
         begun = enqueued.get(payload.job)
         arguments = begun.payload.arguments if begun is not None and isinstance(begun.payload, JobEnqueued) else {}
         yield {
-            "@id": _anchor("job", payload.job),
+            "@id": anchor("job", payload.job),
             "@type": "CreateAction",
             "name": f"{payload.job_kind} for {payload.step}",
             "instrument": {"@id": "#software"},

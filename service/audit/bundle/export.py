@@ -11,13 +11,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from service.audit.bundle.contents import BundledRun, Progress, read_bundled_run, write_artefacts, write_records
-from service.audit.bundle.crate import METADATA, crate
+from service.audit.bundle.crate import crate_json
 from service.audit.bundle.zip_file import BundleZip, ZipTime, writing_bundle
 from service.core.errors import IntegrityError
 from service.core.gates.release import refuse_export
 from service.core.protocol.models import Protocol
 from service.core.records.events import EvidenceExported, RunStarted
 from service.core.run.fold import fold
+from service.dataset.package.crate_entities import METADATA
 from service.run_start import recorded_run
 from service.store.events import canonical
 from service.store.files.artefacts import hash_file
@@ -160,7 +161,7 @@ def export_bundle(
                 bundle.add("report.html", [report(exportable.audit, run.head.seq)])
             if not hashes_only:
                 write_artefacts(bundle, store, run.artefacts, progress)
-            bundle.add(METADATA, [canonical(crate(run, bundle.listed)).encode()])
+            bundle.add(METADATA, [crate_json(run, bundle.listed)])
             key_id = _add_manifest(bundle, store, run, hashes_only=hashes_only)
     ((sha256, size),) = left
     return WrittenBundle(target, sha256, size, run.head.seq, run.head.sha256, key_id, root.simulated)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,12 +10,25 @@ from pathlib import Path
 from typing import Literal
 
 from service.audit.background.child_process import ChildProcesses, ChildState
+from service.audit.bundle.export import marked_name
+from service.audit.export.wanted import (
+    ExportRequest,
+    UnfinishedExport,
+    WantedExport,
+    discard_unfinished,
+    forget_request,
+    keep_request,
+    unfinished_exports,
+)
 from service.core.errors import DataError, IllegalTransitionError
 from service.core.records.events import Event, EvidenceExported
-from service.store.durable_effects import Clock
+from service.dataset.posed.folder import SUMS
+from service.store.durable_effects import Clock, utc_text
 
 FOLDER = "exports"
+FORMAT = "format"  # instead of a What: the data set in a format
 What = Literal["bundle", "hashes", "dataset", "report", "report_pdf"]
+_UNSAFE = re.compile(r"[^0-9A-Za-z_-]+")
 _SUFFIX: dict[What, str] = {
     "bundle": "bundle.zip",
     "hashes": "bundle-hashes.zip",
@@ -55,19 +69,44 @@ class Exports:
     def start(self, run_id: str, export: What, by: str) -> None:
         """Start an export. Raises IllegalTransitionError while another export of the run is running."""
         self.folder.mkdir(exist_ok=True)
-        at = f"{self._clock.utc_now():%Y%m%d-%H%M%S}"
-        target = self.folder / f"{run_id}-exported-{at}-{_SUFFIX[export]}"
-        if not self._children.start(run_id, [str(self._data), run_id, export, str(target), by], by=by):
-            now = self._children.state(run_id)
-            raise IllegalTransitionError(
-                f"{now.by if now else 'somebody'} is exporting this run already",
-                where=run_id,
-                remedy="Wait until that one is ready",
-            )
+        self._start(run_id, export, self.folder / f"{self._name(run_id)}-{_SUFFIX[export]}", by)
+
+    def start_format(self, run_id: str, wanted: WantedExport, by: str, *, simulated: bool) -> None:
+        """Start an export of the data set in a format. Raises IllegalTransitionError as `start` does."""
+        self.folder.mkdir(exist_ok=True)
+        options = (
+            _UNSAFE.sub("_", wanted.form)[:40],
+            f"{wanted.crop}x{wanted.crops}" if wanted.crop else "",
+            "anonymous" if wanted.anonymous else "",
+        )
+        name = "-".join((self._name(run_id), *filter(None, options)))
+        target = self.folder / marked_name(name, simulated=simulated)
+        keep_request(target, ExportRequest(run_id, wanted, by, utc_text(self._clock.utc_now())))
+        try:
+            self._start(run_id, FORMAT, target, by)
+        except IllegalTransitionError:
+            forget_request(target)
+            raise
+
+    def go_on(self, run_id: str, name: str, by: str) -> None:
+        """Go on with an unfinished export. Raises DataError for any other name, IllegalTransitionError as `start`."""
+        self._start(run_id, FORMAT, self._unfinished(run_id, name), by)
+
+    def discard(self, run_id: str, name: str) -> None:
+        """Remove an unfinished export. Raises DataError for another name, ConfigurationError while it is written."""
+        discard_unfinished(self._unfinished(run_id, name))
+
+    def stop(self, run_id: str) -> bool:
+        """Stop the running export; what a format has written so far stays. Returns whether there was one."""
+        return self._children.stop(run_id)
 
     def wait(self, run_id: str, timeout_s: float) -> None:
         """Wait until the present export has ended."""
         self._children.wait(run_id, timeout_s)
+
+    def unfinished(self, run_id: str) -> list[UnfinishedExport]:
+        """Exports in a format that were begun and have not ended, newest first."""
+        return unfinished_exports(self.folder, run_id)
 
     def files(self, events: Sequence[Event]) -> list[ExportedFile]:
         """Every export of a run, newest first."""
@@ -79,7 +118,7 @@ class Exports:
         return found[::-1]
 
     def path(self, events: Sequence[Event], file_name: str) -> tuple[Path, EvidenceExported]:
-        """A file for download, by its recorded name. Raises DataError for any other name."""
+        """A file or folder for download, by its recorded name. Raises DataError for any other name."""
         for file in self.files(events):
             path = self._path(file.record) if file.record.file_name == file_name else None
             if path is not None:
@@ -91,12 +130,39 @@ class Exports:
         )
 
     def _path(self, record: EvidenceExported) -> Path | None:
-        """The file if it exists with the recorded size, else None; names that lead out of the folder are refused."""
+        """The file, or the folder of a data set, if it exists with the recorded size (of its list of checksums).
+
+        Names that lead out of the folder are refused, and so are links.
+        """
         path = self.folder / record.file_name
         if path.parent != self.folder or path.name != record.file_name:
             return None
         try:
             found = path.lstat()
+            if stat.S_ISDIR(found.st_mode):
+                found = (path / SUMS).lstat()
         except OSError:
             return None
         return path if stat.S_ISREG(found.st_mode) and found.st_size == record.size_bytes else None
+
+    def _name(self, run_id: str) -> str:
+        return f"{run_id}-exported-{self._clock.utc_now():%Y%m%d-%H%M%S}"
+
+    def _unfinished(self, run_id: str, name: str) -> Path:
+        found = next((export.name for export in self.unfinished(run_id) if export.name == name), None)
+        if found is None:
+            raise DataError(
+                "no unfinished export of this run has this name",
+                where=name[:200],
+                remedy="Choose one of the list, or export again",
+            )
+        return self.folder / found
+
+    def _start(self, run_id: str, export: str, target: Path, by: str) -> None:
+        if not self._children.start(run_id, [str(self._data), run_id, export, str(target), by], by=by):
+            now = self._children.state(run_id)
+            raise IllegalTransitionError(
+                f"{now.by if now else 'somebody'} is exporting this run already",
+                where=run_id,
+                remedy="Wait until that one is ready",
+            )

@@ -11,10 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.audit.background.child_process import Progress, report
+from service.audit.background.child_process import Progress, ends_tidily_when_stopped, report
 from service.audit.bundle.export import export_bundle, marked_name, record_export, require_exportable
 from service.audit.bundle.report import bundle_report
 from service.audit.bundle.zip_file import writing_bundle
+from service.audit.export.exports import FORMAT
+from service.audit.export.wanted import forget_request, kept_request
 from service.core.errors import ConfigurationError
 from service.store.files.artefacts import chunks_of
 from service.store.files.space_used import require_export_space
@@ -28,11 +30,13 @@ _OLDEST = (1980, 1, 1, 0, 0, 0)  # the earliest time in zip; the files state the
 
 
 def export(data: Path, run_id: str, what: str, target: Path, actor: str, progress: Progress) -> Path:
-    """Make a bundle, a data set or a report, and record the export. Returns the file.
+    """Make a bundle, a data set or a report, and record the export. Returns the file or, of a format, the folder.
 
     Raises OrthocaptureError, for example if the evidence does not verify or the run was not released.
     """
     with Store.open(data, create=False) as store:
+        if what == FORMAT:
+            return _in_format(store, run_id, target, actor, progress)
         if what in ("bundle", "hashes"):
             hashes_only = what == "hashes"
             html = bundle_report(data, run_id, with_pictures=not hashes_only)
@@ -68,11 +72,24 @@ def export(data: Path, run_id: str, what: str, target: Path, actor: str, progres
         return path
 
 
+def _in_format(store: Store, run_id: str, target: Path, actor: str, progress: Progress) -> Path:
+    """Write the format that the request beside the folder names; goes on with what an interrupted export wrote."""
+    from service.audit.export.posed import export_data_set  # noqa: PLC0415 - as above
+
+    try:
+        export_data_set(store, run_id, kept_request(target).wanted, target, actor, progress)
+    finally:
+        forget_request(target)
+    return target
+
+
 def _write_dataset(run: RecordedRun, folder: Path, target: Path, leave: Callable[[Path], None]) -> None:
     from service.audit.record.missing_results import not_in_yet  # noqa: PLC0415
-    from service.dataset.export import export_dataset  # noqa: PLC0415
+    from service.dataset.posed.exporter import exporter, write_data_set  # noqa: PLC0415
+    from service.dataset.posed.of_run import data_set_of  # noqa: PLC0415
 
-    export_dataset(run.summary(), folder, not_in_yet(run.protocol, run.state, run.events))
+    missing = not_in_yet(run.protocol, run.state, run.events)
+    write_data_set(data_set_of(run.summary(), missing), exporter("plain"), folder)
     with writing_bundle(target, _OLDEST, leave) as archive:
         for path in sorted(path for path in folder.rglob("*") if path.is_file()):
             compress = path.suffix.lower() not in (".jpg", ".jpeg", ".png", ".npz")
@@ -89,6 +106,7 @@ def _write_report(run: RecordedRun, audit: AuditReport, path: Path, *, pdf: bool
 
 def main(arguments: list[str]) -> None:
     """Make the export, and write progress and the name of the file to stdout."""
+    ends_tidily_when_stopped()
     data, run_id, what, target, actor = arguments
     report(
         lambda progress: export(Path(data), run_id, what, Path(target), actor, progress).name, outlives_parent=True

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from service.audit.overview.findings import value_at, value_text
-from service.audit.record.queries import one_event
+from service.audit.record.event_rows import one_event
 from service.core.errors import DataError
 from service.core.records.events import Event, RecordCorrected
 from service.core.text.json_text import parse_json

@@ -10,7 +10,9 @@ from pydantic import TypeAdapter
 from sqlalchemy import Connection, text
 
 from service.audit.background.incremental import IncrementalResults, PartialResult
-from service.audit.record.queries import Facets, head, root
+from service.audit.record.event_rows import root
+from service.audit.record.event_search import Facets
+from service.audit.record.run_rows import head
 from service.core.errors import IntegrityError, OrthocaptureError
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import (

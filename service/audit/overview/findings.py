@@ -11,12 +11,8 @@ from pydantic import TypeAdapter
 from sqlalchemy import Connection, text
 
 from service.audit.overview.digest import Digest
-from service.audit.record.queries import (
-    EventRow,
-    plain,
-    read_rows,
-    seqs_of_kind,
-)
+from service.audit.record.event_rows import EventRow, read_rows, seqs_of_kind
+from service.audit.record.run_rows import plain
 from service.core.gates.verdict import quantity, uncertain
 from service.core.records.events import RecordCorrected, Uncertainty
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from service.audit.background.incremental import Progress
 from service.audit.overview.digest import Digest, FailedGate
-from service.audit.record.queries import RunBasics
+from service.audit.record.run_rows import RunBasics
 from service.audit.verify.verifications import Verification
 from service.core.gates.verdict import describe_judged
 from service.core.run.state import DeviationKind

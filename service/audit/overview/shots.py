@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, text
 
 from service.audit.overview.digest import Digest
-from service.audit.record.queries import plain
+from service.audit.record.run_rows import plain
 from service.core.protocol.models import Protocol
 from service.core.records.events import Event, ViewpointFailed
 from service.core.run.state import RunState

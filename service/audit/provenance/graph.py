@@ -12,7 +12,8 @@ from sqlalchemy import Connection, text
 
 from service.audit.background.incremental import IncrementalResults, PartialResult
 from service.audit.record.artefact_queries import ArtefactRow, artefacts_of_events, one_artefact
-from service.audit.record.queries import EventRow, head, plain, read_rows
+from service.audit.record.event_rows import EventRow, read_rows
+from service.audit.record.run_rows import head, plain
 from service.core.jobs.references import Each, Reference, references_in
 from service.core.records.events import FilesKept, JobEnqueued
 from service.store.events import parse_canonical

@@ -9,14 +9,15 @@ from typing import Any
 
 from sqlalchemy import Connection, text
 
-from service.audit.record.queries import PAGE, head, plain
+from service.audit.record.filters import Filter
+from service.audit.record.run_rows import PAGE, head, plain
 from service.store.errors import UnknownRunError
 
 _LARGEST_PAGE = 10**6
 
 
 @dataclass(frozen=True, slots=True)
-class ArtefactFilter:
+class ArtefactFilter(Filter):
     """A filter for artefacts; an empty field matches all."""
 
     kind: str = ""
@@ -24,16 +25,6 @@ class ArtefactFilter:
     device: str = ""
     viewpoint: str = ""
     q: str = ""
-
-    @property
-    def active(self) -> bool:
-        """Whether anything is filtered."""
-        return any((self.kind, self.step, self.device, self.viewpoint, self.q))
-
-    def query(self) -> dict[str, str]:
-        """The filter as query parameters of a link."""
-        fields = {name: getattr(self, name) for name in ("kind", "step", "device", "viewpoint", "q")}
-        return {name: value for name, value in fields.items() if value}
 
 
 @dataclass(frozen=True, slots=True)

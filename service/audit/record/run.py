@@ -41,7 +41,6 @@ class RecordedRun:
     run_id: str
     root: RunStarted
     protocol: Protocol
-    protocol_source: str
     events: Sequence[Event]
     state: RunState
     artefacts: Sequence[Artefact]
@@ -84,4 +83,4 @@ def read_run(data_dir: Path, name: str, *, last_seq: int | None = None) -> Recor
     content = files.artefact_path(root.protocol.sha256, verify=True).read_bytes()
     loaded = parse_protocol(content, params_models(), name=root.protocol.original_name)
     state = fold(loaded.protocol, events)
-    return RecordedRun(data_dir, run_id, root, loaded.protocol, loaded.source, events, state, artefacts, files, names)
+    return RecordedRun(data_dir, run_id, root, loaded.protocol, events, state, artefacts, files, names)

@@ -11,6 +11,7 @@ from service.core.jobs.references import Reference
 from service.core.run.state import JobState
 
 _TELLING_DIGITS = 12  # a number with so many digits is recognised by its value, since nobody typed it
+_TELLING_BITS = 32  # what rounding leaves of zero (-7 / 2**55) prints many digits, but two computations often meet in it
 
 
 @dataclass
@@ -53,7 +54,8 @@ def _key(value: Any) -> str:
 def _is_telling(value: Any) -> bool:
     """Whether this holds a number with so many digits that equality means a copy."""
     if isinstance(value, float):
-        return len(repr(value).split("e")[0].replace("-", "").replace(".", "").strip("0")) >= _TELLING_DIGITS
+        digits = repr(value).split("e")[0].replace("-", "").replace(".", "").strip("0")
+        return len(digits) >= _TELLING_DIGITS and value.as_integer_ratio()[0].bit_length() >= _TELLING_BITS
     if isinstance(value, Mapping):
         return any(map(_is_telling, cast("Mapping[str, Any]", value).values()))
     return isinstance(value, list | tuple) and any(map(_is_telling, cast("Sequence[Any]", value)))

@@ -12,6 +12,7 @@ from service.audit.replay.copied import CopiedResults
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.geometry import apply
 from service.core.jobs.references import jobs_of, resolve
+from service.core.records.events import JobFinished
 from service.core.run.state import JobState, RunState
 from service.core.units import mm
 from service.dataset.registrations import registration_name
@@ -47,9 +48,9 @@ class RecomputedJobs:
         self._jobs = jobs_of(state)
         self._copied = CopiedResults()
 
-    def add(self, step: str, job: JobState, now: Mapping[str, Any], answer: JobAnswer) -> None:
-        """Add a recomputed job, in the order of the jobs; `now` is its JobFinished as plain data."""
-        again = replace(job, measures=now["measures"], result=now["result"], artefacts=answer.artefacts)
+    def add(self, step: str, job: JobState, now: JobFinished, answer: JobAnswer) -> None:
+        """Add a recomputed job, in the order of the jobs; `now` as its event would be."""
+        again = replace(job, measures=now.measures, result=now.result, artefacts=answer.artefacts)
         for old, new in zip(job.artefacts, answer.artefacts, strict=False):
             if old.sha256 != new.sha256:
                 self.renamed[old.sha256] = new.sha256
@@ -94,7 +95,8 @@ def drifts(summary: RunSummary, recomputed: RecomputedJobs) -> Iterator[Drift]:
         return
     centre_m = np.array(spheres, dtype=np.float64).mean(axis=0)
     for pair in recomputed.pairs:
-        if pair.before.kind != register.KIND.name:
+        of_scan = summary.protocol.step(pair.step).gives == "registrations"  # the ground truth registers the CT, too
+        if pair.before.kind != register.KIND.name or not of_scan:
             continue
         before, after = (register.KIND.read_answer(job.result) for job in (pair.before, pair.now))
         shared = sorted(before.T_scan_camera.keys() & after.T_scan_camera.keys())

@@ -155,7 +155,6 @@ def _replay_job(
         attempt=job.attempt,
         label=str(job.arguments.get("poses", "")),
         verdict="not_replayed",
-        recorded_s=recorded.duration_s,
     )
     started_s = time.monotonic()
     try:
@@ -174,21 +173,20 @@ def _replay_job(
 def _compare(
     about: JobReplay,
     recorded: JobFinished,
-    now: Mapping[str, Any],
+    now: JobFinished,
     answer: JobAnswer,
     files: tuple[RecordedFiles, ScratchStore],
     renamed: Mapping[str, str],
 ) -> JobReplay:
-    """The job with its measures, result and files compared. `now`: its JobFinished as plain data."""
-    before = parse_canonical(payload_text(recorded))
+    """The job with its measures, result and files compared. `now`: as its event would be."""
     artefacts = [
         _compare_artefacts(*files, old, new, renamed)
         for old, new in zip(recorded.artefacts, answer.artefacts, strict=False)
     ]
     names = [[ref.original_name for ref in refs] for refs in (recorded.artefacts, answer.artefacts)]
     listed = compare_data(*names, path="files")
-    measures = compare_data(before["measures"], now["measures"], path="measures")
-    result = compare_data(before["result"], now["result"], path="result", renamed=renamed)
+    measures = compare_data(recorded.measures, now.measures, path="measures")
+    result = compare_data(recorded.result, now.result, path="result", renamed=renamed)
     parts = (measures, result, listed, *(artefact.content for artefact in artefacts))
     same_files = all(artefact.recorded_sha256 == artefact.recomputed_sha256 for artefact in artefacts)
     result = replace(result, differences=(*listed.differences, *result.differences))
@@ -209,8 +207,8 @@ def _finished(run: RecordedRun, job: JobState) -> JobFinished:
     return next(p for p in events if isinstance(p, JobFinished) and p.job == job.job)
 
 
-def _as_recorded(recorded: JobFinished, answer: JobAnswer) -> Any:
-    """An answer as it would stand in the evidence: plain data, through the same canonical form."""
+def _as_recorded(recorded: JobFinished, answer: JobAnswer) -> JobFinished:
+    """An answer as it would stand in the evidence, through the same canonical form."""
     payload = recorded.model_copy(
         update={
             "measures": dict(answer.measures),
@@ -218,7 +216,7 @@ def _as_recorded(recorded: JobFinished, answer: JobAnswer) -> Any:
             "result": answer.result,
         }
     )
-    return parse_canonical(payload_text(payload))
+    return JobFinished.model_validate(parse_canonical(payload_text(payload)))
 
 
 def _compare_artefacts(

@@ -46,7 +46,6 @@ class JobReplay:
     measures: Comparison = field(default_factory=Comparison)
     result: Comparison = field(default_factory=Comparison)
     artefacts: tuple[ArtefactReplay, ...] = ()
-    recorded_s: float = 0.0
     duration_s: float = 0.0
     error: str = ""  # why it could not be replayed
 

@@ -238,7 +238,7 @@ def _calibrated(run: ComparedRun) -> _Calibrated:
     measures: dict[str, float] = {}
     for step in run.protocol.steps:
         state = run.state.steps[step.id]
-        if step.kind == "calibration" and state.result:
+        if step.gives == "calibration" and state.result:
             answer = calibrate.KIND.read_answer(state.result)
             camera = answer.camera
             if answer.T_flange_camera is not None:

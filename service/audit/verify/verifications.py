@@ -28,11 +28,9 @@ class VerifiedFault(Record):
     what: str
 
 
-class Verification(Record):
-    """The result of the last verification of a run."""
+class Outcome(Record):
+    """What a verification found."""
 
-    at_utc: str
-    by: str
     ok: bool
     events: int
     artefacts: int
@@ -43,6 +41,13 @@ class Verification(Record):
     fault_count: int
     notes: tuple[str, ...]
     duration_s: float
+
+
+class Verification(Outcome):
+    """The result of the last verification of a run, when it was done, and who asked for it."""
+
+    at_utc: str
+    by: str
 
 
 def keep_verification(data: Path, run_id: str, kept: Verification) -> None:

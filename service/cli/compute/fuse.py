@@ -18,6 +18,7 @@ from service.compute.ground_truth.distances.heat_mesh import write_heat_mesh
 from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.fusion.cut_out import Markers, without_markers
 from service.compute.ground_truth.fusion.fuse import Fused, FusionSettings, Source, fuse
+from service.compute.ground_truth.fusion.picture import fusion_picture
 from service.compute.ground_truth.ply import write_ply
 from service.compute.ground_truth.surface import Surface
 from service.core.units import metres, mm
@@ -41,6 +42,10 @@ def fuse_command(
     heat_map: Annotated[
         Path | None, typer.Option("--heat-map", help="Write the CT as PLY, coloured by its distance to the scan.")
     ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", help="Write a PNG: CT and scan by their distances, the result by its sources."),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Fuse a CT mesh and a scan: the CT in the wound, the scan outside, blended between.
@@ -52,7 +57,7 @@ def fuse_command(
         for name, value in (("--radius-mm", radius_mm), ("--blend-mm", blend_mm), ("--spacing-mm", spacing_mm)):
             if not 0 < value < float("inf"):
                 raise typer.BadParameter(f"{name} must be a positive number, not {value:g}")
-        for file in (out, heat_map):
+        for file in (out, heat_map, picture):
             if file is not None:
                 require_writable(file)
         of_scan = read_mesh_file(scan, scan_unit)
@@ -75,6 +80,8 @@ def fuse_command(
         if heat_map is not None:
             distance_m = PointIndex(score.gt.samples.points_m).nearest(tomogram.vertices_m)[0]
             write_heat_mesh(heat_map, tomogram, distance_m, HeatScale.of(score, 0.02), unit_m)
+        if picture is not None:
+            picture.write_bytes(fusion_picture(tomogram, scanned, score, HeatScale.of(score, 0.02), fused))
         record = fusion_record(aligned, score, fused)
         if json:
             print_json(record)

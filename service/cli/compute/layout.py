@@ -13,7 +13,7 @@ from drivers.meshes.mesh_file import MeshUnit
 from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors
 from service.cli.compute.spheres import spheres_of
 from service.compute.images.files import read_image
-from service.compute.layout.ambiguity import LayoutReport, check_layout, layout_record
+from service.compute.layout.ambiguity import LayoutReport, check_layout
 from service.compute.layout.photo_adjustment import CALIBRATED, Photograph
 from service.compute.layout.photographs import layout_from_photographs
 from service.compute.layout.sphere_moves import Move, suggest_moves
@@ -22,6 +22,7 @@ from service.compute.poses.files.camera_files import read_camera_json, read_sphe
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.core.units import metres, mm
+from service.worker.surfaces.records import judged_layout
 
 
 def layout_command(
@@ -40,7 +41,7 @@ def layout_command(
         centres, covariances, radius_m = _centres(spheres, mesh, photo or [], camera, radius_mm, mesh_unit)
         report = check_layout(centres, covariances, radius_m=radius_m)
         if json:
-            print_json(layout_record(report))
+            print_json(judged_layout(report).plain())
         else:
             _show(report, centres, radius_m)
     if not report.passed:
@@ -59,7 +60,7 @@ def _centres(
         raise typer.BadParameter("give one of --spheres, --mesh and --photo")
     if spheres is not None:
         known = read_spheres_json(spheres)
-        return np.concatenate([known.registration_m, known.control_m]), None, known.radius_m
+        return np.concatenate([known.centres_m, known.control_m]), None, known.radius_m
     if radius_mm is None:
         raise typer.BadParameter("--mesh and --photo need --radius-mm")
     radius_m = metres(radius_mm)

@@ -195,7 +195,7 @@ def _spheres(
         raise typer.BadParameter("give either --mesh or --spheres")
     if spheres is not None:
         known = read_spheres_json(spheres)
-        return known.registration_m, known.control_m, known.radius_m if radius_mm is None else metres(radius_mm)
+        return known.centres_m, known.control_m, known.radius_m if radius_mm is None else metres(radius_mm)
     if radius_mm is None:
         raise typer.BadParameter("--mesh needs --radius-mm")
     assert mesh is not None

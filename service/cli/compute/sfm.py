@@ -27,7 +27,6 @@ from service.cli.common import (
     tell_left_out,
 )
 from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
-from service.compute.camera_model import CameraModel
 from service.compute.images.folder import image_folder
 from service.compute.markers.search.image_files import detect_all
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json, write_camera_json
@@ -35,8 +34,8 @@ from service.compute.poses.files.pose_covariance import write_pose_covariance
 from service.compute.poses.files.pose_files import read_poses_csv, write_poses_csv
 from service.compute.poses.files.robot_files import read_hand_eye, read_stations
 from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
-from service.compute.poses.sfm.estimate import SfmModel, reconstruct
-from service.compute.poses.sfm.options import Effort, Refine, SfmOptions, options_for
+from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
+from service.compute.poses.sfm.options import Effort, Refine, options_for
 from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
 from service.core.errors import DataError
@@ -111,7 +110,8 @@ def sfm_command(
         options = options_for(effort, model, refine=refine, threads=os.cpu_count() or 1)
         known = _spheres(mesh, spheres, radius_mm, mesh_unit) if hybrid else None
         with _workspace(workspace) as folder, progress_bar(quiet=json) as progress:
-            solved, off_m = _reconstruct(files, model, folder, mapper, prior, station, options, progress)
+            work = SfmWorkspace(folder, model, options, progress)
+            solved, off_m = _reconstruct(files, work, mapper, prior, station)
             well_known = read_camera_covariance(camera) if refine == "nothing" else None
             _write_model(out, solved, well_known)
             record = {**_record(solved, off_m), "left_out": found.left_out}
@@ -149,7 +149,7 @@ def _spheres(
     """Sphere centres (M, 3) and radius, in metres."""
     if spheres is not None:
         known = read_spheres_json(spheres)
-        return known.registration_m, known.radius_m if radius_mm is None else metres(radius_mm)
+        return known.centres_m, known.radius_m if radius_mm is None else metres(radius_mm)
     if radius_mm is None:
         raise typer.BadParameter("--mesh needs --radius-mm")
     assert mesh is not None
@@ -169,28 +169,16 @@ def _workspace(folder: Path | None) -> Generator[Path]:
 
 def _reconstruct(
     files: Mapping[str, Path],
-    camera: CameraModel,
-    folder: Path,
+    workspace: SfmWorkspace,
     mapper: Literal["incremental", "global"],
     prior: Mapping[str, Transform] | None,
     stations: Mapping[str, str] | None,
-    options: SfmOptions,
-    progress: Any,
 ) -> tuple[SfmModel, float | None]:
     """The model, and the rms distance in metres of the robot's poses from it (None without them).
 
     If the robot's poses are in another frame or images are missing, it matches all pairs and reconstructs again.
     """
-    solved = reconstruct(
-        files,
-        camera,
-        folder,
-        mapper,
-        T_world_camera_prior=prior,
-        stations=stations,
-        options=options,
-        progress=progress,
-    )
+    solved = reconstruct(files, workspace, mapper, T_world_camera_prior=prior, stations=stations)
     if prior is None:
         return solved, None
     off_m, spread_m = _disagreement(solved, prior, stations)
@@ -201,8 +189,7 @@ def _reconstruct(
             f"The robot's poses miss the model by {mm(off_m):.0f} mm: several stations without --stations, "
             "or poses of other images. All pairs of images are matched instead."
         )
-    again = reconstruct(files, camera, folder, mapper, options=options, progress=progress)
-    return again, off_m
+    return reconstruct(files, workspace, mapper), off_m
 
 
 def _disagreement(

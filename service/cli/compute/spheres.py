@@ -17,11 +17,11 @@ from drivers.meshes.point_cloud import is_point_cloud, read_point_cloud
 from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors, require_writable
 from service.compute.surfaces.spheres.mesh_spheres import MeshSphere, SphereLimits, locate_spheres
 from service.compute.surfaces.spheres.other_radii import SeenRadius, seen_radius
-from service.compute.surfaces.spheres.records import spheres_document
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 from service.core.text.counts import counted
 from service.core.units import metres, mm
+from service.worker.surfaces.records import measured_sphere
 
 _NAMED = 3  # most spheres listed in an error
 
@@ -71,7 +71,12 @@ def spheres_command(
             found = spheres_of(mesh, radius_m, mesh_unit, expect, seeds, limits)
         except ComputeError as error:
             raise _with_limits(error, limits, radius_mm) from error
-        document = spheres_document(found, metres(radius_mm))
+        document = {
+            "radius_mm": mm(radius_m),
+            "registration_mm": [mm(sphere.centre_m).tolist() for sphere in found],
+            "control_mm": [],
+            "details": [measured_sphere(sphere).plain() for sphere in found],
+        }
         out.write_text(json_module.dumps(document, indent=1), encoding="utf-8")
         if json:
             print_json(document)

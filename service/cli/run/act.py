@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 
 from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
-from service.cli.run.commands import OperatorOption, PasswordOption, typed_password
+from service.cli.run.person import OperatorOption, PasswordOption, typed_password
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.protocol.models import Protocol
 from service.core.records.events import CaptureAsked, OperatorAction
@@ -53,8 +53,9 @@ def act_command(
         protocol, _ = recorded_run(store, run_id)
         state = fold(protocol, store.events(run_id))
         name = operator or getpass.getuser()
+        password = partial(typed_password, name, from_stdin=password_stdin)
         if verb in _OF_A_CAPTURE:
-            name = who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin)).name
+            name = who_acts(People(store), name, password).name
             asked = step or state.current
             _ask_capture(
                 store,
@@ -66,12 +67,10 @@ def act_command(
             )
             _report_recorded(run_id, verb, asked, name, json=json)
             return
-        identity = identity_for(
-            People(store), protocol, state, verb, name, partial(typed_password, name, from_stdin=password_stdin)
-        )
+        identity = identity_for(People(store), protocol, state, verb, name, password)
         if identity is None and verb == "pause":  # pausing is always safe, so anybody may do it
             identity = Identity(name, "", "claimed")
-        identity = identity or who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin))
+        identity = identity or who_acts(People(store), name, password)
         name = identity.name
         action = OperatorAction(
             action=verb,

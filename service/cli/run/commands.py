@@ -1,18 +1,14 @@
-"""`orthocapture run`, `resume` and `status`: run a protocol from its first step to its last."""
+"""`orthocapture run` and `resume`: run a protocol from its first step to its last."""
 
 from __future__ import annotations
 
 import getpass
-import sys
 from contextlib import nullcontext
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, cast
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
 from drivers.interfaces import Camera, Lightbox, RobotArm
 from service.cli.common import (
@@ -22,25 +18,22 @@ from service.cli.common import (
     console,
     error_console,
     print_json,
-    print_table,
     reporting_errors,
 )
 from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption
 from service.cli.run.beside import worker_beside
 from service.cli.run.ending import sigterm_like_ctrl_c
-from service.cli.run.hands import SimulatedHands
-from service.cli.run.import_operator import ImportOperator
-from service.cli.run.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
-from service.cli.run.waiting import wait_for_results
+from service.cli.run.person import OperatorOption, PasswordOption, typed_password
+from service.cli.run.status import status_record
+from service.cli.run.terminal.hands import SimulatedHands
+from service.cli.run.terminal.import_operator import ImportOperator
+from service.cli.run.terminal.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
+from service.cli.run.terminal.waiting import wait_for_results
 from service.core.errors import ConfigurationError
-from service.core.gates.verdict import Standing, describe, standing
 from service.core.protocol.models import Protocol, load_protocol
-from service.core.records.entered import about_rows, about_run
-from service.core.records.events import GateVerdict
-from service.core.recovery.ways_on import takes_words, ways_on
+from service.core.records.entered import about_run
 from service.core.run.fold import fold
-from service.core.run.state import RunState, StepState
-from service.jobs.capture import live_summary, live_view
+from service.core.run.state import RunState
 from service.logs.file_log import file_log
 from service.monitor.alarm import alarm_of
 from service.monitor.devices import OpenDevices
@@ -49,7 +42,6 @@ from service.people.approvals import approve
 from service.people.authorisation import Identity, who_acts
 from service.people.sessions import People
 from service.rig import Rig, load_rig
-from service.run_record import read_log, results_to_come
 from service.run_start import (
     recorded_rig,
     recorded_run,
@@ -62,19 +54,14 @@ from service.run_start import (
 from service.runner.loop import Runner
 from service.station import Station, layout_of
 from service.steps import params_models
-from service.steps.capture.live_numbers import describe_view
 from service.steps.capture.plan.preview import preview_board_poses, preview_plans
 from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.timestamps import stamp_end
 from service.store.store import Store
 
 RigOption = Annotated[Path, typer.Option("--rig", help="The rig file: devices and stations of this site.")]
-OperatorOption = Annotated[str, typer.Option("--operator", help="Your name, as it goes into the record.")]
 AutoOption = Annotated[
     bool, typer.Option("--auto-confirm", help="Answer every question automatically; simulated rigs only.")
-]
-PasswordOption = Annotated[
-    bool, typer.Option("--password-stdin", help="Read the password, if one is needed, from stdin.")
 ]
 WorkerOption = Annotated[
     bool, typer.Option("--worker/--no-worker", help="Compute in this command, or leave it to other workers.")
@@ -131,102 +118,6 @@ def resume_command(
         rig = recorded_rig(store, root)
         state = drive(store, run_id, rig, data=data, auto_confirm=auto_confirm, worker=worker, screens=screens)
         _report_end(run_id, state, json=json)
-
-
-def typed_password(name: str, *, from_stdin: bool) -> str:
-    """A password from the keyboard, or the next line of stdin. Raises ConfigurationError if none is given."""
-    if from_stdin:
-        return sys.stdin.readline().rstrip("\n")
-    try:
-        return getpass.getpass(f"Password of {name}: ")
-    except EOFError as error:
-        raise ConfigurationError("no password was given", remedy="Type it, or give --password-stdin") from error
-
-
-def status_command(
-    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
-    data: DataOption = DEFAULT_DATA,
-    json: JsonOption = False,
-) -> None:
-    """Show the state of a run: steps, gates, deviations."""
-    with reporting_errors(json), Store.open(data, create=False) as store:
-        run_id = store.find_run(run)
-        protocol, root = recorded_run(store, run_id)
-        log = read_log(store, run_id, protocol)
-        state, missing = log.state, [left.text for left in results_to_come(log)]
-    if json:
-        ways = [asdict(way) for way in ways_on(protocol, state)]
-        about = None if root.about is None else root.about.model_dump()
-        print_json(status_record(run_id, state) | {"about": about, "still_to_come": missing, "ways_on": ways})
-        return
-    table = Table(title=f"Run {run_id}: {state.status}", title_justify="left")
-    for heading in ("step", "state", "attempt", "views", "gates"):
-        table.add_column(heading)
-    for step in protocol.steps:
-        now = state.steps[step.id]
-        gates = "\n".join(f"{describe(v)}: {_STANDINGS[_standing(v, now)]}" for v in now.verdicts)
-        phase = "skipped" if now.skipped else now.phase.replace("_", " ")
-        table.add_row(step.id, phase, str(now.attempt), str(len(now.captured) or ""), escape(gates))
-    print_table(table)
-    for name, entered in about_rows(root.about):
-        console.print(f"{name}: {escape(entered)}")
-    live = [job for job in state.step.jobs.values() if job.kind == "live_view" and job.status != "enqueued"]
-    for job in live[-3:]:
-        console.print(escape(describe_view(job)))
-    for line in missing:
-        console.print(f"result to come: {escape(line)}")
-    for way in ways_on(protocol, state):
-        can = f"takes {takes_words(way.minutes)}, loses: {way.loses}" if way.available else f"no: {way.why_not}"
-        console.print(f"way on: {way.verb} {way.step}: {escape(way.words)}; {escape(can)}")
-    for deviation in state.deviations:
-        if not deviation.is_note:
-            console.print(f"deviation: {escape(deviation.text)}")
-
-
-_STANDINGS: dict[Standing, str] = {
-    "within": "ok",
-    "not_decided": "NOT DECIDED",
-    "accepted": "ACCEPTED",
-    "outside": "FAILED",
-}
-
-
-def _standing(verdict: GateVerdict, step: StepState) -> Standing:
-    return standing(verdict, accepted=step.accepted is not None)
-
-
-def status_record(run_id: str, state: RunState) -> dict[str, Any]:
-    """A run's state as plain data, for JSON output."""
-    return {
-        "run": run_id,
-        "status": state.status,
-        "current": state.current,
-        "deviations": [d.text for d in state.deviations if not d.is_note],
-        "steps": {
-            name: {
-                "phase": s.phase,
-                "attempt": s.attempt,
-                "captured": sorted(s.captured),
-                "measures": dict(s.measures),
-                "gates": [v.model_dump() | {"standing": _standing(v, s), "text": describe(v)} for v in s.verdicts],
-                "live": [
-                    {"viewpoint": live_view.KIND.read_answer(job.result).viewpoint, **job.measures}
-                    for job in s.jobs.values()
-                    if job.kind == live_view.KIND.name and job.status == "finished"
-                ],
-            }
-            for name, s in state.steps.items()
-        },
-        "next_best_views": [view.plain() for view in next_best_views(state)],
-    }
-
-
-def next_best_views(state: RunState) -> tuple[live_summary.Suggestion, ...]:
-    """The suggested views in a run's newest summary of its images; empty before the first one."""
-    jobs = [job for step in state.steps.values() for job in step.jobs.values()]
-    done = [job for job in jobs if job.kind == live_summary.KIND.name and job.status == "finished"]
-    newest = max(done, key=lambda job: job.enqueued_seq, default=None)
-    return () if newest is None else live_summary.KIND.read_answer(newest.result).next_best_views
 
 
 def drive(

@@ -20,7 +20,8 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from service.audit.record.missing_results import not_in_yet
+from service.audit.export.posed import export_data_set
+from service.audit.export.wanted import WantedExport
 from service.audit.record.run import read_run
 from service.audit.report.content import report_content
 from service.audit.report.output.html import write_html
@@ -41,7 +42,7 @@ from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import inverse
 from service.core.protocol.models import load_protocol
 from service.core.units import mm
-from service.dataset.export import export_dataset
+from service.dataset.posed.folder import check_folder
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary, summarise
 from service.jobs.registration.evaluate import Row
@@ -51,6 +52,7 @@ from service.steps import params_models
 from service.store.store import Store
 from service.store.verification.verify import verify
 
+_EXPORTED = WantedExport("plain")
 _ARM_PORTS = (29999, 30003, 30004)  # of a Universal Robots controller
 
 
@@ -81,12 +83,14 @@ def demo_command(
                     raise OrthocaptureError(f"the demo is {state.status}: {state.stop_reason}", where=state.current)
         with Store.open(data) as store, progress_bar(quiet=json) as progress:
             summary = summarise(store, run_id, loaded.protocol)
-            audit = verify(data, run_id, progress)
+            dataset = folder / "dataset"
+            export_data_set(store, run_id, _EXPORTED, dataset, "demo", progress)
+            files = check_folder(dataset)
+            audit = verify(data, run_id, progress)  # with the record of the export
             truth = true_errors_mm(summary, ready.truth)
             report = folder / "report.html"
             write_html(report_content(read_run(data, run_id), audit, true_error_mm=truth), report)
-            dataset = folder / "dataset"
-            export_dataset(summary, dataset, not_in_yet(summary.protocol, summary.state, summary.events))
+            compared = summary.state.steps["ground_truth"].measures
             rows = summary.table()
             database = str(store.database_path)
     result = _Result(
@@ -97,6 +101,13 @@ def demo_command(
         dataset=str(dataset),
         report=str(report),
         audit_ok=audit.ok,
+        dataset_files=files,
+        chamfer_mm=round(compared["chamfer_ct_scan_mm"], 4),
+        ct_to_scan_mm=round(compared["ct_to_scan_mm"], 4),
+        scan_to_ct_mm=round(compared["scan_to_ct_mm"], 4),
+        ct_to_scan_median_mm=round(compared["ct_to_scan_median_mm"], 4),
+        scan_to_ct_median_mm=round(compared["scan_to_ct_median_mm"], 4),
+        chamfer_floor_mm=round(compared["chamfer_floor_mm"], 4),
         duration_s=round(time.monotonic() - started_s, 1),
         table_note=shared_adjustment_note(summary.protocol, summary.state),
     )
@@ -213,6 +224,13 @@ class _Result:
     dataset: str
     report: str
     audit_ok: bool
+    dataset_files: int  # of which each has the hash that is listed
+    chamfer_mm: float  # CT and scan, both ways
+    ct_to_scan_mm: float
+    scan_to_ct_mm: float
+    ct_to_scan_median_mm: float  # the means hold what only one of them shows
+    scan_to_ct_median_mm: float
+    chamfer_floor_mm: float  # what equal surfaces would give
     duration_s: float
     table_note: str
 
@@ -238,10 +256,15 @@ def _print(result: _Result, rows: Sequence[Row], true_error_mm: Mapping[str, flo
         "run": result.run,
         "database": result.database,
         "artefacts": result.artefacts,
-        "dataset": result.dataset,
+        "dataset": f"{result.dataset}, {result.dataset_files} files verified",
         "report": result.report,
     }
     for name, place in made.items():
         console.print(f"{name:<10} {place}")
+    console.print(
+        f"{'Chamfer':<10} CT and scan {result.chamfer_mm:.2f} mm (mean {result.ct_to_scan_mm:.2f} and "
+        f"{result.scan_to_ct_mm:.2f}, median {result.ct_to_scan_median_mm:.2f} and "
+        f"{result.scan_to_ct_median_mm:.2f}; equal surfaces {result.chamfer_floor_mm:.2f})"
+    )
     console.print(f"{'audit':<10} {'verified' if result.audit_ok else 'FAILED'}")
     console.print(f"{'took':<10} {result.duration_s:.0f} s")

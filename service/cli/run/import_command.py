@@ -25,8 +25,9 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption
-from service.cli.run.commands import OperatorOption, WorkerOption, drive
-from service.cli.run.import_operator import part_of
+from service.cli.run.commands import WorkerOption, drive
+from service.cli.run.person import OperatorOption
+from service.cli.run.terminal.import_operator import part_of
 from service.cli.shipped_protocols import shipped_protocols
 from service.core.errors import ConfigurationError
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol

@@ -19,7 +19,7 @@ from service.cli.common import (
     print_table,
     reporting_errors,
 )
-from service.cli.run.commands import next_best_views
+from service.cli.run.status import next_best_views
 from service.core.errors import ConfigurationError
 from service.core.protocol.models import Step, load_protocol
 from service.core.run.fold import fold
@@ -27,6 +27,7 @@ from service.rig import load_rig
 from service.run_start import recorded_run
 from service.station import layout_of
 from service.steps import params_models
+from service.steps.capture.plan.planning import StepPlan
 from service.steps.capture.plan.preview import BoardPreview, preview_board_poses, preview_plans
 from service.steps.kinds import calibration
 from service.store.store import Store
@@ -46,11 +47,11 @@ def show_command(
         loaded = load_protocol(protocol, params_models())
         rig_file = load_rig(rig)
         steps = [loaded.protocol.step(step)] if step else list(loaded.protocol.steps)
-        answers: dict[str, Any] = {}
+        answers: dict[str, list[dict[str, Any]]] = {}
         for one in steps:
             plans = preview_plans(loaded.protocol, one, rig_file, lambda station: layout_of(rig_file, station))
             if plans:
-                answers[one.id] = [dict(plan.record) | {"text": plan.text} for plan in plans]
+                answers[one.id] = [_motion_record(plan) for plan in plans]
             board = preview_board_poses(loaded.protocol, one, rig_file, lambda station: layout_of(rig_file, station))
             if board is not None:
                 answers[one.id] = [_board_record(one, board)]
@@ -68,6 +69,11 @@ def show_command(
             console.print(f"{name}, {plan['station']}: {escape(plan['text'])}")
             if "prediction" in plan:
                 console.print(_coverage_text(plan["prediction"]["coverage_map"]), highlight=False)
+
+
+def _motion_record(plan: StepPlan) -> dict[str, Any]:
+    (station,) = plan.motions
+    return {**station.model_dump(mode="json"), "text": plan.text}
 
 
 def _board_record(step: Step, board: BoardPreview) -> dict[str, Any]:

@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from service.compute.descent import Damping, largest, levenberg_marquardt
 from service.core.errors import ConfigurationError, DataError
-from service.core.geometry import Array, Transform, inverse
+from service.core.geometry import Array, Transform, inverse, rotation_angle_rad, to_rotation_vector
 
 JOINT_LIMIT_RAD = 2 * np.pi
+_LONGEST_STEP_RAD = 0.4
+_REACHED = 1e-7  # m and rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,19 +158,39 @@ def solve_joints(arm: ArmModel, T_base_flange: Transform, starts_rad: Array) -> 
     """Joints (6,) that reach a pose, by damped Newton steps from each start (S, 6) in turn; None if none converges.
 
     The result is within ±360°. For planning only: whether the arm reaches the pose in a posture near the starts.
+    Every step is taken with the same damping, since on a long way round the error may grow for a while.
     """
+
+    def at(q: Array) -> _Reach:
+        frames = chain(arm.joint_values(q[None]))
+        return _Reach(q, frames, to_rotation_vector(inverse(frames[0, 6]) @ T_base_flange))
+
+    def candidate(here: _Reach, damping: float) -> _Reach:
+        J = dh_jacobian(here.frames)[0, :, 3::4]
+        step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), here.error)
+        return at(here.q + step * min(1.0, _LONGEST_STEP_RAD / max(largest(step), 1e-12)))
+
     for start in np.atleast_2d(starts_rad):
-        q = np.array(start, dtype=np.float64)
-        for _ in range(40):
-            frames = chain(arm.joint_values(q[None]))
-            gap = inverse(frames[0, 6]) @ T_base_flange
-            error = np.concatenate([gap[:3, 3], Rotation.from_matrix(gap[:3, :3]).as_rotvec()])
-            if float(np.abs(error).max()) < 1e-7:
-                return q if float(np.abs(q).max()) <= JOINT_LIMIT_RAD else None
-            J = dh_jacobian(frames)[0, :, 3::4]
-            step = J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(6), error)
-            q = q + step * min(1.0, 0.4 / max(float(np.abs(step).max()), 1e-12))
+        found = levenberg_marquardt(
+            at(np.array(start, dtype=np.float64)),
+            candidate,
+            lambda _here, _there: 0.0,
+            lambda _here, there: largest(there.error) < _REACHED,
+            damping=Damping(1e-6, down=1.0),
+            most=40,
+        )
+        if found.settled:
+            return found.state.q if largest(found.state.q) <= JOINT_LIMIT_RAD else None
     return None
+
+
+@dataclass(frozen=True, slots=True)
+class _Reach:
+    """Joints (6,), the frames of their links, and the pose's error (6,) there, m and rad."""
+
+    q: Array
+    frames: Array
+    error: Array
 
 
 def pose_gap(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> tuple[float, float]:
@@ -181,7 +203,7 @@ def pose_gap(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> tuple[fl
     if len(joints) != len(T_base_flange):
         raise DataError(f"{len(joints)} joint positions for {len(T_base_flange)} poses")
     gap = np.array([inverse(a) @ b for a, b in zip(forward(arm, joints), T_base_flange, strict=True)])
-    turn = Rotation.from_matrix(gap[:, :3, :3]).magnitude()
+    turn = [rotation_angle_rad(T) for T in gap]
     return float(np.median(np.linalg.norm(gap[:, :3, 3], axis=1))), float(np.median(turn))
 
 

@@ -12,8 +12,9 @@ from service.compute.camera_model import CameraModel
 from service.compute.capture.live import clipped_fraction, expected_spheres, sharpness
 from service.compute.layout.photographs import places_by_size
 from service.compute.markers.detect import detect_spheres
+from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import DetectionOptions, SphereOutline
-from service.compute.markers.search.predicted import fit_pose
+from service.compute.markers.search.cone_pose import fit_pose
 from service.compute.planning.information import ViewInformation, view_information
 from service.compute.registration.identification.identity import identify_each
 from service.compute.registration.identification.pairing import paired
@@ -28,6 +29,10 @@ _MOST_EDGE_PX = 3.5  # edge width across an outline; a sharp image has about 1.5
 _MOST_CLIPPED = 0.05  # of the pixels
 _LEAST_BRIGHT = 60.0  # of 255: exceeded by at least a hundredth of the pixels
 _ROUGH_M, _ROUGH_SIGMA_M = 0.012, 0.01  # difference between two layouts from photographs
+_NO_POSE = (
+    "{count} spheres found, which do not determine the camera pose: it may have moved, be out of focus or too near, "
+    "or something may be in front of the lens"
+)
 _POSE_SIGMA_M = 2e-3  # outlines that contradict the image's own pose by more are not spheres of the list
 
 
@@ -76,14 +81,10 @@ def look_at_image(
     T_camera_scene, markers = _refined(found, outlines, camera, spheres_m, radius_m)
     exposure = _exposure(image_bgr, clipped)
     if T_camera_scene is None:
-        why = exposure or (
-            f"{len(outlines)} spheres found, which do not determine the camera pose: it may have moved, be out of "
-            "focus or too near, or something may be in front of the lens"
-        )
+        why = exposure or _NO_POSE.format(count=len(outlines))
         return HandView(None, None, len(outlines), 0, 0, quality.edge_px, quality.rms_px, clipped, why)
     T_scene_camera = inverse(T_camera_scene)
     expected = expected_spheres(T_camera_scene, spheres_m, radius_m, camera)
-    seen = len(markers)
     information = view_information(
         T_scene_camera,
         np.eye(4),
@@ -93,21 +94,16 @@ def look_at_image(
         spheres_m.mean(axis=0),
         _ROUGH_SIGMA_M if rough else _POSE_SIGMA_M,
     )
-    why = exposure
-    if not why and quality.edge_px > _MOST_EDGE_PX:
-        why = f"blurred: outlines are {quality.edge_px:.1f} px wide; hold the camera still"
-    if not why and len(expected) >= _LEAST_SPHERES and seen < _LEAST_SHARE * len(expected):
-        why = f"{seen} of {len(expected)} spheres are seen: something is in front of the lens"
     return HandView(
         T_scene_camera,
         information,
         len(outlines),
-        seen,
+        len(markers),
         len(expected),
         quality.edge_px,
         quality.rms_px,
         clipped,
-        why,
+        exposure or _fault(quality.edge_px, len(markers), len(expected)),
         {sphere: outlines[o] for o, sphere in markers.items()},
     )
 
@@ -149,10 +145,18 @@ def _refined(
     markers = paired(outlines, start, spheres_m, radius_m, camera)
     if len(markers) < _LEAST_SPHERES:
         return None, {}
-    axes = np.array([outlines[o].cone.axis for o in markers])
-    half = np.array([outlines[o].cone.half_angle_rad for o in markers])
-    pose = fit_pose(axes, half, spheres_m[list(markers.values())], radius_m, start)
+    cones = ObservedCones.of(outlines[o].cone for o in markers)
+    pose = fit_pose(cones, spheres_m[list(markers.values())], radius_m, start)
     return pose, paired(outlines, pose, spheres_m, radius_m, camera)
+
+
+def _fault(edge_px: float, seen: int, expected: int) -> str:
+    """What is wrong with an image whose camera pose is known; empty if nothing."""
+    if edge_px > _MOST_EDGE_PX:
+        return f"blurred: outlines are {edge_px:.1f} px wide; hold the camera still"
+    if expected >= _LEAST_SPHERES and seen < _LEAST_SHARE * expected:
+        return f"{seen} of {expected} spheres are seen: something is in front of the lens"
+    return ""
 
 
 def _exposure(image_bgr: NDArray[np.uint8], clipped: float) -> str:

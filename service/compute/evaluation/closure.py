@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from service.compute.descent import gauss_newton
+from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import cone_residuals
 from service.compute.registration.identification.identity import Assignment
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, align_points, apply, increment, place_jacobian
@@ -72,7 +72,7 @@ def locate_in_images(
 ) -> dict[int, SeenSphere]:
     """Centres of spheres from their outlines and the registered cameras, each sphere on its own.
 
-    Weighted least squares of the cones' three parameters (`cone_residuals`); outlines more than 4 sigma from the
+    Weighted least squares of the cones' three parameters (`ObservedCones`); outlines more than 4 sigma from the
     others of their sphere are excluded. The covariance follows from the outlines', inflated if they scatter more.
 
     Args:
@@ -98,16 +98,19 @@ def locate_in_images(
 def _intersect(
     seen: Sequence[tuple[int, SphereOutline]], T_scan_camera: Array, start: Array, radius_m: float, least: int
 ) -> SeenSphere:
+    """One sphere, by Gauss–Newton steps with a loop of its own.
+
+    Before each step, the outlines to keep and the factor on their variances are chosen again, so there is no fixed
+    cost to descend; the covariance follows from those of the last step.
+    """
     T = T_scan_camera[[i for i, _ in seen]]
-    axes = np.array([o.cone.axis for _, o in seen])
-    frames = np.array([o.cone.frame()[:, :2] for _, o in seen])
-    half = np.array([o.cone.half_angle_rad for _, o in seen])
+    cones = ObservedCones.of(o.cone for _, o in seen)
     whiten = np.array([np.linalg.inv(np.linalg.cholesky(o.cone_covariance)) for _, o in seen])
     centre, keep, factor = start.copy(), np.ones(len(seen), dtype=bool), 1.0
     information: Array = np.eye(3)
     for _ in range(_MAX_STEPS):
         camera_m = np.einsum("oji,oj->oi", T[:, :3, :3], centre - T[:, :3, 3])
-        r, D = cone_residuals(axes, frames, half, camera_m, radius_m)
+        r, D = cones.residuals(camera_m, radius_m)
         r = np.einsum("oij,oj->oi", whiten, r)
         J = whiten @ D @ T[:, :3, :3].transpose(0, 2, 1)
         square = np.sum(r**2, axis=1)

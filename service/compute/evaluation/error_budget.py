@@ -9,7 +9,6 @@ import numpy as np
 
 from service.compute.evaluation.closure import Alignment, Closure, SeenSphere, compare_in_frame, compare_shapes
 from service.core.geometry import Array
-from service.core.units import mm
 
 CONTROL_SPHERES = "control spheres"
 HONEST = (0.5, 2.0)  # range of normalised chi square in which the covariances agree with the observation
@@ -82,28 +81,6 @@ class ErrorBudget:
     def total_m(self) -> float:
         """Root sum of squares of the counted contributions, metres."""
         return float(np.sqrt(sum(c.sigma_m**2 for c in self.contributions if c.counted)))
-
-    def as_json(self) -> dict[str, object]:
-        """Plain data in millimetres."""
-        return {
-            "contributions": [
-                {"name": c.name, "sigma_mm": mm(c.sigma_m), "how": c.how, "counted": c.counted}
-                for c in self.contributions
-            ],
-            "total_mm": mm(self.total_m),
-            "observations": [
-                {
-                    "name": o.name,
-                    "observed_mm": mm(o.observed_m),
-                    "predicted_mm": mm(o.predicted_m),
-                    "normalised_chi2": o.normalised_chi2,
-                    "n": o.n,
-                    "how": o.how,
-                    "verdict": o.verdict,
-                }
-                for o in self.observations
-            ],
-        }
 
 
 def contributions(

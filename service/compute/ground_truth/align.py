@@ -11,10 +11,19 @@ from service.compute.ground_truth.frames import DistanceChange, distance_changes
 from service.compute.ground_truth.surface import Surface
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.loop_closure import LoopClosure, close_loop
-from service.compute.surfaces.spheres.mesh_spheres import MeshSphere, locate_spheres
+from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
 from service.core.geometry import Array, Transform
 
 TRANSPORT_GATE_M = 3e-4  # largest change of a distance between spheres over the transport
+
+
+@dataclass(frozen=True, slots=True)
+class Spheres:
+    """The spheres of a mesh: centres (M, 3), covariances (M, 3, 3), rms (M,) of the surface about them; metres."""
+
+    centres_m: Array
+    covariances_m2: Array
+    rms_m: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +35,7 @@ class Aligned:
         covariance: (6, 6) of T_scan_ct, as in `evaluation.closure.Alignment`.
         loop: the spheres one by one.
         distances: their distances before (CT) and after (scan) the transport.
+        only_ct: spheres, by their numbers in the CT, that the scan lacks.
         scan_spheres_m: (M, 3) centres in the scan.
         sigma_ct_m, sigma_scan_m: median rms of the surface of the spheres in each: its noise.
     """
@@ -34,6 +44,7 @@ class Aligned:
     covariance: Array = field(repr=False)
     loop: LoopClosure
     distances: DistanceChange
+    only_ct: tuple[int, ...]
     scan_spheres_m: Array = field(repr=False)
     sigma_ct_m: float
     sigma_scan_m: float
@@ -50,24 +61,31 @@ def align(ct: Surface, scan: Surface, radius_m: float) -> Aligned:
     Raises:
         ComputeError: spheres are lacking, or the two constellations do not agree.
     """
-    in_ct = locate_spheres(ct.vertices_m, ct.faces, radius_m)
-    in_scan = locate_spheres(scan.vertices_m, scan.faces, radius_m)
-    (a, Ca), (b, Cb) = _arrays(in_scan), _arrays(in_ct)
-    match = match_constellations(a, b)
-    loop = close_loop(a, Ca, b, Cb, match)
-    staying = np.array([s.pair for s in loop.spheres if not s.moved])
-    i, j = staying.T
-    _, alignment = compare_shapes(a[i], Ca[i], b[j], Cb[j])
+    return align_spheres(_located(ct, radius_m), _located(scan, radius_m))
+
+
+def align_spheres(ct: Spheres, scan: Spheres) -> Aligned:
+    """Register the spheres of a CT with those of a scan. Raises ComputeError if the constellations do not agree."""
+    match = match_constellations(scan.centres_m, ct.centres_m)
+    loop = close_loop(scan.centres_m, scan.covariances_m2, ct.centres_m, ct.covariances_m2, match)
+    i, j = np.array([s.pair for s in loop.spheres if not s.moved]).T
+    _, alignment = compare_shapes(scan.centres_m[i], scan.covariances_m2[i], ct.centres_m[j], ct.covariances_m2[j])
     return Aligned(
         T_scan_ct=loop.T_a_b,
         covariance=alignment.covariance,
         loop=loop,
-        distances=distance_changes(b, a, [(k, n) for n, k in match.pairs]),
-        scan_spheres_m=a,
-        sigma_ct_m=float(np.median([s.rms_m for s in in_ct])),
-        sigma_scan_m=float(np.median([s.rms_m for s in in_scan])),
+        distances=distance_changes(ct.centres_m, scan.centres_m, [(k, n) for n, k in match.pairs]),
+        only_ct=match.missing_b,
+        scan_spheres_m=scan.centres_m,
+        sigma_ct_m=float(np.median(ct.rms_m)),
+        sigma_scan_m=float(np.median(scan.rms_m)),
     )
 
 
-def _arrays(spheres: tuple[MeshSphere, ...]) -> tuple[Array, Array]:
-    return np.array([s.centre_m for s in spheres]), np.array([s.covariance for s in spheres])
+def _located(surface: Surface, radius_m: float) -> Spheres:
+    found = locate_spheres(surface.vertices_m, surface.faces, radius_m)
+    return Spheres(
+        np.array([s.centre_m for s in found]),
+        np.array([s.covariance for s in found]),
+        np.array([s.rms_m for s in found]),
+    )

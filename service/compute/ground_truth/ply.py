@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.ground_truth.surface import Surface
+from service.compute.ground_truth.surface import IntArray, Surface
+from service.core.errors import DataError
 
 _STORED = {"f": "<f4", "u": "u1", "b": "u1"}
 _NAMES = {"<f4": "float", "<f8": "double", "|u1": "uchar"}
+_KINDS = {name: kind for kind, name in _NAMES.items()}
+_FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
 
 
 def write_ply(
@@ -50,7 +53,7 @@ def ply_bytes(
     vertex = np.zeros(len(columns["x"]), dtype=list(kinds.items()))
     for name, values in columns.items():
         vertex[name] = values
-    face = np.zeros(len(faces), dtype=[("count", "u1"), ("vertices", "<i4", 3)])
+    face = np.zeros(len(faces), dtype=_FACE)
     face["count"], face["vertices"] = 3, faces
     lines = [
         "ply",
@@ -63,3 +66,26 @@ def ply_bytes(
         "end_header",
     ]
     return ("\n".join(lines) + "\n").encode("ascii") + vertex.tobytes() + face.tobytes()
+
+
+def read_ply(path: Path) -> tuple[dict[str, NDArray[np.generic]], IntArray]:
+    """The properties of the vertices (V,) by name, and the faces (F, 3), of a file that this module wrote.
+
+    Raises:
+        DataError: another program wrote the file, or its end is missing.
+    """
+    data = path.read_bytes()
+    head, _, body = data.partition(b"end_header\n")
+    kinds: list[tuple[str, str]] = []
+    counts: dict[str, int] = {}
+    try:
+        for words in (line.split() for line in head.decode("ascii").splitlines()):
+            if words[0] == "element":
+                counts[words[1]] = int(words[2])
+            elif words[0] == "property" and words[1] != "list":
+                kinds.append((words[2], _KINDS[words[1]]))
+        vertex = np.frombuffer(body, dtype=kinds, count=counts["vertex"])
+        face = np.frombuffer(body, dtype=_FACE, count=counts["face"], offset=vertex.nbytes)
+    except (ValueError, KeyError, IndexError, UnicodeDecodeError) as error:
+        raise DataError("no PLY file of this program, or cut short", where=str(path)) from error
+    return {name: vertex[name] for name, _ in kinds}, face["vertices"].astype(np.int64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,12 @@ class Surface:
     vertices_m: Array = field(repr=False)
     faces: IntArray = field(repr=False)
     normals: Array | None = field(default=None, repr=False)
+
+    @classmethod
+    def kept(cls, path: Path) -> Surface:
+        """The mesh of a CT or a scan as an import keeps it: an .npz file of `vertices_m` and `faces`."""
+        with np.load(path, allow_pickle=False) as mesh:
+            return cls(mesh["vertices_m"].astype(np.float64), mesh["faces"].astype(np.int64))
 
     @property
     def is_mesh(self) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,10 +61,6 @@ class BoundedLength:
     def sigma_m(self) -> float:
         """Standard deviation of a normal distribution with bounds this far apart."""
         return (self.upper_m - self.lower_m) / (2 * _QUANTILE)
-
-    def record_mm(self) -> dict[str, float]:
-        """Plain data in millimetres, as gates read it."""
-        return {"sigma": mm(self.sigma_m), "lower": mm(self.lower_m), "upper": mm(self.upper_m)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,16 +125,7 @@ def check_layout(
         DataError: the centres are not (N, 3), or not finite.
         ComputeError: fewer than four spheres, or two at the same place.
     """
-    centres = np.asarray(centres_m, dtype=np.float64)
-    if centres.ndim != 2 or centres.shape[1] != 3 or not np.isfinite(centres).all():
-        raise DataError(f"sphere centres of shape {centres.shape} are not points (N, 3)")
-    if len(centres) < SUBSET:
-        raise ComputeError(
-            f"{len(centres)} spheres have no layout to judge, {SUBSET} are needed", remedy="place more spheres"
-        )
-    between = distances(centres)
-    if between[~np.eye(len(centres), dtype=bool)].min() < radius_m:
-        raise ComputeError("two spheres are at the same place", remedy="check the list of centres for repeats")
+    centres = _checked(centres_m, radius_m)
     joint = _joint(covariance, len(centres))
     matches = confusions(centres, beyond_m=max(2 * required_margin_m, _REACH_M))
     order = np.argsort(matches.misfit, kind="stable")
@@ -147,11 +133,6 @@ def check_layout(
         Confusion(_ints(matches.seen[k]), _ints(matches.taken[k]), float(matches.misfit[k]))
         for k in distinct(matches, order)
     )
-    sphere_margins = np.full(len(centres), np.inf)
-    moved = matches.seen != matches.taken
-    for column in range(SUBSET):
-        chosen = moved[:, column]
-        np.minimum.at(sphere_margins, matches.seen[chosen, column], matches.misfit[chosen])
     by_count = by_visible_count(centres, matches, order)
     best = order[:MOST_JUDGED]
     margin = _least(centres, joint, Matches(matches.seen[best], matches.taken[best], matches.misfit[best]))
@@ -162,13 +143,37 @@ def check_layout(
         margin_of_five=of_five,
         worst=worst,
         margin_by_count_m={n: float(m.misfit[0]) for n, m in by_count.items()},
-        sphere_margins_m=sphere_margins,
+        sphere_margins_m=_sphere_margins(len(centres), matches),
         depth=_depth(centres, singular, axes, joint),
         extent_m=float(np.sqrt(np.mean(np.sum((centres - centres.mean(axis=0)) ** 2, axis=1)))),
         largest_gap_rad=_largest_gap(centres, axes),
         problems=(),
     )
     return replace(report, problems=_problems(report, required_margin_m))
+
+
+def _checked(centres_m: Array, radius_m: float) -> Array:
+    """The centres as numbers (N, 3). Raises DataError or ComputeError, as `check_layout` says."""
+    centres = np.asarray(centres_m, dtype=np.float64)
+    if centres.ndim != 2 or centres.shape[1] != 3 or not np.isfinite(centres).all():
+        raise DataError(f"sphere centres of shape {centres.shape} are not points (N, 3)")
+    if len(centres) < SUBSET:
+        raise ComputeError(
+            f"{len(centres)} spheres have no layout to judge, {SUBSET} are needed", remedy="place more spheres"
+        )
+    if distances(centres)[~np.eye(len(centres), dtype=bool)].min() < radius_m:
+        raise ComputeError("two spheres are at the same place", remedy="check the list of centres for repeats")
+    return centres
+
+
+def _sphere_margins(count: int, matches: Matches) -> Array:
+    """(N,) smallest misfit of an assignment that takes each sphere for another one; infinite if there is none."""
+    margins = np.full(count, np.inf)
+    moved = matches.seen != matches.taken
+    for column in range(SUBSET):
+        chosen = moved[:, column]
+        np.minimum.at(margins, matches.seen[chosen, column], matches.misfit[chosen])
+    return margins
 
 
 def _problems(report: LayoutReport, required_margin_m: float) -> tuple[str, ...]:
@@ -193,25 +198,6 @@ def _problems(report: LayoutReport, required_margin_m: float) -> tuple[str, ...]
     if report.largest_gap_rad > LARGEST_GAP_RAD:
         problems.append(f"no sphere over {np.rad2deg(report.largest_gap_rad):.0f}° of the way around: spread them")
     return tuple(problems)
-
-
-def layout_record(report: LayoutReport) -> dict[str, Any]:
-    """The report as plain data, lengths in mm."""
-    return {
-        "passed": report.passed,
-        "problems": list(report.problems),
-        "margin_mm": mm(report.margin_m),
-        "margin_sigma_mm": mm(report.margin.sigma_m),
-        "bounds": {name: bounded.record_mm() for name, (bounded, _) in layout_bounds(report).items()},
-        "margin_by_count_mm": {str(k): mm(v) for k, v in report.margin_by_count_m.items() if np.isfinite(v)},
-        "worst": [
-            {"spheres": list(c.spheres), "taken_for": list(c.taken_for), "misfit_mm": mm(c.misfit_m)}
-            for c in report.worst
-        ],
-        "depth_mm": mm(report.depth.value_m),
-        "extent_mm": mm(report.extent_m),
-        "largest_gap_deg": deg(report.largest_gap_rad),
-    }
 
 
 def layout_bounds(report: LayoutReport) -> dict[str, tuple[BoundedLength, float]]:

@@ -145,7 +145,7 @@ def adjust(
         lambda x, step: problem.moved(x, step * min(1.0, _LONGEST_STEP / max(size(step), 1e-12))),
         most=_ITERATIONS,
         settled=_DONE,
-        size=size,
+        size=lambda _state, step: size(step),
     )
     _, covariance, chi2 = problem.step(x)
     count = 3 * len(centres_m)
@@ -279,7 +279,11 @@ class _Problem:
         )
 
     def _measure(self, seen: Array, lens: Array, focal: Array) -> Array:
-        """(M, 3) size and axis differences of the outlines from those of spheres at `seen` (M, 3)."""
+        """(M, 3) size and axis differences of the outlines from those of spheres at `seen` (M, 3).
+
+        They are not ObservedCones.residuals, because the observed cones change with the lens: the rim's pixels are
+        undistorted again and compared with the predicted cone.
+        """
         scale = 1.0 + lens[0] + focal
         fx, fy = self.nominal[:, 0] * scale, self.nominal[:, 1] * scale * (1.0 + lens[1])
         centre = self.nominal[:, 2:] + lens[2:4] * self.width

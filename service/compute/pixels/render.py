@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
+from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.rays import PixelRays, pixel_rays
-from service.compute.pixels.surface import Surface
 from service.core.geometry import Transform
 
 Float32s = NDArray[np.float32]
@@ -52,7 +52,7 @@ class Seen:
         return self.depth_m > 0
 
 
-def seen_rows(surface: Surface, camera: CameraModel, T_world_camera: Transform) -> Iterator[SeenRows]:
+def seen_rows(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Iterator[SeenRows]:
     """The mesh as the camera at T_world_camera (4, 4) sees it, from the first rows of the image to the last.
 
     Raises:
@@ -87,7 +87,7 @@ def _on_planes(planes: NDArray[np.float64], rays: PixelRays, begin: int, end: in
     return SeenRows(begin, depth, normal)
 
 
-def seen(surface: Surface, camera: CameraModel, T_world_camera: Transform) -> Seen:
+def seen(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Seen:
     """The whole image at once: 16 bytes for each pixel, 1 GB at 60 million.
 
     Raises:
@@ -101,7 +101,7 @@ def seen(surface: Surface, camera: CameraModel, T_world_camera: Transform) -> Se
     return Seen(depth, normal)
 
 
-def depth_map(surface: Surface, camera: CameraModel, T_world_camera: Transform) -> Float32s:
+def depth_map(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Float32s:
     """(H, W) z-depth in metres alone; 0 where no surface is seen.
 
     Raises:

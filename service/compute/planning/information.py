@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from service.compute.markers.cones import Cone, cone_of_sphere
+from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import cone_residuals
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse, place_jacobian, skew
@@ -88,8 +88,7 @@ def cone_rows(
 ) -> tuple[Array, Array]:
     """Residual (3,) in radians of a sphere's cone as seen, and its derivative (3, 6) by (d, w)."""
     c = apply(inverse(T_base_camera), sphere_base_m)
-    half = np.array([seen.half_angle_rad])
-    residual, by_centre = cone_residuals(seen.axis[None], seen.frame()[None, :, :2], half, c[None], radius_m)
+    residual, by_centre = ObservedCones.of([seen]).residuals(c[None], radius_m)
     move = T_base_camera[:3, :3].T @ np.hstack([np.eye(3), -skew(sphere_base_m - centre_m)])  # (3, 6) of c
     return residual[0], by_centre[0] @ move
 

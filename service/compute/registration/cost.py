@@ -1,4 +1,7 @@
-"""Residuals of an outline against a projected sphere: its cone's three parameters, or the paper's x^T E x."""
+"""Residuals of an outline's points against a projected sphere: the paper's x^T E x, or Sampson's distance.
+
+The cost "cone" is that of the outline's cone (`markers.observed_cones`).
+"""
 
 from __future__ import annotations
 
@@ -10,32 +13,6 @@ from service.core.geometry import Array
 
 PointCost = Literal["sampson", "algebraic"]
 Cost = Literal["cone", "sampson", "algebraic"]
-
-
-def cone_residuals(
-    axes: Array, frames: Array, half_angles_rad: Array, centres_camera_m: Array, radius_m: float
-) -> tuple[Array, Array]:
-    """Residuals (O, 3) in radians of observed cones against spheres, and their derivative (O, 3, 3) by the centres.
-
-    Args:
-        axes: (O, 3) observed unit vectors to the centres.
-        frames: (O, 3, 2) first two columns of each cone's `frame()`.
-        half_angles_rad: (O,) observed half angles.
-        centres_camera_m: (O, 3) predicted centres in the camera frame.
-        radius_m: radius of the spheres.
-
-    A sphere at c appears as the cone with the axis u = c / |c| and sin(a) = r / |c|. The residual is the tilt of u
-    along the two columns of the frame, and a minus the observed half angle. These three numbers hold all the
-    information of an outline and are nearly linear in c.
-    """
-    distance = np.linalg.norm(centres_camera_m, axis=1)
-    u = centres_camera_m / distance[:, None]
-    half = np.arcsin(np.clip(radius_m / distance, 0.0, 0.999))
-    across = np.einsum("oik,oi->ok", frames, u - axes)
-    r = np.column_stack([across, half - half_angles_rad])
-    tilt = np.einsum("oik,oij->okj", frames, np.eye(3) - u[:, :, None] * u[:, None, :]) / distance[:, None, None]
-    shrink = -np.tan(half)[:, None] * u / distance[:, None]
-    return r, np.concatenate([tilt, shrink[:, None, :]], axis=1)
 
 
 def residuals(points: Array, centres_camera_m: Array, radius_m: float, cost: PointCost) -> Array:

@@ -11,8 +11,9 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
+from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import Cost, PointCost, cone_residuals, residuals_and_derivative
+from service.compute.registration.cost import Cost, PointCost, residuals_and_derivative
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.scene import PosedImages, ScanSpheres
@@ -37,9 +38,7 @@ class Problem:
     radius_m: float
     camera: CameraModel
     focal_px: float
-    axes: Array  # (O, 3)
-    frames: Array  # (O, 3, 2)
-    half_angles: Array  # (O,)
+    cones: ObservedCones  # (O,)
     whiten: Array  # (O, 3, 3): whiten @ residual has unit covariance
     points: list[Array] = field(repr=False)  # (L, 2) normalised; only for costs on points
     point_sigma: Array = field(repr=False)  # (O,) of each of the L points if they were independent
@@ -170,9 +169,7 @@ def assemble(
         radius_m=spheres.radius_m,
         camera=camera,
         focal_px=f,
-        axes=np.zeros((0, 3)),
-        frames=np.zeros((0, 3, 2)),
-        half_angles=np.zeros(0),
+        cones=ObservedCones.of(()),
         whiten=np.zeros((0, 3, 3)),
         points=[],
         point_sigma=np.zeros(0),
@@ -201,13 +198,11 @@ def with_outlines(
     """The problem with these outlines (image, outline, marker) instead of its own."""
     used = [outlines[i][j] for i, j, _ in members]
     camera, image = problem.camera, np.array([i for i, _, _ in members], dtype=np.int64)
-    axes = np.array([o.cone.axis for o in used])
-    frames = np.array([o.cone.frame()[:, :2] for o in used])
-    half = np.array([o.cone.half_angle_rad for o in used])
-    common = _common_displacements(axes, frames, camera)
+    cones = ObservedCones.of(o.cone for o in used)
+    common = _common_displacements(cones, camera)
     n_intrinsics = problem.common.shape[2] - 3
     if n_intrinsics:
-        more = _intrinsics_errors(axes, frames, half, camera)[:, :, :n_intrinsics]
+        more = _intrinsics_errors(cones, camera)[:, :, :n_intrinsics]
         common = np.concatenate([common, more], axis=2)
     return replace(
         problem,
@@ -215,9 +210,7 @@ def with_outlines(
         image=image,
         marker=np.array([m for _, _, m in members], dtype=np.int64),
         group=problem.station[image],
-        axes=axes,
-        frames=frames,
-        half_angles=half,
+        cones=cones,
         whiten=_whitening(np.array([o.cone_covariance for o in used])),
         points=[o.points for o in used],
         point_sigma=np.array([_point_sigma(o) for o in used]) / problem.focal_px,
@@ -244,20 +237,21 @@ def _block_inverse(covariances: Array) -> Array:
     return out
 
 
-def _common_displacements(axes: Array, frames: Array, camera: CameraModel) -> Array:
+def _common_displacements(cones: ObservedCones, camera: CameraModel) -> Array:
     """Displacement (O, 3, 3) of cones if all outlines shift by a pixel in x, in y, or grow by one."""
-    z = axes[:, 2]
-    out = np.zeros((len(axes), 3, 3))
+    z = cones.axes[:, 2]
+    out = np.zeros((len(cones), 3, 3))
     for k, f in enumerate((camera.fx, camera.fy)):
-        out[:, :2, k] = frames[:, k, :] * (z / f)[:, None]
+        out[:, :2, k] = cones.directions[:, k, :] * (z / f)[:, None]
     out[:, 2, 2] = z / (0.5 * (camera.fx + camera.fy))
     return out
 
 
-def _intrinsics_errors(axes: Array, frames: Array, half: Array, camera: CameraModel) -> Array:
+def _intrinsics_errors(cones: ObservedCones, camera: CameraModel) -> Array:
     """Displacement (O, 3, 8) of cones by errors of fx, fy, cx, cy, k1, k2, p1, p2, with the image pixels fixed."""
-    x, y, z = axes[:, 0] / axes[:, 2], axes[:, 1] / axes[:, 2], axes[:, 2]
-    r2, zero = x**2 + y**2, np.zeros(len(axes))
+    z = cones.axes[:, 2]
+    x, y = cones.axes[:, 0] / z, cones.axes[:, 1] / z
+    r2, zero = x**2 + y**2, np.zeros(len(cones))
     plane = -np.stack(
         [
             np.stack([x / camera.fx, zero]), np.stack([zero, y / camera.fy]),
@@ -266,10 +260,10 @@ def _intrinsics_errors(axes: Array, frames: Array, half: Array, camera: CameraMo
             np.stack([2 * x * y, r2 + 2 * y**2]), np.stack([r2 + 2 * x**2, 2 * x * y]),
         ]
     )  # fmt: skip
-    out = np.zeros((len(axes), 3, 8))
-    out[:, :2] = np.einsum("oik,cio->okc", frames[:, :2], plane) * z[:, None, None]
+    out = np.zeros((len(cones), 3, 8))
+    out[:, :2] = np.einsum("oik,cio->okc", cones.directions[:, :2], plane) * z[:, None, None]
     size = [-0.5 / camera.fx + zero, -0.5 / camera.fy + zero, zero, zero, -2 * r2, -3 * r2**2, zero, zero]
-    out[:, 2] = (np.stack(size) * half).T
+    out[:, 2] = (np.stack(size) * cones.half_angles).T
     return out
 
 
@@ -282,7 +276,7 @@ def linearise(problem: Problem, state: State, cost: Cost) -> Linearised:
     place = rotated + state.bases[problem.group, :3, 3]
     c = np.einsum("oji,oj->oi", T[:, :3, :3], place - T[:, :3, 3])
     in_image = state.common[3:]
-    seen, slope = cone_residuals(problem.axes, problem.frames, problem.half_angles, c, problem.radius_m)
+    seen, slope = problem.cones.residuals(c, problem.radius_m)
     if cost == "cone":
         seen = seen + problem.common @ in_image
         r = np.einsum("oij,oj->oi", problem.whiten, seen)

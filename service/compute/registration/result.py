@@ -21,7 +21,6 @@ class OutlineResidual:
     rms_px: float  # with the camera pose as given
     excluded: bool
     reason: str = ""
-    refined_rms_px: float = 0.0  # with the camera pose corrected by its estimated error
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +67,9 @@ class RegistrationResult:
     n_images: int
     cost: str
     components: dict[str, Array] = field(repr=False)
-    group_covariance: dict[int, Array] = field(repr=False)  # (6, 6) of T_group_scan, axes of that group's base
     T_scan_camera_refined: Array = field(repr=False)  # (N, 4, 4) corrected by the estimated pose errors
     pose_sigma: tuple[float, float]  # m and rad, rms per coordinate, of single poses' errors; 0 if taken as exact
     outline_factor: float  # factor on the outlines' stated variances, estimated from the residuals
-    sphere_offsets_m: Array = field(repr=False)  # (M, 3) estimated displacements of the centres, scan frame
-    common_px: Array = field(
-        repr=False
-    )  # (6,) estimated displacement in space, shift in x and y, growth, shared by all outlines
     solution: Solution = field(repr=False)
 
     @property

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from service.compute.descent import halved_gauss_newton
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import Cost
 from service.compute.registration.identification.identity import Assignment
@@ -25,6 +26,7 @@ from service.compute.registration.normal_equations import (
 from service.compute.registration.problem import Linearised, Problem, State, assemble, linearise
 from service.compute.registration.result import OutlineResidual, RegistrationResult, Solution
 from service.compute.registration.settings import RegistrationSettings
+from service.compute.registration.start import starting_state
 from service.compute.registration.variance_components import (
     PoseNoise,
     estimate,
@@ -34,10 +36,13 @@ from service.compute.registration.variance_components import (
 )
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, Transform, apply, inverse, transform
+from service.core.geometry import Array, inverse
 
 _ROUNDS = 8
+_REWEIGHTED = 3  # times, in the approach to the answer
 _STEPS = 25
+_SHORTEST = 1e-3  # share of a step
+_CONVERGED = 1e-10  # decrement: a hundred-thousandth of a standard deviation
 _DEFAULT = RegistrationSettings()
 
 __all__ = ["OutlineResidual", "RegistrationResult", "register"]
@@ -70,7 +75,7 @@ def register(
     """
     problem = assemble(outlines, assignments, images, spheres, settings)
     _require(problem, np.ones(len(problem.members), dtype=bool))
-    start = _start(problem, assignments, images.poses, images.stations)
+    start = starting_state(problem, assignments, images)
     noise = _noise(problem, settings.pose_covariance, start.scale)
     solution = _solve(problem, start, noise, robust=settings.robust, cost=settings.cost)
     return _result(solution, images.stations, settings.cost)
@@ -97,62 +102,6 @@ def _require(problem: Problem, keep: NDArray[np.bool_]) -> None:
             )
 
 
-def _start(problem: Problem, assignments: Sequence[Assignment], poses: Array, groups: NDArray[np.int64]) -> State:
-    """Initial bases and scale from the assignments' poses: the median image of each group."""
-    scale = 1.0
-    if problem.with_scale:
-        scales = [a.scale for a in assignments if a.scale is not None]
-        scale = float(np.median(scales)) if scales else _scale(problem, assignments, poses, groups)
-    bases: list[Transform] = []
-    for g in problem.groups:
-        candidates: list[Transform] = []
-        for i, a in enumerate(assignments):
-            if int(groups[i]) == g and a.T_camera_scan is not None:
-                T = np.array(poses[i], dtype=np.float64)
-                T[:3, 3] *= scale
-                candidates.append(T @ a.T_camera_scan)
-        if not candidates:
-            raise ComputeError(f"no image of station {g} has a starting pose", where=f"station {g}")
-        middle = problem.centres.mean(axis=0)
-        places = np.array([apply(T, middle) for T in candidates])
-        far = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-        near = np.argsort(far)[: max(1, (len(far) + 1) // 2)]
-        R = Rotation.from_matrix(np.array([candidates[k][:3, :3] for k in near])).mean()
-        bases.append(transform(R, places[near].mean(axis=0) - R.apply(middle)))
-    n = problem.n_images
-    return State(
-        np.array(bases),
-        scale,
-        np.zeros_like(problem.centres),
-        np.zeros(problem.size - problem.common_column),
-        np.zeros((n, 6)),
-    )
-
-
-def _scale(problem: Problem, assignments: Sequence[Assignment], poses: Array, groups: NDArray[np.int64]) -> float:
-    """Initial scale from the assignments' poses: R_i c_i + scale p_i (positions p_i) is equal for all i."""
-    middle = problem.centres.mean(axis=0)
-    upper, lower = 0.0, 0.0
-    for g in problem.groups:
-        mine = {
-            i: poses[i][:3, :3] @ apply(a.T_camera_scan, middle)
-            for i, a in enumerate(assignments)
-            if int(groups[i]) == g and a.T_camera_scan is not None
-        }
-        if len(mine) < 2:
-            continue
-        seen = np.array(list(mine.values()))
-        position = poses[list(mine), :3, 3] - poses[list(mine), :3, 3].mean(axis=0)
-        upper -= float(np.sum(position * (seen - seen.mean(axis=0))))
-        lower += float(np.sum(position**2))
-    if upper <= 0.0 or lower <= 0.0:
-        raise ComputeError(
-            "the scale of the camera positions cannot be determined from the images alone",
-            remedy="Use poses of several images of the same scene, from different places",
-        )
-    return upper / lower
-
-
 @dataclass(frozen=True, slots=True)
 class _Weighting:
     """The current weighting of the rows."""
@@ -166,16 +115,41 @@ def _blocks(problem: Problem, rows: Linearised, weights: Array) -> Blocks:
     return compress(rows.J, rows.A, rows.r, problem.image, problem.n_images, weights)
 
 
-def _descend(problem: Problem, state: State, weighting: _Weighting, cost: Cost) -> State:
+@dataclass(frozen=True, slots=True)
+class _Iterate:
+    """A state with its rows, its objective, and the Gauss–Newton step from it.
+
+    Attributes:
+        state: of the common unknowns and the pose errors.
+        rows: of the outlines there.
+        objective: weighted sum of squares, with the priors.
+        dx: (n,) step of the common unknowns.
+        poses: (N, 6) pose errors after the whole step.
+        decrement: of the objective by the step, if the problem were linear.
+        share: of a step, by which the state was reached.
+    """
+
+    state: State
+    rows: Linearised
+    objective: float
+    dx: Array
+    poses: Array
+    decrement: float
+    share: float
+
+
+def _descend(problem: Problem, start: State, weighting: _Weighting, cost: Cost) -> _Iterate:
     """Gauss–Newton; a step that would increase the objective is halved.
 
     Halving, not damping: the poses' errors are eliminated with their own covariance, and a shorter step shortens them
     in proportion.
+
+    Raises:
+        ComputeError: the objective is not finite.
     """
     prior = problem.prior()
-    previous, best, dx, poses = np.inf, state, np.zeros(problem.size), state.poses
-    share = 1.0
-    for _ in range(_STEPS):
+
+    def at(state: State, share: float = 1.0) -> _Iterate:
         rows = linearise(problem, state, cost)
         blocks = _blocks(problem, rows, weighting.outlines)
         m = marginalise(blocks, weighting.pose_root, weighting.factor)
@@ -183,89 +157,110 @@ def _descend(problem: Problem, state: State, weighting: _Weighting, cost: Cost) 
         objective = m.quadratic + float(held @ prior @ held)
         if not np.isfinite(objective):
             raise ComputeError("the registration did not converge", remedy="Check the camera poses and the spheres")
-        if objective > previous * (1 + 1e-9) + 1e-9 and share > 1e-3:
-            share /= 2
-            state = best.moved(problem, share * dx, best.poses + share * (poses - best.poses))
-            continue
-        previous, best, share = objective, state, 1.0
         g = m.g + prior @ held
         dx = -solve_symmetric(m.H + prior, g)
         poses = pose_errors(blocks, m, dx, weighting.factor)
-        state = state.moved(problem, dx, poses)
-        # A hundred-thousandth of a standard deviation: converged.
-        if float(-g @ dx) < 1e-10:
-            return state
-    return state
+        return _Iterate(state, rows, objective, dx, poses, float(-g @ dx), share)
+
+    def candidate(here: _Iterate, share: float) -> _Iterate:
+        before = here.state.poses
+        poses = here.poses if share == 1.0 else before + share * (here.poses - before)
+        return at(here.state.moved(problem, share * here.dx, poses), share)
+
+    return halved_gauss_newton(
+        at(start),
+        candidate,
+        _gain,
+        lambda here, _there: here.decrement < _CONVERGED,
+        most=_STEPS,
+    ).state
+
+
+def _gain(here: _Iterate, there: _Iterate) -> float:
+    """Decrease of the objective; growth by rounding alone does not count.
+
+    The shortest step is taken even if the objective grows: from a bad start, the way may lead over a rise. So is the
+    last one, whose decrease may be smaller than the objective's rounding.
+    """
+    if there.share < _SHORTEST or here.decrement < _CONVERGED:
+        return math.inf
+    return here.objective * (1 + 1e-9) + 1e-9 - there.objective
 
 
 def _solve(problem: Problem, start: State, noise: PoseNoise, *, robust: bool, cost: Cost) -> Solution:
-    n = len(problem.members)
+    """Alternate between the weights of the outlines, the variance components and a descent, until they settle."""
     prior = problem.prior()
     scales, factor = np.full(len(noise.parts), 1.0), 1.0
     root = noise.root(scales)
-    state = _begin(problem, start)
-    keep, weights = np.ones(n, dtype=bool), np.ones(n)
+    here = _begin(problem, start)
+    keep, weights = np.ones(len(problem.members), dtype=bool), np.ones(len(problem.members))
     for turn in range(_ROUNDS if robust else 3):
-        rows = linearise(problem, state, "cone")
-        blocks = _blocks(problem, rows, weights)
+        settled = False
         if robust:
-            d, px = _distances(problem, rows, blocks, state, root, factor)
-            typical = float(np.median(px[keep]))
-            typical_d = float(np.median(d[keep])) / 1.54  # the median norm of three standard normals
-            new_keep = px < max(5.0 * typical, 0.8)
-            new_weights = np.where(new_keep, np.minimum(1.0, 3.0 * typical_d / np.maximum(d, 1e-12)), 0.0)
+            new_keep, new_weights = _robust_weights(problem, here, _Weighting(weights, root, factor), keep)
             settled = turn > 1 and np.array_equal(new_keep, keep) and np.abs(new_weights - weights).max() < 0.02
             keep, weights = new_keep, new_weights
             _require(problem, keep)
-            blocks = _blocks(problem, rows, weights)
-        else:
-            settled = False
+        blocks = _blocks(problem, here.rows, weights)
         before = np.maximum(scales, 0.3)
-        factor, scales = estimate(blocks, noise, prior, prior @ state.prior_values(problem), (factor, before))
+        factor, scales = estimate(blocks, noise, prior, prior @ here.state.prior_values(problem), (factor, before))
         settled = settled and bool(np.all(scales < 2 * before))
         root = noise.root(scales)
-        state = _descend(problem, state, _Weighting(weights, root, factor), "cone")
+        here = _descend(problem, here.state, _Weighting(weights, root, factor), "cone")
         if settled:
             break
     if cost != "cone":
-        state = _descend(problem, state, _Weighting(weights, root, factor), cost)
-    rows = linearise(problem, state, "cone")
+        here = _descend(problem, here.state, _Weighting(weights, root, factor), cost)
+    rows = here.rows if cost == "cone" else linearise(problem, here.state, "cone")
     blocks = _blocks(problem, rows, weights)
     m = marginalise(blocks, root, factor)
     return Solution(
-        problem, state, weights, blocks, m, rows, inverse_symmetric(m.H + prior), root, factor,
+        problem, here.state, weights, blocks, m, rows, inverse_symmetric(m.H + prior), root, factor,
     )  # fmt: skip
 
 
-def _begin(problem: Problem, start: State) -> State:
+def _begin(problem: Problem, start: State) -> _Iterate:
     """From the assignments' poses to the neighbourhood of the answer, outlines weighted equally but robustly."""
-    state, none = start, np.zeros((problem.n_images, 6, 6))
-    for _ in range(4):
-        rows = linearise(problem, state, "cone")
+    none = np.zeros((problem.n_images, 6, 6))
+    size = np.einsum("oij,oij->o", problem.whiten, problem.whiten)
+
+    def weighted(rows: Linearised) -> _Weighting:
         seen = np.linalg.norm(np.linalg.solve(problem.whiten, rows.r[:, :, None])[:, :2, 0], axis=1)
         # From a tenth of a radius on, an outline is doubtful; stated covariances are not used here.
-        soft = 1 / (1 + (seen / problem.half_angles / 0.1) ** 2)
-        size = np.einsum("oij,oij->o", problem.whiten, problem.whiten)
-        weights = soft / size * float(np.median(size))
-        state = _descend(problem, state, _Weighting(weights, none, 1.0), "cone")
-    return state
+        soft = 1 / (1 + (seen / problem.cones.half_angles / 0.1) ** 2)
+        return _Weighting(soft / size * float(np.median(size)), none, 1.0)
+
+    here = _descend(problem, start, weighted(linearise(problem, start, "cone")), "cone")
+    for _ in range(_REWEIGHTED):
+        here = _descend(problem, here.state, weighted(here.rows), "cone")
+    return here
 
 
-def _distances(
-    problem: Problem, rows: Linearised, blocks: Blocks, state: State, root: Array, factor: float
-) -> tuple[Array, Array]:
+def _robust_weights(
+    problem: Problem, here: _Iterate, weighting: _Weighting, keep: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], Array]:
+    """Which outlines to keep (O,), by the median of those kept so far, and the weights (O,), 0 for the rest."""
+    d, px = _distances(problem, here, weighting)
+    typical = float(np.median(px[keep]))
+    typical_d = float(np.median(d[keep])) / 1.54  # the median norm of three standard normals
+    kept = px < max(5.0 * typical, 0.8)
+    return kept, np.where(kept, np.minimum(1.0, 3.0 * typical_d / np.maximum(d, 1e-12)), 0.0)
+
+
+def _distances(problem: Problem, here: _Iterate, weighting: _Weighting) -> tuple[Array, Array]:
     """Norm of each outline's residual (O,), in its standard deviations and in px, with pose errors removed."""
-    m = marginalise(blocks, root, factor)
-    xi = pose_errors(blocks, m, np.zeros(problem.size), factor)
-    r = rows.r + np.einsum("okj,oj->ok", rows.A, xi[problem.image])
-    return np.linalg.norm(r, axis=1) / np.sqrt(factor), rms_px(problem, r)
+    blocks = _blocks(problem, here.rows, weighting.outlines)
+    m = marginalise(blocks, weighting.pose_root, weighting.factor)
+    xi = pose_errors(blocks, m, np.zeros(problem.size), weighting.factor)
+    r = here.rows.r + np.einsum("okj,oj->ok", here.rows.A, xi[problem.image])
+    return np.linalg.norm(r, axis=1) / np.sqrt(weighting.factor), rms_px(problem, r)
 
 
 def rms_px(problem: Problem, whitened: Array) -> Array:
     """RMS (O,) in px, over an outline, of its cone's displacement, given as whitened rows (O, 3)."""
     r = np.linalg.solve(problem.whiten, whitened[:, :, None])[:, :, 0]
     # Angles are stretched in the image plane by 1 / cos^2 in the radial direction and by 1 / cos across it.
-    stretch = problem.focal_px / problem.axes[:, 2] ** 1.5
+    stretch = problem.focal_px / problem.cones.axes[:, 2] ** 1.5
     return stretch * np.sqrt(np.sum(r[:, :2] ** 2, axis=1) / 2 + r[:, 2] ** 2)
 
 
@@ -280,7 +275,6 @@ def _result(s: Solution, groups: NDArray[np.int64], cost: Cost) -> RegistrationR
         OutlineResidual(
             i, j, m, float(given[o]), not bool(keep[o]),
             "" if keep[o] else f"{refined[o]:.1f} px from its predicted outline, the others {typical:.2f} px",
-            float(refined[o]),
         )
         for o, (i, j, m) in enumerate(problem.members)
     )  # fmt: skip
@@ -313,14 +307,9 @@ def _result(s: Solution, groups: NDArray[np.int64], cost: Cost) -> RegistrationR
         n_images=len({r.image for r in records if not r.excluded}),
         cost=cost,
         components={name: part[np.ix_(pick, pick)] for name, part in _components(s).items()},
-        group_covariance={
-            g: s.covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k, g in enumerate(problem.groups)
-        },
         T_scan_camera_refined=cameras[1],
         pose_sigma=(float(np.sqrt(variances[:, :3].mean())), float(np.sqrt(variances[:, 3:].mean()))),
         outline_factor=s.outline_factor,
-        sphere_offsets_m=state.spheres,
-        common_px=state.common[:6],
         solution=s,
     )
 

@@ -28,7 +28,6 @@ class SphereDifference:
         difference_m: (3,) position in b minus position in a, in frame a.
         sigma_m: standard deviation of the difference along its direction, including the registration's.
         z: Mahalanobis length of the difference.
-        probability: of such a z if the sphere did not move.
         moved: whether the sphere counts as moved.
     """
 
@@ -36,7 +35,6 @@ class SphereDifference:
     difference_m: Array
     sigma_m: float
     z: float
-    probability: float
     moved: bool
 
 
@@ -106,11 +104,7 @@ def close_loop(
     spheres: list[SphereDifference] = []
     for i, pair in enumerate(match.pairs):
         difference, z2, sigma = _against_others(pa, pb, C, staying, i, T)
-        spheres.append(
-            SphereDifference(
-                pair, difference, sigma, float(np.sqrt(z2)), float(chi2.sf(z2, 3)), moved=not bool(staying[i])
-            )
-        )
+        spheres.append(SphereDifference(pair, difference, sigma, float(np.sqrt(z2)), moved=not bool(staying[i])))
     d = apply(T, pb[staying]) - pa[staying]
     dof = 3 * int(staying.sum()) - 6
     statistic = float(np.einsum("ni,nij,nj->", d, np.linalg.inv(C[staying]), d))

@@ -109,7 +109,7 @@ def views_left(protocol: Protocol, state: RunState | None) -> int:
         now = None if state is None else state.steps[step.id]
         if now is not None and (now.phase == "passed" or now.skipped):
             continue
-        planned = _MANUAL_VIEWS if step.kind == "manual_capture" else planned_views(step)
+        planned = _MANUAL_VIEWS if step.by_hand else planned_views(step)
         left += max(0, planned - (0 if now is None else len(now.captured)))
     return left
 

@@ -33,11 +33,13 @@ class RecordedReport:
         identity: the device.
         clock_offset_s: device clock minus host UTC, or minus host monotonic for an uptime clock; None: not reported.
         clock: uptime: it counts from power-on. Old records do not say; there the kind of device decides.
+        details: what else it says of itself, by name.
     """
 
     identity: RecordedIdentity
     clock_offset_s: float | None
     clock: Literal["utc", "uptime"]
+    details: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,9 @@ def recorded_report(report: object) -> RecordedReport:
     fields = _mapping(report)
     identity = recorded_identity(fields.get("identity"))
     stated = fields.get("clock") or ("uptime" if identity.kind == "robot" else "utc")
-    return RecordedReport(identity, _number(fields.get("clock_offset_s")), "uptime" if stated == "uptime" else "utc")
+    clock = "uptime" if stated == "uptime" else "utc"
+    details = {name: str(value) for name, value in _mapping(fields.get("details")).items()}
+    return RecordedReport(identity, _number(fields.get("clock_offset_s")), clock, details)
 
 
 def recorded_optics(camera: object) -> RecordedOptics:

@@ -1,4 +1,4 @@
-"""When a completed run may be exported: its release by a second person."""
+"""When a run may be exported: complete, and released by a second person where the protocol asks for it."""
 
 from __future__ import annotations
 
@@ -35,5 +35,14 @@ def refuse_export(protocol: Protocol, state: RunState) -> IllegalTransitionError
             "the protocol asks for a second person's release before anything is exported",
             where=state.run_id,
             remedy="A supervisor who took no part in the run reads it and signs its release",
+        )
+    return None
+
+
+def refuse_data_set(state: RunState) -> IllegalTransitionError | None:
+    """The reason why there is no data set of the run yet, or None."""
+    if state.status != "completed":
+        return IllegalTransitionError(
+            f"the run is {state.status}", where=state.run_id, remedy="Only a completed run is exported"
         )
     return None

@@ -21,7 +21,8 @@ from pydantic import (
 
 from service.core.errors import ProtocolError
 from service.core.protocol.rules import rule_violations
-from service.core.protocol.step_params import RepeatedStep, StepParams
+from service.core.protocol.step_params import Gives, RepeatedStep, StepParams
+from service.core.records.data_set import DataSetStatement
 from service.core.records.events import Record
 from service.core.recovery.reasons import Reasons
 from service.core.run.lifecycle import RESERVED_STEP_IDS
@@ -184,6 +185,21 @@ class Step(StepFields):
         return self.params.repeated
 
     @property
+    def gives(self) -> Gives | None:
+        """What others look for in this step's result."""
+        return self.params.gives
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether a person takes this step's images with the camera in the hand."""
+        return self.params.by_hand
+
+    @property
+    def photographs_specimen(self) -> bool:
+        """Whether this step takes images of the specimen."""
+        return self.params.photographs_specimen
+
+    @property
     def needs_disk(self) -> bool:
         """Whether this step stores files."""
         return self.params.needs_disk
@@ -215,6 +231,7 @@ class ProtocolFields(Record):
     # Whether a person who took no part in the run must release it before anything is exported.
     release: Literal["none", "second_person"] = "none"
     reasons: Reasons = Reasons()  # presets for the reason of a redo, a skip or an acceptance
+    data_set: DataSetStatement = DataSetStatement()  # what an exported data set says about itself
 
 
 class Protocol(ProtocolFields):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from service.core.records.base import Record
 
@@ -25,20 +25,37 @@ class RepeatedStep:
     computes: bool = True
 
 
+# What other steps, pages, the audit and exports look for in the results of a run.
+Gives = Literal[
+    "calibration", "ct_surface", "scan_surface", "rough_spheres", "registrations", "accuracy", "ground_truth"
+]
+
+
 class StepParams(Record):
     """Base of the params of every step kind.
 
     Attributes:
+        gives: what others look for in the result of such a step; None: nothing that others look for.
+        by_hand: whether a person takes its images with the camera in the hand, as many as are needed.
+        only_ticks: whether it is nothing but what people tick.
         repeated: what trying such a step again means.
         needs_disk: whether such a step stores files; the others also run when the disk is full.
     """
 
+    gives: ClassVar[Gives | None] = None
+    by_hand: ClassVar[bool] = False
+    only_ticks: ClassVar[bool] = False
     repeated: ClassVar[RepeatedStep] = RepeatedStep("Put right what the figures show, then try this step again")
     needs_disk: ClassVar[bool] = True
 
     @property
     def moves_robot(self) -> bool:
         """Whether the robot moves during this step with these params."""
+        return False
+
+    @property
+    def photographs_specimen(self) -> bool:
+        """Whether this step takes images of the specimen, which nobody can take again once it was changed."""
         return False
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import BaseModel, ConfigDict
 
 
@@ -9,6 +11,14 @@ class Record(BaseModel):
     """Base of everything that is written down: frozen, no unknown fields."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def recorded(record: Record) -> dict[str, Any]:
+    """A record as it is written into an event: all of its own fields; of the records in it, the fields that were set.
+
+    So a part that was read from an earlier event is written again exactly as it was.
+    """
+    return record.model_dump(mode="json") | record.model_dump(mode="json", exclude_unset=True)
 
 
 class ArtefactRef(Record):

@@ -14,6 +14,7 @@ from service.core.protocol.models import Protocol, Step
 from service.core.records.events import OperatorVerb
 from service.core.recovery.words import REMEDIES, UNKNOWN_REMEDY
 from service.core.run.actions import redo_refusal, skip_refusal, unmet_requirements
+from service.core.run.noted import Mending
 from service.core.run.state import RunState, StepState
 from service.core.run.state_transitions import seconds_between
 
@@ -84,10 +85,7 @@ def view_s(protocol: Protocol, state: RunState, step: Step) -> float | None:
     """Seconds for one view: the median of this run's, else from the arm's plan; None if neither is known."""
     if state.view_gaps_s:
         return median(state.view_gaps_s)
-    plans = [n.data for n in state.steps[step.id].notes if "estimated_s" in n.data and n.data.get("views")]
-    if plans:
-        return float(plans[-1]["estimated_s"]) / len(plans[-1]["views"])
-    return None
+    return state.steps[step.id].motion_plan.view_s
 
 
 def takes_words(minutes: float | None) -> str:
@@ -104,16 +102,17 @@ def takes_words(minutes: float | None) -> str:
 
 def _again(protocol: Protocol, state: RunState, trouble: Trouble) -> WayOn:
     step, now = protocol.step(state.current), state.step
-    words = str(now.mend.get("advice") or (_WITH_WHAT_IS_THERE if _all_taken(step, now) else step.repeated.words))
-    if not now.mend and trouble == "failure" and now.failure is not None:
+    mend = now.mend or Mending()
+    words = mend.advice or (_WITH_WHAT_IS_THERE if _all_taken(step, now) else step.repeated.words)
+    if now.mend is None and trouble == "failure" and now.failure is not None:
         words = f"{REMEDIES.get(now.failure.error, UNKNOWN_REMEDY)}; then try again"
-    mended = len(now.mend.get("viewpoints", ())) + int(now.mend.get("images", 0))
+    mended = len(mend.viewpoints) + mend.images
     left = mended or max(planned_views(step) - len(now.captured), 0)
     each_s = view_s(protocol, state, step)
     minutes = _minutes(now.worked_s)
     if left and each_s is not None:
         minutes = left * each_s / 60
-    elif now.captured and step.kind in ("viewpoint_capture", "calibration"):
+    elif now.captured and planned_views(step):
         minutes = _computing(now.worked_s, len(now.captured), each_s)
     kept = {0: "", 1: " The image is kept."}.get(len(now.captured), f" The {len(now.captured)} images are kept.")
     return WayOn("confirm", step.id, words, minutes, f"Nothing.{kept}")
@@ -126,7 +125,7 @@ def _computing(worked_s: float | None, views: int, each_s: float | None) -> floa
 
 def _all_taken(step: Step, now: StepState) -> bool:
     """Whether every planned view is taken and the step suggests no others: a retry would change no figure."""
-    return not now.mend and 0 < planned_views(step) <= len(now.captured)
+    return now.mend is None and 0 < planned_views(step) <= len(now.captured)
 
 
 def _redos(protocol: Protocol, state: RunState, step: Step) -> list[WayOn]:

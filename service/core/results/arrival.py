@@ -7,7 +7,7 @@ from datetime import datetime
 from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
 
-_ANSWERS = ("registration", "evaluation")  # kinds of the steps whose results a release depends on
+_ANSWERS = ("registrations", "accuracy")  # what a release depends on
 
 
 def released_utc(protocol: Protocol, state: RunState) -> str:
@@ -17,7 +17,7 @@ def released_utc(protocol: Protocol, state: RunState) -> str:
     the run.
     """
     for step in protocol.steps:
-        rests = any(protocol.step(name).kind in _ANSWERS for name in step.requires)
+        rests = any(protocol.step(name).gives in _ANSWERS for name in step.requires)
         if step.irreversible and rests and state.steps[step.id].phase == "passed":
             return state.steps[step.id].ended_utc
     return state.ended_utc if state.status == "completed" else ""

@@ -15,15 +15,8 @@ Refusal = IllegalTransitionError
 VERBS: tuple[OperatorVerb, ...] = ("confirm", "sign", "redo", "skip", "accept", "pause", "resume", "abort")
 
 
-def check_action(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> None:
-    """Raise IllegalTransitionError, with the reason and a remedy, unless `actor` may do this now."""
-    refusal = refuse(protocol, state, action, actor)
-    if refusal is not None:
-        raise refusal
-
-
 def refuse(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:  # noqa: PLR0911 - one return per rule
-    """The reason to refuse an action, or None; `check_action` and the fold share it."""
+    """The reason to refuse an action, or None."""
     if not state.started:
         return Refusal("the run has not started", where=action.action)
     if state.terminal:
@@ -53,7 +46,7 @@ def capture_refusal(protocol: Protocol, state: RunState, step: str, attempt: int
     if state.paused:
         return Refusal("the run is paused", where=step, remedy="Resume first")
     now = state.step
-    if (step, attempt) != (now.step, now.attempt) or protocol.step(step).kind != "manual_capture":
+    if (step, attempt) != (now.step, now.attempt) or not protocol.step(step).by_hand:
         title = protocol.step(now.step).title
         return Refusal("this step takes no images now", where=step, remedy=f"The run is at: {title}")
     if now.phase != "running":

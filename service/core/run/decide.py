@@ -14,7 +14,6 @@ from service.core.records.events import OperatorVerb, Uncertainty
 from service.core.recovery.ways_on import WayOn, ways_on
 from service.core.run.actions import (
     allowed_actions,
-    check_action,
     needs_leave,
     needs_signature_now,
     record_to_sign,
@@ -42,7 +41,6 @@ __all__ = [
     "Superseded",
     "advance",
     "allowed_actions",
-    "check_action",
     "decide",
     "evaluate_gates",
     "fold",
@@ -193,7 +191,7 @@ def _decide_recovering(protocol: Protocol, state: RunState) -> Decision:
         failed = "; ".join(say(verdict) for verdict in now.verdicts if not verdict.passed)
         found = "Outside its limits" if outside else "Not decided yet"
         # The step may suggest a remedy, such as further viewpoints that would bring the figures within limits.
-        advice = str(now.mend.get("advice", ""))
+        advice = now.mend.advice if now.mend is not None else ""
         return _ask(protocol, state, "recovery", f"{found}: {failed}" + (f". {advice}" if advice else ""))
     why = f"{now.failure.error}: {now.failure.message}"
     if anew and now.failure.recovery == "retry":

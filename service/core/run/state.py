@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from service.core.jobs.priorities import WAITED
-from service.core.records.events import ArtefactRef, GateVerdict, Identified, Uncertainty
+from service.core.records.events import ArtefactRef, GateVerdict, Identified, RegionDrawn, Uncertainty
 from service.core.run.lifecycle import Phase
+from service.core.run.noted import MOTION_PLAN, Mending, MotionPlan
 from service.core.text.counts import counted
 
 # The progress text of a step while a person takes the images: the camera is idle and shows its live view.
@@ -129,15 +130,23 @@ class StepState:
         return self.phase == "passed" and (self.gates_passed or self.accepted is not None) and not self.skipped
 
     @property
-    def mend(self) -> Mapping[str, Any]:
-        """What would bring this attempt within limits: the data of its newest note with `advice`, else empty.
+    def mend(self) -> Mending | None:
+        """What would bring this attempt within limits, by its newest note with `advice`; None without one.
 
         Advice in earlier notes is out of date and is ignored, `hands` included.
         """
         advised = (
             note.data for note in reversed(self.notes) if note.attempt == self.attempt and "advice" in note.data
         )
-        return next(advised, {})
+        newest = next(advised, None)
+        return None if newest is None else Mending.model_validate(dict(newest))
+
+    @property
+    def motion_plan(self) -> MotionPlan:
+        """How the arm moves, by the newest plan; empty without one."""
+        planned = (note.data for note in reversed(self.notes) if note.note == MOTION_PLAN)
+        newest = next(planned, None)
+        return MotionPlan() if newest is None else MotionPlan.model_validate(dict(newest))
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,6 +210,15 @@ class Correction:
 
 
 @dataclass(frozen=True, slots=True)
+class DrawnRegion:
+    """A region of the ground truth that a person drew."""
+
+    seq: int
+    by: str
+    region: RegionDrawn
+
+
+@dataclass(frozen=True, slots=True)
 class RunState:
     """The fold of a run's events."""
 
@@ -226,6 +244,7 @@ class RunState:
     people: frozenset[str] = frozenset()  # who took part: started it, controlled it, acted on it
     controller: str = ""  # person whose screen controls the run; "" for nobody
     corrections: tuple[Correction, ...] = ()
+    drawn: tuple[DrawnRegion, ...] = ()  # regions of the ground truth that people drew, the latest last
     ended_utc: str = ""  # of run_completed or run_aborted
     completed_sha256: str = ""  # of the run_completed event: what a release binds
     released_by: str = ""

@@ -13,7 +13,7 @@ from service.core.geometry import Array, inverse
 from service.core.units import mm
 from service.dataset.formats.meshes import mask_png, ply, png
 from service.dataset.posed.exporter import Exporter
-from service.dataset.posed.folder import ExportFolder
+from service.dataset.posed.folder import ExportFolder, Part, json_bytes
 from service.dataset.posed.records import DataSet, View
 
 _SCENE = "test/000001"
@@ -22,7 +22,7 @@ _OBJECT = 1
 
 def write(dataset: DataSet, folder: ExportFolder) -> None:
     """`models/`, `camera.json` and the scene: `scene_camera.json`, `scene_gt.json`, `scene_gt_info.json`, rgb, depth,
-    mask, mask_visib.
+    mask, mask_visib. `dataset_info.json` has the views' names by their numbers.
 
     Millimetres; depth is 16 bit in units of depth_scale; pixel centres lie at integers. The model's frame is the
     world's. The object is all of the mesh: nothing hides it but itself and what is not in it.
@@ -30,7 +30,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     numbers = {str(k): view for k, view in enumerate(dataset.views, start=1)}
     vertices_mm = mm(dataset.mesh.vertices_m)
     folder.file(f"models/obj_{_OBJECT:06d}.ply", lambda: ply(vertices_mm, dataset.mesh.faces, dataset.mark))
-    folder.json("models/models_info.json", {str(_OBJECT): _extent(vertices_mm)})
+    folder.file("models/models_info.json", lambda: json_bytes({str(_OBJECT): _extent(vertices_mm)}))
     if dataset.views:
         camera = dataset.views[0].camera
         shape = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
@@ -44,11 +44,21 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     )
     for key, view in numbers.items():
         name = f"{int(key):06d}"
-        folder.file(f"{_SCENE}/rgb/{name}{view.suffix}", lambda view=view: dataset.pixels.picture(view))
-        folder.file(f"{_SCENE}/depth/{name}.png", lambda view=view: png(coded_depth(dataset.pixels.depth_m(view))))
+        folder.file(
+            f"{_SCENE}/rgb/{name}{view.suffix}",
+            lambda view=view: dataset.pixels.picture(view),
+            Part("image", view.name),
+        )
+        folder.file(
+            f"{_SCENE}/depth/{name}.png",
+            lambda view=view: png(coded_depth(dataset.pixels.depth_m(view))),
+            Part("depth", view.name),
+        )
         for mask in ("mask", "mask_visib"):
             folder.file(
-                f"{_SCENE}/{mask}/{name}_000000.png", lambda view=view: mask_png(dataset.pixels.depth_m(view) > 0)
+                f"{_SCENE}/{mask}/{name}_000000.png",
+                lambda view=view: mask_png(dataset.pixels.depth_m(view) > 0),
+                Part("mask", view.name),
             )
 
 

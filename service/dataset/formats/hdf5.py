@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from service.dataset.posed.exporter import Exporter
-from service.dataset.posed.folder import ExportFolder
+from service.dataset.posed.folder import ExportFolder, Part
 from service.dataset.posed.records import DataSet, View
 
 LOADER = "loader.py"
@@ -23,7 +23,9 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     (4, 4) and covariance (6, 6). Each view is a file of its own, so that an interrupted export goes on.
     """
     for view in dataset.views:
-        folder.written_by(f"views/{view.name}.h5", lambda part, view=view: _view(part, dataset, view))
+        folder.written_by(
+            f"views/{view.name}.h5", lambda path, view=view: _view(path, dataset, view), Part("arrays", view.name)
+        )
     folder.written_by("data.h5", lambda part: _index(part, dataset))
     source = importlib.resources.files("service.dataset.posed").joinpath("h5_loader.py")
     folder.file(LOADER, source.read_bytes)

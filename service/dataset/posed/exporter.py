@@ -6,13 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.core.declared_kinds import declared_kinds
-from service.core.errors import ConfigurationError
-from service.dataset.posed.folder import ExportFolder, export_folder
+from service.core.declared_kinds import declared_kinds, kind_named
+from service.dataset.package.packaging import write_package
+from service.dataset.posed.folder import ExportFolder, count_files, export_folder
 from service.dataset.posed.pixels import undistorted_data_set
 from service.dataset.posed.records import DataSet
 
 GROUP = "orthocapture.exporters"
+Progress = Callable[[str, int, int], None]  # activity, files done, files in total
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +48,7 @@ def exporter(name: str) -> Exporter:
     Raises:
         ConfigurationError: there is none.
     """
-    known = exporters()
-    if name not in known:
-        raise ConfigurationError(
-            f"there is no format {name!r}", where="--format", remedy=f"Choose one of {', '.join(sorted(known))}"
-        )
-    return known[name]
+    return kind_named(name, exporters(), what="format", option="--format")
 
 
 def write_data_set(
@@ -62,8 +58,9 @@ def write_data_set(
     *,
     personal: bool = True,
     leaving: Callable[[Path], None] = lambda _sums: None,
+    progress: Progress | None = None,
 ) -> None:
-    """Write a data set into a new folder, with `dataset.json`, `splits.json` and `SHA256SUMS` beside the format.
+    """Write a data set into a new folder, with what every folder has beside the format.
 
     Args:
         dataset: as photographed; it is undistorted here where the format needs that.
@@ -71,6 +68,7 @@ def write_data_set(
         target: a new folder; it appears when it is whole.
         personal: False leaves GPS, owner and serial numbers out of resampled pictures.
         leaving: called with the list of checksums when all is written, before the folder has its name.
+        progress: called with the activity, the files done and their total.
 
     Raises:
         DataError: the target exists, the data set does not fit into the format, or a picture cannot be read.
@@ -78,7 +76,19 @@ def write_data_set(
     """
     ready = undistorted_data_set(dataset, personal=personal) if how.pinhole else dataset
     identity = f"{how.name} 1 {ready.identity} {'with' if personal else 'without'} personal data"
-    with export_folder(target, identity, leaving) as folder:
-        how.write(ready, folder)
-        folder.json("dataset.json", {"format": how.name, "simulated": dataset.simulated, **dataset.statement})
-        folder.json("splits.json", {"simulated": dataset.simulated, **ready.splits.named()})
+    with export_folder(target, identity, leaving, _told(ready, how, progress)) as folder:
+        _write(ready, how, folder)
+
+
+def _write(dataset: DataSet, how: Exporter, folder: ExportFolder) -> None:
+    """The files of the format, and those that every folder has."""
+    how.write(dataset, folder)
+    write_package(dataset, folder, form=how.name, words=how.words, description=how.write.__doc__ or "")
+
+
+def _told(dataset: DataSet, how: Exporter, progress: Progress | None) -> Callable[[int], None]:
+    """Turns a number of files into progress."""
+    if progress is None:
+        return lambda _count: None
+    total = count_files(lambda folder: _write(dataset, how, folder))
+    return lambda count: progress("writing", count, total)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Sequence
@@ -11,16 +12,21 @@ import numpy as np
 
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.masks import Ball, Post, hull_mask, posts_below
+from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.splits import splits
-from service.compute.pixels.surface import Surface
 from service.core.errors import DataError
-from service.core.geometry import Array, Transform, apply, inverse, skew
+from service.core.geometry import Array, apply, inverse
 from service.core.picture_files import PNG_BEGINS
+from service.core.records.data_set import FIRST_VERSION, DataSetStatement
 from service.core.units import metres
 from service.dataset.control_spheres import control_centres
-from service.dataset.export import described_run
+from service.dataset.posed.about_run import about_run
 from service.dataset.posed.pixels import Photographs
+from service.dataset.posed.pose_errors import own_pose_errors
 from service.dataset.posed.records import DataSet, Mesh, View
+from service.dataset.posed.statement import described_run
+from service.dataset.posed.view_covariances import view_covariances
+from service.dataset.registered_scan import control_scan
 from service.dataset.registrations import result_of_step
 from service.dataset.summary import RunSummary
 from service.jobs.records import SpheresFound
@@ -32,18 +38,27 @@ _WITHIN, _LEVEL = 0.7, 0.996  # cosines: of the board from the cameras' directio
 _LEAST_LEVEL = 0.05  # share of the surface that must be level
 
 
-def data_set_of(summary: RunSummary, not_in_yet: Sequence[str] = (), *, personal: bool = True) -> DataSet:
+def data_set_of(
+    summary: RunSummary,
+    not_in_yet: Sequence[str] = (),
+    *,
+    personal: bool = True,
+    stated: DataSetStatement | None = None,
+    version: str = FIRST_VERSION,
+) -> DataSet:
     """Images, poses and mesh of a run in the frame of its scan, which is the data set's `world`.
 
     The poses are those of the run's own registration, with the camera that it was made with. Images that were taken
     for the evaluation alone are left out. Control spheres are masked in all images: they were taken away before the
-    scan. So are posts, if the scan shows the board on which they stand. A pose's covariance is that of the
-    registration, which is common to all images.
+    scan. So are posts, if the scan shows the board on which they stand.
 
     Args:
         summary: the run.
         not_in_yet: results that have not arrived yet, in words.
-        personal: False leaves GPS, owner and serial numbers out of the pictures.
+        personal: False leaves GPS, owner and serial numbers out of the pictures, and people and serial numbers out of
+            the metadata.
+        stated: title, licence, ethics, creators and citation; they replace those of the protocol.
+        version: of the data set.
 
     Raises:
         DataError: the run has no evaluated registration, no scan, or no registered image.
@@ -58,14 +73,18 @@ def data_set_of(summary: RunSummary, not_in_yet: Sequence[str] = (), *, personal
         raise DataError(
             "no image of the data set is registered", where=summary.run_id, remedy="Repeat the registration"
         )
-    vertices_m, faces = summary.scan_mesh()
-    mesh = Mesh(np.asarray(vertices_m, dtype=np.float64), np.asarray(faces, dtype=np.int64))
-    views = tuple(_view(name, path, registered) for name, (path, _) in sorted(files.items()))
-    balls, posts = _markers(summary, views, mesh)
+    truth = summary.ground_truth()
+    mesh = Mesh(truth.vertices_m, truth.faces)
+    joint = own_pose_errors(summary, registered, sorted(files))
+    stated_errors = view_covariances(summary, own, registered, sorted(files), joint)
+    views = tuple(
+        _view(name, path, registered, stated_errors.covariance[name]) for name, (path, _) in sorted(files.items())
+    )
+    balls, posts = _markers(summary, views)
     simulated = summary.root.simulated
     pixels = Photographs(
         {name: path for name, (path, _) in files.items()},
-        Surface(mesh.vertices_m, mesh.faces),
+        RayMesh(mesh.vertices_m, mesh.faces),
         balls,
         posts,
         personal=personal,
@@ -73,14 +92,25 @@ def data_set_of(summary: RunSummary, not_in_yet: Sequence[str] = (), *, personal
     )
     masks = _masked(balls, posts)
     hashes = {view.file: files[view.name][1] for view in views}
+    about = about_run(summary, own, not_in_yet, stated=stated, version=version, personal=personal)
     return DataSet(
-        identity=_identity(summary, own, registered, hashes),
+        identity=_identity(summary, own, registered, {**hashes, "mesh": truth.sha256}),
         simulated=simulated,
-        statement={**described_run(summary, own, not_in_yet), "masks": masks, "image_sha256": hashes},
+        statement={
+            **described_run(summary, own, not_in_yet, personal=personal),
+            "mesh": truth.words,
+            "mesh_sha256": truth.sha256,
+            "masks": masks,
+            "image_sha256": hashes,
+        },
         views=views,
         pixels=pixels,
         mesh=mesh,
         splits=splits({view.name: _sees(view, mesh) for view in views}),
+        about=dataclasses.replace(
+            about, masks=masks, mesh=f"{truth.words}, in the frame of the scan", covariance=stated_errors.words
+        ),
+        pose_errors=joint,
     )
 
 
@@ -100,36 +130,24 @@ def _photographs(summary: RunSummary, registered: Registration) -> dict[str, tup
     return found
 
 
-def _view(name: str, path: Path, registered: Registration) -> View:
+def _view(name: str, path: Path, registered: Registration, covariance: Array) -> View:
     with path.open("rb") as file:
         suffix = ".png" if file.read(len(PNG_BEGINS)) == PNG_BEGINS else ".jpg"
     camera = CameraModel.from_record((registered.full_camera or registered.camera).model_dump())
     T_scan_camera = np.array(registered.T_scan_camera[name])
-    covariance = pose_covariance(np.array(registered.T_world_scan), np.array(registered.covariance), T_scan_camera)
     return View(name, suffix, camera, T_scan_camera, covariance)
 
 
-def pose_covariance(T_world_scan: Transform, covariance: Array, T_scan_camera: Transform) -> Array:
-    """(6, 6) covariance of T_scan_camera that the covariance (6 or 7, …) of T_world_scan causes.
-
-    T_scan_camera = T_world_scan^-1 T_world_camera with the camera held: with R of T_world_scan and the vector a from
-    its origin to the camera, in the world's axes, d_scan = R^T (a x w - d) and w_scan = -R^T w.
-    """
-    R = T_world_scan[:3, :3]
-    J = np.zeros((6, 6))
-    J[:3, :3], J[3:, 3:] = -R.T, -R.T
-    J[:3, 3:] = R.T @ skew(R @ T_scan_camera[:3, 3])
-    return J @ covariance[:6, :6] @ J.T
-
-
-def _markers(summary: RunSummary, views: Sequence[View], mesh: Mesh) -> tuple[tuple[Ball, ...], tuple[Post, ...]]:
+def _markers(summary: RunSummary, views: Sequence[View]) -> tuple[tuple[Ball, ...], tuple[Post, ...]]:
     """All spheres that an image may show, and the posts of the registration spheres."""
     radius_m = metres(summary.protocol.spheres.radius_mm)
     balls, extra = (
         tuple(Ball(np.array(centre), radius_m) for centre in centres)
         for centres in (summary.scan_spheres_m(), control_spheres(summary))
     )
-    return (*balls, *extra), _posts(balls, mesh, views)
+    vertices_m, faces = summary.scan_mesh()
+    scan = Mesh(np.asarray(vertices_m, dtype=np.float64), np.asarray(faces, dtype=np.int64))
+    return (*balls, *extra), _posts(balls, scan, views)
 
 
 def _masked(balls: Sequence[Ball], posts: Sequence[Post]) -> str:
@@ -141,9 +159,8 @@ def _masked(balls: Sequence[Ball], posts: Sequence[Post]) -> str:
 
 def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ...]:
     """Centres of the control spheres, which the images show and the scan does not."""
-    evaluation = next((step for step in reversed(summary.protocol.steps) if step.kind == "evaluation"), None)
-    before = None if evaluation is None else evaluation.params.model_dump().get("control_scan")
-    if before is None or not summary.state.steps[before].result:
+    before = control_scan(summary.protocol)
+    if not before or not summary.state.steps[before].result:
         return ()
     return control_centres(summary.scan_spheres_m(), result_of_step(summary.state, before, SpheresFound).spheres_m)
 
@@ -196,6 +213,5 @@ def _sees(view: View, mesh: Mesh) -> np.ndarray[tuple[int, ...], np.dtype[np.boo
 
 
 def _identity(summary: RunSummary, own: str, registered: Registration, hashes: dict[str, str]) -> str:
-    scan = summary.artefacts("scan_mesh")[-1].sha256
-    inputs = json.dumps([own, registered.model_dump(mode="json"), hashes, scan], sort_keys=True)
+    inputs = json.dumps([own, registered.model_dump(mode="json"), hashes], sort_keys=True)
     return f"{summary.run_id} {hashlib.sha256(inputs.encode()).hexdigest()}"

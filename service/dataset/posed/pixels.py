@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -14,14 +15,30 @@ from service.compute.images.files import read_image_of
 from service.compute.pixels.crops import FULL_HD, Crop, marker_free_crops
 from service.compute.pixels.masks import Ball, Post, marker_mask
 from service.compute.pixels.metadata import described, with_metadata_of, without_personal_data
+from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.render import depth_map, seen
 from service.compute.pixels.splits import Splits
-from service.compute.pixels.surface import Surface
 from service.compute.pixels.undistort import pinhole_of, undistorted, valid_pixels
 from service.core.errors import DataError
 from service.dataset.posed.records import DataSet, View
 
+_T = TypeVar("_T")
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+
+
+class _Last(Generic[_T]):
+    """Keeps what was made last: crops of an image follow each other, and each image is decoded once for them all."""
+
+    def __init__(self, make: Callable[[View], _T]) -> None:
+        self._make = make
+        self._kept: tuple[str, _T] | None = None
+
+    def of(self, view: View) -> _T:
+        """What belongs to a view; not to be written to."""
+        if self._kept is None or self._kept[0] != view.name:
+            self._kept = None  # the memory of the last one is free while the next is made
+            self._kept = (view.name, self._make(view))
+        return self._kept[1]
 
 
 class Photographs:
@@ -30,7 +47,7 @@ class Photographs:
     def __init__(
         self,
         files: Mapping[str, Path],
-        surface: Surface,
+        surface: RayMesh,
         balls: Sequence[Ball],
         posts: Sequence[Post] = (),
         *,
@@ -49,6 +66,7 @@ class Photographs:
         """
         self._files, self._surface, self._balls, self._posts = files, surface, balls, posts
         self._personal, self._mark = personal, mark
+        self._colours = _Last(lambda view: read_image_of(files[view.name], view.camera))
 
     def picture(self, view: View) -> bytes:
         """The file as the camera wrote it, but for what was asked to be removed or marked."""
@@ -64,7 +82,7 @@ class Photographs:
 
     def colours(self, view: View) -> NDArray[np.uint8]:
         """(H, W, 3) BGR."""
-        return read_image_of(self._files[view.name], view.camera)
+        return self._colours.of(view)
 
     def depth_m(self, view: View) -> NDArray[np.float32]:
         """(H, W) z of the mesh."""
@@ -90,6 +108,7 @@ class Undistorted:
         """Take the distorted data set; its views have the same names."""
         self._sources, self._inner = {view.name: view for view in distorted.views}, distorted.pixels
         self._personal = personal
+        self._colours = _Last(self._resampled)
 
     def picture(self, view: View) -> bytes:
         """Resampled, with the photograph's metadata."""
@@ -97,6 +116,9 @@ class Undistorted:
 
     def colours(self, view: View) -> NDArray[np.uint8]:
         """(H, W, 3) BGR; black where the photograph has no pixel."""
+        return self._colours.of(view)
+
+    def _resampled(self, view: View) -> NDArray[np.uint8]:
         source = self._sources[view.name]
         return undistorted(self._inner.colours(source), source.camera).image
 
@@ -123,10 +145,11 @@ class Cropped:
     def __init__(self, whole: DataSet, crops: Mapping[str, tuple[View, Crop]], *, personal: bool) -> None:
         """Take the whole data set, and for each new view its source and its place there."""
         self._inner, self._crops, self._personal = whole.pixels, crops, personal
+        self._originals = _Last(whole.pixels.picture)
 
     def picture(self, view: View) -> bytes:
         """Cut out and encoded anew, with the photograph's metadata."""
-        original = self._inner.picture(self._crops[view.name][0])
+        original = self._originals.of(self._crops[view.name][0])
         return _encoded(view, self.colours(view), original, self._personal)
 
     def colours(self, view: View) -> NDArray[np.uint8]:
@@ -201,12 +224,14 @@ def cropped_data_set(
         key: tuple(child for name in names for child in children.get(name, ()))
         for key, names in dataset.splits.named().items()
     }
+    number = {view.name: k for k, view in enumerate(dataset.views)}
     return dataclasses.replace(
         dataset,
         identity=f"{dataset.identity} crops {size[0]}x{size[1]} {most}",
         views=tuple(views),
         pixels=Cropped(dataset, crops, personal=personal),
         splits=Splits(**of_crops),
+        pose_errors=dataset.errors_of([number[crops[view.name][0].name] for view in views]),
     )
 
 

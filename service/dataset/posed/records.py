@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 from typing import Protocol as Interface
 
@@ -15,6 +15,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.pixels.splits import Splits
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
+from service.dataset.posed.about import About
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +90,9 @@ class DataSet:
         pixels: of the views.
         mesh: ground truth in the world frame.
         splits: of the names of the views.
+        pose_errors: (6 V, 6 V) joint covariance of the poses in the views' order, as a view's covariance, but without
+            the errors that are common to all views; None where it is not stated.
+        about: the data set as a whole, for its data card and metadata.
     """
 
     identity: str
@@ -98,18 +102,28 @@ class DataSet:
     pixels: Pixels
     mesh: Mesh
     splits: Splits
+    pose_errors: Array | None = None
+    about: About = field(default_factory=About)
 
     @property
     def mark(self) -> str:
         """A sentence for every file that can say it; "" for a real capture."""
         return "SIMULATED: made by a simulated rig, not by a camera in front of a specimen" if self.simulated else ""
 
+    def errors_of(self, views: Sequence[int]) -> Array | None:
+        """(6 N, 6 N) `pose_errors` of the views with these numbers, which may repeat."""
+        if self.pose_errors is None:
+            return None
+        rows = (6 * np.array(views, dtype=np.int64)[:, None] + np.arange(6)).ravel()
+        return self.pose_errors[np.ix_(rows, rows)]
+
     def keeping(self, names: tuple[str, ...]) -> DataSet:
         """The same data set with these views only; the splits are cut to them."""
         chosen = set(names)
         cut = {key: tuple(n for n in split if n in chosen) for key, split in self.splits.named().items()}
-        views = tuple(view for view in self.views if view.name in chosen)
-        return dataclasses.replace(self, views=views, splits=Splits(**cut))
+        kept = [k for k, view in enumerate(self.views) if view.name in chosen]
+        views = tuple(self.views[k] for k in kept)
+        return dataclasses.replace(self, views=views, splits=Splits(**cut), pose_errors=self.errors_of(kept))
 
 
 def only_camera(dataset: DataSet, of: str) -> CameraModel:
@@ -125,9 +139,3 @@ def only_camera(dataset: DataSet, of: str) -> CameraModel:
             remedy="Choose COLMAP or nerfstudio, which have a camera for each image",
         )
     return cameras.pop()
-
-
-def require_pinholes(dataset: DataSet, of: str) -> None:
-    """Raise DataError if a camera has distortion, which a format cannot say."""
-    if any(view.camera.distortion.any() for view in dataset.views):
-        raise DataError(f"{of} has no distortion", remedy="Export undistorted images")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from service.jobs.calibration.records import HandEye, Intrinsics
+from service.jobs.calibration.records import HandEye, Intrinsics, KnownBoard
 from service.jobs.kind import JobKind, JobRecord
 from service.jobs.records import BoardSize, Camera, Hash, Matrix, Photograph
 
@@ -24,7 +24,7 @@ class Arguments(BoardSize):
     images: tuple[Photograph, ...]
     camera: Camera | None = None
     corners: tuple[Hash | None, ...] | None = None
-    known: dict[str, Any] | None = None
+    known: KnownBoard | None = None
 
 
 class CalibrationDetails(JobRecord):

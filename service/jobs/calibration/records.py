@@ -9,7 +9,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from service.jobs.kind import JobRecord
-from service.jobs.records import ArmCorrection, Matrix, ParameterCovariance
+from service.jobs.records import ArmCorrection, Camera, Matrix, ParameterCovariance
 
 
 class Coverage(JobRecord):
@@ -53,6 +53,28 @@ class ExcludedImage(JobRecord):
 
     image: str
     reason: str
+
+
+class KnownBoard(JobRecord):
+    """An estimate of camera, mount and board, with its tolerances.
+
+    Attributes:
+        camera: nominal, or estimated from the images like the two poses.
+        T_flange_camera: of the camera on the flange.
+        T_base_board: of the board.
+        spread: (12, 12); possible increments of the two poses.
+        focal: relative tolerance of the focal length.
+        centre: tolerance of the principal point, over the image's width.
+        measured: number of images used.
+    """
+
+    camera: Camera
+    T_flange_camera: Matrix
+    T_base_board: Matrix
+    spread: Matrix
+    focal: float
+    centre: float
+    measured: int
 
 
 class BoardSeen(JobRecord):

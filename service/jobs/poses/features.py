@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from service.jobs.kind import JobKind, JobRecord, NoAnswer
 from service.jobs.records import ImageFile, ImagesCamera
 
 
-class FrontEndArguments(ImagesCamera):
-    """Arguments that features and matches share; `effort` holds SfmOptions."""
+class Effort(JobRecord):
+    """How much effort structure from motion makes; SfmOptions has further fields, and the same defaults.
 
-    effort: dict[str, Any]
+    Attributes:
+        max_image_size: features are searched in images reduced to this longer side, px.
+        max_features: per image.
+        neighbours: number of images that each image is matched with.
+    """
+
+    max_image_size: int = 3200
+    max_features: int = 3000
+    neighbours: int = 8
+
+
+class FrontEndArguments(ImagesCamera):
+    """Arguments that features and matches share."""
+
+    effort: Effort
 
 
 class ImagesToMatch(JobRecord):

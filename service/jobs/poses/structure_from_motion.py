@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from service.jobs.kind import JobKind, NoAnswer
+from service.jobs.kind import JobKind, JobRecord, NoAnswer
+from service.jobs.poses.features import Effort
 from service.jobs.records import Hash, ImagesCamera, Matrix, Photograph
 
 
@@ -14,7 +15,7 @@ class Arguments(ImagesCamera):
     Attributes:
         images: of the captures.
         mappers: each makes one model.
-        effort: SfmOptions.
+        effort: how many features and pairs.
         prior: T_scan_camera by viewpoint, of an earlier registration; decides which pairs are matched.
         features: files by viewpoint; None in old runs, in which one job did everything.
         matches: files.
@@ -22,10 +23,16 @@ class Arguments(ImagesCamera):
 
     images: tuple[Photograph, ...] = ()
     mappers: tuple[Literal["incremental", "global", "triangulated"], ...]
-    effort: dict[str, Any]
+    effort: Effort
     prior: dict[str, Matrix] | None = None
     features: dict[str, Hash] | None = None
     matches: tuple[Hash, ...] = ()
+
+
+class ModelFile(JobRecord):
+    """The part of a file of camera poses that later jobs read: the pose of each image, by viewpoint."""
+
+    T_world_camera: dict[str, Matrix]
 
 
 KIND = JobKind(

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from service.jobs.kind import JobKind, JobRecord
-from service.jobs.records import Hash, Point
+from service.jobs.records import Hash, JudgedLayout, Point
 
 
 class LayoutPhotograph(JobRecord):
@@ -30,17 +28,27 @@ class Arguments(JobRecord):
 class SphereMove(JobRecord):
     """A move of a sphere, in words and between places in the photograph, as fractions of its width and height."""
 
+    model_config = ConfigDict(serialize_by_alias=True, validate_by_name=True, validate_by_alias=True)
+
     words: str
-    old_place: tuple[float, float] = Field(validation_alias="from")
-    new_place: tuple[float, float] = Field(validation_alias="to")
+    old_place: tuple[float, float] = Field(alias="from")
+    new_place: tuple[float, float] = Field(alias="to")
     higher_mm: float
 
 
-class LayoutDetails(JobRecord):
-    """Near-symmetries (service/compute/layout/ambiguity.py), and the moves that would resolve them."""
+class SearchedPhotograph(JobRecord):
+    """A photograph of the spheres: whether it is used, and the centre of each sphere's outline in pixels."""
 
-    problems: tuple[str, ...] = ()
-    moves: tuple[dict[str, Any], ...] = ()  # SphereMove reads them; its fields cannot be named as they are recorded
+    used: bool
+    spheres: dict[str, tuple[float, float]]
+
+
+class LayoutDetails(JudgedLayout):
+    """The judged layout, its photographs, and the moves that would resolve its near-symmetries."""
+
+    chi2: float | None = None  # of the adjustment of the photographs
+    photographs: tuple[SearchedPhotograph, ...] = ()
+    moves: tuple[SphereMove, ...] = ()
 
 
 class Answer(JobRecord):

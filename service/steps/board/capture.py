@@ -19,7 +19,6 @@ from service.jobs.records import Camera
 from service.steps.board.looks import BoardLooks, SearchedBoardImage
 from service.steps.board.plan import (
     START,
-    BoardPoses,
     Planner,
     Why,
     describe_prediction,
@@ -27,6 +26,7 @@ from service.steps.board.plan import (
     nominal_camera,
     prediction_record,
 )
+from service.steps.board.poses import BoardPoses
 from service.steps.capture.plan.planning import arm_at_station, plan_step, usual_posture
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.capture.retakes import to_take_again
@@ -168,9 +168,21 @@ class BoardCapture:
             Viewpoint(f"{self.wanted.prefix}{number + i + 1:03d}", self.wanted.station, planner.sent(T, known))
             for i, T in enumerate(found.T_base_camera)
         )
-        if not poses:
-            return ()
-        prediction = prediction_record(found.prediction)
+        if poses:
+            self._record_plan(why, poses, looks, found.prediction, known.measured, advise)
+        return poses
+
+    def _record_plan(
+        self,
+        why: Why,
+        poses: tuple[Viewpoint, ...],
+        looks: Sequence[SearchedBoardImage],
+        predicted: Prediction,
+        from_images: int,
+        advise: Callable[[int, str, str], str] | None,
+    ) -> None:
+        """Record planned poses with what they are predicted to give, and tell the operator."""
+        prediction = prediction_record(predicted)
         words = describe_prediction(prediction, self.solve)
         names = poses[0].name if len(poses) == 1 else f"{poses[0].name} … {poses[-1].name}"
         text = f"{counted(len(poses), 'board pose')} ({_WORDS[why]}): {words}"
@@ -186,13 +198,12 @@ class BoardCapture:
             attempt=self.context.attempt,
             poses=tuple(_planned_pose(viewpoint) for viewpoint in poses),
             prediction=prediction,
-            from_images=known.measured,
+            from_images=from_images,
             **instead,
         )
         self.context.note(BOARD_POSES, text=text, **plan.model_dump(mode="json", exclude_unset=True), **advice)
         self.context.tell(text)
         self._plans.append(plan)
-        return poses
 
     def planner(self, known: BoardKnowledge, *, coverage: float) -> Planner:
         """The planner for this station."""

@@ -1,31 +1,30 @@
-"""Board poses as the protocol specifies them, and their planning from estimates of camera, mount and board."""
+"""Plans board poses from estimates of camera, mount and board."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.candidates import ViewRange, board_candidates
+from service.compute.calibration.board_poses.candidates import board_candidates
 from service.compute.calibration.board_poses.design import (
     NOTHING,
     CalibrationTargets,
     ChosenViews,
+    DesignProblem,
     Prediction,
-    as_taken,
     choose_poses,
-    predict,
 )
 from service.compute.calibration.board_poses.knowledge import BoardKnowledge, Tolerances, nominal_knowledge
+from service.compute.calibration.board_poses.view_range import ViewRange
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, Transform, inverse
-from service.core.records.events import Record
 from service.core.units import metres
 from service.rig import LensSection
+from service.steps.board.poses import BoardPoses
 from service.steps.context import StationLayout
 from service.steps.notes import BoardPrediction
 
@@ -35,30 +34,6 @@ FIRST = ViewRange(tilts_deg=(8.0, 14.0, 24.0), distances_m=(0.78, 0.82, 0.86))
 START = 6  # images after which camera, mount and board are known well enough to plan the rest
 _USUAL_FOCAL = 1.2  # focal length over the image's longer side, if the rig file describes no lens
 _UNKNOWN_FOCAL = 0.25  # relative standard deviation of that focal length
-
-
-class BoardPoses(Record):
-    """Board images that the software plans: how many, from where, and what they must reach."""
-
-    station: str  # where the images are taken
-    prefix: str  # of the names of the views
-    count: Annotated[int, Field(ge=4, le=300)]  # how many images
-    # Tilt of the camera from the vertical.
-    tilts_deg: tuple[Annotated[float, Field(ge=0, le=60)], ...] = ViewRange().tilts_deg
-    rolls_deg: tuple[float, ...] = ViewRange().rolls_deg  # of the camera about its axis
-    # Distance from the camera to the board.
-    distances_m: tuple[Annotated[float, Field(ge=0.2, le=2)], ...] = ViewRange().distances_m
-    above_scene_m: float = 0.09  # approximate height of the board above the scene's centre
-    long_side: Literal["across", "along"] = "across"  # how the board lies, seen from the robot
-    place_tolerance_mm: Annotated[float, Field(gt=0, le=100)] = 30.0  # of the position of the board's centre
-    turn_tolerance_deg: Annotated[float, Field(gt=0, le=30)] = 10.0  # of the board's turn about the vertical
-    coverage: Annotated[float, Field(gt=0, le=1)] = 0.97  # share of the image area that the planned images must cover
-    replacements: Annotated[int, Field(ge=0, le=100)] = 12  # most per attempt, for images without a board
-
-    @property
-    def wishes(self) -> ViewRange:
-        """The range of views for the planner."""
-        return ViewRange(self.tilts_deg, self.rolls_deg, self.distances_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,22 +77,24 @@ class Planner:
         """Up to `count` further poses; fewer if the arm can reach no others that show the board."""
         wishes = FIRST if why == "first" else self.wanted.wishes
         candidates = board_candidates(known, self.board, wishes, self.approach, seed=seed)
+        problem = self._problem(known)
         poses = choose_poses(
-            candidates, count, known, self.board, self.aims,
+            problem, candidates, count,
             taken=taken, feasible=lambda T: self.feasible(self.sent(T, known)), enough=enough, seed=seed,
         )  # fmt: skip
-        future = as_taken(known, self.board, poses)
-        everything = taken.plus(future.T_base_camera, future.pixels)
-        return PlannedBoard(poses, predict(everything, known, self.board, self.aims))
+        return PlannedBoard(poses, problem.predict(self.with_planned(taken, poses, known)))
 
     def prediction(self, taken: ChosenViews, known: BoardKnowledge) -> Prediction:
         """The prediction without further images."""
-        return predict(taken, known, self.board, self.aims)
+        return self._problem(known).predict(taken)
 
     def with_planned(self, taken: ChosenViews, T_base_camera: Array, known: BoardKnowledge) -> ChosenViews:
         """The images with those added that are planned but not taken yet."""
-        future = as_taken(known, self.board, T_base_camera)
+        future = self._problem(known).as_taken(T_base_camera)
         return taken.plus(future.T_base_camera, future.pixels)
+
+    def _problem(self, known: BoardKnowledge) -> DesignProblem:
+        return DesignProblem(known, self.board, self.aims)
 
     def sent(self, T_base_camera: Transform, known: BoardKnowledge) -> Transform:
         """T_base_camera for the nominal mount, if the camera is to be at T_base_camera with the estimated mount."""
@@ -131,7 +108,7 @@ def preview_board(planner: Planner, known: BoardKnowledge) -> PlannedBoard:
     """
     first = planner.next("first", 1, known)
     sure = _as_if_measured(known)
-    taken = as_taken(known, planner.board, first.T_base_camera)
+    taken = planner.with_planned(NOTHING, first.T_base_camera, known)
     rest = planner.next("rest", planner.wanted.count - len(first.T_base_camera), sure, taken)
     return PlannedBoard(np.concatenate([first.T_base_camera, rest.T_base_camera]), rest.prediction)
 

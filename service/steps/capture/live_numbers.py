@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -26,8 +26,8 @@ from service.jobs.surfaces import coverage_points, locate_spheres
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.capture.spoilt import ImageSharpness, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.context import JobRequest, StepContext
-from service.steps.inputs import artefact_of, earlier_answer, mounting_of, robot_pose_of
-from service.steps.notes import SPOILT, SUGGESTION, mending, suggested_views
+from service.steps.inputs import artefact_of, earlier_answer, mounting_of, with_robot_pose
+from service.steps.notes import SPOILT, SUGGESTION, suggested_views
 
 ERROR, COVERAGE = "predicted_target_error_mm", "specimen_coverage"
 
@@ -96,18 +96,14 @@ class LiveAnalysis:
             sha256 = capture.artefacts[0].sha256
             if sha256 in begun or not all(capture.verdicts.values()):
                 continue
-            image = Photograph.model_validate(
-                {
-                    "viewpoint": capture.viewpoint,
-                    "station": capture.station,
-                    "sha256": sha256,
-                    **robot_pose_of(capture),
-                }
-            )
+            image = Photograph(viewpoint=capture.viewpoint, station=capture.station, sha256=sha256)
             mounted = mounting_of(self.context, self.params.hand_eye, [capture.station])
             earlier, looks = self._earlier()
             arguments = live_view.Arguments(
-                **self.shared.fields(mounted.mounting), image=image, surface=self._surface(), earlier=earlier
+                **self.shared.arguments(mounted.mounting).set_fields(),
+                image=with_robot_pose(image, capture),
+                surface=self._surface(),
+                earlier=earlier,
             )
             references = {**self.shared.taken, **mounted.references, "earlier": looks}
             request = JobRequest.of(live_view.KIND, arguments, references, LIVE)
@@ -131,7 +127,7 @@ class LiveAnalysis:
         least = coverage_gate.min if coverage_gate and coverage_gate.min is not None else 0.0
         views, looks = self._earlier()
         arguments = live_summary.Arguments(
-            **self.shared.fields(self.shared.mounting),
+            **self.shared.arguments(self.shared.mounting).set_fields(),
             surface=self._surface(),
             views=views,
             station=station,
@@ -207,9 +203,10 @@ class LiveAnalysis:
         # Pages show the newest note with advice, so it must hold everything that the confirmation does.
         both = f"{retakes}. {advice}" if retakes else advice
         # This note replaces that of the retakes, so it repeats what has to be done for them.
-        hands = mending(self.context.evidence.state().steps[self.context.step.id]).hands if retakes else ()
+        told = self.context.evidence.state().steps[self.context.step.id].mend if retakes else None
+        hands = [] if told is None else [work.model_dump(mode="json") for work in told.hands]
         views = [view.plain() for view in suggestions]
-        self.context.note(SUGGESTION, advice=both, viewpoints=views, images=again, hands=list(hands))
+        self.context.note(SUGGESTION, advice=both, viewpoints=views, images=again, hands=hands)
 
     def _gate(self, measure: str) -> Gate | None:
         return next((gate for gate in self.context.step.gates if gate.measure == measure), None)
@@ -353,18 +350,18 @@ class Shared:
             },
         )
 
-    def fields(self, mounting: Mounting) -> dict[str, Any]:
-        """Fields of the arguments of a job, with the mounting at a station."""
-        return {
-            "camera": self.camera,
+    def arguments(self, mounting: Mounting) -> live_view.LiveArguments:
+        """What the arguments of all jobs share, with the mounting at a station."""
+        return live_view.LiveArguments(
+            camera=self.camera,
             **mounting.set_fields(),
-            "hand_eye_covariance": self.hand_eye_covariance,
-            "arm_sigma_m": self.arm_sigma_m,
-            "arm_sigma_rad": self.arm_sigma_rad,
-            "spheres_m": self.spheres_m,
-            "radius_m": self.radius_m,
-            "limits": self.limits,
-        }
+            hand_eye_covariance=self.hand_eye_covariance,
+            arm_sigma_m=self.arm_sigma_m,
+            arm_sigma_rad=self.arm_sigma_rad,
+            spheres_m=self.spheres_m,
+            radius_m=self.radius_m,
+            limits=self.limits,
+        )
 
 
 def _rms(values: Iterable[float]) -> float:

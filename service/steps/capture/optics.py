@@ -68,7 +68,7 @@ def _calibration_images(context: StepContext) -> tuple[View, ...]:
     ids = [step.id for step in context.protocol.steps]
     until = ids.index(context.step.id) + 1
     for step in reversed(context.protocol.steps[:until]):
-        if step.kind != "calibration":
+        if step.gives != "calibration":
             continue
         params = _CalibrationParams.model_validate(step.params.model_dump())
         if "intrinsics" in params.solve:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from service.core.errors import ImagesSpoiltError
 from service.core.run.state import JobState
@@ -12,7 +11,7 @@ from service.jobs.looks import image_of
 from service.steps.context import StepContext
 from service.steps.notes import SPOILT, images_to_repeat
 
-CLEAN: list[dict[str, Any]] = [{"action": "clean_lens"}]  # for the simulated technician
+CLEAN: list[dict[str, str]] = [{"action": "clean_lens"}]  # for the simulated technician
 IN_A_ROW = 3  # so many spoilt images have a common cause
 _MOST_STOPS = 2  # of one step; after that, only the gates judge the images
 _FACTOR = 1.6  # of the edge width in the sharpest image of the step

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
 
-from service.compute.calibration.board.board import Board
 from service.core.errors import ConfigurationError
 from service.core.protocol.step_params import MovingParams, RepeatedStep
 from service.core.records.events import Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
-from service.steps.board.capture import BoardCapture
-from service.steps.board.looks import board_arguments
-from service.steps.board.mend import mend_calibration
-from service.steps.board.plan import BoardPoses
+from service.jobs.calibration.records import HandEye, KnownBoard
+from service.jobs.records import Camera, Matrix, matrix
+from service.steps.board.poses import BoardPoses
 from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.capture.plan.viewpoints import ViewpointSet, plan_viewpoints
 from service.steps.context import ROBOT_MOVES, Announcement, JobRequest, JobResult, StepContext, StepKind, StepOutcome
 from service.steps.inputs import EarlierAnswer, captured_images, earlier_answer
 from service.steps.measures import CaptureMeasures, Count, FineMm, Measure, Mm, Px, Share
+
+if TYPE_CHECKING:
+    from service.compute.calibration.board.board import Board
+    from service.compute.calibration.board_poses.knowledge import BoardKnowledge
+    from service.steps.board.capture import BoardCapture
 
 _FEWEST_KNOWN = 3  # images of the whole board needed before images of a part of it are used
 
@@ -29,6 +32,7 @@ _FEWEST_KNOWN = 3  # images of the whole board needed before images of a part of
 class Params(MovingParams):
     """Which board images are taken, and what is computed from them."""
 
+    gives: ClassVar = "calibration"
     repeated: ClassVar = RepeatedStep("Take the board images that are missing and compute again; the others are kept")
 
     solve: tuple[Literal["intrinsics", "hand_eye"], ...]  # what is computed
@@ -107,16 +111,19 @@ class Measures(CaptureMeasures):
 class Result(Record):
     """The camera and, if solved, its pose on the flange (4×4, metres)."""
 
-    camera: dict[str, float]
-    T_flange_camera: tuple[tuple[float, ...], ...] | None = None
-    T_base_board: tuple[tuple[float, ...], ...] | None = None
-    hand_eye: dict[str, Any] | None = None  # whole record: covariance, residuals, methods, the arm's correction
+    camera: Camera
+    T_flange_camera: Matrix | None = None
+    T_base_board: Matrix | None = None
+    hand_eye: HandEye | None = None  # covariance, residuals, methods, the arm's correction
     robots: tuple[str, ...] = ()  # robots that carried the camera
-    details: dict[str, object]
+    details: calibrate.CalibrationDetails
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Capture the board and let the worker solve; if a gate fails, plan the views that would make it pass."""
+    # Here, not above: a process that only reads the protocol does without the numerics that this brings.
+    from service.steps.board.mend import mend_calibration  # noqa: PLC0415
+
     board = board_of_protocol(context)
     camera = _camera(context, params)
     measures: dict[str, float] = {}
@@ -134,11 +141,13 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     measures |= answer.measures
     if capture is not None:
         mend_calibration(context, capture, measures)
-    return StepOutcome(Measures.read(measures), answer.artefacts, result.model_dump(mode="json"))
+    return StepOutcome(Measures.read(measures), answer.artefacts, result)
 
 
 def board_of_protocol(context: StepContext) -> Board:
     """The protocol's board. Raises ConfigurationError if it describes none."""
+    from service.compute.calibration.board.board import Board  # noqa: PLC0415 - as above
+
     board = context.protocol.board
     if board is None:
         raise ConfigurationError(
@@ -161,6 +170,8 @@ def _camera(context: StepContext, params: Params) -> EarlierAnswer[calibrate.Ans
 def _board_capture(
     context: StepContext, params: Params, board: Board, camera: EarlierAnswer[calibrate.Answer] | None
 ) -> BoardCapture:
+    from service.steps.board.capture import BoardCapture  # noqa: PLC0415 - as above
+
     given = tuple(
         viewpoint
         for viewpoint_set in params.viewpoints
@@ -192,6 +203,8 @@ def _solve(
     camera: EarlierAnswer[calibrate.Answer] | None,
     capture: BoardCapture | None,
 ) -> JobResult:
+    from service.steps.board.looks import board_arguments  # noqa: PLC0415 - as above
+
     images = captured_images(context, [params.images_of or context.step.id])
     looks = {} if capture is None else {look.capture.artefacts[0].sha256: look for look in capture.looks()}
     images = [image for image in images if image.sha256 not in looks or not looks[image.sha256].spoilt]
@@ -207,10 +220,22 @@ def _solve(
         known = capture.knowledge() if None in corners else None
         if known is not None and known.measured < _FEWEST_KNOWN:
             known = None
-        more = {"corners": corners, "known": None if known is None else known.record()}
+        more = {"corners": corners, "known": None if known is None else _known(known)}
         arguments = arguments.model_copy(update=more)
     (answer,) = context.evidence.run_jobs(JobRequest.of(calibrate.KIND, arguments, references))
     return answer
+
+
+def _known(knowledge: BoardKnowledge) -> KnownBoard:
+    return KnownBoard(
+        camera=Camera.model_validate(knowledge.camera.record()),
+        T_flange_camera=matrix(knowledge.T_flange_camera),
+        T_base_board=matrix(knowledge.T_base_board),
+        spread=matrix(knowledge.spread),
+        focal=knowledge.focal,
+        centre=knowledge.centre,
+        measured=knowledge.measured,
+    )
 
 
 KIND = StepKind(

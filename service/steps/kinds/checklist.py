@@ -13,6 +13,7 @@ from service.steps.measures import Count, MeasureRecord
 class Params(StepParams):
     """No parameters: the items are in the step's checklist."""
 
+    only_ticks: ClassVar = True
     repeated: ClassVar = RepeatedStep("Do the open items, tick them, and confirm again", device=False, computes=False)
     needs_disk: ClassVar = False
 
@@ -37,7 +38,7 @@ def execute(context: StepContext, _params: Params) -> StepOutcome:
     ticked = len(context.state.ticked)
     result = Result(items=items, ticked=ticked)
     measures = Measures(checklist_items_ticked=float(ticked), checklist_items_open=float(items - ticked))
-    return StepOutcome(measures, result=result.model_dump())
+    return StepOutcome(measures, result=result)
 
 
 KIND = StepKind(

@@ -9,7 +9,7 @@ from drivers.interfaces import CtSource
 from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, Record
 from service.core.units import metres, mm
-from service.jobs.records import SpheresFound
+from service.jobs.records import Point, SphereDetails
 from service.jobs.surfaces import ct_surface, locate_spheres
 from service.steps.arrivals import keep, keep_array, keep_mesh, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
@@ -20,6 +20,7 @@ from service.steps.measures import Count, Measure, SphereMeasures
 class Params(StepParams):
     """What to expect from the CT suite."""
 
+    gives: ClassVar = "ct_surface"
     repeated: ClassVar = RepeatedStep("Put another series into the CT folder and import it")
 
     source: Literal["dicom", "mesh"] = "dicom"  # mesh: segmented by other software (Mimics STL)
@@ -40,8 +41,8 @@ class Measures(SphereMeasures):
 class Result(Record):
     """The spheres in the CT frame, metres."""
 
-    spheres_m: tuple[tuple[float, float, float], ...]
-    details: dict[str, Any]
+    spheres_m: tuple[Point, ...]
+    details: SphereDetails
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
@@ -49,9 +50,9 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     request, kept, measures = (_mesh if params.source == "mesh" else _series)(context, params)
     (answer,) = context.evidence.run_jobs(request)
     result = Result.model_validate(answer.result)
-    uncertainties = layout_uncertainties(SpheresFound.model_validate(answer.result).details.layout)
+    uncertainties = layout_uncertainties(result.details.layout)
     measured = Measures.read({**measures, **answer.measures})
-    return StepOutcome(measured, kept + answer.artefacts, result.model_dump(mode="json"), uncertainties)
+    return StepOutcome(measured, kept + answer.artefacts, result, uncertainties)
 
 
 def _mesh(context: StepContext, params: Params) -> tuple[JobRequest, tuple[ArtefactRef, ...], Mapping[str, float]]:

@@ -6,7 +6,7 @@ It evaluates the registrations that have arrived; a later one is evaluated when 
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 from service.core.errors import ConfigurationError
 from service.core.jobs.references import Reference
@@ -26,6 +26,7 @@ _SCAN, _CONTROL, _CT = "scan", "control_scan", "ct"  # fields of the job's argum
 class Params(StepParams):
     """Where the control spheres were photographed and measured."""
 
+    gives: ClassVar = "accuracy"
     repeated: ClassVar = RepeatedStep(
         "Compute it again; the same registration gives the same figures", same=True, device=False
     )
@@ -60,8 +61,8 @@ class Measures(RegistrationMeasures[EvaluatedRegistration]):
 class Result(Record):
     """The paper's table, with one row for each registration, and the error budget of each."""
 
-    table: tuple[dict[str, Any], ...]
-    budgets: dict[str, dict[str, Any]]
+    table: tuple[evaluate.Row, ...]
+    budgets: dict[str, evaluate.ErrorBudget]
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
@@ -99,7 +100,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     (answer,) = context.evidence.run_jobs(JobRequest.of(evaluate.KIND, arguments, references))
     result = Result.model_validate(answer.result)
     measures = Measures.read_all(answer.measures, registrations)
-    return StepOutcome(measures, answer.artefacts, result.model_dump(mode="json"))
+    return StepOutcome(measures, answer.artefacts, result)
 
 
 KIND = StepKind(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
+
+from pydantic import BaseModel
 
 from service.core.errors import ConfigurationError, DataError
 from service.core.protocol.models import CameraSection
@@ -68,14 +70,14 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         optics_departures=None if departures is None else float(departing_images(departures)),
     )
     result = Result(photographs=params.photographs, imported=len(imported))
-    return StepOutcome(measures, result=result.model_dump())
+    return StepOutcome(measures, result=result)
 
 
 def _bring_in(context: StepContext, params: Params, listed: ImportList, view: ImportedView) -> None:
     """Store one photograph: first its files, then its rows and its event in one transaction."""
     photograph = _put(context, listed, view.photograph, _KINDS[params.photographs])
     refs = (photograph, *(_put(context, listed, raw, "raw") for raw in view.raws))
-    settings = settings_agree(view.camera, context.protocol.camera)
+    settings = settings_agree(StatedSettings.model_validate(view.camera), context.protocol.camera)
     rows = tuple(
         NewArtefact(
             ref=ref,
@@ -116,18 +118,27 @@ def _put(context: StepContext, listed: ImportList, file: ImportedFile, kind: str
     return ref
 
 
-def settings_agree(stated: dict[str, Any], wanted: CameraSection | None) -> bool | None:
+class StatedSettings(BaseModel):
+    """The settings that a photograph states; 0 and None: not stated."""
+
+    aperture_f: float | None = None
+    exposure_s: float | None = None
+    iso: float | None = None
+
+
+def settings_agree(stated: StatedSettings, wanted: CameraSection | None) -> bool | None:
     """Whether aperture, exposure time and ISO of a photograph are those of the protocol, as in a capture.
 
     None if the protocol sets none, or the file states none of the three.
     """
     if wanted is None:
         return None
-    agree: list[bool] = []
-    for name, tolerance in (("aperture_f", 0.02), ("exposure_s", 0.02), ("iso", 0.0)):
-        value = stated.get(name)
-        if value:
-            agree.append(abs(float(value) / getattr(wanted, name) - 1) <= tolerance)
+    pairs = (
+        (stated.aperture_f, wanted.aperture_f, 0.02),
+        (stated.exposure_s, wanted.exposure_s, 0.02),
+        (stated.iso, wanted.iso, 0.0),
+    )
+    agree = [abs(value / meant - 1) <= tolerance for value, meant, tolerance in pairs if value]
     return all(agree) if agree else None
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -14,6 +14,7 @@ from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, GateVerdict, Record
 from service.core.units import metres
+from service.jobs.records import Point
 from service.jobs.surfaces import layout
 from service.steps.arrivals import keep
 from service.steps.capture.exposure import wanted_settings
@@ -39,6 +40,7 @@ _SIDES: tuple[tuple[str, str], ...] = (
 class Params(StepParams):
     """How many photographs are taken, and how."""
 
+    gives: ClassVar = "rough_spheres"
     repeated: ClassVar = RepeatedStep("Move the spheres as it says, then take another photograph")
 
     photographs: int = 1  # in the first attempt; the camera is moved in between
@@ -58,8 +60,8 @@ class Measures(LayoutMeasures):
 class Result(Record):
     """The spheres in the frame of the photograph that shows most of them, metres."""
 
-    spheres_m: tuple[tuple[float, float, float], ...]
-    details: dict[str, Any]
+    spheres_m: tuple[Point, ...]
+    details: layout.LayoutDetails
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
@@ -78,7 +80,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         kept += _photographs(context, images, params.wait_s)
     spheres = context.protocol.spheres
     arguments = layout.Arguments(
-        images=tuple(layout.LayoutPhotograph.model_validate(image) for image in images),
+        images=tuple(images),
         sensor_width_mm=params.sensor_width_mm,
         radius_m=metres(spheres.radius_mm),
         expected=spheres.registration + spheres.control,
@@ -90,23 +92,23 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     judged = evaluate_gates(
         context.step, context.attempt, answer.measures, context.run.skipped, uncertainties
     ).verdicts
-    _advise(context, judged, layout.KIND.read_answer(answer.result).details, images, params)
+    _advise(context, judged, result.details, len(images), params)
     measures = Measures.read(answer.measures)
-    return StepOutcome(measures, (*kept, *answer.artefacts), result.model_dump(mode="json"), uncertainties)
+    return StepOutcome(measures, (*kept, *answer.artefacts), result, uncertainties)
 
 
-def _earlier(context: StepContext) -> list[dict[str, Any]]:
+def _earlier(context: StepContext) -> list[layout.LayoutPhotograph]:
     """The photographs of the present layout: those taken since a sphere was last moved."""
-    images: list[dict[str, Any]] = []
+    images: list[layout.LayoutPhotograph] = []
     for note in context.state.notes:
         if note.note == MOVE_WANTED:
             images = []
         elif note.note == PHOTOGRAPH:
-            images.append({key: note.data[key] for key in ("sha256", "focal_mm")})
+            images.append(layout.LayoutPhotograph(sha256=note.data["sha256"], focal_mm=note.data["focal_mm"]))
     return images
 
 
-def _photographs(context: StepContext, images: list[dict[str, Any]], wait_s: float) -> list[ArtefactRef]:
+def _photographs(context: StepContext, images: list[layout.LayoutPhotograph], wait_s: float) -> list[ArtefactRef]:
     """Take one, or wait for those of a camera without a cable; store, note and add them to `images`."""
     camera = context.devices.camera()
     refs: list[ArtefactRef] = []
@@ -120,9 +122,8 @@ def _photographs(context: StepContext, images: list[dict[str, Any]], wait_s: flo
             media_type = image.jpeg.media_type
             ref = keep(context, image.jpeg.path, device="camera", kind="layout_image", media_type=media_type)
             found = {"found_at": image.found_at} if image.found_at else {}
-            data = {"sha256": ref.sha256, "focal_mm": image.focal_length_mm}
-            context.note(PHOTOGRAPH, **data, **found)
-            images.append(data)
+            context.note(PHOTOGRAPH, sha256=ref.sha256, focal_mm=image.focal_length_mm, **found)
+            images.append(layout.LayoutPhotograph(sha256=ref.sha256, focal_mm=image.focal_length_mm))
             refs.append(ref)
     return refs
 
@@ -131,7 +132,7 @@ def _advise(
     context: StepContext,
     verdicts: Sequence[GateVerdict],
     details: layout.LayoutDetails,
-    images: Sequence[Mapping[str, Any]],
+    images: int,
     params: Params,
 ) -> None:
     """If the layout fails its gates, advise one more photograph while that may decide, or a move."""
@@ -140,21 +141,20 @@ def _advise(
         return
     unseen = any(verdict.measure == "spheres_seen" for verdict in short)
     bad = [v for v in short if not v.undecided and v.measure != "spheres_seen"]
-    if not bad and len(images) < params.most_photographs:
-        _ask_for_photograph(context, len(images), unseen=unseen)
+    if not bad and images < params.most_photographs:
+        _ask_for_photograph(context, images, unseen=unseen)
         return
-    moves = [layout.SphereMove.model_validate(move) for move in details.moves]
-    if not moves:
+    if not details.moves:
         remedy = "; ".join(details.problems) or "the photographs do not decide it"
         advice = f"{remedy[0].upper()}{remedy[1:]}. Set the spheres up less regularly and photograph them anew"
         context.note(MOVE_WANTED, advice=advice)
     else:
-        steps = "; then ".join(move.words for move in moves)
+        steps = "; then ".join(move.words for move in details.moves)
         advice = (
             f"{steps}. The picture of this step shows the spheres with their numbers, and arrows. Then hold the "
             "camera nearly above the scene again and confirm"
         )
-        hands = [_move_hand(move) for move in moves]
+        hands = [_move_hand(move) for move in details.moves]
         context.note(MOVE_WANTED, advice=advice, hands=[*hands, {"action": "hold_camera", "side": "above"}])
     context.tell(advice)
 
@@ -170,7 +170,7 @@ def _ask_for_photograph(context: StepContext, taken: int, *, unseen: bool) -> No
     context.tell(advice)
 
 
-def _move_hand(move: layout.SphereMove) -> dict[str, Any]:
+def _move_hand(move: layout.SphereMove) -> dict[str, object]:
     """For the simulated technician, who is told the sphere's place in the photograph, as a person is."""
     return {
         "action": "move_sphere",

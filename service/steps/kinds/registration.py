@@ -46,6 +46,7 @@ class StructureFromMotion(Record):
 class Params(StepParams):
     """Which images, which scan, which camera poses."""
 
+    gives: ClassVar = "registrations"
     repeated: ClassVar = RepeatedStep(
         "Compute it again; the same images give the same figures", same=True, device=False
     )
@@ -191,7 +192,7 @@ def _outcome(found: RegistrationJobs) -> StepOutcome:
         registrations={name: register.KIND.read_answer(job.result) for name, job in found.arrived.items()},
     )
     artefacts = tuple(ref for _, job in done for ref in job.artefacts)
-    return StepOutcome(measures, artefacts, result.model_dump(mode="json", exclude_unset=True))
+    return StepOutcome(measures, artefacts, result)
 
 
 KIND = StepKind(

@@ -9,7 +9,7 @@ from service.core.jobs.references import Reference
 from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, Record
 from service.core.units import metres
-from service.jobs.records import SpheresFound
+from service.jobs.records import Point, SphereDetails
 from service.jobs.surfaces import locate_spheres
 from service.steps.arrivals import keep_mesh, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
@@ -22,6 +22,7 @@ from service.steps.measures import Count, Measure, SphereMeasures
 class Params(StepParams):
     """What the scan must contain."""
 
+    gives: ClassVar = "scan_surface"
     repeated: ClassVar = RepeatedStep("Scan again, export the scan, and import it")
 
     spheres: int  # number of spheres in the scan
@@ -54,8 +55,8 @@ class Measures(SphereMeasures):
 class Result(Record):
     """The spheres in the scan frame, metres."""
 
-    spheres_m: tuple[tuple[float, float, float], ...]
-    details: dict[str, Any]
+    spheres_m: tuple[Point, ...]
+    details: SphereDetails
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
@@ -80,11 +81,11 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     arguments, references = _arguments(context, params, mesh)
     (answer,) = context.evidence.run_jobs(JobRequest.of(locate_spheres.KIND, arguments, references))
     result = Result.model_validate(answer.result)
-    uncertainties = layout_uncertainties(SpheresFound.model_validate(answer.result).details.layout)
+    uncertainties = layout_uncertainties(result.details.layout)
     return StepOutcome(
         Measures.read({**measures, **answer.measures}),
         kept + answer.artefacts,
-        result.model_dump(mode="json"),
+        result,
         uncertainties,
     )
 

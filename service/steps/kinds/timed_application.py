@@ -70,7 +70,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         scan_within_s=params.scan_within_s,
         sublimates_after_s=params.sublimates_after_s,
     )
-    return StepOutcome(Measures(applications=1.0), result=result.model_dump())
+    return StepOutcome(Measures(applications=1.0), result=result)
 
 
 KIND = StepKind(

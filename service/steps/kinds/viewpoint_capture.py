@@ -30,6 +30,11 @@ class Params(MovingParams):
     order: Order = "as_listed"  # of the viewpoints: as listed, or along the shortest way
     live: Live | None = None  # what is computed from each image during the capture; nothing if left out
 
+    @property
+    def photographs_specimen(self) -> bool:
+        """True: the specimen, or the control spheres around it."""
+        return True
+
 
 class Measures(PredictedMeasures, CaptureMeasures):
     """Of the capture, and of what its images are predicted to give."""
@@ -72,7 +77,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         candidates = capture.candidates()
         measures |= capture.live.summary(capture.last.station, candidates, retakes, again if retakes else 0)
     result = Result(purpose=params.purpose, captured=totals.captured)
-    return StepOutcome(Measures.read(measures), result=result.model_dump())
+    return StepOutcome(Measures.read(measures), result=result)
 
 
 class _Capture:

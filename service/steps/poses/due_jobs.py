@@ -23,7 +23,7 @@ class _Evaluated(JobRecord):
 
 def evaluation_tasks(protocol: Protocol, state: RunState, step: Step) -> dict[str, Task]:
     """The evaluation jobs of registrations that arrived after the step's own evaluation, by registration."""
-    if step.kind != "evaluation" or state.steps[step.id].skipped:
+    if step.gives != "accuracy" or state.steps[step.id].skipped:
         return {}
     own = [j for j in state.steps[step.id].jobs.values() if j.kind == "evaluate" and j.priority == WAITED]
     newest = max(own, key=lambda job: job.enqueued_seq, default=None)

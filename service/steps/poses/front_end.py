@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from service.core.run.state import JobState, RunState
 from service.jobs.calibration import calibrate
 from service.jobs.kind import read_part
 from service.jobs.poses import features, match
-from service.jobs.poses.features import FrontEndArguments
+from service.jobs.poses.features import Effort, FrontEndArguments
 from service.jobs.records import Camera, ImageFile
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import JobRequest, StepContext
@@ -44,7 +44,7 @@ class EarlyFeatures:
 
     context: StepContext
     camera: EarlierAnswer[calibrate.Answer]
-    effort: Mapping[str, Any]
+    effort: Effort
     neighbours: Mapping[str, Sequence[str]]  # by viewpoint, as planned
     asked: set[str] = field(default_factory=set[str])
 
@@ -60,7 +60,7 @@ class EarlyFeatures:
         except ConfigurationError:
             return None
         effort = wanted.structure_from_motion
-        options = SfmOptions(**effort)
+        options = SfmOptions(**effort.set_fields())
         nominal = context.devices.nominal_T_flange_camera()
         neighbours: dict[str, list[str]] = {}
         for station in dict.fromkeys(v.station for v in plan):
@@ -83,7 +83,7 @@ class EarlyFeatures:
             self.asked.add(sha256)
             arguments = features.Arguments(
                 camera=self.camera.answer.camera,
-                effort=dict(self.effort),
+                effort=self.effort,
                 images=(ImageFile(viewpoint=capture.viewpoint, sha256=sha256),),
                 match_with=tuple(sorted(self.neighbours.get(capture.viewpoint, ()))),
             )
@@ -94,7 +94,7 @@ class EarlyFeatures:
 def _registration_of(protocol: Protocol, capture: str) -> Step | None:
     """The step that will register the images of a capture by their features."""
     for step in protocol.steps:
-        if step.kind == "registration":
+        if step.gives == "registrations":
             wanted = WantedRegistrations.of(step.params)
             if capture in wanted.captures and _SOURCES_OF_IMAGES.intersection(wanted.poses):
                 return step
@@ -160,7 +160,7 @@ class EarlyJobs:
         ]
 
 
-def found_early(state: RunState, jobs: Jobs, camera: Camera, effort: Mapping[str, Any]) -> EarlyJobs:
+def found_early(state: RunState, jobs: Jobs, camera: Camera, effort: Effort) -> EarlyJobs:
     """The jobs that computed features and matches with this camera and effort while the images arrived."""
     early = EarlyJobs()
     for step in state.steps.values():
@@ -170,7 +170,7 @@ def found_early(state: RunState, jobs: Jobs, camera: Camera, effort: Mapping[str
             if job.status == "failed":
                 continue
             shared = read_part(FrontEndArguments, job.arguments, jobs)
-            if shared.effort != effort or shared.camera.plain() != camera.plain():
+            if shared.effort.plain() != effort.plain() or shared.camera.plain() != camera.plain():
                 continue
             if job.kind == "features":
                 early.features[_image_of(job).sha256] = job

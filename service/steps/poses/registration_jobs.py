@@ -179,7 +179,7 @@ class _Plan:
             **shared,
             **pieces,
             "mappers": [mapper],
-            "effort": self.wanted.structure_from_motion,
+            "effort": self.wanted.structure_from_motion.plain(),
             "prior": None if prior is None else prior.record(),
         }
         made = self._need("structure_from_motion", mapper, size, arguments)
@@ -191,7 +191,7 @@ class _Plan:
     def _pieces(self, size: str, shared: Mapping[str, Any], prior: Reference | None) -> dict[str, Any] | None:
         """Features and matches as arguments, with those computed while the images arrived; None until all exist."""
         effort = self.wanted.structure_from_motion
-        common = {**_copied(shared, "camera"), "effort": effort, **_copied(shared, *_REDUCED)}
+        common = {**_copied(shared, "camera"), "effort": effort.plain(), **_copied(shared, *_REDUCED)}
         images = read_part(_Images, shared).images
         camera = read_part(ImagesCamera, shared, self.jobs).camera
         early = EarlyJobs() if size else found_early(self.state, self.jobs, camera, effort)
@@ -214,7 +214,8 @@ class _Plan:
         matched: list[JobState | None] = [*early.matching(features)]
         done = {pair for job in early.matching(features) for pair in read_part(PairsToMatch, job.arguments).pairs}
         known = {} if prior is None else {name: np.array(T) for name, T in resolve(prior.record(), self.jobs).items()}
-        left = [pair for pair in pairs_of(features, known or None, SfmOptions(**effort)) if pair not in done]
+        options = SfmOptions(**effort.set_fields())
+        left = [pair for pair in pairs_of(features, known or None, options) if pair not in done]
         for pairs in chunks(left, PAIRS_A_JOB):
             mine = {name: features[name] for pair in pairs for name in pair}
             listed = [list(pair) for pair in pairs]
@@ -269,7 +270,7 @@ def recorded_registration_jobs(protocol: Protocol, state: RunState, step: Step) 
     Also None in runs of old versions, in which a registration waited for all of its sources.
     """
     now = state.steps[step.id]
-    if step.kind != "registration" or now.skipped or all(note.note != PLANNED for note in now.notes):
+    if step.gives != "registrations" or now.skipped or all(note.note != PLANNED for note in now.notes):
         return None
     begun = [j for j in now.jobs.values() if j.kind == "detect_spheres" and not set(_REDUCED) & set(j.arguments)]
     if not begun:

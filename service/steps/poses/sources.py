@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
 from service.core.protocol.models import Protocol, Step
+from service.jobs.poses.features import Effort
 from service.jobs.records import Photograph
 
 # "robot" is the paper's baseline: the arm's poses as reported. "robot_corrected" removes the arm's errors as the
@@ -32,7 +33,7 @@ class WantedRegistrations(BaseModel):
         poses: sources.
         reduced: sizes of reduced images, such as 1920x1080.
         reduced_poses: sources for the reduced images.
-        structure_from_motion: SfmOptions.
+        structure_from_motion: how many features and pairs.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -43,7 +44,7 @@ class WantedRegistrations(BaseModel):
     poses: tuple[str, ...]
     reduced: tuple[str, ...]
     reduced_poses: tuple[str, ...]
-    structure_from_motion: dict[str, Any]
+    structure_from_motion: Effort
 
     @classmethod
     def of(cls, params: BaseModel) -> WantedRegistrations:
@@ -85,7 +86,7 @@ def evaluated_step(evaluation: Step) -> str:
 
 def evaluations_of(protocol: Protocol, registration: Step) -> tuple[Step, ...]:
     """The evaluation steps of a registration step."""
-    every = (step for step in protocol.steps if step.kind == "evaluation")
+    every = (step for step in protocol.steps if step.gives == "accuracy")
     return tuple(step for step in every if evaluated_step(step) == registration.id)
 
 

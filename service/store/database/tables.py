@@ -17,8 +17,6 @@ from sqlalchemy import (
     UniqueConstraint,
 )
 
-APPEND_ONLY = ("runs", "events", "artefacts", "checkpoints", "timestamps", "event_index")
-
 metadata = MetaData()
 
 runs = Table(

@@ -10,7 +10,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from service.audit.background.incremental import Progress
 from service.audit.overview import findings, first_page
 from service.audit.overview.corrections import correct
-from service.audit.record import artefact_queries, queries
+from service.audit.record import artefact_queries, event_rows, run_rows
 from service.web.audit.frame import CurrentAudit, audit_frame, link
 from service.web.page.rendering import render
 from service.web.security.guards import SignedInPerson, requires
@@ -28,9 +28,9 @@ def corrections_page(request: Request, audit: CurrentAudit, run_id: str, page: i
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)
     views = findings.replaced_viewpoints(known) if known else []
-    pages = max(1, -(-len(views) // queries.PAGE))
+    pages = max(1, -(-len(views) // run_rows.PAGE))
     page = min(max(page, 1), pages)
-    shown = views[(page - 1) * queries.PAGE : page * queries.PAGE]
+    shown = views[(page - 1) * run_rows.PAGE : page * run_rows.PAGE]
     with audit.site.store.database.reading() as connection:
         values = findings.corrected_values(connection, run_id)
         steps = findings.replaced_steps(connection, run_id, known) if known else []
@@ -40,7 +40,7 @@ def corrections_page(request: Request, audit: CurrentAudit, run_id: str, page: i
             for row in reversed(artefact_queries.artefacts_of_events(connection, run_id, seqs))
             if row.is_picture
         }
-        corrected = queries.count_of_kind(connection, run_id, "record_corrected")
+        corrected = event_rows.count_of_kind(connection, run_id, "record_corrected")
     return render(
         request,
         "audit/corrections.html.j2",

@@ -1,17 +1,21 @@
-"""Release of a run by a second person, and its exports: bundle, report, data set."""
+"""Release of a run by a second person, and its exports: bundle, report, data set in any registered format."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from threading import Lock
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Form, Path, Request, Response
-from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse
+from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, StreamingResponse
+from pydantic import BaseModel, Field
 
 from service.audit.export.exports import Exports, What
+from service.audit.export.folder_zip import zip_chunks
+from service.audit.export.formats import Formats
+from service.audit.export.wanted import WantedExport
 from service.core.errors import ConfigurationError
-from service.core.gates.release import refuse_export, refuse_release
+from service.core.gates.release import refuse_data_set, refuse_export, refuse_release
 from service.core.records.events import RunReleased
 from service.store.signatures.signing import checkpoint
 from service.web.audit.frame import CurrentAudit, audit_frame
@@ -27,6 +31,8 @@ MEANINGS = (
     "I have read it and release it with its deviations",
 )
 _READ = [Depends(requires("read"))]
+_EXPORT = [Depends(requires("export"))]
+_LISTING_S, _STOPPING_S = 30.0, 5.0  # how long a press of a button may wait for it
 _LOCK = Lock()
 
 
@@ -39,7 +45,17 @@ def _exports(request: Request, site: CurrentSite) -> Exports:
     return found
 
 
+def _formats(request: Request, site: CurrentSite) -> Formats:
+    state = request.app.state
+    with _LOCK:
+        if not hasattr(state, "formats"):
+            state.formats = Formats(site.store.clock)
+        found: Formats = state.formats
+    return found
+
+
 CurrentExports = Annotated[Exports, Depends(_exports)]
+CurrentFormats = Annotated[Formats, Depends(_formats)]
 
 
 @router.get("/runs/{run_id}/exports", name="exports", dependencies=_READ, response_class=HTMLResponse)
@@ -48,6 +64,7 @@ def exports_page(
     site: CurrentSite,
     audit: CurrentAudit,
     exports: CurrentExports,
+    formats: CurrentFormats,
     person: SignedInPerson,
     run_id: RunId,
 ) -> Response:
@@ -66,11 +83,16 @@ def exports_page(
         needs_release=log.protocol.release == "second_person",
         released=released,
         refusal=refusal,
+        incomplete=refuse_data_set(log.state),
         may_release=person.may("release"),
         unfit=unfit,
         meanings=MEANINGS,
         may_export=person.may("export"),
         exporting=exports.state(run_id),
+        formats=formats.known(),
+        listing=formats.state(),
+        unfinished=exports.unfinished(run_id),
+        exports_folder=exports.folder,
         files=exports.files(log.events),
         signed_to=max((item.seq for item in site.store.checkpoints(run_id)), default=0),
     )
@@ -98,7 +120,7 @@ def release(
     return _back(run_id)
 
 
-@router.post("/runs/{run_id}/exports", name="start_export", dependencies=[Depends(requires("export"))])
+@router.post("/runs/{run_id}/exports", name="start_export", dependencies=_EXPORT)
 def start_export(
     site: CurrentSite, exports: CurrentExports, person: SignedInPerson, run_id: RunId, what: Annotated[What, Form()]
 ) -> RedirectResponse:
@@ -111,14 +133,75 @@ def start_export(
     return _back(run_id)
 
 
+class FormatForm(BaseModel):
+    """A data set in a format, as the form has it."""
+
+    form: str = Field(max_length=200)
+    crop: str = Field("", pattern=r"^([1-9][0-9]{0,5}x[1-9][0-9]{0,5})?$")
+    crops: int = Field(1, ge=1, le=16)
+    anonymous: bool = False
+    csrf: str = ""
+
+
+@router.post("/runs/{run_id}/exports/formats", name="start_format_export", dependencies=_EXPORT)
+def start_format_export(
+    site: CurrentSite,
+    exports: CurrentExports,
+    formats: CurrentFormats,
+    person: SignedInPerson,
+    run_id: RunId,
+    asked: Annotated[FormatForm, Form()],
+) -> RedirectResponse:
+    """Begin an export of the data set in one of the registered formats."""
+    log = site.run(run_id)
+    refusal = refuse_export(log.protocol, log.state) or refuse_data_set(log.state)
+    if refusal is not None:
+        raise refusal
+    if asked.form not in {known.name for known in formats.known(wait_s=_LISTING_S)}:
+        raise ConfigurationError("there is no such format", where=asked.form, remedy="Choose one of the list")
+    wanted = WantedExport(asked.form, asked.crop, asked.crops, asked.anonymous)
+    exports.start_format(run_id, wanted, person.account, simulated=log.state.simulated)
+    return _back(run_id)
+
+
+@router.post("/runs/{run_id}/exports/stop", name="stop_export", dependencies=_EXPORT)
+def stop_export(exports: CurrentExports, run_id: RunId) -> RedirectResponse:
+    """Stop the export that is running. What a format has written so far stays, so that it can go on."""
+    if exports.stop(run_id):
+        exports.wait(run_id, _STOPPING_S)
+    return _back(run_id)
+
+
+@router.post("/runs/{run_id}/exports/unfinished", name="unfinished_export", dependencies=_EXPORT)
+def unfinished_export(
+    site: CurrentSite,
+    exports: CurrentExports,
+    person: SignedInPerson,
+    run_id: RunId,
+    name: Annotated[str, Form(max_length=200)],
+    verb: Annotated[Literal["continue", "discard"], Form()],
+) -> RedirectResponse:
+    """Go on with an export that was interrupted, or remove what it left."""
+    site.run(run_id)
+    if verb == "continue":
+        exports.go_on(run_id, name, person.account)
+    else:
+        exports.discard(run_id, name)
+    return _back(run_id)
+
+
 @router.get("/runs/{run_id}/exports/{file_name}", name="exported_file", dependencies=_READ)
 def exported_file(
     site: CurrentSite, exports: CurrentExports, run_id: RunId, file_name: Annotated[str, Path(max_length=200)]
-) -> FileResponse:
-    """Download one of the recorded exports."""
+) -> Response:
+    """Download one of the recorded exports; a folder as a zip file."""
     path, record = exports.path(site.run(run_id).events, file_name)
     # Never shown within this origin: a report is a page of its own, and pages from here may act.
     headers = {"X-SHA256": record.sha256, "Cache-Control": "private, no-store"}
+    if path.is_dir():
+        headers["Content-Disposition"] = f'attachment; filename="{path.name}.zip"'
+        chunks = zip_chunks(path, record.sha256)
+        return StreamingResponse(chunks, media_type="application/octet-stream", headers=headers)
     return FileResponse(path, filename=path.name, media_type="application/octet-stream", headers=headers)
 
 

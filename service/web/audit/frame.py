@@ -15,8 +15,8 @@ from service.audit.background.incremental import IncrementalResults
 from service.audit.overview.digest import Digest, digests
 from service.audit.overview.first_page import verified
 from service.audit.provenance.graph import Graph, graphs
-from service.audit.record import queries
-from service.audit.record.queries import RunBasics
+from service.audit.record import run_rows
+from service.audit.record.run_rows import RunBasics
 from service.audit.verify.verifications import Verification, Verifications
 from service.core.records.import_list import imported_sentence
 from service.store.errors import UnknownRunError
@@ -85,7 +85,7 @@ class AuditFrame:
 def audit_frame(audit: AuditState, run_id: str, tab: str) -> AuditFrame:
     """The frame of one run's page at `tab`. Raises UnknownRunError."""
     with audit.site.store.database.reading() as connection:
-        found = queries.runs(connection, run_id)
+        found = run_rows.runs(connection, run_id)
     if not found:
         raise UnknownRunError(f"there is no run {run_id!r}", remedy="Choose one from the list of runs")
     base = f"/audit/runs/{run_id}"
@@ -102,7 +102,7 @@ def audit_frame(audit: AuditState, run_id: str, tab: str) -> AuditFrame:
     )
 
 
-def link(address: str, query: Mapping[str, object]) -> str:
+def link(address: str, query: Mapping[str, str | int | None]) -> str:
     """An address with its query; empty fields are left out."""
     fields = {name: value for name, value in query.items() if value not in ("", None, 0)}
     return f"{address}?{urlencode(fields)}" if fields else address

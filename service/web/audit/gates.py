@@ -91,7 +91,7 @@ def accuracy_of(digest: Digest | None) -> list[AccuracyRow]:
 def _accuracy(protocol: Protocol, state: RunState) -> list[AccuracyRow]:
     rows = evaluated(protocol, state)
     own = own_registration(protocol, state)
-    gates = [gate for step in protocol.steps if step.kind == "evaluation" for gate in step.gates]
+    gates = [gate for step in protocol.steps if step.gives == "accuracy" for gate in step.gates]
     most = next((gate.max for gate in gates if gate.measure.endswith(_ERROR)), None)
     out: list[AccuracyRow] = []
     for row in rows:

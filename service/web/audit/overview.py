@@ -15,7 +15,7 @@ from service.audit.overview.digest import Digest
 from service.audit.overview.first_page import GROUPS
 from service.audit.overview.shots import failed_exposures_of, shots_of, together
 from service.audit.overview.signatures import signatures as signatures_of
-from service.audit.record import queries
+from service.audit.record import event_rows, run_rows
 from service.run_record import results_to_come
 from service.steps.poses.time_left import PendingResult
 from service.web.audit.frame import AuditState, CurrentAudit, audit_frame, close_audit, link
@@ -46,8 +46,8 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)
     with audit.site.store.database.reading() as connection:
-        root = queries.read_rows(connection, run_id, [1], whole=True)
-        corrected = queries.count_of_kind(connection, run_id, "record_corrected")
+        root = event_rows.read_rows(connection, run_id, [1], whole=True)
+        corrected = event_rows.count_of_kind(connection, run_id, "record_corrected")
         devices = opened_devices(findings.events_of(connection, run_id, "device_opened", newest=True))
         sessions = findings.events_of(connection, run_id, "session_started", newest=True)
         exports = findings.events_of(connection, run_id, "evidence_exported", newest=True)
@@ -104,7 +104,7 @@ def deviations_page(request: Request, audit: CurrentAudit, run_id: str, group: s
     known = first_page.known(digest)
     group = group if group in GROUPS else ""
     listed = first_page.findings(known, group) if known else []
-    pages = max(1, -(-len(listed) // queries.PAGE))
+    pages = max(1, -(-len(listed) // run_rows.PAGE))
     page = min(max(page, 1), pages)
     return render(
         request,
@@ -114,7 +114,7 @@ def deviations_page(request: Request, audit: CurrentAudit, run_id: str, group: s
         groups=GROUPS,
         counts=first_page.counts(known) if known else {},
         group=group,
-        listed=listed[(page - 1) * queries.PAGE : page * queries.PAGE],
+        listed=listed[(page - 1) * run_rows.PAGE : page * run_rows.PAGE],
         count=len(listed),
         page=page,
         pages=pages,

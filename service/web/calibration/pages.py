@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
 from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse, Response
@@ -10,10 +11,13 @@ from fastapi.responses import HTMLResponse, Response
 from service.core.errors import IllegalTransitionError
 from service.core.gates.dependence import AcceptedGate, depends_on
 from service.core.gates.verdict import figure
-from service.core.records.events import ViewpointCaptured
+from service.core.records.events import Event, ViewpointCaptured
 from service.run_record import RunRecord
 from service.web.calibration.view import (
     Calibration,
+    Certificate,
+    Charts,
+    ImageRow,
     calibration_of,
     certificate_of,
     charts_of,
@@ -21,16 +25,59 @@ from service.web.calibration.view import (
     held_out_mm,
     image_rows,
 )
+from service.web.page.charts import Dots
 from service.web.page.rendering import render
-from service.web.page.run_frame import run_frame
+from service.web.page.run_frame import RunFrame, run_frame
 from service.web.page.run_words import gate_word, limit, measure_name
 from service.web.security.guards import requires
 from service.web.site import CurrentSite, Site
 
+if TYPE_CHECKING:
+    from service.web.calibration.board_advice import PoseAdvice
+
 router = APIRouter(tags=["calibration"])
 
-_WORDS: dict[str, Any] = {"measure_name": measure_name, "figure": figure, "limit": limit, "gate_word": gate_word}
 RunId = Annotated[str, Path(max_length=64)]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationPage:
+    """What the page of a calibration shows.
+
+    Attributes:
+        run_id: of the run.
+        found: the calibration in force.
+        charts: of the intrinsics; None if they are not solved.
+        hand_eye_chart: None without a hand-eye calibration.
+        images: of the board, with their residuals.
+        held_out: median and maximum error of the board's position by images that were not used, mm.
+        depends: acceptances on which the calibration depends.
+        regions: parts of the image without corners: name, empty cells, all cells.
+        poses: of the board that would help most.
+    """
+
+    run_id: str
+    found: Calibration
+    charts: Charts | None
+    hand_eye_chart: Dots | None
+    images: list[ImageRow]
+    held_out: tuple[float, float] | None
+    depends: list[AcceptedGate]
+    regions: list[tuple[str, int, int]]
+    poses: tuple[PoseAdvice, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CertificatePage:
+    """What the certificate shows; its fields are those of CalibrationPage, and `head`, the last event of the run."""
+
+    run_id: str
+    found: Calibration
+    held_out: tuple[float, float] | None
+    depends: list[AcceptedGate]
+    certificate: Certificate
+    simulated: bool
+    head: Event
 
 
 @router.get("/runs/{run_id}/calibration", name="calibration", dependencies=[Depends(requires("read"))])
@@ -38,17 +85,22 @@ def calibration(request: Request, site: CurrentSite, run_id: RunId) -> HTMLRespo
     """Whether the calibration is good, in pixels and in millimetres, and what would make it better."""
     log = site.run(run_id)
     found = calibration_of(log)
-    context: dict[str, Any] = {**_WORDS, "run_id": run_id, "found": found, "frame": run_frame(site, run_id)}
-    if found is not None:
-        context |= {
-            "charts": charts_of(found),
-            "hand_eye_chart": hand_eye_chart(found),
-            "images": image_rows(found),
-            "held_out": held_out_mm(found),
-            "depends": _depends(log, found),
-            **_advice(site, log, found),
-        }
-    return render(request, "calibration/calibration.html.j2", **context)
+    frame = run_frame(site, run_id)
+    if found is None:
+        return render(request, "calibration/calibration.html.j2", run_id=run_id, found=None, frame=frame)
+    regions, poses = _advice(site, log, found)
+    shown = CalibrationPage(
+        run_id=run_id,
+        found=found,
+        charts=charts_of(found),
+        hand_eye_chart=hand_eye_chart(found),
+        images=image_rows(found),
+        held_out=held_out_mm(found),
+        depends=_depends(log, found),
+        regions=regions,
+        poses=poses,
+    )
+    return _rendered(request, "calibration/calibration.html.j2", shown, frame)
 
 
 @router.get("/runs/{run_id}/board-plan.svg", name="board_plan", dependencies=[Depends(requires("read"))])
@@ -74,10 +126,7 @@ def certificate(request: Request, site: CurrentSite, run_id: RunId) -> HTMLRespo
         raise IllegalTransitionError(
             "there is no calibration to certify yet", where=run_id, remedy="Finish the calibration step first"
         )
-    return render(
-        request,
-        "calibration/certificate.html.j2",
-        frame=run_frame(site, run_id),
+    shown = CertificatePage(
         run_id=run_id,
         found=found,
         held_out=held_out_mm(found),
@@ -85,7 +134,23 @@ def certificate(request: Request, site: CurrentSite, run_id: RunId) -> HTMLRespo
         certificate=certificate_of(log, found),
         simulated=log.state.simulated,
         head=log.events[-1],
-        **_WORDS,
+    )
+    return _rendered(request, "calibration/certificate.html.j2", shown, run_frame(site, run_id))
+
+
+def _rendered(
+    request: Request, template: str, page: CalibrationPage | CertificatePage, frame: RunFrame
+) -> HTMLResponse:
+    """A page with the words for measures and gates."""
+    return render(
+        request,
+        template,
+        page,
+        frame=frame,
+        measure_name=measure_name,
+        figure=figure,
+        limit=limit,
+        gate_word=gate_word,
     )
 
 
@@ -94,7 +159,10 @@ def _depends(log: RunRecord, found: Calibration) -> list[AcceptedGate]:
     return list(dict.fromkeys(gates))
 
 
-def _advice(site: Site, log: RunRecord, found: Calibration) -> dict[str, object]:
+def _advice(
+    site: Site, log: RunRecord, found: Calibration
+) -> tuple[list[tuple[str, int, int]], tuple[PoseAdvice, ...]]:
+    """Parts of the image without corners, and board poses worth taking."""
     # The planning of poses brings scipy, which the start of the service does not wait for.
     from service.web.calibration.board_advice import advised_poses, empty_regions  # noqa: PLC0415
     from service.web.record.planned_poses import recorded_rig  # noqa: PLC0415
@@ -103,7 +171,7 @@ def _advice(site: Site, log: RunRecord, found: Calibration) -> dict[str, object]
     regions = [] if coverage is None else empty_regions(coverage.corners)
     board = log.protocol.board
     if found.hand_eye is None or found.best is None or board is None or found.artefact is None:
-        return {"regions": regions, "poses": ()}
+        return regions, ()
     used = set(found.best.residuals.mm)
     poses = advised_poses(
         found.hand_eye,
@@ -114,4 +182,4 @@ def _advice(site: Site, log: RunRecord, found: Calibration) -> dict[str, object]
         site.data,
         found.artefact.sha256,
     )
-    return {"regions": regions, "poses": poses}
+    return regions, poses

@@ -8,6 +8,7 @@ from statistics import median
 
 from pydantic import BaseModel
 
+from service.core.equipment.recorded_devices import RecordedIdentity, recorded_report
 from service.core.protocol.models import Step
 from service.core.records.events import ArtefactRef, DeviceOpened, OperatorAction, View
 from service.core.run.state import StepState
@@ -80,7 +81,7 @@ def calibration_of(log: RunRecord) -> Calibration | None:
     solved = [
         (step, log.state.steps[step.id])
         for step in log.protocol.steps
-        if step.kind == "calibration" and log.state.steps[step.id].result
+        if step.gives == "calibration" and log.state.steps[step.id].result
     ]
     if not solved:
         return None
@@ -293,17 +294,17 @@ def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
     since = there.passed_seq or state.seq
     stops = [f"{t.device}: {t.message} (event {t.seq})" for t in state.troubles if t.seq > since]
     known = {
-        event.payload.device: event.payload.report.get("identity", {})
+        event.payload.device: recorded_report(event.payload.report).identity
         for event in log.events
         if isinstance(event.payload, DeviceOpened)
     }
-    models = [str(identity.get("model", "")) for identity in known.values() if identity.get("kind") == "camera"]
+    models = [identity.model for identity in known.values() if identity.kind == "camera"]
     stated = StatedCamera() if first is None else stated_camera(first)
-    robots = [(name, known.get(name, {})) for name in calibration.robots]
+    robots = [(name, known.get(name, RecordedIdentity())) for name in calibration.robots]
     return Certificate(
         stated,
         models[-1] if models else stated.model or "",
-        tuple((name, str(about.get("model", "")), str(about.get("serial", ""))) for name, about in robots),
+        tuple((name, about.model, about.serial) for name, about in robots),
         {} if first is None else first.environment,
         state.operator,
         passed,

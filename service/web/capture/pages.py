@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field
 
 from service.core.protocol.models import Step
+from service.jobs.capture.live_summary import Suggestion
 from service.people.control import Control
 from service.people.person import Person
 from service.run_record import RunRecord
@@ -22,7 +26,7 @@ from service.web.site import CurrentSite, Site
 
 if TYPE_CHECKING:
     from service.web.capture.plan_drawing import PlanDrawing
-    from service.web.capture.view import View
+    from service.web.capture.view import Redo, Verdict, View, ViewState
 
 router = APIRouter(tags=["capture"])
 
@@ -47,13 +51,99 @@ class CaptureQuery(BaseModel):
 Wanted = Annotated[CaptureQuery, Query()]
 
 
+@dataclass(frozen=True, slots=True)
+class ViewTable:
+    """The viewpoints of a step, and a page of the table that lists them."""
+
+    views: list[View]
+    rows: list[View]  # on this page
+    page: int
+    pages: int
+    counts: Mapping[ViewState, int]  # of all viewpoints; none is 0
+
+
+@dataclass(frozen=True, slots=True)
+class ContactSheet:
+    """A page of the contact sheet."""
+
+    captures: list[Capture]  # on this page
+    uses: Mapping[str, BoardUse]  # of board images, by SHA-256
+    replaced: int  # images of the step that no longer count
+    page: int
+    pages: int
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenImage:
+    """The large image; `capture` is None where the step has none to show."""
+
+    capture: Capture | None
+    verdicts: list[Verdict]
+    sums: list[Verdict]  # of all images up to this one
+    registered: bool  # the spheres have the numbers of the registration
+
+
+@dataclass(frozen=True, slots=True)
+class StepImages:
+    """Everything about the images of one step.
+
+    Attributes:
+        run_id: of the run.
+        step: whose images they are.
+        table: of its viewpoints.
+        sheet: of its images.
+        image: the large one.
+        drawings: the viewpoints from above, one drawing a station.
+        view: the chosen viewpoint.
+        redo: whether it may be redone; None without a chosen viewpoint.
+        in_control: the person's screen has control of the run.
+        advice, suggestions: what the images lack, and the views that would help most.
+        following: the page shows the newest image.
+        query: what the page was asked for.
+        tail: the same as the query of an address, for the parts of the page.
+        words, tones: of the states of viewpoints.
+        reasons: presets for a redo.
+        csrf: token of the forms.
+    """
+
+    run_id: str
+    step: Step
+    table: ViewTable
+    sheet: ContactSheet
+    image: ChosenImage
+    drawings: list[PlanDrawing]
+    view: View | None
+    redo: Redo | None
+    in_control: bool
+    advice: str
+    suggestions: tuple[Suggestion, ...]
+    following: bool
+    query: CaptureQuery
+    tail: str
+    words: Mapping[ViewState, str]
+    tones: Mapping[ViewState, str]
+    reasons: tuple[str, ...]
+    csrf: str
+
+
+@dataclass(frozen=True, slots=True)
+class CapturePage:
+    """What the page shows."""
+
+    run_id: str
+    log: RunRecord
+    steps: list[Step]  # that take images with the robot
+    held: bool  # a person holds the camera in another step
+    images: StepImages | None  # None where no step takes images with the robot
+
+
 @router.get("/runs/{run_id}/capture", name="capture", dependencies=[Depends(requires("read"))])
 def capture(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, wanted: Wanted
 ) -> HTMLResponse:
     """Everything about the images of one step."""
     shown = _shown(site, person, run_id, wanted)
-    return render(request, "capture/capture.html.j2", frame=run_frame(site, run_id), **shown)
+    return render(request, "capture/capture.html.j2", shown, frame=run_frame(site, run_id))
 
 
 @router.get("/runs/{run_id}/capture/parts/{names}", name="capture_parts", dependencies=[Depends(requires("read"))])
@@ -62,41 +152,53 @@ def capture_parts(
 ) -> HTMLResponse:
     """Parts of the page, all from the same moment, for the script that keeps the page up to date."""
     shown = _shown(site, person, run_id, wanted)
-    return render(request, "capture/parts.html.j2", names=names.split(","), **shown)
+    return render(request, "capture/parts.html.j2", shown, names=names.split(","))
 
 
-def _shown(site: Site, person: Person, run_id: str, wanted: CaptureQuery) -> dict[str, Any]:
+def _shown(site: Site, person: Person, run_id: str, wanted: CaptureQuery) -> CapturePage:
     # The planning of viewpoints brings scipy, which the start of the service does not wait for.
     from service.web.capture import view as capture_view  # noqa: PLC0415
 
     log = site.run(run_id)
-    common = {"run_id": run_id, "steps": capture_view.capture_steps(log.protocol), "log": log}
     step = capture_view.step_to_show(log, wanted.step)
-    if step is None:
-        return {**common, "step": None, "held": any(s.kind == "manual_capture" for s in log.protocol.steps)}
+    return CapturePage(
+        run_id=run_id,
+        log=log,
+        steps=capture_view.capture_steps(log.protocol),
+        held=any(s.by_hand for s in log.protocol.steps),
+        images=None if step is None else _of_step(site, person, log, step, wanted),
+    )
+
+
+def _of_step(site: Site, person: Person, log: RunRecord, step: Step, wanted: CaptureQuery) -> StepImages:
+    from service.web.capture import view as capture_view  # noqa: PLC0415
+
     captures = captures_of(log, step.id)
     chosen = _chosen(captures, wanted)
     name = wanted.viewpoint or ("" if chosen is None else chosen.payload.viewpoint)
     views = capture_view.views_of(log, step)
     view = next((v for v in views if v.name == name), None)
     advice, suggestions = capture_view.suggestions_of(log, step)
-    holder = Control(site.store).holder(run_id)
-    return {
-        **common,
-        "step": step,
-        "state": log.state.steps[step.id],
-        **_table(views, view, wanted.views),
-        **_sheet(log, step, captures, wanted),
-        **_image(log, step, chosen, captures),
-        "drawings": _drawings(log, views, name),
-        "view": view,
-        "redo": None if view is None else capture_view.redo_of(log, step, view, person.account),
-        "in_control": person.may("operate") and holder.screen == person.screen,
-        "advice": advice,
-        "suggestions": suggestions,
-        "following": not wanted.viewpoint and not wanted.seq,
-        "query": wanted.model_dump(exclude={"page"}) | {"step": step.id},
-    }
+    return StepImages(
+        run_id=log.run_id,
+        step=step,
+        table=_table(views, view, wanted.views),
+        sheet=_sheet(log, step, captures, wanted),
+        image=_image(log, step, chosen, captures),
+        drawings=_drawings(log, views, name),
+        view=view,
+        redo=None if view is None else capture_view.redo_of(log, step, view, person.account),
+        in_control=person.may("operate") and Control(site.store).holder(log.run_id).screen == person.screen,
+        advice=advice,
+        suggestions=suggestions,
+        following=not wanted.viewpoint and not wanted.seq,
+        query=wanted,
+        tail="?" + urlencode(wanted.model_dump(exclude={"page"}) | {"step": step.id}),
+        words=capture_view.WORDS,
+        tones=capture_view.TONES,
+        reasons=log.protocol.reasons.redo,
+        csrf=person.csrf,
+    )
 
 
 def _chosen(captures: Sequence[Capture], wanted: CaptureQuery) -> Capture | None:
@@ -109,26 +211,24 @@ def _chosen(captures: Sequence[Capture], wanted: CaptureQuery) -> Capture | None
     return (named or ([] if wanted.viewpoint else valid) or [None])[-1]
 
 
-def _table(views: list[View], view: View | None, page: int) -> dict[str, Any]:
+def _table(views: list[View], view: View | None, page: int) -> ViewTable:
     """A page of the table: the one asked for, or the one with the viewpoint that is shown or comes next."""
     from service.web.capture import view as capture_view  # noqa: PLC0415
 
     pages = max(1, -(-len(views) // LISTED))
     here = next((k for k, v in enumerate(views) if v is view or (view is None and v.state == "next")), 0)
     page = min(page or 1 + here // LISTED, pages)
-    counts = {state: sum(v.state == state for v in views) for state in capture_view.WORDS}
-    return {
-        "views": views,
-        "rows": views[(page - 1) * LISTED : page * LISTED],
-        "views_page": page,
-        "views_pages": pages,
-        "counts": {state: count for state, count in counts.items() if count},
-        "words": capture_view.WORDS,
-        "tones": capture_view.TONES,
-    }
+    counts = Counter(v.state for v in views)
+    return ViewTable(
+        views=views,
+        rows=views[(page - 1) * LISTED : page * LISTED],
+        page=page,
+        pages=pages,
+        counts={state: counts[state] for state in capture_view.WORDS if counts[state]},
+    )
 
 
-def _sheet(log: RunRecord, step: Step, captures: Sequence[Capture], wanted: CaptureQuery) -> dict[str, Any]:
+def _sheet(log: RunRecord, step: Step, captures: Sequence[Capture], wanted: CaptureQuery) -> ContactSheet:
     """A page of the contact sheet: images with something wrong first, then newest first."""
     valid = [c for c in captures if c.replaced is None]
     uses = board_uses(log.state, log.events, step.id)
@@ -137,27 +237,27 @@ def _sheet(log: RunRecord, step: Step, captures: Sequence[Capture], wanted: Capt
     )  # stable
     pages = max(1, -(-len(listed) // SHEET))
     page = min(wanted.page, pages)
-    return {
-        "uses": uses,
-        "captures": listed[::-1][(page - 1) * SHEET : page * SHEET],
-        "replaced_count": len(captures) - len(valid),
-        "page": page,
-        "pages": pages,
-    }
+    return ContactSheet(
+        captures=listed[::-1][(page - 1) * SHEET : page * SHEET],
+        uses=uses,
+        replaced=len(captures) - len(valid),
+        page=page,
+        pages=pages,
+    )
 
 
-def _image(log: RunRecord, step: Step, chosen: Capture | None, captures: Sequence[Capture]) -> dict[str, Any]:
+def _image(log: RunRecord, step: Step, chosen: Capture | None, captures: Sequence[Capture]) -> ChosenImage:
     """The large image, with what is known about it."""
     from service.web.capture import view as capture_view  # noqa: PLC0415
     from service.web.record.known_spheres import best_registration  # noqa: PLC0415
 
     valid = [c for c in captures if c.replaced is None]
-    return {
-        "capture": chosen,
-        "verdicts": [] if chosen is None else capture_view.verdicts_of(log, step, chosen, valid),
-        "sums": [] if chosen is None else capture_view.summary_of(step, chosen),
-        "registered": best_registration(log) is not None and (chosen is None or chosen.replaced is None),
-    }
+    return ChosenImage(
+        capture=chosen,
+        verdicts=[] if chosen is None else capture_view.verdicts_of(log, step, chosen, valid),
+        sums=[] if chosen is None else capture_view.summary_of(step, chosen),
+        registered=best_registration(log) is not None and (chosen is None or chosen.replaced is None),
+    )
 
 
 def _drawings(log: RunRecord, views: Sequence[View], name: str) -> list[PlanDrawing]:

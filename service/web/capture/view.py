@@ -18,7 +18,7 @@ from service.core.run.state import StepState
 from service.core.units import mm, mrad
 from service.jobs.capture import live_summary, live_view
 from service.run_record import RunRecord
-from service.steps.notes import motion_plan, suggested_views
+from service.steps.notes import suggested_views
 from service.web.record.board_images import board_use, board_uses, calibration_in
 from service.web.record.images import Capture, captures_of, last_failures, stated_camera
 from service.web.record.planned_poses import Vector, nominal_T_flange_camera, place, planned_viewpoints
@@ -162,11 +162,11 @@ def _state(
 
 def _order(state: StepState) -> list[str]:
     taken = sorted(state.captured, key=lambda name: state.captured[name])
-    return taken + [view.viewpoint for view in motion_plan(state).views]
+    return taken + [view.viewpoint for view in state.motion_plan.views]
 
 
 def _refused(state: StepState) -> dict[str, str]:
-    return {view.viewpoint: view.reason for view in motion_plan(state).views if view.outcome == "refused"}
+    return {view.viewpoint: view.reason for view in state.motion_plan.views if view.outcome == "refused"}
 
 
 def _place(log: RunRecord, capture: Capture) -> tuple[Vector, Vector] | tuple[None, None]:

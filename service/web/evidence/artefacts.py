@@ -11,6 +11,7 @@ from service.audit.background.incremental import Progress
 from service.audit.provenance.drawing import draw
 from service.audit.provenance.graph import origin
 from service.audit.record import artefact_queries
+from service.jobs.words import term
 from service.web.audit.frame import CurrentAudit, audit_frame, link
 from service.web.audit.queries import ArtefactQuery
 from service.web.page.rendering import render
@@ -67,4 +68,5 @@ def provenance_page(request: Request, audit: CurrentAudit, run_id: str) -> Respo
         progress=graph if isinstance(graph, Progress) else None,
         graph=known,
         drawing=draw(known) if known else None,
+        term=term,
     )

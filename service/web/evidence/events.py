@@ -10,7 +10,7 @@ from fastapi.responses import HTMLResponse, Response
 from service.audit.background.incremental import Progress
 from service.audit.overview import findings
 from service.audit.overview.corrections import correctable
-from service.audit.record import artefact_queries, queries
+from service.audit.record import artefact_queries, event_rows, event_search, run_rows
 from service.store.records import SITE
 from service.web.audit.frame import AuditState, CurrentAudit, audit_frame, link
 from service.web.audit.queries import EventQuery
@@ -41,12 +41,14 @@ def _events(
     wanted = query.wanted()
     digest = here.digests.get(chain) if chain != SITE else None
     with here.site.store.database.reading() as connection:
-        facets = digest.facets if digest is not None and not isinstance(digest, Progress) else queries.Facets()
-        last, _ = queries.head(connection, chain)
+        facets = digest.facets if digest is not None and not isinstance(digest, Progress) else event_search.Facets()
+        last, _ = run_rows.head(connection, chain)
         if chain == SITE:
             facets.add(connection, SITE, 0, last)
         counted = facets.matching(wanted) if facets.kinds else None
-        page = queries.events_page(connection, chain, wanted, after=query.after, before=query.before, counted=counted)
+        page = event_search.events_page(
+            connection, chain, wanted, after=query.after, before=query.before, counted=counted
+        )
         devices = artefact_queries.artefact_facets(connection, chain)["device"]
     address = request.url.path
     return render(
@@ -75,15 +77,15 @@ def _event(
     request: Request, here: AuditState, chain: str, seq: int, *, may_correct: bool, **context: Any
 ) -> Response:
     with here.site.store.database.reading() as connection:
-        row = queries.one_event(connection, chain, seq)
-        last, _ = queries.head(connection, chain)
+        row = event_rows.one_event(connection, chain, seq)
+        last, _ = run_rows.head(connection, chain)
         brought = artefact_queries.artefacts_of_events(connection, chain, [row.seq])
     return render(
         request,
         "evidence/event.html.j2",
         event=row,
         last=last,
-        computed_sha256=queries.computed_sha256(chain, row),
+        computed_sha256=event_rows.computed_sha256(chain, row),
         brought=brought,
         fields=correctable(row.payload) if may_correct and row.kind != "record_corrected" else [],
         events_at=f"/audit/runs/{chain}/events" if chain != SITE else "/audit/site/events",

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from fastapi import APIRouter, Depends, Form, Path, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
+from service.core.protocol.models import Step
 from service.core.records.events import CaptureAsked
 from service.core.run.actions import capture_refusal
 from service.people.control import Control
 from service.people.person import Person
+from service.run_record import RunRecord
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
+
+if TYPE_CHECKING:
+    from service.web.handheld.view import HandheldView
 
 router = APIRouter(tags=["capture by hand"])
 
@@ -23,12 +29,25 @@ Name = Annotated[str, Query(max_length=64)]
 Parts = Annotated[str, part_names("way", "image", "plan", "overlay")]
 
 
+@dataclass(frozen=True, slots=True)
+class HandheldPage:
+    """What the page shows; `step` and `now` are None in a protocol without images by hand."""
+
+    run_id: str
+    log: RunRecord
+    steps: list[Step]
+    step: Step | None
+    now: HandheldView | None
+    attempt: int
+    in_control: bool
+    size: float  # of the drawing of the hemisphere
+
+
 @router.get("/runs/{run_id}/held", name="held", dependencies=[Depends(requires("read"))])
 def held(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, step: Name = "") -> HTMLResponse:
     """The page that a technician has beside the camera."""
-    return render(
-        request, "handheld/handheld.html.j2", frame=run_frame(site, run_id), **_shown(site, person, run_id, step)
-    )
+    shown = _shown(site, person, run_id, step)
+    return render(request, "handheld/handheld.html.j2", shown, frame=run_frame(site, run_id))
 
 
 @router.get("/runs/{run_id}/held/parts/{names}", name="held_parts", dependencies=[Depends(requires("read"))])
@@ -36,7 +55,7 @@ def held_parts(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, names: Parts, step: Name = ""
 ) -> HTMLResponse:
     """Parts of the page, all from the same moment, for the script that keeps the page up to date."""
-    return render(request, "handheld/parts.html.j2", names=names.split(","), **_shown(site, person, run_id, step))
+    return render(request, "handheld/parts.html.j2", _shown(site, person, run_id, step), names=names.split(","))
 
 
 @router.post("/runs/{run_id}/held", name="ask_capture", dependencies=[Depends(requires("operate"))])
@@ -58,19 +77,19 @@ def ask(
     return RedirectResponse(f"/runs/{run_id}/held", status_code=303)
 
 
-def _shown(site: Site, person: Person, run_id: str, wanted: str) -> dict[str, Any]:
+def _shown(site: Site, person: Person, run_id: str, wanted: str) -> HandheldPage:
     from service.web.handheld import view as held_view  # noqa: PLC0415 - brings numerics that the start does not wait for
 
     log = site.run(run_id)
     step = held_view.step_to_show(log, wanted)
     holder = Control(site.store).holder(run_id)
-    return {
-        "run_id": run_id,
-        "log": log,
-        "steps": held_view.held_steps(log.protocol),
-        "step": step,
-        "now": None if step is None else held_view.held_now(log, step),
-        "attempt": 1 if step is None else log.state.steps[step.id].attempt,
-        "in_control": person.may("operate") and holder.screen == person.screen,
-        "size": held_view.SIZE,
-    }
+    return HandheldPage(
+        run_id=run_id,
+        log=log,
+        steps=held_view.held_steps(log.protocol),
+        step=step,
+        now=None if step is None else held_view.held_now(log, step),
+        attempt=1 if step is None else log.state.steps[step.id].attempt,
+        in_control=person.may("operate") and holder.screen == person.screen,
+        size=held_view.SIZE,
+    )

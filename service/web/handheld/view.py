@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from service.core.equipment.recorded_devices import recorded_report
 from service.core.gates.verdict import quantity
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import DeviceOpened, ViewHeld
@@ -17,7 +18,7 @@ from service.jobs.capture import hand_board, hand_view
 from service.jobs.looks import image_of
 from service.jobs.records import Matrix
 from service.run_record import RunRecord
-from service.steps.kinds.manual_capture import failure_words
+from service.steps.handheld.guide import failure_words
 from service.web.page.run_words import limit, measure_name
 from service.web.record.images import captures_of
 
@@ -78,7 +79,7 @@ class HandheldView:
 
 def held_steps(protocol: Protocol) -> list[Step]:
     """The steps in which a person holds the camera."""
-    return [step for step in protocol.steps if step.kind == "manual_capture"]
+    return [step for step in protocol.steps if step.by_hand]
 
 
 def step_to_show(log: RunRecord, wanted: str) -> Step | None:
@@ -125,9 +126,10 @@ def held_now(log: RunRecord, step: Step) -> HandheldView:
 
 
 def _photographs_from(log: RunRecord) -> str:
-    opened = (e.payload.report for e in reversed(log.events) if isinstance(e.payload, DeviceOpened))
-    camera = next((report for report in opened if report["identity"]["kind"] == "camera"), {})
-    return str(camera.get("details", {}).get("photographs_from", ""))
+    payloads = (event.payload for event in reversed(log.events))
+    opened = (recorded_report(payload.report) for payload in payloads if isinstance(payload, DeviceOpened))
+    camera = next((report for report in opened if report.identity.kind == "camera"), None)
+    return "" if camera is None else camera.details.get("photographs_from", "")
 
 
 def _overlay(here: Matrix, there: Matrix) -> Overlay:

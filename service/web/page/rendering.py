@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from datetime import datetime
 from functools import partial
 from itertools import takewhile
@@ -14,7 +15,9 @@ from jinja2 import Environment, PackageLoader, PrefixLoader, StrictUndefined, se
 from pydantic import ValidationError
 
 if TYPE_CHECKING:
-    from service.audit.record.queries import EventRow
+    from _typeshed import DataclassInstance
+
+    from service.audit.record.event_rows import EventRow
 
 from service.core.records.entered import RunAbout, about_rows
 from service.core.text.counts import counted
@@ -24,6 +27,7 @@ _FOLDERS = (
     "audit",
     "calibration",
     "capture",
+    "dataset",
     "evidence",
     "handheld",
     "home",
@@ -80,14 +84,26 @@ def part_names(*names: str) -> Any:
     return Path(pattern=f"^{one}(,{one}){{0,{len(names) - 1}}}$")
 
 
-def render(request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
-    """A page, or a part of one. `person` is who is signed in, or None on the few public pages."""
+def render(
+    request: Request, template: str, shown: DataclassInstance | None = None, /, *, status: int = 200, **more: object
+) -> HTMLResponse:
+    """A page, or a part of one.
+
+    Args:
+        request: whose `person` is who is signed in, or None on the few public pages.
+        template: `run/step.html.j2` is service/web/run/templates/step.html.j2.
+        shown: record of what the page shows; the template has its fields as variables.
+        status: of the response.
+        more: further variables of the template.
+    """
+    own: Mapping[str, object] = {} if shown is None else {f.name: getattr(shown, f.name) for f in fields(shown)}
     person = getattr(request.state, "person", None)
     text = TEMPLATES.get_template(template).render(
         request=request,
         person=person,
         robots=partial(driven_frames, request.app.state.site),  # asked by whole pages, not by parts
         robots_lost=LOST,
-        **context,
+        **own,
+        **more,
     )
     return HTMLResponse(text, status_code=status)

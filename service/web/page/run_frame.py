@@ -92,6 +92,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
             Tab(f"{here}/capture", "Capture"),
             Tab(f"{here}/scene", "3D view"),
             Tab(f"{here}/calibration", "Calibration"),
+            Tab(f"{here}/dataset", "Data set"),
             Tab(f"/audit/runs/{run_id}", "Audit", below=True),
         ),
     )

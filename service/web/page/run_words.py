@@ -7,10 +7,10 @@ from service.core.protocol.models import Protocol, Step
 from service.core.records.events import GateVerdict
 from service.core.recovery.ways_on import WayOn, planned_sets, planned_views
 from service.core.run.decide import AskOperator
+from service.core.run.noted import Mending
 from service.core.run.state import RunState, StepState
 from service.steps import step_kinds
 from service.steps.context import ROBOT_MOVES, Announcement, BeforeStep
-from service.steps.notes import mending
 
 _ACRONYMS = {"rms": "RMS", "ct": "CT", "colmap": "COLMAP", "five": "Five", "px": "px"}
 _UNITS = frozenset({"px", "mm", "deg", "min", "m", "s", "rad"})
@@ -69,7 +69,7 @@ def will_happen(step: Step, now: StepState) -> tuple[str, str]:
 
 def irreversible_warning(protocol: Protocol, step: Step) -> str:
     """In plain words what cannot be undone after this step."""
-    before = [s.title for s in protocol.steps[: protocol.index(step.id)] if s.kind == "viewpoint_capture"]
+    before = [s.title for s in protocol.steps[: protocol.index(step.id)] if s.photographs_specimen]
     words = step.cannot_be_undone or "This step changes the scene for good."
     tail = f" None of these can be done again: {', '.join(before)}." if before else ""
     return f"{words}{tail} Read the figures before you go on."
@@ -103,7 +103,7 @@ def stopped_words(protocol: Protocol, state: RunState, question: AskOperator) ->
 
 def way_words(state: RunState, way: WayOn) -> str:
     """A way on in few words, with a small letter: the views that mend are counted, an advice is cut at its end."""
-    mends = mending(state.step)
+    mends = state.step.mend or Mending()
     views = len(mends.viewpoints)
     if way.verb == "confirm" and views:
         return f"take {'this view' if views == 1 else f'these {views} views'}"

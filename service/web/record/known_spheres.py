@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from service.core.protocol.step_params import Gives
 from service.dataset.control_spheres import control_centres
+from service.dataset.registered_scan import control_scan, registered_scan
 from service.dataset.registrations import best_registration as best_registration_name
 from service.dataset.registrations import registrations
 from service.jobs.records import SpheresFound
 from service.jobs.registration.register import Registration
 from service.jobs.surfaces import locate_spheres
 from service.run_record import RunRecord
-from service.steps.kinds import evaluation, registration
 
 SphereKind = Literal["registration", "control", "sphere"]
 
@@ -37,9 +38,9 @@ class ShownRegistration:
     step: str
 
 
-def last_of_kind(log: RunRecord, kind: str) -> str:
-    """The last step of a kind that has a result; "" if there is none."""
-    steps = (step.id for step in reversed(log.protocol.steps) if step.kind == kind)
+def last_step(log: RunRecord, gives: Gives) -> str:
+    """The last step that gives this and has a result; "" if there is none."""
+    steps = (step.id for step in reversed(log.protocol.steps) if step.gives == gives)
     return next((step for step in steps if log.state.steps[step].result), "")
 
 
@@ -49,24 +50,23 @@ def best_registration(log: RunRecord) -> ShownRegistration | None:
     if name is None:
         return None
     record = registrations(log.protocol, log.state)[name]
-    return ShownRegistration(name, record, last_of_kind(log, "registration"))
+    return ShownRegistration(name, record, last_step(log, "registrations"))
 
 
-def scan_spheres(log: RunRecord, by: ShownRegistration) -> tuple[Sphere, ...]:
+def scan_spheres(log: RunRecord) -> tuple[Sphere, ...]:
     """Spheres of the registered scan, and the control spheres, in its frame."""
-    scan = _found_in(log, log.protocol.step(by.step).params_as(registration.Params).scan)
+    scan = _found_in(log, registered_scan(log.protocol, log.state))
     if not scan.spheres_m:
         return ()
-    judged = next((s for s in reversed(log.protocol.steps) if s.kind == evaluation.KIND.name), None)
-    before = None if judged is None else judged.params_as(evaluation.Params).control_scan
-    control = SpheresFound(spheres_m=()) if before is None else _found_in(log, before)
+    before = control_scan(log.protocol)
+    control = _found_in(log, before) if before else SpheresFound(spheres_m=())
     extra = control_centres(scan.spheres_m, control.spheres_m)
     return (*_numbered(scan, "registration"), *(Sphere(f"C{i}", "control", c) for i, c in enumerate(extra)))
 
 
 def ct_spheres(log: RunRecord) -> tuple[Sphere, ...]:
     """All spheres of the CT, in its frame; the CT does not tell which of them are removed later."""
-    return _numbered(_found_in(log, last_of_kind(log, "ct_import")), "sphere")
+    return _numbered(_found_in(log, last_step(log, "ct_surface")), "sphere")
 
 
 def _found_in(log: RunRecord, step: str) -> SpheresFound:

@@ -51,7 +51,7 @@ def outlines_of(log: RunRecord, capture: Capture) -> OutlineSource | None:
             return OutlineSource(
                 f"{artefact[:16]}-{registered.name}",
                 artefact,
-                scan_spheres(log, registered),
+                scan_spheres(log),
                 CameraModel.from_record(registered.record.camera.plain()),
                 CameraModel.from_record((registered.record.full_camera or registered.record.camera).plain()),
                 inverse(np.array(T, dtype=np.float64)),

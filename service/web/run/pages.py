@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
-from service.core.gates.dependence import accepted_gates
+from service.core.gates.dependence import AcceptedGate, accepted_gates
+from service.core.protocol.models import Step
 from service.core.records.entered import about_rows
 from service.core.records.events import RunStarted
+from service.core.recovery.reasons import Reasons
 from service.dataset.registrations import evaluated, shared_adjustment_note
+from service.jobs.registration.evaluate import Row
 from service.monitor.snapshot import read_snapshot
 from service.people.control import Control
-from service.people.person import Person
+from service.people.person import Account, Person
+from service.rig import SigningSection
 from service.run_record import RunRecord, results_to_come
+from service.steps import step_kinds
 from service.store.files.space_used import forecast_of
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
-from service.web.run.notes import notes_of
+from service.web.run.notes import Note, notes_of
 from service.web.run.view import run_view
-from service.web.run.view_records import Viewer
+from service.web.run.view_records import RunView, Viewer
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
@@ -36,14 +42,52 @@ Parts = Annotated[str, part_names("banner", "control", "vitals", "step", "action
 _DRAWINGS = files("service.web.run") / "drawings"
 
 
+@dataclass(frozen=True, slots=True)
+class RunPage:
+    """What the page shows.
+
+    Attributes:
+        view: the run and the step on the screen.
+        acceptors: accounts that may accept the question's figures.
+        looking_back: the step on the screen is not the current one.
+        dialog: the one that is open without script; "" for none.
+        notes: people's notes on the step, or on the whole run once it has ended.
+        about: what was entered when the run began: name and text.
+        reasons: presets of the protocol.
+        signing: what may stand for a password.
+        drawing: beside the instructions.
+        lens_step: the live view belongs to this step.
+        board_plan: version of the plan of the step's board images; 0 for other steps.
+        now_utc: time of the page.
+        depends: acceptances on which the run's results depend.
+        result_table: rows of the evaluation.
+        result_note: what some of these rows share.
+    """
+
+    view: RunView
+    acceptors: list[Account]
+    looking_back: bool
+    dialog: str
+    notes: tuple[Note, ...]
+    about: list[tuple[str, str]]
+    reasons: Reasons
+    signing: SigningSection
+    drawing: Markup
+    lens_step: bool
+    board_plan: int
+    now_utc: str
+    depends: tuple[AcceptedGate, ...]
+    result_table: list[Row]
+    result_note: str
+
+
 @router.get("/runs/{run_id}", name="run", dependencies=[Depends(requires("read"))])
 def run(
     request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, step: Name = "", dialog: Name = ""
 ) -> HTMLResponse:
     """The current step, or another one to look at."""
-    return render(
-        request, "run/run.html.j2", frame=run_frame(site, run_id), **_shown(site, person, run_id, step, dialog)
-    )
+    shown = _shown(site, person, run_id, step, dialog)
+    return render(request, "run/run.html.j2", shown, frame=run_frame(site, run_id))
 
 
 @router.get("/runs/{run_id}/parts/{names}", name="run_parts", dependencies=[Depends(requires("read"))])
@@ -53,11 +97,11 @@ def run_parts(
     """Parts of the page, all from the same moment, for the script that keeps the page up to date."""
     asked = names.split(",")
     frame = run_frame(site, run_id) if "banner" in asked else None
-    shown = {} if asked == ["banner"] else _shown(site, person, run_id, step)
-    return render(request, "run/parts.html.j2", names=asked, of_run=frame, **shown)
+    shown = None if asked == ["banner"] else _shown(site, person, run_id, step)
+    return render(request, "run/parts.html.j2", shown, names=asked, of_run=frame)
 
 
-def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "") -> dict[str, Any]:
+def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "") -> RunPage:
     log = site.run(run_id)
     view = run_view(
         log,
@@ -70,25 +114,25 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
     )
     looking_back = bool(step) and view.shown.id != view.current
     role = view.question.acceptance.role if view.question.acceptance else ""
-    return {
-        "view": view,
+    return RunPage(
+        view=view,
         # Offered by name, so that nobody types one with gloves.
-        "acceptors": [a for a in site.people.accounts.all() if (a.role, a.state) == (role, "active")] if role else [],
-        "looking_back": looking_back,
-        "dialog": dialog,
-        "notes": notes_of(log.events, "" if view.mode == "ended" and not looking_back else view.shown.id),
-        "about": _about(log),
-        "reasons": log.protocol.reasons,
-        "signing": site.rig.section.signing,
-        "drawing": drawing(view.shown.drawing),
+        acceptors=[a for a in site.people.accounts.all() if (a.role, a.state) == (role, "active")] if role else [],
+        looking_back=looking_back,
+        dialog=dialog,
+        notes=notes_of(log.events, "" if view.mode == "ended" and not looking_back else view.shown.id),
+        about=_about(log),
+        reasons=log.protocol.reasons,
+        signing=site.rig.section.signing,
+        drawing=drawing(log.protocol.step(view.shown.id)),
         # Where the camera is set up the lens is focused: the live view belongs there.
-        "lens_step": view.shown.drawing == "camera" and view.shown.current and view.shown.kind == "checklist",
-        "board_plan": _board_plan(log, view.shown.id),
-        "now_utc": datetime.now(UTC).isoformat(),
-        "depends": accepted_gates(log.protocol, log.state),
-        "result_table": evaluated(log.protocol, log.state),
-        "result_note": shared_adjustment_note(log.protocol, log.state),
-    }
+        lens_step=view.shown.drawing == "camera" and view.shown.current and view.shown.only_ticks,
+        board_plan=_board_plan(log, view.shown.id),
+        now_utc=datetime.now(UTC).isoformat(),
+        depends=accepted_gates(log.protocol, log.state),
+        result_table=evaluated(log.protocol, log.state),
+        result_note=shared_adjustment_note(log.protocol, log.state),
+    )
 
 
 def _about(log: RunRecord) -> list[tuple[str, str]]:
@@ -126,6 +170,11 @@ def _drawings() -> dict[str, Markup]:
     return {file.name.removesuffix(".svg"): Markup(file.read_text("utf-8")) for file in found}
 
 
-def drawing(name: str) -> Markup:
-    """A drawing by its name, to stand in a page; empty when there is none of this name."""
-    return _drawings().get(name, Markup(""))
+def drawing(step: Step) -> Markup:
+    """The drawing of a step, to stand in a page: one of ours, or the SVG of a plug-in's kind; empty without one."""
+    kind = step_kinds().get(step.kind)
+    own = "" if kind is None else kind.drawing
+    found = _drawings().get(step.drawing or own)
+    if found is not None:
+        return found
+    return Markup(own if own.startswith("<svg") and not step.drawing else "")

@@ -17,7 +17,6 @@ from service.core.run.decide import AskOperator, decide
 from service.core.run.state import RunState
 from service.dataset.registrations import evaluated
 from service.monitor.snapshot import STOPS, Snapshot
-from service.steps.notes import mending
 from service.web.page.run_words import (
     count,
     drawing_of,
@@ -165,7 +164,8 @@ def _shown(protocol: Protocol, state: RunState, step: Step, *, stopped: bool, un
         title=step.title,
         number=protocol.index(step.id) + 1,
         attempt=now.attempt,
-        kind=step.kind,
+        by_hand=step.by_hand,
+        only_ticks=step.params.only_ticks,
         why=step.why,
         instructions="\n".join(" ".join(part.split()) for part in step.instructions.split("\n\n")),
         drawing=drawing_of(step),
@@ -185,7 +185,7 @@ def _shown(protocol: Protocol, state: RunState, step: Step, *, stopped: bool, un
         skipped=now.skipped,
         started_utc=now.started_utc,
         ended_utc=now.ended_utc,
-        table=evaluated(protocol, state) if step.kind == "evaluation" and now.result else (),
+        table=evaluated(protocol, state) if step.gives == "accuracy" and now.result else (),
         depends=depends_on(protocol, state, step.id),
     )
 
@@ -237,7 +237,7 @@ def _trouble(protocol: Protocol, state: RunState, decision: object) -> StepTroub
     step, now = protocol.step(state.current), state.step
     images = sum(len(there.captured) for there in state.steps.values())
     safe = f"Yes. {count(images, 'image is', 'images are')} recorded, and every result so far."
-    advice = mending(now).advice
+    advice = now.mend.advice if now.mend is not None else ""
     short = stopped_words(protocol, state, decision)
     if now.failure is not None:
         return StepTrouble(f"{step.title} did not work", short, sentence(now.failure.message), safe, advice)

@@ -76,7 +76,8 @@ class StepView:
     title: str
     number: int
     attempt: int
-    kind: str
+    by_hand: bool  # a person takes its images
+    only_ticks: bool  # it is nothing but its checklist
     why: str
     instructions: str
     drawing: str

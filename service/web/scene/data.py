@@ -15,18 +15,18 @@ from service.compute.evaluation.closure import Alignment
 from service.core.geometry import Array, Transform, inverse
 from service.core.records.events import ArtefactRef, View, ViewpointCaptured
 from service.core.units import metres, mm
+from service.dataset.registered_scan import registered_scan
 from service.dataset.registrations import registrations
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
 from service.jobs.registration.register import Registration
 from service.run_record import RunRecord
-from service.steps.kinds import registration
 from service.web.record.images import captures_of
 from service.web.record.known_spheres import (
     ShownRegistration,
     Sphere,
     best_registration,
     ct_spheres,
-    last_of_kind,
+    last_step,
     scan_spheres,
 )
 from service.web.record.live_files import LivePose, read_live_pose
@@ -83,10 +83,10 @@ def scene_of(log: RunRecord) -> KnownScene:
 def _registered(log: RunRecord, registered: ShownRegistration) -> KnownScene:
     record = registered.record
     cameras = {name: np.array(T, dtype=np.float64) for name, T in record.T_scan_camera.items()}
-    spheres = scan_spheres(log, registered)
+    spheres = scan_spheres(log)
     bases, missing = _bases(log, record)
-    scan = log.protocol.step(registered.step).params_as(registration.Params).scan
-    meshes = [ref for ref in log.state.steps[scan].artefacts if ref.kind == "scan_mesh"]
+    scan = registered_scan(log.protocol, log.state)
+    meshes = [ref for ref in log.state.steps[scan].artefacts if ref.kind == "scan_mesh"] if scan else []
     left_out = record.leave_one_out
     seen = {} if left_out is None else {label: int(row[2]) for label, row in left_out.spheres.items()}
     scene = Scene(
@@ -152,7 +152,7 @@ def _live(log: RunRecord) -> KnownScene | None:
         planned=planned,
         bases=T_ct_base,
     )
-    step = last_of_kind(log, "ct_import")
+    step = last_step(log, "ct_surface")
     meshes = [ref for ref in log.state.steps[step].artefacts if ref.kind == "ct_mesh"] if step else []
     return KnownScene(
         scene,

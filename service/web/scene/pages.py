@@ -8,9 +8,11 @@ from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse
 
 from service.core.gates.dependence import accepted_gates
+from service.people.control import Control
 from service.web.page.rendering import render
 from service.web.page.run_frame import run_frame
-from service.web.security.guards import requires
+from service.web.scene.region import drawing_step, drawn_rows
+from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite
 
 router = APIRouter(tags=["scene"])
@@ -35,7 +37,7 @@ FRAME_HEADERS = {
 
 
 @router.get("/runs/{run_id}/scene", name="scene", dependencies=[Depends(requires("read"))])
-def scene(request: Request, site: CurrentSite, run_id: RunId) -> HTMLResponse:
+def scene(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId) -> HTMLResponse:
     """The 3D view in its frame, and everything in it as tables."""
     from service.web.scene.tables import scene_tables  # noqa: PLC0415 - mesh and matching, not needed to start
 
@@ -49,19 +51,32 @@ def scene(request: Request, site: CurrentSite, run_id: RunId) -> HTMLResponse:
         tables=tables,
         depends=accepted_gates(log.protocol, log.state),
         live=not log.state.terminal,
+        drawing=drawing_step(log) if person.may("operate") else "",
+        in_control=Control(site.store).holder(run_id).screen == person.screen,
+        drawn=drawn_rows(log),
     )
 
 
 @router.get("/runs/{run_id}/scene/frame", name="scene_frame", dependencies=[Depends(requires("read"))])
-def scene_frame(request: Request, site: CurrentSite, run_id: RunId, theme: Theme = "auto") -> HTMLResponse:
+def scene_frame(
+    request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, theme: Theme = "auto"
+) -> HTMLResponse:
     """The 3D view alone, for the sandboxed frame."""
-    from service.dataset.scene_view import scene_json  # noqa: PLC0415 - as above
+    from service.dataset.scene_view import scene_json, viewing_frame  # noqa: PLC0415 - as above
     from service.web.scene.data import scene_of, with_mesh  # noqa: PLC0415
 
     log = site.run(run_id)
     now = scene_of(log)
-    figure = scene_json(with_mesh(now, log, site.data))
-    views = sorted(now.scene.bases)
-    response = render(request, "scene/frame.html.j2", figure=figure, theme=theme, stations=views, title="Scene in 3D")
+    whole = with_mesh(now, log, site.data)
+    drawing = bool(person.may("operate") and drawing_step(log))
+    response = render(
+        request,
+        "scene/frame.html.j2",
+        figure=scene_json(whole),
+        theme=theme,
+        stations=sorted(now.scene.bases),
+        title="Scene in 3D",
+        to_view=viewing_frame(whole).tolist() if drawing else None,
+    )
     response.headers.update(FRAME_HEADERS)
     return response

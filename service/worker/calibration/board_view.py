@@ -16,7 +16,9 @@ from service.compute.images.quality import image_quality
 from service.core.errors import ComputeError
 from service.jobs.calibration import board_view as job
 from service.jobs.calibration import calibrate as calibrate_job
+from service.jobs.calibration.records import KnownBoard
 from service.jobs.records import BoardSize
+from service.worker.camera import camera_of
 from service.worker.job import JobAnswer, JobContext
 
 _WHITE = 245.0  # an image counts as white if nearly all grey levels exceed this
@@ -93,7 +95,7 @@ def boards_of(
     )
     if arguments.known is None or board.pattern != "checkerboard":
         return found, {}
-    known = BoardKnowledge.from_record(arguments.known)
+    known = _knowledge(arguments.known)
     greys = [
         read_grey(context.input(image.sha256)) if one.view is None and one.size != (0, 0) else None
         for image, one in zip(images, found, strict=True)
@@ -106,3 +108,15 @@ def boards_of(
         if before.view is None and now.view is not None
     }
     return whole, parts
+
+
+def _knowledge(known: KnownBoard) -> BoardKnowledge:
+    return BoardKnowledge(
+        camera_of(known.camera),
+        np.array(known.T_flange_camera),
+        np.array(known.T_base_board),
+        np.array(known.spread),
+        known.focal,
+        known.centre,
+        known.measured,
+    )

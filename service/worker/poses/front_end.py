@@ -90,6 +90,6 @@ _KEPT = _ColmapChildren()
 
 
 def _front_end(arguments: FrontEndArguments) -> FrontEnd:
-    options = SfmOptions(**arguments.effort)
+    options = SfmOptions(**arguments.effort.set_fields())
     child = _KEPT.children.setdefault(options.seed, ColmapProcess(seed=options.seed))
     return FrontEnd(camera_used(arguments), options, child=child)

@@ -11,7 +11,7 @@ import numpy as np
 
 from service.compute.poses.files.pose_covariance import blocks
 from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
-from service.compute.poses.sfm.estimate import SfmModel, reconstruct, reconstruct_from
+from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct, reconstruct_from
 from service.compute.poses.sfm.options import Mapper, SfmOptions
 from service.compute.poses.sfm.tracks import Tracks
 from service.compute.scene import PosedImages, ScanSpheres
@@ -19,6 +19,7 @@ from service.core.geometry import Array
 from service.core.units import mm
 from service.jobs.poses import hybrid as hybrid_job
 from service.jobs.poses import structure_from_motion as sfm_job
+from service.jobs.poses.structure_from_motion import ModelFile
 from service.jobs.records import Hash, Photograph, matrices, matrix
 from service.worker.camera import camera_used
 from service.worker.job import JobAnswer, JobContext
@@ -31,7 +32,7 @@ from service.worker.registration.outlines import read_outlines
 def structure_from_motion(context: JobContext[sfm_job.Arguments]) -> JobAnswer:
     """Run each mapper on the same features; the prior poses only select which pairs are matched."""
     arguments = context.arguments
-    options = SfmOptions(**arguments.effort)
+    options = SfmOptions(**arguments.effort.set_fields())
     reconstructed = (
         _from_images(context, options)
         if arguments.features is None
@@ -72,17 +73,11 @@ def _from_pieces(
     features = read_features(context, files)
     matches = read_matches(context, arguments.matches, features, prior, options)
 
+    workspace = SfmWorkspace(context.scratch, camera_used(arguments), options, context.progress)
+
     def reconstructed(mapper: Mapper) -> SfmModel:
-        return reconstruct_from(
-            features,
-            matches,
-            camera_used(arguments),
-            context.scratch,
-            mapper,
-            T_world_camera_start=prior if mapper == "triangulated" else None,
-            options=options,
-            progress=context.progress,
-        )
+        start = prior if mapper == "triangulated" else None
+        return reconstruct_from(features, matches, workspace, mapper, T_world_camera_start=start)
 
     return reconstructed
 
@@ -91,15 +86,8 @@ def _from_images(context: JobContext[sfm_job.Arguments], options: SfmOptions) ->
     """Compute everything in this job, as in old runs, which had no jobs for features and matches."""
     images = context.arguments.images
     files = dict(zip((image.viewpoint for image in images), photographs(context, images), strict=True))
-    return partial(
-        reconstruct,
-        files,
-        camera_used(context.arguments),
-        context.scratch,
-        T_world_camera_prior=_prior(context.arguments) or None,
-        options=options,
-        progress=context.progress,
-    )
+    workspace = SfmWorkspace(context.scratch, camera_used(context.arguments), options, context.progress)
+    return partial(reconstruct, files, workspace, T_world_camera_prior=_prior(context.arguments) or None)
 
 
 def _prior(arguments: sfm_job.Arguments) -> dict[str, Array]:
@@ -110,7 +98,7 @@ def hybrid(context: JobContext[hybrid_job.Arguments]) -> JobAnswer:
     """Adjust the tracks of a model, the robot's poses and the registration spheres together."""
     arguments = context.arguments
     camera = camera_used(arguments)
-    model = context.input_json(arguments.model)["T_world_camera"]
+    model = ModelFile.model_validate(context.input_json(arguments.model)).T_world_camera
     images = [image for image in arguments.images if image.viewpoint in model]
     names = [image.viewpoint for image in images]
     stations = sorted({image.station for image in images})

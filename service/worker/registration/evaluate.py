@@ -81,7 +81,7 @@ def evaluate(context: JobContext[job.Arguments]) -> JobAnswer:
     for name, record in arguments.registrations.items():
         registered = _registered(arguments, name, record, measured, read)
         budget = _budget(registered, measured, radius_m)
-        budgets[name] = job.ErrorBudget.model_validate(budget.as_json())
+        budgets[name] = budget_record(budget)
         table.append(_row(registered, budget, _errors(registered, measured, radius_m)))
         pictures[name] = partial(_overlays, context, registered, measured, radius_m)
     best = best_row(table)
@@ -100,6 +100,29 @@ def evaluate(context: JobContext[job.Arguments]) -> JobAnswer:
     refs.append(context.keep_json(answer.plain()["table"], kind="evaluation", name="evaluation.json"))
     refs.append(context.keep_json(answer.plain()["budgets"], kind="error_budget", name="error_budget.json"))
     return JobAnswer(measures, tuple(refs), answer)
+
+
+def budget_record(budget: ErrorBudget) -> job.ErrorBudget:
+    """The record of an error budget, in millimetres."""
+    return job.ErrorBudget(
+        contributions=tuple(
+            job.Contribution(name=c.name, sigma_mm=mm(c.sigma_m), how=c.how, counted=c.counted)
+            for c in budget.contributions
+        ),
+        total_mm=mm(budget.total_m),
+        observations=tuple(
+            job.Observation(
+                name=o.name,
+                observed_mm=mm(o.observed_m),
+                predicted_mm=mm(o.predicted_m),
+                normalised_chi2=o.normalised_chi2,
+                n=o.n,
+                how=o.how,
+                verdict=o.verdict,
+            )
+            for o in budget.observations
+        ),
+    )
 
 
 def _row(registered: _Registered, budget: ErrorBudget, errors: _Errors) -> job.Row:

@@ -16,6 +16,7 @@ from service.compute.markers.search.image_files import LocatedOutlines, detect_a
 from service.compute.markers.search.paper_files import detect_file_by_masks
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
+from service.jobs.poses.structure_from_motion import ModelFile
 from service.jobs.records import Hash, Photograph
 from service.jobs.registration import detect_spheres as job
 from service.worker.camera import camera_used
@@ -59,7 +60,7 @@ def _posed(context: JobContext[job.Arguments]) -> tuple[Sequence[Photograph], Ar
     arguments = context.arguments
     if arguments.model is None:
         return arguments.images, None
-    model = context.input_json(arguments.model)["T_world_camera"]
+    model = ModelFile.model_validate(context.input_json(arguments.model)).T_world_camera
     images = tuple(image for image in arguments.images if image.viewpoint in model)
     return images, np.array([model[image.viewpoint] for image in images])
 

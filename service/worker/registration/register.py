@@ -20,6 +20,7 @@ from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, inverse
 from service.core.units import mm
 from service.jobs.poses.hybrid import HybridModel
+from service.jobs.poses.structure_from_motion import ModelFile
 from service.jobs.records import ParameterCovariance, Photograph, matrices, matrix
 from service.jobs.registration import register as job
 from service.worker.camera import camera_record, camera_reduced, camera_used
@@ -110,7 +111,7 @@ def _posed_images(context: JobContext[job.Arguments]) -> _PosedImages:
     elif arguments.model is None:
         raise DataError(f"a registration with {arguments.poses} poses needs the file of these poses")
     else:
-        model = context.input_json(arguments.model)["T_world_camera"]
+        model = ModelFile.model_validate(context.input_json(arguments.model)).T_world_camera
         images = tuple(image for image in images if image.viewpoint in model)
         poses = np.array([model[image.viewpoint] for image in images])
         groups = [0] * len(images)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +16,6 @@ from service.compute.layout.ambiguity import (
     check_layout,
     layout_bounds,
     layout_measures,
-    layout_record,
 )
 from service.compute.layout.photo_adjustment import LensPrior, Photograph
 from service.compute.layout.photographs import PhotoLayout, layout_from_photographs
@@ -30,6 +28,7 @@ from service.core.geometry import Array
 from service.core.units import mm
 from service.jobs.surfaces import layout as job
 from service.worker.job import JobAnswer, JobContext
+from service.worker.surfaces.records import judged_layout
 
 # The lens is not calibrated yet, and its distortion deforms the ellipses of the outlines. In an image of 9504 px this
 # exceeds the noise of the edges, so that ten of thirteen good outlines were rejected: copies of smaller width are
@@ -56,15 +55,15 @@ def layout(context: JobContext[job.Arguments]) -> JobAnswer:
         "photographs_used": float(found.used),
         **layout_measures(report),
     }
-    details = {
-        **layout_record(report),
-        "chi2": found.chi2,
-        "photographs": [_photograph_record(ids, o) for ids, (_, o) in zip(found.spheres, seen, strict=True)],
-        "moves": [_move_record(move, seen[-1][0]) for move in shown],
-    }
+    details = job.LayoutDetails(
+        **judged_layout(report).set_fields(),
+        chi2=found.chi2,
+        photographs=tuple(_searched(ids, o) for ids, (_, o) in zip(found.spheres, seen, strict=True)),
+        moves=tuple(_move_record(move, seen[-1][0]) for move in shown),
+    )
     picture = _picture(pixels, seen[-1][0], seen[-1][1], found.spheres[-1], shown)
     overlay = context.keep_bytes(picture, kind="layout_overlay", media_type="image/jpeg", name="layout.jpg")
-    answer = job.Answer.model_validate({"spheres_m": found.centres_m.tolist(), "details": details})
+    answer = job.Answer(spheres_m=found.centres_m.tolist(), details=details)
     return JobAnswer(measures, (overlay,), answer)
 
 
@@ -142,20 +141,16 @@ def _up(centres: Array) -> Array:
     return np.asarray(axes[2] if axes[2, 2] < 0 else -axes[2], dtype=np.float64)
 
 
-def _photograph_record(ids: NDArray[np.int64], outlines: Sequence[SphereOutline]) -> dict[str, Any]:
+def _searched(ids: NDArray[np.int64], outlines: Sequence[SphereOutline]) -> job.SearchedPhotograph:
     shown = zip(ids.tolist(), outlines, strict=False)
-    return {"used": bool(len(ids)), "spheres": {str(i): list(o.centre_px) for i, o in shown if i >= 0}}
+    return job.SearchedPhotograph(used=bool(len(ids)), spheres={str(i): o.centre_px for i, o in shown if i >= 0})
 
 
-def _move_record(move: PhotographedMove, camera: CameraModel) -> dict[str, Any]:
+def _move_record(move: PhotographedMove, camera: CameraModel) -> job.SphereMove:
     """The move as recorded; places are fractions of the image's width and height."""
     size = np.array([camera.width, camera.height])
-    return {
-        "words": move.words,
-        "from": (move.from_px / size).tolist(),
-        "to": (move.to_px / size).tolist(),
-        "higher_mm": mm(move.higher_m),
-    }
+    places = {"from": (move.from_px / size).tolist(), "to": (move.to_px / size).tolist()}
+    return job.SphereMove.model_validate({"words": move.words, **places, "higher_mm": mm(move.higher_m)})
 
 
 def _picture(

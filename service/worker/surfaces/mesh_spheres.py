@@ -7,20 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.layout.ambiguity import check_layout, layout_measures, layout_record
+from service.compute.layout.ambiguity import check_layout, layout_measures
 from service.compute.layout.confusions import SUBSET as LAYOUT_SUBSET
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.isosurface import surface
 from service.compute.surfaces.loop_closure import LoopClosure, close_loop
 from service.compute.surfaces.spheres.mesh_spheres import locate_spheres as find_spheres
-from service.compute.surfaces.spheres.records import sphere_record
 from service.core.geometry import Array
 from service.core.units import mm
 from service.jobs.records import LoopClosure as LoopClosureRecord
-from service.jobs.records import MeasuredSphere, SphereChange, SphereDetails, SpheresFound, matrix
+from service.jobs.records import SphereChange, SphereDetails, SpheresFound, matrix
 from service.jobs.surfaces import ct_surface as ct_job
 from service.jobs.surfaces import locate_spheres as locate_job
 from service.worker.job import JobAnswer, JobContext
+from service.worker.surfaces.records import judged_layout, measured_sphere
 
 
 def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
@@ -55,10 +55,10 @@ def _search(arguments: ct_job.Arguments | locate_job.Arguments, vertices_m: Arra
         "sphere_rms_max_mm": mm(max(s.rms_m for s in spheres)),
         "sphere_sigma_max_mm": mm(max(float(np.sqrt(np.trace(s.covariance))) for s in spheres)),
     }
-    details = SphereDetails(spheres=tuple(MeasuredSphere.model_validate(sphere_record(s)) for s in spheres))
+    details = SphereDetails(spheres=tuple(measured_sphere(s) for s in spheres))
     if layout is not None:
         measures |= layout_measures(layout)
-        details = details.model_copy(update={"layout": layout_record(layout)})
+        details = details.model_copy(update={"layout": judged_layout(layout)})
     if isinstance(arguments, locate_job.Arguments) and arguments.reference_m is not None:
         reference = np.array(arguments.reference_m)
         match = match_constellations(reference, centres)

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -40,6 +39,7 @@ from service.core.geometry import Array, Transform, from_rotation_vector, to_rot
 from service.core.records.events import OperatorAction
 from service.core.records.import_list import ImportList
 from service.core.run.decide import AskOperator
+from service.core.run.noted import HandWork
 from service.core.run.state import RunState
 from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, LensSection, OpticsSection
@@ -361,8 +361,8 @@ class ScriptedOperator:
     busy_with: list[str] = field(default_factory=list[str])
     attended: list[tuple[Doing, bool]] = field(default_factory=list[tuple[Doing, bool]])
     prepared: list[tuple[str, int]] = field(default_factory=list[tuple[str, int]])
-    mended: list[tuple[str, int, tuple[Mapping[str, Any], ...]]] = field(
-        default_factory=list[tuple[str, int, tuple[Mapping[str, Any], ...]]]
+    mended: list[tuple[str, int, tuple[HandWork, ...]]] = field(
+        default_factory=list[tuple[str, int, tuple[HandWork, ...]]]
     )
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
@@ -391,7 +391,7 @@ class ScriptedOperator:
         self.prepared.append((step, attempt))
         self.on_prepare()
 
-    def mend(self, step: str, attempt: int, hands: Sequence[Mapping[str, Any]]) -> None:
+    def mend(self, step: str, attempt: int, hands: Sequence[HandWork]) -> None:
         self.mended.append((step, attempt, tuple(hands)))
 
 

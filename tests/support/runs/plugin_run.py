@@ -14,14 +14,12 @@ from service.audit.provenance.graph import graphs
 from service.audit.record.run import read_run
 from service.audit.replay.replay import replay
 from service.core.protocol.models import parse_protocol
-from service.jobs.words import term
 from service.steps import params_models
 from service.steps.protocol_check import implausible
 from service.store.signatures.signing import checkpoint
-from service.store.store import Store
-from service.web.page.run_words import drawing_of, will_happen
+from service.web.audit.frame import AuditState
 from service.worker.loop import work
-from tests.support.runs.bench_run import begin_run
+from tests.support.pages.web import WebSite, web_site
 
 PROTOCOL = """\
 id: weighed
@@ -43,36 +41,48 @@ def quiet(_what: str, _done: int, _total: int) -> None:
 
 def main(folder: Path) -> None:
     """Print everything as one line of JSON."""
-    with Store.open(folder / "data") as store:
-        bench = begin_run(store, PROTOCOL, folder)
-        waiting = bench.state()
+    with web_site(folder) as web:
+        bench = web.begin_run(PROTOCOL)
+        technician = web.browser("technician")
+        web.take_control(bench.run_id, technician)
+        web.site.launcher.start(bench.run_id)
+        run_page = technician.get(f"/runs/{bench.run_id}").text
 
         def compute(_seconds: float) -> None:
-            work(store, until_idle=True, stop=lambda: False, progress=quiet)
+            work(web.store, until_idle=True, stop=lambda: False, progress=quiet)
 
         bench.on_wait = compute
         state = bench.run()
-        checkpoint(store, bench.run_id)
-        computed = graphs(store)
+        checkpoint(web.store, bench.run_id)
+        computed = graphs(web.store)
         graph = computed.get(bench.run_id, wait_s=60)
-        computed.close()
         assert not isinstance(graph, Progress)
+        audit_page = _provenance_page(web, bench.run_id)
+        computed.close()
     run = read_run(folder / "data", bench.run_id)
-    step = run.protocol.step("scales")
     wrong = parse_protocol(PROTOCOL.replace("weight_g", "weight_mg").encode(), params_models(), name="wrong.yaml")
     said = {
         "status": state.status,
         "measures": dict(state.steps["scales"].measures),
-        "button": will_happen(step, waiting.steps["scales"])[0],
-        "drawing": drawing_of(step),
+        "run_page": run_page,
         "drawn": [[box.node.kind, box.node.is_job] for box in draw(graph).boxes],
-        "words": term("weigh"),
+        "audit_page": audit_page,
         "replayed": [[job.kind, job.verdict] for job in replay(run, progress=quiet).jobs],
         "problems": [str(problem) for problem in implausible(wrong)],
         "step_page": steps_text({}),
         "job_page": jobs_text(),
     }
     print(json.dumps(said))  # noqa: T201 - the test reads it
+
+
+def _provenance_page(web: WebSite, run_id: str) -> str:
+    """The auditor's page once its graph is computed, which the first request asks for."""
+    auditor = web.browser("auditor")
+    address = f"/audit/runs/{run_id}/provenance"
+    auditor.get(address)
+    state: AuditState = web.app.state.audit
+    state.graphs.get(run_id, wait_s=60)
+    return auditor.get(address).text
 
 
 if __name__ == "__main__":

@@ -65,13 +65,14 @@ steps:
 """
 
 
-def record_run(folder: Path, *, complete: bool = True, version: int = 1) -> str:
+def record_run(folder: Path, *, complete: bool = True, version: int = 1, protocol: str = PROTOCOL) -> str:
     """Record a run in folder/data, from its first event to its last; returns its id.
 
-    With version 1 its jobs hold copies of earlier results, with version 2 references to them.
+    With version 1 its jobs hold copies of earlier results, with version 2 references to them. A protocol may have
+    steps after those of PROTOCOL, which are not done.
     """
     (folder / "rig.yaml").write_text("name: small\nsimulated: true\ndevices: {}\n")
-    loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="recorded.yaml")
+    loaded = parse_protocol(protocol.encode(), params_models(), name="recorded.yaml")
     with Store.open(folder / "data") as store:
         run_id = start_run(store, loaded, load_rig(folder / "rig.yaml"), operator="Ada", auto_confirm=False)
         software = software_versions() | {"numpy": "1.0.0-recorded"}

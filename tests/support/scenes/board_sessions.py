@@ -18,7 +18,8 @@ from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, align_points, apply, inverse, look_at, transform
 from service.rig import LensSection
-from service.steps.board.plan import BoardPoses, Planner, nominal_board, nominal_camera, preview_board
+from service.steps.board.plan import Planner, nominal_board, nominal_camera, preview_board
+from service.steps.board.poses import BoardPoses
 from service.steps.capture.plan.viewpoints import ViewpointSet, flange_target, plan_viewpoints
 from service.steps.context import StationLayout
 from simulators.scene.arm import ARM_MODEL

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +13,9 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.masks import Ball, posts_below
+from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.rays import pixel_rays
 from service.compute.pixels.splits import splits
-from service.compute.pixels.surface import Surface
 from service.core.geometry import Array, Transform, apply, inverse, look_at
 from service.dataset.posed.pixels import Photographs
 from service.dataset.posed.records import DataSet, Mesh, View
@@ -55,6 +56,17 @@ def scene() -> Scene:
     return Scene(mesh, tuple(Ball(np.array(centre), 0.012) for centre in at))
 
 
+def reach(eye: Array, directions: Array) -> Array:
+    """(N,) how many times the directions (N, 3) from the eye (3,) the nearer box is away; inf: none is hit."""
+    found = np.full(len(directions), np.inf)
+    for low, high in BOXES_M:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (low - eye) / directions, (high - eye) / directions
+        near, far = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+        found = np.minimum(found, np.where((near <= far) & (near > 0), near, np.inf))
+    return found
+
+
 def poses(count: int) -> dict[str, Transform]:
     """T_world_camera by name, around the scene."""
     angles = np.linspace(0.2, 2 * np.pi, count, endpoint=False)
@@ -62,11 +74,19 @@ def poses(count: int) -> dict[str, Transform]:
     return {f"v1_{k:03d}": look_at(eye, np.array([0.01, 0.02, 0.02]), UP) for k, eye in enumerate(eyes)}
 
 
-def posed_data_set(folder: Path, count: int = 4, *, camera: CameraModel = CAMERA, simulated: bool = True) -> DataSet:
-    """Paint the photographs into a folder, and give the data set of them."""
+def posed_data_set(
+    folder: Path,
+    count: int = 4,
+    *,
+    camera: CameraModel = CAMERA,
+    simulated: bool = True,
+    tone: Callable[[Array], Array] | None = None,
+) -> DataSet:
+    """Paint the photographs into a folder, and give the data set of them; `tone` replaces that of the scene."""
     shown = scene()
+    painted = shown.tone if tone is None else tone
     vertices, faces = np.asarray(shown.mesh.vertices), np.asarray(shown.mesh.faces, dtype=np.int64)
-    surface = Surface(vertices, faces)
+    surface = RayMesh(vertices, faces)
     covariance = np.diag([1e-10, 1e-10, 2e-10, 1e-9, 1e-9, 3e-9])
     views = tuple(View(name, ".png", camera, T, covariance) for name, T in poses(count).items())
     files = {view.name: folder / view.file for view in views}
@@ -75,8 +95,8 @@ def posed_data_set(folder: Path, count: int = 4, *, camera: CameraModel = CAMERA
         depth = blank.depth_m(view).astype(np.float64)[..., None]
         xy = pixel_rays(camera).xy(0, camera.height)
         world = apply(view.T_world_camera, np.concatenate([xy * depth, depth], axis=2))
-        tone = np.where(depth[..., 0] > 0, shown.tone(world), 20.0).astype(np.uint8)
-        cv2.imwrite(str(files[view.name]), np.dstack([tone, tone // 2, tone // 3]))
+        grey = np.where(depth[..., 0] > 0, painted(world), 20.0).astype(np.uint8)
+        cv2.imwrite(str(files[view.name]), np.dstack([grey, grey // 2, grey // 3]))
     points = trimesh.sample.sample_surface(shown.mesh, 300, seed=1)[0]
     sees: dict[str, NDArray[np.bool_]] = {}
     for view in views:

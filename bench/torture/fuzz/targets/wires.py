@@ -21,7 +21,8 @@ from bench.torture.fuzz.mutations import BYTES, JSON, TEXT
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
 from drivers.lightbox import LightboxConfig, SerialLightbox
 from drivers.ur.link import read_facts
-from service.cli.run.hands import SimulatedHands
+from service.cli.run.terminal.hands import SimulatedHands
+from service.core.run.noted import HandWork
 from service.store.events import canonical
 from simulators.faults import FaultPlan
 from simulators.lightbox import Lightbox
@@ -358,7 +359,7 @@ def _hands_answers(_: Path) -> list[bytes]:
 
 def _hands(data: bytes, _: Path) -> None:
     with _Answering("127.0.0.1", 0, [data]) as port:
-        SimulatedHands(f"127.0.0.1:{port}").act("fixation", 1, [{"action": "spray"}])
+        SimulatedHands(f"127.0.0.1:{port}").act("fixation", 1, [HandWork(action="spray")])
 
 
 _SIMULATOR: dict[str, Any] = {"errors": (SimulatorError,), "says_place": False}
@@ -374,5 +375,5 @@ TARGETS: tuple[Target, ...] = (
     Target("fault_plan", "simulators.faults:FaultPlan.parse", _fault_plan, _fault_plans, JSON, **_SIMULATOR),
     Target("ur_facts", "drivers.ur.link:read_facts", _facts, _dashboard_answers, TEXT, pace=0.5),
     Target("lightbox_answers", "drivers.lightbox:SerialLightbox", _box_driver, _box_answers, _BOTH, pace=0.2),
-    Target("hands_answers", "service.cli.run.hands:SimulatedHands", _hands, _hands_answers, JSON, pace=0.5),
+    Target("hands_answers", "service.cli.run.terminal.hands:SimulatedHands", _hands, _hands_answers, JSON, pace=0.5),
 )

@@ -18,7 +18,6 @@ from service.compute.arm.joint_file import read_joints_csv
 from service.compute.calibration.hand_eye.record import read_arm_correction
 from service.compute.camera_model import CameraModel
 from service.compute.markers.search.paper_files import read_boxes
-from service.compute.poses.colmap.model_files import write_model
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json, write_camera_json
 from service.compute.poses.files.pose_files import (
     read_colmap_model,
@@ -191,14 +190,18 @@ def _unpack(data: bytes, folder: Path, suffix: str) -> None:
 
 
 def _text_models(folder: Path) -> list[bytes]:
-    write_model(folder, CAMERA, _poses())
+    from tests.support.scenes.colmap_model import write_colmap_text  # noqa: PLC0415 - loads pycolmap, which takes a second
+
+    write_colmap_text(folder, CAMERA, _poses())
     return [_packed({part: (folder / f"{part}.txt").read_bytes() for part in MODEL_PARTS})]
 
 
 def _binary_models(folder: Path) -> list[bytes]:
     import pycolmap  # noqa: PLC0415 - takes a second, and only this needs it
 
-    write_model(folder, CAMERA, _poses())
+    from tests.support.scenes.colmap_model import write_colmap_text  # noqa: PLC0415 - loads pycolmap
+
+    write_colmap_text(folder, CAMERA, _poses())
     (folder / "binary").mkdir()
     pycolmap.Reconstruction(str(folder)).write_binary(str(folder / "binary"))
     return [_packed({part: (folder / "binary" / f"{part}.bin").read_bytes() for part in MODEL_PARTS})]

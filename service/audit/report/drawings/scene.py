@@ -58,11 +58,11 @@ class _Geometry:
 def report_scene(summary: RunSummary, *, turning: bool) -> Scene | None:
     """Cameras, spheres and mesh in one frame; None without a registration. `turning`: also for a browser."""
     best, registrations = summary.best(), summary.registrations()
-    spheres = summary.scan_spheres_m()
-    if best is None or best not in registrations or not spheres or not summary.artefacts("scan_mesh"):
+    spheres, scan = summary.scan_spheres_m(), summary.scan_mesh_file()
+    if best is None or best not in registrations or not spheres or scan is None:
         return None
     try:
-        summary.store.artefact_path(summary.artefacts("scan_mesh")[-1].sha256, verify=True)
+        summary.store.artefact_path(scan.sha256, verify=True)
     except IntegrityError:
         return None  # the first page names the file
     registered = registrations[best]

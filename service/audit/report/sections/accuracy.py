@@ -62,7 +62,7 @@ def result_sentence(summary: RunSummary) -> Cell:
 
 def rests_on(summary: RunSummary) -> tuple[str, ...]:
     """The accepted gates on which the evaluation rests, in words."""
-    evaluations = [step.id for step in summary.protocol.steps if step.kind == "evaluation"]
+    evaluations = [step.id for step in summary.protocol.steps if step.gives == "accuracy"]
     gates = (gate for step in evaluations for gate in depends_on(summary.protocol, summary.state, step))
     return tuple(dict.fromkeys(f"Depends on an accepted gate: {gate.text}" for gate in gates))
 

@@ -26,7 +26,7 @@ def certificate_sections(run: RecordedRun) -> Iterator[Section]:
     for step in run.protocol.steps:
         state = run.state.steps[step.id]
         kept = [ref for ref in state.artefacts if ref.kind == "calibration"]
-        if step.kind == "calibration" and state.result and kept:
+        if step.gives == "calibration" and state.result and kept:
             solved = calibrate.KIND.read_answer(state.result)
             blocks = (
                 _facts(run, step.id, kept[-1].sha256, solved),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.board_poses.knowledge import BoardKnowledge
+from service.compute.calibration.board_poses.view_range import ViewRange
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 
@@ -18,16 +19,6 @@ _ROUNDS = 4
 _MARGIN = 0.006  # of the image's width, on top of all uncertainty
 _DRAWS, _CHECKED = 16, 64
 _MOST = 800
-
-
-@dataclass(frozen=True, slots=True)
-class ViewRange:
-    """The wanted range of views of the board."""
-
-    tilts_deg: tuple[float, ...] = (4.0, 14.0, 24.0, 32.0, 38.0)  # of the optical axis from the board's normal
-    rolls_deg: tuple[float, ...] = (0.0, 12.0, -12.0, 180.0, 168.0, 192.0)  # of the image about the optical axis
-    distances_m: tuple[float, ...] = (0.62, 0.68, 0.74)
-    azimuths: int = 16
 
 
 @dataclass(frozen=True, slots=True)

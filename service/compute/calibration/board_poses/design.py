@@ -86,12 +86,54 @@ class ChosenViews:
 NOTHING = ChosenViews(np.zeros((0, 4, 4)))
 
 
+@dataclass(frozen=True, slots=True)
+class DesignProblem:
+    """What images of the board are to determine.
+
+    Attributes:
+        known: estimates of camera, mount and board.
+        board: the board.
+        aims: calibrations and targets.
+    """
+
+    known: BoardKnowledge
+    board: Board
+    aims: CalibrationTargets
+
+    def as_taken(self, T_base_camera: Array) -> ChosenViews:
+        """Poses (K, 4, 4) as if their images were taken, with the board's points at their expected pixels."""
+        poses = T_base_camera.reshape(-1, 4, 4)
+        return ChosenViews(poses, tuple(expected_pixels(self.known, self.board, poses)))
+
+    def predict(self, taken: ChosenViews) -> Prediction:
+        """What calibrations from these images will achieve."""
+        known, board, sigma_px = self.known, self.board, self.aims.corner_sigma_px
+        counts = _counts(taken.pixels, known)
+        boards = np.array([inverse(T) @ known.T_base_board for T in taken.T_base_camera]).reshape(-1, 4, 4)
+        worst_mm = uncertainty_mm(boards, known.camera, board, sigma_px) if len(boards) >= 3 else np.nan
+        sigma_mm = sigma_deg = np.nan
+        if len(boards) >= 3:
+            information = hand_eye_information(taken.T_base_camera, known, board, sigma_px).sum(axis=0)
+            covariance = inverse_of(information[None])[0]
+            sigma_mm = mm(float(np.sqrt(np.trace(covariance[:3, :3]))))
+            sigma_deg = deg(np.sqrt(np.trace(covariance[3:6, 3:6])))
+        tilts = np.degrees(np.arccos(np.clip(np.abs(boards[:, 2, 2]), 0, 1)))
+        return Prediction(
+            images=len(boards),
+            coverage=float(np.count_nonzero(counts)) / counts.size,
+            coverage_map=counts,
+            uncertainty_mm=worst_mm,
+            tilt_deg=float(tilts.max(initial=0.0)),
+            rotation_spread_deg=_spread_deg(boards),
+            hand_eye_sigma_mm=sigma_mm,
+            hand_eye_sigma_deg=sigma_deg,
+        )
+
+
 def choose_poses(
+    problem: DesignProblem,
     candidates: Candidates,
     count: int,
-    known: BoardKnowledge,
-    board: Board,
-    aims: CalibrationTargets,
     *,
     taken: ChosenViews = NOTHING,
     feasible: Callable[[Transform], bool] = lambda _T: True,
@@ -101,98 +143,59 @@ def choose_poses(
     """Up to `count` of the candidates' poses (K, 4, 4), in the order of their gain.
 
     Args:
+        problem: what the images are to determine.
         candidates: to choose from.
         count: largest number of poses.
-        known: estimates of camera, mount and board.
-        board: the board.
-        aims: calibrations and targets.
         taken: images that count already.
         feasible: whether the arm can go there; asked only for the best candidates.
         enough: asked after each pose; once it returns True, no more are chosen.
         seed: of the random samples of later picks.
     """
     rng = np.random.default_rng([seed, 0x9A5E])
-    worth = _InformationGain(known, board, aims)
-    cells = _cells(candidates.pixels, known, _CELL_SHARE)
-    covered = _covered(taken.pixels, known)
+    worth = _InformationGain(problem)
+    cells = _cells(candidates.pixels, problem.known, _CELL_SHARE)
+    covered = _covered(taken.pixels, problem.known)
     gains = worth.gains(candidates.T_base_camera)
     so_far = worth.start(taken.T_base_camera)
     open_ = np.ones(len(cells), dtype=bool)
     chosen: list[int] = []
     while len(chosen) < count and open_.any():
-        fresh = (cells & ~covered).sum(axis=1)
-        wanted = covered.mean() < aims.coverage and bool((fresh[open_] > 0).any())
         pool = np.flatnonzero(open_)
+        fresh = (cells[pool] & ~covered).sum(axis=1)
+        wanted = covered.mean() < problem.aims.coverage and bool((fresh > 0).any())
         if not wanted and len(pool) > _OPEN:
             pool = rng.choice(pool, _OPEN, replace=False)
         cost = worth.cost(so_far, gains, pool)
-        order = np.lexsort((cost, -fresh[pool])) if wanted else np.argsort(cost)
-        best = -1
-        for k in pool[order[:_TRIED]].tolist():
-            if feasible(candidates.T_base_camera[k]):
-                best = k
-                break
-            open_[k] = False
-        if best < 0:
+        order = np.lexsort((cost, -fresh)) if wanted else np.argsort(cost)
+        best = _first(pool[order[:_TRIED]], open_, lambda k: feasible(candidates.T_base_camera[k]))
+        if best is None:
             continue
-        open_[best] = False
         chosen.append(best)
         covered |= cells[best]
         so_far = worth.plus(so_far, gains, best)
-        if enough is not None and enough(_of_chosen(candidates, chosen, known, board, aims, taken)):
-            break
+        if enough is not None:
+            more = candidates.take(np.array(chosen, dtype=np.int64))
+            if enough(problem.predict(taken.plus(more.T_base_camera, list(more.pixels)))):
+                break
     return candidates.T_base_camera[chosen]
 
 
-def _of_chosen(
-    candidates: Candidates,
-    chosen: list[int],
-    known: BoardKnowledge,
-    board: Board,
-    aims: CalibrationTargets,
-    taken: ChosenViews,
-) -> Prediction:
-    more = candidates.take(np.array(chosen, dtype=np.int64))
-    return predict(taken.plus(more.T_base_camera, list(more.pixels)), known, board, aims)
-
-
-def as_taken(known: BoardKnowledge, board: Board, T_base_camera: Array) -> ChosenViews:
-    """Poses as if their images were taken, with the board's points at their expected pixels."""
-    poses = T_base_camera.reshape(-1, 4, 4)
-    return ChosenViews(poses, tuple(expected_pixels(known, board, poses)))
-
-
-def predict(taken: ChosenViews, known: BoardKnowledge, board: Board, aims: CalibrationTargets) -> Prediction:
-    """Predict what calibrations from images at these poses will achieve."""
-    counts = _counts(taken.pixels, known)
-    boards = np.array([inverse(T) @ known.T_base_board for T in taken.T_base_camera]).reshape(-1, 4, 4)
-    worst_mm = uncertainty_mm(boards, known.camera, board, aims.corner_sigma_px) if len(boards) >= 3 else np.nan
-    sigma_mm = sigma_deg = np.nan
-    if len(boards) >= 3:
-        information = hand_eye_information(taken.T_base_camera, known, board, aims.corner_sigma_px).sum(axis=0)
-        covariance = inverse_of(information[None])[0]
-        sigma_mm = mm(float(np.sqrt(np.trace(covariance[:3, :3]))))
-        sigma_deg = deg(np.sqrt(np.trace(covariance[3:6, 3:6])))
-    tilts = np.degrees(np.arccos(np.clip(np.abs(boards[:, 2, 2]), 0, 1)))
-    return Prediction(
-        images=len(boards),
-        coverage=float(np.count_nonzero(counts)) / counts.size,
-        coverage_map=counts,
-        uncertainty_mm=worst_mm,
-        tilt_deg=float(tilts.max(initial=0.0)),
-        rotation_spread_deg=_spread_deg(boards),
-        hand_eye_sigma_mm=sigma_mm,
-        hand_eye_sigma_deg=sigma_deg,
-    )
+def _first(ranked: NDArray[np.int64], open_: NDArray[np.bool_], feasible: Callable[[int], bool]) -> int | None:
+    """The first feasible candidate, or None; it and those before it are no longer open."""
+    for k in ranked.tolist():
+        open_[k] = False
+        if feasible(k):
+            return k
+    return None
 
 
 class _InformationGain:
     """Information gained by poses, and the variance left by a set of them."""
 
-    def __init__(self, known: BoardKnowledge, board: Board, aims: CalibrationTargets) -> None:
-        self.known, self.board, self.aims = known, board, aims
-        self.prior = lens_prior(known.camera)
-        self.field = lens_field(known.camera)
+    def __init__(self, problem: DesignProblem) -> None:
+        self.known, self.board, self.aims = problem.known, problem.board, problem.aims
+        self.prior = lens_prior(problem.known.camera)
+        self.field = lens_field(problem.known.camera)
 
     def gains(self, T_base_camera: Array) -> tuple[Array, Array]:
         """(C, 8, 8) of the camera and (C, 12, 12) of mount and board."""

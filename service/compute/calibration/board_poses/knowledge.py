@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,11 +13,13 @@ from service.compute.calibration.hand_eye.weighted import linearise
 from service.compute.calibration.intrinsics.adjustment import parameters_of
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
 from service.compute.camera_model import CameraModel
+from service.compute.descent import gauss_newton
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, increment, inverse, skew, transform
 
 _ARM_M, _ARM_RAD = 0.7e-3, 1e-3  # per axis: pose error of an uncalibrated arm
-_ROUNDS = 6
+_MOST_STEPS = 6
+_SETTLED = 1e-10  # metres and radians
 _SAFETY = 1.3 * np.sqrt(3.0)  # bound over standard deviation; a uniform error within ± b has b / √3
 _LENS_VIEWS = 5  # from this many images, the lens is known better than from its engraving
 _REFINED_FOCAL, _REFINED_CENTRE = 0.006, 0.003
@@ -70,31 +71,6 @@ class BoardKnowledge:
     focal: float
     centre: float
     measured: int = 0
-
-    def record(self) -> dict[str, Any]:
-        """The knowledge as plain data."""
-        return {
-            "camera": self.camera.record(),
-            "T_flange_camera": self.T_flange_camera.tolist(),
-            "T_base_board": self.T_base_board.tolist(),
-            "spread": self.spread.tolist(),
-            "focal": self.focal,
-            "centre": self.centre,
-            "measured": self.measured,
-        }
-
-    @classmethod
-    def from_record(cls, record: Mapping[str, Any]) -> BoardKnowledge:
-        """Read a record written by `record`."""
-        return cls(
-            CameraModel.from_record(record["camera"]),
-            np.array(record["T_flange_camera"]),
-            np.array(record["T_base_board"]),
-            np.array(record["spread"]),
-            float(record["focal"]),
-            float(record["centre"]),
-            int(record["measured"]),
-        )
 
     def draws(self, count: int, seed: int = 0) -> tuple[Array, Array, Array, Array]:
         """Draw `count` possible truths within the tolerances.
@@ -195,20 +171,28 @@ def _posterior(
 ) -> tuple[Transform, Transform, Array]:
     """Posterior T_flange_camera and T_base_board, and their covariance (12, 12)."""
     precision = np.linalg.inv(known.spread @ known.spread.T / 3 + 1e-16 * np.eye(12))
-    mount0, board0 = known.T_flange_camera, prior_board
-    mount, board = mount0, hands[0] @ mount0 @ boards[0]
+    mount0 = known.T_flange_camera
     noise = np.diag([_ARM_M**2] * 3 + [_ARM_RAD**2] * 3)
-    covariance = np.eye(12)
-    for _ in range(_ROUNDS):
+
+    def minimum_at(mount: Transform, board: Transform) -> tuple[Array, Array]:
+        """Step (12,) and covariance (12, 12)."""
         e, J, JM = linearise(hands, boards, mount, board)
         V = np.linalg.inv(noise + JM @ C @ np.swapaxes(JM, 1, 2))
         H = np.einsum("nia,nij,njb->ab", J, V, J) + precision
-        off = np.concatenate([_from(mount0, mount), _from(board0, board)])
+        off = np.concatenate([_from(mount0, mount), _from(prior_board, board)])
         gradient = np.einsum("nia,nij,nj->a", J, V, e) + precision @ off
         scale = 1 / np.sqrt(np.diag(H))
         covariance = np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale)
-        step = -covariance @ gradient
-        mount, board = increment(mount, step[:3], step[3:6]), increment(board, step[6:9], step[9:])
+        return -covariance @ gradient, covariance
+
+    mount, board = gauss_newton(
+        (mount0, hands[0] @ mount0 @ boards[0]),
+        lambda at: minimum_at(*at)[0],
+        lambda at, step: (increment(at[0], step[:3], step[3:6]), increment(at[1], step[6:9], step[9:])),
+        most=_MOST_STEPS,
+        settled=_SETTLED,
+    )
+    covariance = minimum_at(mount, board)[1]
     return mount, board, (covariance + covariance.T) / 2
 
 

@@ -13,7 +13,7 @@ from service.compute.calibration.hand_eye.reprojection import projection_jacobia
 from service.compute.calibration.hand_eye.weighted import linearise
 from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
-from service.core.geometry import Array, Transform, inverse, look_at, transform
+from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from service.core.units import deg, metres, mm
 
 _TILTS_DEG = (0.0, 12.0, 25.0, 38.0, 48.0)
@@ -75,16 +75,12 @@ def suggest_board_poses(
     if len(T_base_flange) == 0:
         raise DataError("there is no board pose yet")
     X, B = answer.T_flange_camera, answer.T_base_board
+    model = _Model.of(answer, points_m, camera, corner_sigma_px)
     candidates = _candidates(B, T_base_flange @ X, points_m, camera)
-    noise = np.diag(
-        [max(metres(answer.robot_noise_mm or 0.0), _FLOOR_M) ** 2] * 3
-        + [max(np.radians(answer.robot_noise_deg or 0.0), _FLOOR_RAD) ** 2] * 3
-    )
     flanges = candidates @ inverse(X)
-    so_far = _information(T_base_flange, X, B, points_m, camera, corner_sigma_px, noise).sum(axis=0)
-    gains = _information(flanges, X, B, points_m, camera, corner_sigma_px, noise)
-    middle = points_m.mean(axis=0)
-    lever = float(np.median(np.linalg.norm((T_base_flange @ X)[:, :3, 3] - (B[:3, :3] @ middle + B[:3, 3]), axis=1)))
+    so_far, gains = model.information(T_base_flange).sum(axis=0), model.information(flanges)
+    middle = apply(B, points_m.mean(axis=0))
+    lever = float(np.median(np.linalg.norm((T_base_flange @ X)[:, :3, 3] - middle, axis=1)))
     open_ = list(range(len(flanges)))
     chosen: list[SuggestedPose] = []
     known: dict[int, bool] = {}
@@ -135,22 +131,49 @@ def _candidates(T_base_board: Transform, T_base_camera: Array, points_m: Array, 
     return all_poses[inside.all(axis=(1, 2))]
 
 
-def _information(
-    flanges: Array, X: Transform, B: Transform, points_m: Array, camera: CameraModel, sigma_px: float, noise: Array
-) -> Array:
-    """(N, 12, 12) information of each pose about T_flange_camera and T_base_board."""
-    if len(flanges) == 0:
-        return np.zeros((0, 12, 12))
-    boards = np.array([inverse(flange @ X) @ B for flange in flanges])
-    _, J_px = projection_jacobian(points_m, boards, camera)
-    rows = J_px.reshape(len(boards), -1, 6)
-    normal = np.swapaxes(rows, 1, 2) @ rows
-    scale = 1 / np.sqrt(np.einsum("nii->ni", normal))
-    both = scale[:, :, None] * scale[:, None, :]
-    covariance = np.linalg.inv(normal * both) * both * sigma_px**2
-    _, J, from_board = linearise(flanges, boards, X, B)
-    V = noise + from_board @ covariance @ np.swapaxes(from_board, 1, 2)
-    return np.swapaxes(J, 1, 2) @ np.linalg.solve(V, J)
+@dataclass(frozen=True, slots=True)
+class _Model:
+    """The linearised measurement of a board pose.
+
+    Attributes:
+        T_flange_camera, T_base_board: by the calibration so far.
+        points_m: (P, 3) of the board.
+        camera: calibrated.
+        corner_sigma_px: standard deviation of a corner.
+        robot_covariance: (6, 6) of a flange pose, m² and rad².
+    """
+
+    T_flange_camera: Transform
+    T_base_board: Transform
+    points_m: Array
+    camera: CameraModel
+    corner_sigma_px: float
+    robot_covariance: Array
+
+    @classmethod
+    def of(cls, answer: HandEyeAnswer, points_m: Array, camera: CameraModel, corner_sigma_px: float) -> _Model:
+        """With the robot's noise from the calibration so far."""
+        robot = np.diag(
+            [max(metres(answer.robot_noise_mm or 0.0), _FLOOR_M) ** 2] * 3
+            + [max(np.radians(answer.robot_noise_deg or 0.0), _FLOOR_RAD) ** 2] * 3
+        )
+        return cls(answer.T_flange_camera, answer.T_base_board, points_m, camera, corner_sigma_px, robot)
+
+    def information(self, flanges: Array) -> Array:
+        """(N, 12, 12) information of each pose (N, 4, 4) about T_flange_camera and T_base_board."""
+        if len(flanges) == 0:
+            return np.zeros((0, 12, 12))
+        X, B = self.T_flange_camera, self.T_base_board
+        boards = np.array([inverse(flange @ X) @ B for flange in flanges])
+        _, J_px = projection_jacobian(self.points_m, boards, self.camera)
+        rows = J_px.reshape(len(boards), -1, 6)
+        normal = np.swapaxes(rows, 1, 2) @ rows
+        scale = 1 / np.sqrt(np.einsum("nii->ni", normal))
+        both = scale[:, :, None] * scale[:, None, :]
+        covariance = np.linalg.inv(normal * both) * both * self.corner_sigma_px**2
+        _, J, from_board = linearise(flanges, boards, X, B)
+        V = self.robot_covariance + from_board @ covariance @ np.swapaxes(from_board, 1, 2)
+        return np.swapaxes(J, 1, 2) @ np.linalg.solve(V, J)
 
 
 def _covariance_of(information: Array) -> Array:

@@ -116,16 +116,10 @@ def calibrate_hand_eye(
     rms: dict[ArmTerms, float] = {
         terms: float(np.sqrt(np.mean(o.held_out_mm[turns.keep] ** 2))) for terms, o in outcomes.items()
     }
-    best = min(rms, key=lambda terms: rms[terms])
     share = np.zeros((6, 6))
     if camera_covariance is not None and data.corners is not None:
         share = camera_share(good, camera_covariance)
     quality = partial(_quality, turns.data, point, share, partial(_bootstrap, good, method, bootstrap, seed))
-    corrected: CorrectedHandEye | None = None
-    if rms[best] < _WORTH * rms["none"]:
-        correction = outcomes[best].answer.correction
-        assert correction is not None
-        corrected = CorrectedHandEye(**quality(outcomes[best]), correction=correction, terms=best)
     methods = _methods(good, method, turns.plain)
     distances = [distance(T, turns.plain.T_flange_camera) for T in methods.values()]
     return HandEyeResult(
@@ -140,7 +134,7 @@ def calibrate_hand_eye(
         condition=condition,
         turned=tuple(bool(t) for t in turns.turned),
         excluded=turns.excluded,
-        corrected=corrected,
+        corrected=_corrected(outcomes, rms, quality),
         arm_held_out_mm=rms,
     )
 
@@ -214,6 +208,17 @@ def _outcomes(agreed: _Agreed, method: Method, folds: NDArray[np.int64], point: 
             errors = held_out(data, used, method, terms, (plain, noise), folds, point)
             outcomes[terms] = _Outcome(answer, *errors)
     return outcomes
+
+
+def _corrected(
+    outcomes: dict[ArmTerms, _Outcome], rms_mm: dict[ArmTerms, float], quality: Callable[[_Outcome], dict[str, Any]]
+) -> CorrectedHandEye | None:
+    """The answer with the arm's errors that held-out views support best; None if they do not improve."""
+    best = min(rms_mm, key=lambda terms: rms_mm[terms])
+    correction = outcomes[best].answer.correction
+    if correction is None or rms_mm[best] >= _WORTH * rms_mm["none"]:
+        return None
+    return CorrectedHandEye(**quality(outcomes[best]), correction=correction, terms=best)
 
 
 def _bootstrap(good: HandEyeMeasurements, method: Method, count: int, seed: int, outcome: _Outcome) -> Array:

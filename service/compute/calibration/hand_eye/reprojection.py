@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from service.compute.calibration.hand_eye.weighted import linearise
 from service.compute.camera_model import CameraModel
+from service.compute.descent import halved_gauss_newton, largest
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, increment, inverse, skew
 
@@ -101,9 +102,9 @@ def _step(gram: Array) -> Array:
 def solve_reprojection(
     hands: Array, corners: BoardCorners, X: Transform, B: Transform
 ) -> tuple[Transform, Transform]:
-    """T_flange_camera and T_base_board of least reprojection error, with the robot's poses fixed (Gauss-Newton).
+    """T_flange_camera and T_base_board of least reprojection error, with the robot's poses fixed.
 
-    The paper's method. It attributes the robot's errors, which are many times larger, to the images.
+    The paper's method, by Gauss–Newton. It attributes the robot's errors, which are many times larger, to the images.
 
     Args:
         hands: (N, 4, 4) T_base_flange.
@@ -114,15 +115,38 @@ def solve_reprojection(
     Raises:
         ComputeError: the views do not determine the answer, or it did not converge.
     """
-    hand_eye, board, before = X, B, np.inf
-    for _ in range(_ITERATIONS):
+
+    def at(hand_eye: Transform, board: Transform) -> _Iterate:
         gram = _grams(hands, corners, hand_eye, board).sum(axis=0)
-        step = _step(gram)
-        hand_eye, board = increment(hand_eye, step[:3], step[3:6]), increment(board, step[6:9], step[9:])
-        if np.abs(step).max() < 1e-9 or abs(before - gram[12, 12]) < 1e-12 * gram[12, 12]:
-            return hand_eye, board
-        before = float(gram[12, 12])
-    raise ComputeError("the reprojection error did not converge", remedy="check robot poses and board size")
+        return _Iterate(hand_eye, board, _step(gram), float(gram[12, 12]))
+
+    def candidate(here: _Iterate, share: float) -> _Iterate:
+        step = share * here.step
+        return at(increment(here.hand_eye, step[:3], step[3:6]), increment(here.board, step[6:9], step[9:]))
+
+    found = halved_gauss_newton(at(X, B), candidate, _gain, _settles, most=_ITERATIONS)
+    if not found.settled:
+        raise ComputeError("the reprojection error did not converge", remedy="check robot poses and board size")
+    return found.state.hand_eye, found.state.board
+
+
+@dataclass(frozen=True, slots=True)
+class _Iterate:
+    """The two transforms, the Gauss–Newton step (12,) from them, and the sum of squares in px²."""
+
+    hand_eye: Transform
+    board: Transform
+    step: Array
+    square_px2: float
+
+
+def _gain(here: _Iterate, there: _Iterate) -> float:
+    """A sum that grows by rounding alone does not count as grown."""
+    return here.square_px2 * (1 + 1e-12) - there.square_px2 if np.isfinite(there.square_px2) else -np.inf
+
+
+def _settles(here: _Iterate, there: _Iterate) -> bool:
+    return largest(here.step) < 1e-9 or abs(here.square_px2 - there.square_px2) < 1e-14 * here.square_px2
 
 
 def resample_reprojection(hands: Array, corners: BoardCorners, X: Transform, B: Transform, counts: Array) -> Array:

@@ -188,7 +188,7 @@ def solve(views: Views, noise: Noise, X: Transform, B: Transform, *, iterations:
             fit.covariance,
         )
 
-    def size(step: Array) -> float:
+    def size(_fit: Fit, step: Array) -> float:
         return max(largest(step[:12]) / _SETTLED, float(np.abs(step[12:]).max(initial=0.0)) / _SETTLED_ARM)
 
     start = Fit(X, B, np.zeros(len(prior)), np.zeros((12 + len(prior),) * 2))

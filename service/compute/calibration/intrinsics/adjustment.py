@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.board.board import BoardView
 from service.compute.camera_model import CameraModel
-from service.compute.descent import Damping, levenberg_marquardt
+from service.compute.descent import Damping, gauss_newton, largest, levenberg_marquardt
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, transform
 
@@ -166,16 +166,29 @@ def start_pose(view: BoardView, points: Array, camera: CameraModel) -> Array:
 
 def fit_pose(view: BoardView, points: Array, camera: CameraModel, pose: Array) -> tuple[Array, float]:
     """The pose (6,) of one view refined from `pose` with a known camera, and its RMS error in px."""
-    object_points = points[view.indices]
-    residual = np.zeros(2 * len(view.indices))
-    for _ in range(10):
-        pixels, J, _ = project_with_jacobian(object_points, pose, camera)
-        residual = (pixels - view.corners).ravel()
-        step = np.linalg.lstsq(J, -residual)[0]
-        pose = pose + step
-        if np.abs(J @ step).max() < 1e-6:
-            break
-    return pose, rms(residual)
+
+    def at(pose: Array) -> _ViewPose:
+        pixels, J, _ = project_with_jacobian(points[view.indices], pose, camera)
+        return _ViewPose(pose, (pixels - view.corners).ravel(), J)
+
+    found = gauss_newton(
+        at(pose),
+        lambda here: np.asarray(np.linalg.lstsq(here.J, -here.residual)[0], dtype=np.float64),
+        lambda here, step: at(here.pose + step),
+        most=10,
+        settled=1e-6,
+        size=lambda here, step: largest(here.J @ step),  # px
+    )
+    return found.pose, rms(found.residual)
+
+
+@dataclass(frozen=True, slots=True)
+class _ViewPose:
+    """A pose (6,) of one view, with the residual (2M,) and its derivative (2M, 6)."""
+
+    pose: Array
+    residual: Array
+    J: Array
 
 
 def adjust(

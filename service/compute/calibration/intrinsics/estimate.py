@@ -121,14 +121,7 @@ def calibrate_intrinsics(
         ComputeError: too few views, or tilts so similar that the focal length is undetermined.
     """
     points = board.points()
-    used: list[int] = []
-    reasons: dict[int, str] = {}
-    for index, view in enumerate(views):
-        _check_view(view, len(points), index)
-        if len(view.indices) < _MIN_CORNERS:
-            reasons[index] = f"{len(view.indices)} corners of the board, at least {_MIN_CORNERS} are needed"
-        else:
-            used.append(index)
+    used, reasons = _usable(views, len(points))
     solution, used = _solve_without_outliers(views, points, size, model, used, reasons)
     seen = tuple(views[k] for k in used)
     count = PARAMETER_COUNT[model]
@@ -196,6 +189,19 @@ def leave_one_out(solution: Adjustment) -> Array:
         if np.linalg.eigvalsh(rest)[0] > _MIN_EIGENVALUE:
             changes[k] = np.linalg.solve(rest, view.gradient / scale) / scale
     return changes
+
+
+def _usable(views: Sequence[BoardView], n_points: int) -> tuple[list[int], dict[int, str]]:
+    """The views with enough corners, and the reasons why the others are not used."""
+    used: list[int] = []
+    reasons: dict[int, str] = {}
+    for index, view in enumerate(views):
+        _check_view(view, n_points, index)
+        if len(view.indices) < _MIN_CORNERS:
+            reasons[index] = f"{len(view.indices)} corners of the board, at least {_MIN_CORNERS} are needed"
+        else:
+            used.append(index)
+    return used, reasons
 
 
 def _solve_without_outliers(

@@ -28,12 +28,16 @@ CHECKED = 100_000  # samples, taken at random, for the floor, the distance to th
 
 @dataclass(frozen=True, slots=True)
 class ChamferSettings:
-    """How two surfaces are compared; the defaults are the paper's."""
+    """How two surfaces are compared; the defaults are the paper's.
+
+    `to_faces`: also measure the distances to the faces, which takes most of the time with large meshes.
+    """
 
     spacing_m: float = SPACING_M
     outlier_m: float = OUTLIER_M
     thresholds_m: tuple[float, ...] = F_THRESHOLDS_M
     seed: int = 0
+    to_faces: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +53,7 @@ class Direction:
         floor_m: mean distance from a random place of the other surface to its own nearest sample: what `mean_m`
             would be if the surfaces were equal.
         surface_mean_m, surface_rms_m: of the distances to the other's faces (exact, of `CHECKED` samples at most);
-            None if the other is a cloud.
+            None if the other is a cloud, or if they were not asked for.
         normal_consistency: mean |cosine| between the normals of a sample and its nearest; None without normals.
     """
 
@@ -150,7 +154,7 @@ def _direction(way: _Way, floor_m: float, settings: ChamferSettings, rng: np.ran
     chosen = np.flatnonzero(near)
     if len(chosen) > CHECKED:
         chosen = np.sort(rng.choice(chosen, CHECKED, replace=False))
-    surface = _to_faces(way, chosen)
+    surface = _to_faces(way, chosen) if settings.to_faces else None
     return Direction(
         n=len(way.distance),
         excluded=int(np.count_nonzero(~near)),

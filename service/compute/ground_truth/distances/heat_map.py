@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -49,31 +50,98 @@ class HeatScale:
 
 
 @dataclass(frozen=True, slots=True)
-class _Panel:
-    surface: Surface = field(repr=False)
-    compared: Compared = field(repr=False)
+class Panel:
+    """Points of a surface to show: places (N, 3), red, green and blue (N, 3), normals (N, 3) or None; a title."""
+
+    points_m: Array = field(repr=False)
+    colours: Pixels = field(repr=False)
+    normals: Array | None = field(repr=False)
     title: str
 
+    @classmethod
+    def of_distances(cls, surface: Surface, compared: Compared, scale: HeatScale, title: str) -> Panel:
+        """The samples of a surface in the colours of their distances."""
+        points = compared.samples.points_m
+        everything = np.arange(len(points))
+        colours = scale.colours(compared.distance_m)
+        return cls(points, colours, normals_of(surface, compared.samples, everything), title)
 
-def heat_picture(pred: Surface, gt: Surface, score: ChamferScore, scale: HeatScale) -> Pixels:
-    """(H, W, 3) picture, blue first as OpenCV has it: both surfaces by their distances, seen along one direction."""
-    axes = _view(gt, score.gt.samples.points_m)
-    both = [score.pred.samples.points_m @ axes.T, score.gt.samples.points_m @ axes.T]
-    low = np.minimum(both[0].min(axis=0), both[1].min(axis=0))
-    size = np.maximum(both[0].max(axis=0), both[1].max(axis=0)) - low
-    pixel_m = max(float(size[:2].max()) / _PANEL_PX, 1e-9)
+
+def heat_picture(
+    pred: Surface,
+    gt: Surface,
+    score: ChamferScore,
+    scale: HeatScale,
+    names: tuple[str, str] = ("prediction", "truth"),
+    more: Sequence[Panel] = (),
+) -> Pixels:
+    """A picture of two surfaces by their distances, seen along one direction.
+
+    Args:
+        pred, gt: the surfaces.
+        score: their distances.
+        scale: of the colours.
+        names: of the two, for the titles.
+        more: further views of the same scene, beside them.
+
+    Returns:
+        (H, W, 3), blue first as OpenCV has it.
+    """
+    one, other = names
     panels = (
-        _Panel(pred, score.pred, f"prediction to truth: mean {mm(score.pred_to_gt.mean_m):.3f} mm"),
-        _Panel(gt, score.gt, f"truth to prediction: mean {mm(score.gt_to_pred.mean_m):.3f} mm"),
+        Panel.of_distances(pred, score.pred, scale, f"{one} to {other}: mean {mm(score.pred_to_gt.mean_m):.3f} mm"),
+        Panel.of_distances(gt, score.gt, scale, f"{other} to {one}: mean {mm(score.gt_to_pred.mean_m):.3f} mm"),
+        *more,
     )
+    axes = _view(gt, score.gt.samples.points_m)
+    seen = [panel.points_m @ axes.T for panel in panels]
+    low = np.min([s.min(axis=0) for s in seen], axis=0)
+    size = np.max([s.max(axis=0) for s in seen], axis=0) - low
+    pixel_m = max(float(size[:2].max()) / _PANEL_PX, 1e-9)
     height, width = (int(np.ceil(size[k] / pixel_m)) + 1 for k in (1, 0))
     drawn = [
-        _captioned(_splat(panel, seen, low, pixel_m, (height, width), axes[2], scale), panel.title)
-        for panel, seen in zip(panels, both, strict=True)
+        _captioned(_splat(panel, s - low, pixel_m, (height, width), axes[2]), panel.title)
+        for panel, s in zip(panels, seen, strict=True)
     ]
     rows = np.full((drawn[0].shape[0], _MARGIN_PX, 3), _PAPER, dtype=np.uint8)
-    body = np.hstack([rows, drawn[0], rows, drawn[1], rows])
+    body = np.hstack([rows, *(part for one in drawn for part in (one, rows))])
     return np.vstack([body, _bar(body.shape[1], scale)])
+
+
+def heat_row(panels: Sequence[Panel], gt: Surface, gt_points_m: Array, panel_px: int) -> Pixels:
+    """(H, W, 3) picture, blue first: surfaces beside one another, without the scale of colours.
+
+    All are seen along the direction in which the truth is seen best, and cut at its rim.
+
+    Args:
+        panels: the surfaces; one without points leaves its place empty.
+        gt: the truth.
+        gt_points_m: (N, 3) samples of it.
+        panel_px: longer side of each.
+    """
+    axes = _view(gt, gt_points_m)
+    seen_gt = gt_points_m @ axes.T
+    low, size = seen_gt.min(axis=0), np.ptp(seen_gt, axis=0)
+    pixel_m = max(float(size[:2].max()) / panel_px, 1e-9)
+    shape = (int(np.ceil(size[1] / pixel_m)) + 1, int(np.ceil(size[0] / pixel_m)) + 1)
+    drawn: list[Pixels] = []
+    for panel in panels:
+        seen = panel.points_m @ axes.T - low
+        at = seen[:, :2] / pixel_m
+        inside = np.flatnonzero(((at >= 0) & (at < np.array([shape[1], shape[0]]))).all(axis=1))
+        image = np.full((*shape, 3), _PAPER, dtype=np.uint8)
+        if len(inside):
+            normals = None if panel.normals is None else panel.normals[inside]
+            kept = Panel(panel.points_m[inside], panel.colours[inside], normals, panel.title)
+            image = _splat(kept, seen[inside], pixel_m, shape, axes[2])
+        gap = np.full((shape[0] + _TEXT_PX, _MARGIN_PX, 3), _PAPER, dtype=np.uint8)
+        drawn += [gap, _captioned(image, panel.title)]
+    return np.hstack(drawn)
+
+
+def heat_bar(width: int, scale: HeatScale) -> Pixels:
+    """(H, width, 3) the scale of colours, to be put under a picture."""
+    return _bar(width, scale)
 
 
 def _view(surface: Surface, points: Array) -> Array:
@@ -87,21 +155,18 @@ def _view(surface: Surface, points: Array) -> Array:
     return np.stack([right, np.cross(away, right), away])
 
 
-def _splat(
-    panel: _Panel, seen: Array, low: Array, pixel_m: float, shape: tuple[int, int], away: Array, scale: HeatScale
-) -> Pixels:
-    """The samples of one surface as pixels, the nearest to the viewer on top."""
-    at = ((seen[:, :2] - low[:2]) / pixel_m).astype(np.int64)
+def _splat(panel: Panel, seen: Array, pixel_m: float, shape: tuple[int, int], away: Array) -> Pixels:
+    """The points of one surface as pixels, the nearest to the viewer on top."""
+    at = (seen[:, :2] / pixel_m).astype(np.int64)
     order = np.argsort(-seen[:, 2])
     depth = np.full(shape, np.inf, dtype=np.float32)
     depth[at[order, 1], at[order, 0]] = seen[order, 2]
-    # What lies behind shows between the samples; it is far behind the nearest sample around it.
+    # What lies behind shows between the points; it is far behind the nearest point around it.
     front = cv2.erode(depth, np.ones((5, 5), np.uint8))
     order = order[seen[order, 2] <= front[at[order, 1], at[order, 0]] + _BEHIND_PX * pixel_m]
-    colours = scale.colours(panel.compared.distance_m[order]).astype(np.float64)
-    normals = normals_of(panel.surface, panel.compared.samples, order)
-    if normals is not None:
-        colours *= (0.55 + 0.45 * np.abs(normals @ away))[:, None]
+    colours = panel.colours[order].astype(np.float64)
+    if panel.normals is not None:
+        colours *= (0.55 + 0.45 * np.abs(panel.normals[order] @ away))[:, None]
     image = np.full((*shape, 3), _PAPER, dtype=np.uint8)
     image[at[order, 1], at[order, 0]] = colours[:, ::-1].astype(np.uint8)
     empty = np.all(image == _PAPER, axis=2)

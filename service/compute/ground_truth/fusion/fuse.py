@@ -1,7 +1,8 @@
 """Fuses a CT mesh and a scan, in one frame, into one mesh: the CT in the wound, the scan elsewhere, no step between.
 
 The triangulation of the CT carries the result, which is watertight where the CT is. Its vertices move onto the scan
-by a weight that rises smoothly from 0 to 1 over the overlap.
+by a weight that rises smoothly from 0 to 1 over the overlap. Where the CT deviates from the scan beside the seam, its
+part on the other side follows, by less and less with the distance: so there is no step.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.ground_truth.distances.neighbours import PointIndex
+from service.compute.ground_truth.fusion.deviation import FieldLengths, deviation_field, moved_unfolded
 from service.compute.ground_truth.fusion.overlap import (
     Mask,
     OverlapLimits,
@@ -24,7 +26,7 @@ from service.compute.ground_truth.fusion.overlap import (
     propose_wound,
     vertex_normals,
 )
-from service.compute.ground_truth.fusion.regions import Correction, corrected
+from service.compute.ground_truth.fusion.regions import Correction, Region, corrected
 from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, place_jacobian
@@ -44,11 +46,12 @@ class FusionSettings:
 
     Attributes:
         blend_m: width of the overlap over which the weight rises.
-        sigma_ct_m, sigma_scan_m: standard deviation of each surface along its normal, as of its spheres.
+        sigma_ct_m, sigma_scan_m: least standard deviation of each surface along its normal, as of its spheres.
         alignment_covariance: (6, 6) of T_scan_ct as in `evaluation.closure.Alignment`; None: known exactly.
         keep_scan_only: whether parts of the scan that the CT lacks are added, unconnected.
         least_part_m2: smaller unconnected parts of the CT are left out.
         overlap, wound: limits.
+        lengths: of the field by which the CT follows the scan.
     """
 
     blend_m: float = 0.003
@@ -59,6 +62,7 @@ class FusionSettings:
     least_part_m2: float = 2e-6
     overlap: OverlapLimits = field(default_factory=OverlapLimits)
     wound: WoundLimits = field(default_factory=WoundLimits)
+    lengths: FieldLengths = field(default_factory=FieldLengths)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +77,7 @@ class Fused:
         wound: (V,) in the wound region, as proposed and corrected.
         ct_offset_m: median height of the CT above the scan, outside the wound: its bias if the scan is right.
         ct_spread_m: robust standard deviation of the same heights.
-        folded: faces that the move turned over.
+        folded: faces that could not be kept from turning over when their vertices moved.
         corrections: that were applied.
     """
 
@@ -98,6 +102,7 @@ def fuse(
     up: Array,
     settings: FusionSettings | None = None,
     corrections: Sequence[Correction] = (),
+    removed: Region | None = None,
 ) -> Fused:
     """Fuse a CT mesh and a scan.
 
@@ -107,30 +112,40 @@ def fuse(
         up: (3,) direction away from the table, by which hollows are told from undersides.
         settings: the defaults if None.
         corrections: regions that people drew.
+        removed: where the CT shows something that was taken away before the scan; there the scan alone counts.
 
     Raises:
         ComputeError: a source has no faces, or the two nowhere agree.
     """
     chosen = settings or FusionSettings()
-    carrier = _without_specks(ct, chosen.least_part_m2)
+    carrier = without_specks(ct if removed is None else outside(ct, removed), chosen.least_part_m2)
     seen = overlap(carrier, scan, chosen.overlap)
     if not seen.covered.any():
         raise ComputeError("CT and scan nowhere agree", remedy="Check that both are in the same frame and unit")
     wound = corrected(propose_wound(carrier, seen.covered, up, chosen.wound), carrier.vertices_m, corrections)
     usable = seen.covered & ~wound
-    weight = _smooth_step(distance_to(carrier.vertices_m, ~usable) / chosen.blend_m)
-    move = seen.nearest_m - carrier.vertices_m
-    moved = Surface(carrier.vertices_m + weight[:, None] * move, carrier.faces)
-    folded = int(np.sum(np.einsum("fi,fi->f", moved.area_vectors_m2, carrier.area_vectors_m2) < 0))
-    sigma = _sigma(carrier, weight, np.linalg.norm(move, axis=1), chosen)
     height = seen.offset_m[usable] if usable.any() else np.zeros(1)
     offset = float(np.median(height))
+    spread = 1.4826 * float(np.median(np.abs(height - offset)))
+    weight = _smooth_step(distance_to(carrier.vertices_m, ~usable) / chosen.blend_m)
+    known_m = np.where(usable, -seen.offset_m, 0.0)
+    followed = deviation_field(carrier, known_m, usable, chosen.lengths)[:, None] * vertex_normals(carrier)
+    onto = seen.nearest_m - carrier.vertices_m
+    moved, folded = moved_unfolded(carrier, (1 - weight)[:, None] * followed + weight[:, None] * onto)
+    sigma = _sigma(carrier, weight, np.linalg.norm(onto - followed, axis=1), max(chosen.sigma_ct_m, spread), chosen)
     source = np.where(weight <= 0, Source.CT, np.where(weight >= 1, Source.SCAN, Source.BLEND)).astype(np.uint8)
     fused = Fused(
-        moved, source, weight, sigma, wound, offset, 1.4826 * float(np.median(np.abs(height - offset))), folded,
+        moved,
+        source,
+        weight,
+        sigma,
+        wound,
+        offset,
+        spread,
+        folded,
         tuple(corrections),
-    )  # fmt: skip
-    return _with_scan_only(fused, carrier, scan, chosen) if chosen.keep_scan_only else fused
+    )
+    return _with_scan_only(fused, carrier, _Addition(scan, chosen, removed)) if chosen.keep_scan_only else fused
 
 
 def _smooth_step(x: Array) -> Array:
@@ -139,9 +154,9 @@ def _smooth_step(x: Array) -> Array:
     return t**3 * (10 + t * (6 * t - 15))
 
 
-def _sigma(carrier: Surface, weight: Array, gap: Array, settings: FusionSettings) -> Array:
+def _sigma(carrier: Surface, weight: Array, gap: Array, sigma_ct_m: float, settings: FusionSettings) -> Array:
     """(V,) standard deviation along the normal; where both count, their disagreement does, too."""
-    ct = np.full(len(weight), settings.sigma_ct_m**2)
+    ct = np.full(len(weight), sigma_ct_m**2)
     if settings.alignment_covariance is not None:
         normals = vertex_normals(carrier)
         J = np.einsum("ni,nik->nk", normals, place_jacobian(carrier.vertices_m))
@@ -150,14 +165,22 @@ def _sigma(carrier: Surface, weight: Array, gap: Array, settings: FusionSettings
     return np.sqrt((weight * settings.sigma_scan_m) ** 2 + (1 - weight) ** 2 * ct + between)
 
 
-def _without_specks(ct: Surface, least_m2: float) -> Surface:
+def without_specks(ct: Surface, least_m2: float) -> Surface:
     """The CT without small unconnected parts (noise) and without vertices that no face has."""
     if not ct.is_mesh:
         raise ComputeError("fusion needs a mesh of the CT", remedy="Extract its surface first")
+    if least_m2 <= 0:
+        return compact(ct.vertices_m, ct.faces)[0]
     labels = components(ct, np.ones(len(ct.vertices_m), dtype=np.bool_))
     part = labels[ct.faces[:, 0]]
     area = np.bincount(part, np.linalg.norm(ct.area_vectors_m2, axis=1))
     return compact(ct.vertices_m, ct.faces[area[part] >= least_m2])[0]
+
+
+def outside(surface: Surface, region: Region) -> Surface:
+    """The surface without the faces that touch a region."""
+    inside = region.contains(surface.vertices_m)
+    return compact(surface.vertices_m, surface.faces[~inside[surface.faces].any(axis=1)])[0]
 
 
 def compact(vertices: Array, faces: IntArray) -> tuple[Surface, IntArray]:
@@ -166,11 +189,27 @@ def compact(vertices: Array, faces: IntArray) -> tuple[Surface, IntArray]:
     return Surface(vertices[kept], index.reshape(-1, 3)), kept
 
 
-def _with_scan_only(fused: Fused, carrier: Surface, scan: Surface, settings: FusionSettings) -> Fused:
-    """With the faces of the scan that are far from the CT, as parts of their own."""
-    far_m = 2 * settings.overlap.distance_m
-    far = PointIndex(carrier.vertices_m).nearest(scan.vertices_m)[0] > far_m
-    extra, _ = compact(scan.vertices_m, scan.faces[far[scan.faces].all(axis=1)])
+@dataclass(frozen=True, slots=True)
+class _Addition:
+    scan: Surface
+    settings: FusionSettings
+    removed: Region | None
+
+    def taken(self, carrier: Surface) -> Mask:
+        """(F,) faces of the scan that are far from the CT, or touch what was taken away since."""
+        far_m = 2 * self.settings.overlap.distance_m
+        vertices, faces = self.scan.vertices_m, self.scan.faces
+        far = PointIndex(carrier.vertices_m).nearest(vertices)[0] > far_m
+        taken: Mask = np.all(far[faces], axis=1)
+        if self.removed is not None:
+            taken |= np.any(self.removed.contains(vertices)[faces], axis=1)
+        return taken
+
+
+def _with_scan_only(fused: Fused, carrier: Surface, addition: _Addition) -> Fused:
+    """With the faces of the scan that the CT lacks, as parts of their own."""
+    scan, settings = addition.scan, addition.settings
+    extra, _ = compact(scan.vertices_m, scan.faces[addition.taken(carrier)])
     n = len(extra.vertices_m)
     if n == 0:
         return fused

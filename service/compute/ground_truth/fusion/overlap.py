@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from service.compute.ground_truth.distances.neighbours import PointIndex
-from service.compute.ground_truth.distances.triangle_tree import TriangleTree
+from service.compute.ground_truth.distances.triangle_tree import closest_on_triangles
 from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array
@@ -53,15 +53,17 @@ def overlap(ct: Surface, scan: Surface, limits: OverlapLimits | None = None) -> 
     """Compare a CT mesh with a scan, both in one frame, with outward faces."""
     bounds = limits or OverlapLimits()
     used = np.unique(scan.faces)
-    rough = PointIndex(scan.vertices_m[used]).nearest(ct.vertices_m)[0]
-    near = rough <= bounds.distance_m + _longest_edge(scan)
-    found = TriangleTree(scan).nearest(ct.vertices_m[near], rough[near])
+    rough, vertex = PointIndex(scan.vertices_m[used]).nearest(ct.vertices_m)
+    near = np.flatnonzero(rough <= bounds.distance_m + _longest_edge(scan))
+    place, face = _on_faces_around(scan, used[vertex[near]], ct.vertices_m[near])
     normals = vertex_normals(ct)
-    nearest, covered, offset = ct.vertices_m.copy(), near.copy(), np.full(len(near), np.inf)
-    nearest[near] = found.points_m
-    offset[near] = np.einsum("ni,ni->n", ct.vertices_m[near] - found.points_m, normals[near])
-    covered[near] = (found.distance_m <= bounds.distance_m) & (
-        np.einsum("ni,ni->n", normals[near], scan.face_normals[found.faces]) >= bounds.cosine
+    way = ct.vertices_m[near] - place
+    nearest, covered = ct.vertices_m.copy(), np.zeros(len(rough), dtype=np.bool_)
+    offset = np.full(len(rough), np.inf)
+    nearest[near] = place
+    offset[near] = np.einsum("ni,ni->n", way, normals[near])
+    covered[near] = (np.linalg.norm(way, axis=1) <= bounds.distance_m) & (
+        np.einsum("ni,ni->n", normals[near], scan.face_normals[face]) >= bounds.cosine
     )
     rim = rim_vertices(scan)
     if len(rim):
@@ -69,6 +71,28 @@ def overlap(ct: Surface, scan: Surface, limits: OverlapLimits | None = None) -> 
         away = PointIndex(scan.vertices_m[rim]).nearest(nearest[index])[0]
         covered[index[away < bounds.rim_m]] = False
     return Overlap(nearest, offset, covered)
+
+
+def _on_faces_around(surface: Surface, vertex: IntArray, points: Array) -> tuple[Array, IntArray]:
+    """Of the faces around a vertex (N,), the place nearest to a point (N, 3), and that face (N,).
+
+    With the vertex nearest to the point, that is nearly always the nearest place of the whole surface.
+    """
+    corner = surface.faces.ravel()
+    order = np.argsort(corner, kind="stable")
+    first = np.searchsorted(corner[order], np.arange(len(surface.vertices_m) + 1))
+    count = np.diff(first)[vertex]
+    best = np.full(len(points), np.inf)
+    place, face = np.empty_like(points), np.zeros(len(points), dtype=np.int64)
+    for k in range(int(count.max(initial=0))):
+        index = np.flatnonzero(count > k)
+        candidate = order[first[vertex[index]] + k] // 3
+        p = closest_on_triangles(points[index], surface.vertices_m[surface.faces[candidate]])
+        d = np.linalg.norm(p - points[index], axis=1)
+        nearer = d < best[index]
+        at = index[nearer]
+        best[at], place[at], face[at] = d[nearer], p[nearer], candidate[nearer]
+    return place, face
 
 
 @dataclass(frozen=True, slots=True)

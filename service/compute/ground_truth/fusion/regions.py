@@ -61,6 +61,21 @@ class Prism:
 
 
 @dataclass(frozen=True, slots=True)
+class Balls:
+    """Balls of one radius about centres (M, 3), such as spheres that were taken away."""
+
+    centres_m: Array
+    radius_m: float
+
+    def contains(self, points_m: Array) -> Mask:
+        """(N,) which points (N, 3) lie in a ball."""
+        out = np.zeros(len(points_m), dtype=np.bool_)
+        for centre in self.centres_m:
+            out |= np.linalg.norm(points_m - centre, axis=1) <= self.radius_m
+        return out
+
+
+@dataclass(frozen=True, slots=True)
 class Correction:
     """A region in which a person decides.
 
@@ -83,14 +98,39 @@ def corrected(proposed: Mask, points_m: Array, corrections: Sequence[Correction]
     return out
 
 
+def seen_along(corners_m: Array, along: Array, depth_m: tuple[float, float]) -> Prism:
+    """A polygon with corners (K, 3) in space, as seen along a direction (3,), extended along it.
+
+    Args:
+        corners_m: in order around the polygon.
+        along: from the surface towards the viewer.
+        depth_m: how far it reaches below the lowest corner (negative) and above the highest one.
+
+    Raises:
+        DataError: fewer than three corners, or no direction.
+    """
+    if len(corners_m) < 3 or not np.linalg.norm(along) > 0:
+        raise DataError("a polygon needs at least three corners and a direction", remedy="Draw it again")
+    T = _plane(along)
+    T[:3, 3] = corners_m.mean(axis=0)
+    p = apply(inverse(T), corners_m)
+    return Prism(T, p[:, :2], (float(p[:, 2].min()) + depth_m[0], float(p[:, 2].max()) + depth_m[1]))
+
+
 def outline(points_m: Array, up: Array) -> Prism:
     """The smallest convex prism along `up` (3,) that holds these points (N, 3): a polygon to begin drawing with."""
-    z = up / np.linalg.norm(up)
-    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    T = _plane(up)
     T[:3, 3] = points_m.mean(axis=0)
     p = apply(inverse(T), points_m)
     hull = cv2.convexHull(p[:, :2].astype(np.float32)).reshape(-1, 2).astype(np.float64)
     return Prism(T, hull, (float(p[:, 2].min()), float(p[:, 2].max())))
+
+
+def _plane(direction: Array) -> Transform:
+    """(4, 4) rotation whose z is this direction (3,)."""
+    z = direction / np.linalg.norm(direction)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    return T

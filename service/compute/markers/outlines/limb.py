@@ -153,7 +153,9 @@ def fit_limb(
 ) -> LimbFit:
     """Edges by Gauss–Newton on the forward model, with one blur for all profiles of an outline.
 
-    Lengths are in one unit: the image's pixel, or the step over which samples were averaged.
+    Lengths are in one unit: the image's pixel, or the step over which samples were averaged. The loop is its own and
+    has a fixed number of steps: before each, noise, selection of profiles and priors are estimated again, so there is
+    no fixed cost to descend.
 
     Args:
         profiles: the values.

@@ -313,7 +313,10 @@ class _ConeFits:
 
 
 def _robust_cones(azimuth: Array, offset: Array, sigma: Array, ok: NDArray[np.bool_]) -> _ConeFits:
-    """Cones by Tukey weights on the geometric distances (G, K), linearised around the given cones."""
+    """Cones by Tukey weights on the geometric distances (G, K), linearised around the given cones.
+
+    The distances are linear in the steps, so each turn solves its weighted equations exactly: nothing is descended.
+    """
     J = -distance_gradient(azimuth)
     least = max(12, round(_LEAST_PART * len(azimuth)))
     good = ok.sum(axis=1) >= least

@@ -39,7 +39,6 @@ class RoughSphere:
     coverage: float  # share of the outline with edges, weighted by their strength
     interior_edges: float  # edge pixels inside over area
     mask_loss: float  # false positives and negatives of the ellipse against the mask, over the ellipse's area
-    leak: float  # share of the outline across which the disc's colour continues without an edge
     colour_bgr: tuple[float, float, float]
     plain: bool  # passes every test by itself
 
@@ -155,7 +154,7 @@ def _judged(
     if bad or leak > _DOUBTFUL_LEAK or interior > _DOUBTFUL_INTERIOR:
         return None
     plain = leak <= options.max_leak and interior <= options.max_interior_edges
-    rough = RoughSphere(cone, coverage, interior, loss, leak, colour, plain)
+    rough = RoughSphere(cone, coverage, interior, loss, colour, plain)
     if plain and rough.score < options.min_score:
         rough = replace(rough, plain=False)
     least = LEAST_UNAIDED if interior < CLEAN_INTERIOR else _DOUBTFUL_COVERAGE

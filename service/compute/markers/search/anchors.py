@@ -17,9 +17,11 @@ from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_reduced
 from service.compute.markers.cones import cone_of_sphere
 from service.compute.markers.detect import find_rough
+from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.outlines.refine import refine_outlines
 from service.compute.markers.records import DetectionOptions, SphereOutline
-from service.compute.markers.search.predicted import WIDE, Tone, deviation, fit_pose, tone_of
+from service.compute.markers.search.cone_pose import fit_pose
+from service.compute.markers.search.predicted import WIDE, Tone, deviation, tone_of
 from service.compute.registration.identification.identity import Assignment, identify
 from service.compute.registration.solve import RegistrationResult, register
 from service.compute.scene import PosedImages, ScanSpheres
@@ -154,9 +156,7 @@ def _pose_error(
     if len(index) < 4:
         return 0.0
     centres = spheres[[m for _, m in index]]
-    axes = np.array([outlines[j].cone.axis for j, _ in index])
-    half = np.array([outlines[j].cone.half_angle_rad for j, _ in index])
-    own = fit_pose(axes, half, centres, radius_m, T)
+    own = fit_pose(ObservedCones.of(outlines[j].cone for j, _ in index), centres, radius_m, T)
     moved = [
         deviation(cone_of_sphere(a, radius_m), cone_of_sphere(b, radius_m))[0]
         for a, b in zip(apply(own, centres), apply(T, centres), strict=True)

@@ -11,18 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.descent import gauss_newton
 from service.compute.markers.cones import Cone, cone_of_sphere, ransac_cone
 from service.compute.markers.detect import detect_spheres
+from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.outlines.edges import envelope_edges, profiles, sample
 from service.compute.markers.outlines.refine import AveragedCone, approach_outlines, measure_outlines, refine_outline
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
-from service.core.geometry import Array, Transform, apply, increment, skew
+from service.compute.markers.search.cone_pose import fit_pose
+from service.compute.registration.identification.pairing import Gate
+from service.core.geometry import Array, Transform, apply
 
 # Lengths below are fractions of a sphere's apparent radius, unless the name has a unit.
 NEAR = 0.08  # a prediction this good is refined directly; its region is searched only if that fails
 WIDE = 0.42  # largest search range, for a robot that is off by millimetres
-_PLACE_GATE, _SIZE_GATE = 0.05, 0.04  # of a whole outline from the image's other spheres; scaled for partial ones
+_GATE = Gate(0.05, 0.04)  # of a whole outline from the image's other spheres; scaled for partial ones
 _ROUGH_GATE = 0.12
 _APPROACH_GATE = 0.02  # of approached outlines, on whose agreement the others are predicted
 _LEAST_PART = 0.45  # share of an outline that must be inside the image and not behind another sphere
@@ -162,12 +164,11 @@ def _attempt(
         else:
             outlines[m] = outline
     cones = {m: o.cone for m, o in outlines.items()}
-    agreed = _agreed_pose(cones, expected, pose, _PLACE_GATE, 0.5 * len(cones))
+    agreed = _agreed_pose(cones, expected, pose, _GATE.place, 0.5 * len(cones))
     pose = pose if agreed is None else agreed
     for m, outline in list(outlines.items()):
-        place, size = deviation(outline.cone, cone_of_sphere(apply(pose, centres[m]), radius_m))
-        part = max(outline.coverage, 0.2)
-        if place > _PLACE_GATE / part or size > _SIZE_GATE / part:
+        there = cone_of_sphere(apply(pose, centres[m]), radius_m)
+        if not _within_gate(outline.cone, there, max(outline.coverage, 0.2)):
             del outlines[m]
             missing[m] = "not where the image's other spheres predict it"
     return PredictedOutlines(outlines, missing, pose)
@@ -191,9 +192,14 @@ def _starts(
     out: dict[int, AveragedCone] = {}
     for m, cone in visible_cones(agreed, centres, radius_m, camera).items():
         own = approached.get(m)
-        place, size = (np.inf, np.inf) if own is None else deviation(own.cone, cone)
-        out[m] = own if own is not None and place < _PLACE_GATE and size < _SIZE_GATE else AveragedCone(cone)
+        out[m] = own if own is not None and _within_gate(own.cone, cone) else AveragedCone(cone)
     return out
+
+
+def _within_gate(cone: Cone, predicted: Cone, part: float = 1.0) -> bool:
+    """Whether a cone, of which a part 0 … 1 of the outline is visible, is where the other spheres predict it."""
+    place, size = deviation(cone, predicted)
+    return place <= _GATE.place / part and size <= _GATE.size / part
 
 
 def deviation(cone: Cone, predicted: Cone) -> tuple[float, float]:
@@ -315,64 +321,9 @@ def _agreed_pose(
     if len(cones) < _POSE_SPHERES:
         return None
     index = list(cones)
-    axes = np.array([c.axis for c in cones.values()])
-    half = np.array([c.half_angle_rad for c in cones.values()])
-    pose = fit_pose(axes, half, expected.centres_m[index], expected.radius_m, start)
+    pose = fit_pose(ObservedCones.of(cones.values()), expected.centres_m[index], expected.radius_m, start)
     agreeing = sum(
         deviation(c, cone_of_sphere(apply(pose, expected.centres_m[m]), expected.radius_m))[0] < gate
         for m, c in cones.items()
     )
     return pose if agreeing >= max(_POSE_SPHERES, least) else None
-
-
-def fit_pose(
-    axes: Array, half_angles: Array, centres_m: Array, radius_m: float, start: Transform, iterations: int = 12
-) -> Transform:
-    """T_camera_scan from cones, by robust Gauss–Newton on their directions and sizes.
-
-    Args:
-        axes: (N, 3) unit directions to the centres, camera frame; N ≥ 3.
-        half_angles: (N,) of the cones, radians.
-        centres_m: (N, 3) of the spheres, scan frame.
-        radius_m: radius of the spheres.
-        start: initial T_camera_scan.
-        iterations: largest number.
-    """
-    try:
-        return gauss_newton(
-            start,
-            lambda pose: _pose_step(pose, axes, half_angles, centres_m, radius_m),
-            lambda pose, step: increment(pose, step[:3], step[3:]),
-            most=iterations,
-            settled=1e-9,
-        )
-    except _InsideSphereError:
-        return start
-
-
-class _InsideSphereError(Exception):
-    """The camera would be inside a sphere."""
-
-
-def _pose_step(pose: Transform, axes: Array, half_angles: Array, centres_m: Array, radius_m: float) -> Array:
-    """One Gauss–Newton step (6,) of translation and rotation. Raises _InsideSphereError."""
-    rotated = centres_m @ pose[:3, :3].T
-    c = rotated + pose[:3, 3]
-    distance = np.linalg.norm(c, axis=1)
-    if np.any(distance < 1.5 * radius_m):
-        raise _InsideSphereError
-    u = c / distance[:, None]
-    place = (u - axes) / half_angles[:, None]
-    size = np.arcsin(radius_m / distance) / half_angles - 1
-    residual = np.column_stack([place, size])  # (N, 4) in radii
-    across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / (distance * half_angles)[:, None, None]
-    shrink = -radius_m / (distance**2 * np.sqrt(1 - (radius_m / distance) ** 2) * half_angles)
-    by_centre = np.concatenate([across, (shrink[:, None] * u)[:, None, :]], axis=1)  # (N, 4, 3)
-    J = np.concatenate([by_centre, -by_centre @ skew(rotated)], axis=2)
-    error = np.linalg.norm(residual, axis=1)
-    scale = max(0.01, 1.5 * float(np.median(error)))
-    weight = 1 / (1 + (error / scale) ** 2)
-    H = np.einsum("n,nki,nkj->ij", weight, J, J)
-    g = np.einsum("n,nki,nk->i", weight, J, residual)
-    d = 1 / np.sqrt(np.maximum(np.diag(H), 1e-12))
-    return -d * np.linalg.lstsq(H * np.outer(d, d), d * g, rcond=1e-12)[0]

@@ -15,7 +15,6 @@ from typing import Any, cast
 
 import psutil
 
-from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.core.geometry import Transform
 
@@ -33,11 +32,6 @@ def read_model(folder: Path) -> dict[str, Transform]:
     return cast("dict[str, Transform]", _in_child(_read, folder, str(folder)))
 
 
-def write_model(folder: Path, camera: CameraModel, T_world_camera: dict[str, Transform]) -> None:
-    """Write a text model without points into an existing folder. Raises DataError if it cannot be written."""
-    _in_child(_write, folder, str(folder), camera, T_world_camera)
-
-
 def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> object:
     context = multiprocessing.get_context("spawn")
     try:
@@ -49,7 +43,7 @@ def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> obj
         outcome = "it announces more than memory can hold"
     if isinstance(outcome, str):
         raise DataError(
-            f"the COLMAP model cannot be read or written: {outcome}",
+            f"the COLMAP model cannot be read: {outcome}",
             where=str(folder),
             remedy="check that cameras, images and points3D belong together and are complete",
         )
@@ -86,19 +80,3 @@ def _read(folder: str) -> dict[str, Transform] | str:
         return "the name of an image is not UTF-8"
     except (RuntimeError, ValueError, IndexError, OSError) as error:  # everything that pycolmap raises
         return (str(error).strip().splitlines() or [type(error).__name__])[-1]
-
-
-def _write(folder: str, camera: CameraModel, T_world_camera: dict[str, Transform]) -> str | None:
-    colmap = importlib.import_module("pycolmap")
-    convention = importlib.import_module("service.compute.poses.colmap.convention")
-    colmap.logging.minloglevel = colmap.logging.FATAL.value
-    model = colmap.Reconstruction()
-    model.add_camera_with_trivial_rig(convention.to_colmap_camera(camera))
-    for image_id, (name, T) in enumerate(T_world_camera.items(), start=1):
-        image = colmap.Image(name=name, camera_id=1, image_id=image_id)
-        model.add_image_with_trivial_frame(image, convention.to_colmap_pose(T))
-    try:
-        model.write_text(folder)
-    except (RuntimeError, ValueError, OSError) as error:
-        return str(error).strip().splitlines()[-1]
-    return None

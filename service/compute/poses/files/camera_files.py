@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from service.compute.camera_model import CameraModel
+from service.compute.scene import ScanSpheres
 from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.text.file_text import file_text
@@ -35,21 +35,6 @@ _CALIBRATION_KEYS = (
     "sigma_by_image", "sigma_corner_px", "inflation", "covariance", "coverage", "tilt", "cross_validation",
     "residuals", "uncertainty", "warnings", "optics",
 )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class SphereFile:
-    """Sphere centres measured elsewhere, in the scan frame.
-
-    Attributes:
-        radius_m: radius of all spheres.
-        registration_m: (M, 3).
-        control_m: (K, 3); K may be 0.
-    """
-
-    radius_m: float
-    registration_m: Array
-    control_m: Array
 
 
 def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> CameraModel:
@@ -90,8 +75,8 @@ def write_camera_json(path: Path, camera: CameraModel) -> None:
     path.write_text(json.dumps(camera.record(), indent=2) + "\n", encoding="utf-8")
 
 
-def read_spheres_json(path: Path) -> SphereFile:
-    """Spheres from {"radius_mm": 15, "registration_mm": [[x,y,z],…], "control_mm": [[x,y,z],…]}.
+def read_spheres_json(path: Path) -> ScanSpheres:
+    """Spheres in the scan frame, from {"radius_mm": 15, "registration_mm": [[x,y,z],…], "control_mm": [[x,y,z],…]}.
 
     `details`, which the `spheres` command adds for each sphere, is ignored.
 
@@ -115,7 +100,7 @@ def read_spheres_json(path: Path) -> SphereFile:
         centres.append(metres(rows))
     if len(centres[0]) == 0:
         raise DataError("registration_mm is empty", where=str(path), remedy="give at least three spheres")
-    return SphereFile(metres(float(radius)), centres[0], centres[1])
+    return ScanSpheres(centres[0], metres(float(radius)), control_m=centres[1])
 
 
 def _check_keys(document: Mapping[str, Any], needed: set[str], optional: set[str], path: Path) -> None:

@@ -200,13 +200,18 @@ def _rotation(matrix: Array, where: str) -> Array:
     return U @ Vt
 
 
-def write_transforms_json(path: Path, camera: CameraModel, T_world_camera: Mapping[str, Transform]) -> None:
+def write_transforms_json(
+    path: Path, camera: CameraModel, T_world_camera: Mapping[str, Transform], *, simulated: bool = False
+) -> None:
     """Write poses and camera as nerfstudio's transforms.json (OPENCV model, OpenGL camera axes).
+
+    `simulated`: the file says so.
 
     Raises:
         DataError: the camera has rational distortion, which that format cannot hold.
     """
     document = {
+        **({"simulated": True} if simulated else {}),
         "camera_model": "OPENCV",
         **transforms_intrinsics(camera, where=str(path), remedy="calibrate with the model opencv4 or opencv5"),
         "frames": [
@@ -256,18 +261,3 @@ def read_colmap_model(folder: Path) -> dict[str, Transform]:
         where=str(folder),
         remedy="it must hold cameras, images and points3D (.bin or .txt)",
     )
-
-
-def write_colmap_text(folder: Path, camera: CameraModel, T_world_camera: Mapping[str, Transform]) -> None:
-    """Write poses and camera as a COLMAP text model without points.
-
-    Raises:
-        DataError: an image name has spaces, which that format cannot hold, or the folder cannot be written.
-    """
-    spaced = [name for name in T_world_camera if name.split() != [name]]
-    if spaced:
-        raise DataError(
-            "COLMAP's text format cannot hold image names with spaces", where=spaced[0], remedy="rename the image"
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    colmap_files.write_model(folder, camera, dict(T_world_camera))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.compute.descent import Damping, levenberg_marquardt
-from service.compute.poses.hybrid.bundle import Data, Normal, Rows, Sigmas, State, moved, normal_equations
+from service.compute.poses.hybrid.bundle import BundleState, Data, Normal, Rows, Sigmas, moved, normal_equations
 from service.compute.poses.hybrid.rows import linearise
 from service.compute.poses.hybrid.stated_covariance import (
     CAUCHY,
@@ -30,7 +30,7 @@ _LEAST = Sigmas(track_px=0.02, sphere=0.3, robot_m=1e-5, robot_rad=1e-5)  # lowe
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
+class BundleSolution:
     """The adjusted state.
 
     Attributes:
@@ -39,20 +39,18 @@ class Solution:
         weights: robust weight of each measurement, by component.
         covariance: (n, n) of the frame parameters, points eliminated.
         chi2: reduced chi square of each component, with robust weights and its own redundancy.
-        redundancy: of each component; their sum plus the number of parameters is the number of rows.
         steps: number of linearisations.
     """
 
-    state: State
+    state: BundleState
     sigmas: Sigmas
     weights: dict[str, Array]
     covariance: Array
     chi2: dict[str, float]
-    redundancy: dict[str, float]
     steps: int
 
 
-def solve(state: State, data: Data, sigmas: Sigmas, *, rounds: int = 3) -> Solution:
+def solve(state: BundleState, data: Data, sigmas: Sigmas, *, rounds: int = 3) -> BundleSolution:
     """Levenberg–Marquardt with Cauchy weights; the components' variances are estimated between rounds.
 
     The variances are Förstner's estimates: each component's weighted sum of squares over its redundancy (Koch,
@@ -85,10 +83,10 @@ def solve(state: State, data: Data, sigmas: Sigmas, *, rounds: int = 3) -> Solut
             sigmas = _estimated(sigmas, chi2, redundancy)
         else:
             covariance = stated_covariance(weighted, len(normal.schur))
-    return Solution(state, sigmas, weights, covariance, chi2, redundancy, steps)
+    return BundleSolution(state, sigmas, weights, covariance, chi2, steps)
 
 
-def first_guess(state: State, data: Data, sigmas: Sigmas) -> Sigmas:
+def first_guess(state: BundleState, data: Data, sigmas: Sigmas) -> Sigmas:
     """Sigmas with the tracks' from the median of their residuals, so that robust weights work from the start."""
     squares = linearise(state, dataclasses.replace(data, sightings=None, robot=None, lens_covariance=None), sigmas)[
         "tracks"
@@ -101,13 +99,15 @@ def first_guess(state: State, data: Data, sigmas: Sigmas) -> Sigmas:
 
 @dataclass(frozen=True, slots=True)
 class _Linearised:
-    state: State
+    state: BundleState
     rows: dict[str, Rows]
     cost: float
 
 
-def _descend(state: State, data: Data, sigmas: Sigmas, settled: float) -> tuple[State, dict[str, Rows], int]:
-    def at(there: State) -> _Linearised:
+def _descend(
+    state: BundleState, data: Data, sigmas: Sigmas, settled: float
+) -> tuple[BundleState, dict[str, Rows], int]:
+    def at(there: BundleState) -> _Linearised:
         rows = linearise(there, data, sigmas)
         cost = _cost(rows)
         return _Linearised(there, rows, cost if math.isfinite(cost) else math.inf)
@@ -182,7 +182,7 @@ def _estimated(sigmas: Sigmas, chi2: dict[str, float], redundancy: dict[str, flo
     )
 
 
-def robust_rows(state: State, data: Data, sigmas: Sigmas) -> dict[str, Rows]:
+def robust_rows(state: BundleState, data: Data, sigmas: Sigmas) -> dict[str, Rows]:
     """Rows of every component with their robust weights."""
     rows = linearise(state, data, sigmas)
     weights = _weights(rows)

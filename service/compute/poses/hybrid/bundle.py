@@ -15,6 +15,7 @@ from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, vstack
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
+from service.compute.markers.observed_cones import ObservedCones
 from service.compute.poses.sfm.tracks import Tracks
 from service.core.errors import ComputeError
 from service.core.geometry import Array
@@ -26,7 +27,7 @@ _CHUNK = 2000  # points eliminated at a time
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class BundleState:
     """The estimated quantities. `points` are those of the tracks, followed by the spheres' centres."""
 
     cameras: Array  # (N, 4, 4) T_frame_camera
@@ -38,13 +39,11 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class SphereSightings:
-    """Outlines of spheres as cones (see SphereOutline)."""
+    """Outlines of S spheres as cones."""
 
     image: Index  # (S,)
     marker: Index  # (S,)
-    axes: Array  # (S, 3) unit
-    frames: Array  # (S, 3, 3) columns e1, e2, axis
-    half_angles: Array  # (S,)
+    cones: ObservedCones
     whitening: Array  # (S, 3, 3) W with W C W^T = I for the cone's covariance C
 
 
@@ -96,17 +95,17 @@ class Rows:
         return np.sum(self.residual.reshape(-1, self.size) ** 2, axis=1)
 
 
-def width(state: State, data: Data) -> int:
+def width(state: BundleState, data: Data) -> int:
     """Number of frame parameters: six per camera, six per base, the errors shared by outlines, and the lens."""
     return lens_column(state, data) + (len(LENS) if data.lens_covariance is not None else 0)
 
 
-def common_column(state: State) -> int:
+def common_column(state: BundleState) -> int:
     """First column of the errors that all outlines share."""
     return 6 * (len(state.cameras) + len(state.bases))
 
 
-def lens_column(state: State, data: Data) -> int:
+def lens_column(state: BundleState, data: Data) -> int:
     """First column of the lens."""
     return common_column(state) + (len(COMMON) if data.sightings is not None else 0)
 
@@ -162,7 +161,7 @@ def normal_equations(rows: list[Rows], damping: float = 0.0) -> Normal:
     return Normal(schur, gradient, W, inverse, point_gradient)
 
 
-def moved(state: State, data: Data, frame: Array, points: Array) -> State:
+def moved(state: BundleState, data: Data, frame: Array, points: Array) -> BundleState:
     """The state after an increment of the frame parameters (n,) and the points (Q, 3)."""
     n, g = len(state.cameras), len(state.bases)
     camera = state.camera
@@ -170,7 +169,7 @@ def moved(state: State, data: Data, frame: Array, points: Array) -> State:
         change = frame[lens_column(state, data) :]
         values = {name: getattr(camera, name) + float(d) for name, d in zip(LENS, change, strict=True)}
         camera = dataclasses.replace(camera, **values)
-    return State(
+    return BundleState(
         _turned(state.cameras, frame[: 6 * n].reshape(-1, 6)),
         state.points + points,
         _turned(state.bases, frame[6 * n : 6 * (n + g)].reshape(-1, 6)),

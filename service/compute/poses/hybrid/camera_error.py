@@ -9,7 +9,7 @@ import numpy as np
 from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone
-from service.compute.poses.hybrid.adjustment import Solution
+from service.compute.poses.hybrid.adjustment import BundleSolution
 from service.compute.poses.hybrid.bundle import Data, SphereSightings, normal_equations
 from service.compute.poses.hybrid.rows import linearise
 from service.core.geometry import Array
@@ -17,7 +17,7 @@ from service.core.geometry import Array
 _RIM = 12  # rays of an outline that are recomputed
 
 
-def camera_share(solution: Solution, data: Data, known: CameraCovariance) -> Array:
+def camera_share(solution: BundleSolution, data: Data, known: CameraCovariance) -> Array:
     """Covariance (n, n) of the frame parameters due to the camera's covariance, to be added to the solution's.
 
     For each deviation of the camera, this takes the step that the adjustment would make with that camera: robust
@@ -47,12 +47,13 @@ def _read_by(sightings: SphereSightings | None, held: CameraModel, other: Camera
     if sightings is None:
         return None
     azimuth = np.linspace(0.0, 2 * np.pi, _RIM, endpoint=False)
-    axes, halves = sightings.axes.copy(), sightings.half_angles.copy()
-    for i, (axis, half) in enumerate(zip(sightings.axes, sightings.half_angles, strict=True)):
+    seen = sightings.cones
+    axes, halves = seen.axes.copy(), seen.half_angles.copy()
+    for i, (axis, half) in enumerate(zip(seen.axes, seen.half_angles, strict=True)):
         cone = Cone(axis, float(half))
         pixels = held.project(np.vstack([axis, cone.rays(azimuth, np.full(_RIM, half))]))
         rays = np.column_stack([other.normalise(pixels), np.ones(_RIM + 1)])
         rays /= np.linalg.norm(rays, axis=1)[:, None]
         axes[i] = rays[0]
         halves[i] = float(np.mean(np.arccos(np.clip(rays[1:] @ rays[0], -1, 1))))
-    return dataclasses.replace(sightings, axes=axes, half_angles=halves)
+    return dataclasses.replace(sightings, cones=dataclasses.replace(seen, axes=axes, half_angles=halves))

@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
+from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import SphereOutline
-from service.compute.poses.hybrid.adjustment import Solution, solve
-from service.compute.poses.hybrid.bundle import Data, Sigmas, SphereSightings, State, whitening_of
+from service.compute.poses.hybrid.adjustment import BundleSolution, solve
+from service.compute.poses.hybrid.bundle import BundleState, Data, Sigmas, SphereSightings, whitening_of
 from service.compute.poses.hybrid.camera_error import camera_share
 from service.compute.poses.sfm.tracks import Tracks
 from service.compute.registration.identification.identity import identify
@@ -194,7 +195,7 @@ def hybrid_poses(
     )
     used = tracks.thinned(settings.most_observations)
     bases, order, group = _bases(start.T_scan_camera, T_base_camera, stations)
-    state = State(
+    state = BundleState(
         cameras=start.T_scan_camera,
         points=np.vstack([apply(inverse(start.T_world_scan), start.scale * used.points), spheres.centres_m]),
         bases=bases,
@@ -219,7 +220,7 @@ def _data(
     covariance = spheres.covariance_m2
     if covariance is None:
         covariance = np.broadcast_to(settings.sphere_sigma_m**2 * np.eye(3), (len(spheres.centres_m), 3, 3))
-    distance_m = float(np.mean(spheres.radius_m / np.sin(sightings.half_angles)))
+    distance_m = float(np.mean(spheres.radius_m / np.sin(sightings.cones.half_angles)))
     return Data(
         tracks=tracks,
         sightings=sightings,
@@ -234,7 +235,7 @@ def _data(
 
 
 def _answer(
-    solution: Solution, share: Array, order: list[int], n_points: int, start: RegistrationResult
+    solution: BundleSolution, share: Array, order: list[int], n_points: int, start: RegistrationResult
 ) -> HybridPoses:
     state, n = solution.state, len(solution.state.cameras)
     T_world_scan = inverse(state.bases[0]) if order else np.eye(4)
@@ -266,9 +267,7 @@ def _sightings(outlines: Sequence[Sequence[SphereOutline]], start: RegistrationR
     return SphereSightings(
         image=np.array([r.image for r in used]),
         marker=np.array([r.marker for r in used]),
-        axes=np.array([o.cone.axis for o in found]),
-        frames=np.array([o.cone.frame() for o in found]),
-        half_angles=np.array([o.cone.half_angle_rad for o in found]),
+        cones=ObservedCones.of(o.cone for o in found),
         whitening=whitening,
     )
 

@@ -15,21 +15,20 @@ from service.compute.camera_model import CameraModel
 from service.compute.poses.hybrid.bundle import (
     COMMON,
     LENS,
+    BundleState,
     Data,
     Index,
     Rows,
     Sigmas,
-    State,
     common_column,
     lens_column,
     whitening_of,
     width,
 )
-from service.compute.registration.cost import cone_residuals
 from service.core.geometry import Array, skew
 
 
-def linearise(state: State, data: Data, sigmas: Sigmas) -> dict[str, Rows]:
+def linearise(state: BundleState, data: Data, sigmas: Sigmas) -> dict[str, Rows]:
     """Rows of every component in the data: tracks, spheres, centres, common, robot_position …, lens."""
     out = {"tracks": _track_rows(state, data, sigmas)}
     if data.sightings is not None:
@@ -52,7 +51,7 @@ def _seen(cameras: Array, points: Array) -> tuple[Array, Array, Array]:
     return np.einsum("oij,oj->oi", Rt, v), d_pose, Rt
 
 
-def _track_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
+def _track_rows(state: BundleState, data: Data, sigmas: Sigmas) -> Rows:
     tracks = data.tracks
     c, d_pose, d_point = _seen(state.cameras[tracks.image], state.points[tracks.point])
     camera = state.camera
@@ -70,20 +69,20 @@ def _track_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
     return _rows(state, data, observed)
 
 
-def _sphere_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
+def _sphere_rows(state: BundleState, data: Data, sigmas: Sigmas) -> Rows:
     s = data.sightings
     assert s is not None
     point = s.marker + len(data.tracks.points)
     light = data.light_unit_m * state.common[3:]
     c, d_pose, d_point = _seen(state.cameras[s.image], state.points[point] + light)
-    e = s.frames[:, :, :2]
-    axes, lens = s.axes, None
+    cones, e, lens = s.cones, s.cones.directions, None
     if data.lens_covariance is not None:
         assert data.calibrated is not None
-        pixels = data.calibrated.project(s.axes)
+        pixels = data.calibrated.project(cones.axes)
         plane = state.camera.normalise(pixels)
         axes = np.column_stack([plane, np.ones(len(plane))])
         axes /= np.linalg.norm(axes, axis=1)[:, None]
+        cones = dataclasses.replace(cones, axes=axes)
         # The focal length also changes the half angle, but by far less than its sigma.
         lift = np.zeros((len(c), 3, len(LENS)))
         lift[:, :2] = _lens_derivative(state.camera, pixels, plane) * axes[:, 2, None, None]
@@ -91,9 +90,9 @@ def _sphere_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
         lens[:, :2] = -np.swapaxes(e, 1, 2) @ lift
     focal = 0.5 * (state.camera.fx + state.camera.fy)
     shift = np.zeros((len(c), 3, len(COMMON)))  # the common errors of the detector
-    shift[:, :2, :2] = np.swapaxes(e[:, :2], 1, 2) * (axes[:, 2] / focal)[:, None, None]
-    shift[:, 2, 2] = axes[:, 2] ** 2 / focal
-    seen, d = cone_residuals(axes, e, s.half_angles, c, data.radius_m)
+    shift[:, :2, :2] = np.swapaxes(e[:, :2], 1, 2) * (cones.axes[:, 2] / focal)[:, None, None]
+    shift[:, 2, 2] = cones.axes[:, 2] ** 2 / focal
+    seen, d = cones.residuals(c, data.radius_m)
     residual = seen + shift @ state.common
     whitening = s.whitening / sigmas.sphere
     d = whitening @ d
@@ -127,7 +126,7 @@ class _Observed:
     more: tuple[int, Array] | None  # first column and derivatives (O, k, m) of further frame parameters
 
 
-def _rows(state: State, data: Data, seen: _Observed) -> Rows:
+def _rows(state: BundleState, data: Data, seen: _Observed) -> Rows:
     """Sparse rows from dense derivatives."""
     n_obs, k = seen.residual.shape
     row = np.arange(n_obs * k).reshape(n_obs, k, 1)
@@ -151,7 +150,7 @@ def _sparse(row: NDArray[Any], column: NDArray[Any], values: NDArray[Any], shape
     return coo_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape).tocsr()
 
 
-def _centre_rows(state: State, data: Data) -> Rows:
+def _centre_rows(state: BundleState, data: Data) -> Rows:
     """Rows of the spheres' measured positions in the scan."""
     assert data.centres is not None
     assert data.centre_whitening is not None
@@ -163,7 +162,7 @@ def _centre_rows(state: State, data: Data) -> Rows:
     return Rows(residual, csr_matrix((3 * m, width(state, data))), point, 3)
 
 
-def _common_rows(state: State, data: Data) -> Rows:
+def _common_rows(state: BundleState, data: Data) -> Rows:
     """Rows of the prior of the errors that all outlines share."""
     assert data.common_sigma_px is not None
     count = len(COMMON)
@@ -172,7 +171,7 @@ def _common_rows(state: State, data: Data) -> Rows:
     return Rows(state.common / data.common_sigma_px, frame, csr_matrix((count, state.points.size)), 1)
 
 
-def _robot_rows(state: State, data: Data, sigmas: Sigmas) -> tuple[Rows, Rows]:
+def _robot_rows(state: BundleState, data: Data, sigmas: Sigmas) -> tuple[Rows, Rows]:
     assert data.robot is not None
     assert data.group is not None
     image = np.nonzero(np.isfinite(data.robot).all(axis=(1, 2)))[0]
@@ -204,7 +203,7 @@ def _robot_rows(state: State, data: Data, sigmas: Sigmas) -> tuple[Rows, Rows]:
     return out[0], out[1]
 
 
-def _lens_rows(state: State, data: Data) -> Rows:
+def _lens_rows(state: BundleState, data: Data) -> Rows:
     """Rows of the lens calibration, as an observation of the lens."""
     assert data.calibrated is not None
     assert data.lens_covariance is not None

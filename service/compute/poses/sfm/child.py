@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_grey
 from service.compute.poses.colmap.convention import from_colmap_pixels, to_colmap_camera, to_colmap_pixels
+from service.compute.poses.sfm.extraction import extract_sift
 from service.compute.poses.sfm.features import match_descriptors
 from service.compute.poses.sfm.mapping import map_images
 from service.compute.poses.sfm.options import Progress, reduction
@@ -71,24 +72,15 @@ def _extract(job: dict[str, Any], _progress: Progress) -> dict[str, Any]:
     factor = reduction(options["max_image_size"], *size)
     if factor > 1:
         small = (round(size[0] / factor), round(size[1] / factor))
-        image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+        image = np.asarray(cv2.resize(image, small, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         scale = np.array(size) / np.array(small)
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.num_threads = 1
-    extraction.use_gpu = False
-    extraction.sift.max_num_features = options["max_features"]
-    extraction.sift.first_octave = options["first_octave"]
-    extractor = pycolmap.FeatureExtractor.create(extraction, pycolmap.Device.cpu)
-    keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(image))
-    # Columns x, y, scale, orientation; COLMAP keeps whole scale levels, so there are more than requested.
-    found = np.asarray(pycolmap.keypoints_to_matrix(keypoints), dtype=np.float64).reshape(-1, 4)
-    kept = np.sort(np.argsort(-found[:, 2], kind="stable")[: options["max_features"]])
+    found = extract_sift(image, options["max_features"], options["first_octave"])
     return {
         "width": size[0],
         "height": size[1],
-        "pixels": from_colmap_pixels(found[kept, :2] * scale).astype(np.float32),
-        "scales_px": (found[kept, 2] * float(scale.mean())).astype(np.float32),
-        "descriptors": np.asarray(descriptors.data, dtype=np.uint8).reshape(-1, 128)[kept],
+        "pixels": from_colmap_pixels(found.points * scale).astype(np.float32),
+        "scales_px": (found.scales_px * float(scale.mean())).astype(np.float32),
+        "descriptors": found.descriptors,
     }
 
 

@@ -79,16 +79,31 @@ class SfmModel:
         return blocks(self.joint_pose_covariance(known))
 
 
+@dataclass(frozen=True, slots=True)
+class SfmWorkspace:
+    """Where and how images of one camera are reconstructed.
+
+    Attributes:
+        folder: for features, matches, models and COLMAP's logs; created if missing.
+        camera: calibrated at the images' size; fixed unless the options refine it.
+        options: settings.
+        progress: called now and then with (stage, done, total); stage is extract, match, map or adjust, and total is
+            0 if COLMAP does not report it.
+    """
+
+    folder: Path
+    camera: CameraModel
+    options: SfmOptions = field(default_factory=SfmOptions)
+    progress: Progress | None = None
+
+
 def reconstruct(
     images: Mapping[str, Path] | Sequence[Path],
-    camera: CameraModel,
-    workspace: Path,
+    workspace: SfmWorkspace,
     mapper: Mapper = "incremental",
     *,
     T_world_camera_prior: Mapping[str, Transform] | None = None,
     stations: Mapping[str, str] | None = None,
-    options: SfmOptions | None = None,
-    progress: Progress | None = None,
 ) -> SfmModel:
     """Estimate the poses of images of one calibrated camera, up to a similarity: all stages in one call.
 
@@ -98,53 +113,38 @@ def reconstruct(
 
     Args:
         images: file of each image by name, or files with unique names.
-        camera: calibrated at the images' size; fixed unless the options refine it.
-        workspace: folder for features, matches, the models and COLMAP's logs; created if missing.
+        workspace: folder, camera and settings.
         mapper: COLMAP's incremental mapper, the global one (GLOMAP), or `triangulated` from the prior.
         T_world_camera_prior: rough poses in one frame (from the robot) that select the pairs to match; images without
             one are matched with all others. Otherwise used only by `triangulated`, which starts from them.
         stations: frame of each image's prior, if there are several.
-        options: settings.
-        progress: called now and then with (stage, done, total); stages extract, match and those of
-            `reconstruct_from`.
 
     Raises:
         DataError: an image is missing, unreadable or of another size than the camera.
         ComputeError: too few images, no model, or COLMAP failed.
     """
-    settings = options or SfmOptions()
+    camera, settings, folder, progress = workspace.camera, workspace.options, workspace.folder, workspace.progress
     files = _by_name(images)
     _check_count(len(files))
-    workspace.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     pairs = pairs_of(files, T_world_camera_prior, settings, stations=stations)
     seconds: dict[str, float] = {}
-    with FrontEnd(camera, settings, processes=settings.threads, log=workspace / "colmap_front.log") as front:
-        kept = KeptFrontEnd(workspace, camera, settings, seconds)
+    with FrontEnd(camera, settings, processes=settings.threads, log=folder / "colmap_front.log") as front:
+        kept = KeptFrontEnd(folder, camera, settings, seconds)
         features = kept.features(files, front, progress)
         matches = kept.matches(features, pairs, front, progress)
-    model = reconstruct_from(
-        features,
-        matches,
-        camera,
-        workspace,
-        mapper,
-        T_world_camera_start=T_world_camera_prior if mapper == "triangulated" else None,
-        options=settings,
-        progress=progress,
-    )
+    start = T_world_camera_prior if mapper == "triangulated" else None
+    model = reconstruct_from(features, matches, workspace, mapper, T_world_camera_start=start)
     return dataclasses.replace(model, seconds={**seconds, **model.seconds})
 
 
 def reconstruct_from(
     features: Mapping[str, ImageFeatures],
     matches: Iterable[PairMatches],
-    camera: CameraModel,
-    workspace: Path,
+    workspace: SfmWorkspace,
     mapper: Mapper = "incremental",
     *,
     T_world_camera_start: Mapping[str, Transform] | None = None,
-    options: SfmOptions | None = None,
-    progress: Progress | None = None,
 ) -> SfmModel:
     """Estimate poses from existing features and matches (see `FrontEnd`), in one child process.
 
@@ -154,8 +154,7 @@ def reconstruct_from(
     Args:
         features: of every image, by name.
         matches: of the pairs to use (`pairs_of` the images); pairs with images without features are dropped.
-        camera: calibrated at the images' size; fixed unless the options refine it.
-        workspace: folder for the model and COLMAP's log; created if missing.
+        workspace: folder, camera and settings.
         mapper: source of the initial poses: COLMAP's incremental mapper or the global one (GLOMAP), both from the
             images alone; or `triangulated`, from T_world_camera_start. All tracks are triangulated from these poses,
             and poses and points are adjusted together.
@@ -164,34 +163,22 @@ def reconstruct_from(
             scale: the adjusted camera positions are aligned to them by a similarity. They do not constrain single
             poses, so their noise does not return. Images without a pose, or without common features with others, are
             missing.
-        options: settings.
-        progress: called now and then with ("map", done, total) and ("adjust", done, total); total is 0 if COLMAP does
-            not report it.
 
     Raises:
         DataError: an image's features are from another image size than the camera's.
         ComputeError: too few images, no model, or COLMAP failed.
     """
-    settings = options or SfmOptions()
+    camera, settings, folder = workspace.camera, workspace.options, workspace.folder
     names = sorted(features)
     _check_count(len(names))
     if mapper == "triangulated" and not T_world_camera_start:
         raise ComputeError("triangulation needs initial poses", remedy="give T_world_camera_start")
-    for name in names:
-        if (features[name].width, features[name].height) != (camera.width, camera.height):
-            raise DataError(
-                f"image {name} is {features[name].width}×{features[name].height}, "
-                f"the camera {camera.width}×{camera.height}",
-                remedy="check that the calibration was made at the images' size",
-            )
-    poor = [name for name in names if len(features[name].pixels) < _FEW]
-    if poor:
-        logger.warning("images with hardly any texture: %s", ", ".join(poor))
-    workspace.mkdir(parents=True, exist_ok=True)
+    _check_features({name: features[name] for name in names}, camera)
+    folder.mkdir(parents=True, exist_ok=True)
     index = {name: k for k, name in enumerate(names)}
     used = sorted((m for m in matches if m.first in index and m.second in index), key=lambda m: m.pair)
     job = {
-        "workspace": str(workspace),
+        "workspace": str(folder),
         "names": names,
         "mapper": mapper,
         "camera": dataclasses.asdict(camera),
@@ -201,9 +188,22 @@ def reconstruct_from(
         "matches": [(index[m.first], index[m.second], m.features, m.configuration, m.matrices) for m in used],
     }
     start = time.monotonic()
-    with ColmapProcess(seed=settings.seed, log=workspace / f"colmap_{mapper}.log") as child:
-        outcome = child.run("map", job, timeout_s=settings.timeout_s, progress=progress)
-    return _model(outcome, names, mapper, workspace, {"map": time.monotonic() - start})
+    with ColmapProcess(seed=settings.seed, log=folder / f"colmap_{mapper}.log") as child:
+        outcome = child.run("map", job, timeout_s=settings.timeout_s, progress=workspace.progress)
+    return _model(outcome, names, mapper, folder, {"map": time.monotonic() - start})
+
+
+def _check_features(features: Mapping[str, ImageFeatures], camera: CameraModel) -> None:
+    """Refuse features from images of another size than the camera's, and warn of images with hardly any."""
+    for name, found in features.items():
+        if (found.width, found.height) != (camera.width, camera.height):
+            raise DataError(
+                f"image {name} is {found.width}×{found.height}, the camera {camera.width}×{camera.height}",
+                remedy="check that the calibration was made at the images' size",
+            )
+    poor = [name for name, found in features.items() if len(found.pixels) < _FEW]
+    if poor:
+        logger.warning("images with hardly any texture: %s", ", ".join(poor))
 
 
 def _check_count(count: int) -> None:
@@ -225,7 +225,7 @@ def _by_name(images: Mapping[str, Path] | Sequence[Path]) -> dict[str, Path]:
 
 
 def _model(
-    outcome: dict[str, Any], names: list[str], mapper: Mapper, workspace: Path, seconds: dict[str, float]
+    outcome: dict[str, Any], names: list[str], mapper: Mapper, folder: Path, seconds: dict[str, float]
 ) -> SfmModel:
     by_index: dict[int, Transform] = outcome["poses"]
     poses = {names[index]: by_index[index] for index in sorted(by_index)}
@@ -241,7 +241,7 @@ def _model(
     if len(poses) < 3 or not math.isfinite(outcome["error_px"]):
         raise ComputeError(
             f"{mapper} mapping registered {len(poses)} of {len(names)} images",
-            where=os.fspath(workspace),
+            where=os.fspath(folder),
             remedy="check the images' overlap, sharpness and texture",
         )
     position = {names.index(name): k for k, name in enumerate(poses)}
@@ -256,6 +256,6 @@ def _model(
         len(poses),
         missing,
         outcome["n_models"],
-        workspace / mapper,
+        folder / mapper,
         seconds,
     )

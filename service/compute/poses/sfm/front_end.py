@@ -30,7 +30,8 @@ class FrontEnd:
 
         with FrontEnd(camera, options) as front:
             features[name] = front.extract_features(file)
-            matches += front.match_pairs(features, pairs_with(name, features, planned))
+            begun = [pair for pair in planned if name in pair and features.keys() >= set(pair)]
+            matches += front.match_pairs(features, begun)
 
     with `planned = pairs_of(…)` of the planned poses. At the end, the pairs of the images that did arrive are used:
     already matched ones are kept, `missing_pairs` of them are matched, and `reconstruct_from` maps.
@@ -189,12 +190,6 @@ def pairs_of(
     order = sorted(names)
     chosen = choose_pairs(order, T_world_camera_prior, options.neighbours, options.max_angle_deg, stations=stations)
     return [(order[i], order[j]) for i, j in chosen]
-
-
-def pairs_with(name: str, arrived: Iterable[str], pairs: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    """The pairs that join the image `name` with one that has arrived, so that they can be matched now."""
-    there = set(arrived)
-    return sorted((min(pair), max(pair)) for pair in pairs if name in pair and there >= set(pair) - {name})
 
 
 def missing_pairs(pairs: Iterable[tuple[str, str]], matches: Iterable[PairMatches]) -> list[tuple[str, str]]:

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
 from service.core.geometry import Array, Transform
 
@@ -86,6 +84,9 @@ def _ordered(i: int, j: int) -> tuple[int, int]:
 
 def _bridges(chosen: set[tuple[int, int]], known: list[int], rays: Array, n: int) -> set[tuple[int, int]]:
     """The nearest pairs between unconnected parts of the graph: several for each, since one may not match."""
+    from scipy.sparse import csr_matrix  # noqa: PLC0415 - half a second, which most commands do without
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
     added: set[tuple[int, int]] = set()
     while True:
         edges = np.array(sorted(chosen | added)).reshape(-1, 2)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
+from service.compute.descent import gauss_newton
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import cone_residuals
 from service.compute.registration.identification.pairing import Gate, Sightings, match, sightings
 from service.core.geometry import Array, Transform, apply, skew, transform
 
@@ -52,7 +52,7 @@ def image_hypotheses(
     from all their outlines and judged by their residuals in standard deviations.
     """
     seen = sightings(outlines, radius_m, camera)
-    D = min(len(seen.axes), _MOST_DETECTIONS)
+    D = min(len(seen.cones), _MOST_DETECTIONS)
     if D < 4 or len(centres_scan_m) < 4:
         return []
     model, image = _triples(seen, D, centres_scan_m)
@@ -149,26 +149,44 @@ def _fitting(
 def _pose_steps(
     seen: Sightings, pick: NDArray[np.int64], points: Array, rotation: Array, t: Array, radius_m: float, steps: int
 ) -> tuple[Array, Array, Array]:
-    """Gauss–Newton on the cones of detections `pick` (K, k) of spheres at (K, k, 3): poses and chi² (K,)."""
+    """A number of Gauss–Newton steps for K poses at a time: rotations, translations and chi² (K,).
+
+    Each pose explains the cones of detections `pick` (K, k) by spheres at `points` (K, k, 3).
+    """
     K, k = pick.shape
-    flat = pick.ravel()
-    chi2 = np.zeros(K)
-    for step in range(steps + 1):
-        turned = np.einsum("kij,knj->kni", rotation, points)
-        c = (turned + t[:, None]).reshape(-1, 3)
+    cones, sigma = seen.cones.take(pick.ravel()), seen.sigma_rad[pick.ravel()]
+
+    def at(rotation: Array, t: Array) -> _Poses:
+        turned = np.einsum("kij,knj->kni", rotation, points).reshape(-1, 3)
+        c = turned + np.repeat(t, k, axis=0)
         # Keep wrong poses in front of the camera, so that the derivative exists; they will not fit anyway.
         c[:, 2] = np.maximum(c[:, 2], 2 * radius_m)
-        r, slope = cone_residuals(seen.axes[flat], seen.frames[flat], seen.half_angles[flat], c, radius_m)
-        r = r / seen.sigma_rad[flat]
-        chi2 = np.sum(r.reshape(K, -1) ** 2, axis=1)
-        if step == steps:
-            break
-        slope = slope / seen.sigma_rad[flat][:, :, None]
-        J = np.concatenate([slope, -slope @ skew(turned.reshape(-1, 3))], axis=2).reshape(K, 3 * k, 6)
-        dx = _damped_steps(J, r.reshape(K, -1))
-        rotation = Rotation.from_rotvec(dx[:, 3:]).as_matrix() @ rotation
-        t = t + dx[:, :3]
-    return rotation, t, chi2
+        r, slope = cones.residuals(c, radius_m)
+        return _Poses(rotation, t, turned, r / sigma, slope / sigma[:, :, None])
+
+    def step_at(here: _Poses) -> Array:
+        J = np.concatenate([here.slope, -here.slope @ skew(here.turned)], axis=2).reshape(K, 3 * k, 6)
+        return _damped_steps(J, here.r.reshape(K, -1))
+
+    def moved(here: _Poses, dx: Array) -> _Poses:
+        return at(Rotation.from_rotvec(dx[:, 3:]).as_matrix() @ here.rotation, here.t + dx[:, :3])
+
+    found = gauss_newton(at(rotation, t), step_at, moved, most=steps, settled=0.0)
+    return found.rotation, found.t, np.sum(found.r.reshape(K, -1) ** 2, axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class _Poses:
+    """K poses, each with k spheres: all K k spheres turned, their residuals over sigma, and the derivatives of these.
+
+    The derivatives are by the centres in the camera frame.
+    """
+
+    rotation: Array  # (K, 3, 3)
+    t: Array  # (K, 3)
+    turned: Array  # (K k, 3)
+    r: Array  # (K k, 3)
+    slope: Array  # (K k, 3, 3)
 
 
 def _damped_steps(J: Array, r: Array) -> Array:
@@ -188,10 +206,10 @@ def _support(seen: Sightings, R: Array, t: Array, centres: Array, radius_m: floa
         part = slice(start, start + 2000)
         c = np.einsum("kij,mj->kmi", R[part], centres) + t[part, None]
         distance = np.maximum(np.linalg.norm(c, axis=2), 2 * radius_m)
-        cosine = np.einsum("dj,kmj->kdm", seen.axes, c / distance[..., None])
+        cosine = np.einsum("dj,kmj->kdm", seen.cones.axes, c / distance[..., None])
         half = np.arcsin(radius_m / distance)
         angle = np.arccos(np.clip(cosine, -1, 1)) / half[:, None, :]
-        ratio = seen.half_angles[None, :, None] / half[:, None, :]
+        ratio = seen.cones.half_angles[None, :, None] / half[:, None, :]
         angle[(angle > _LOOSE.place) | (np.abs(ratio - 1) > _LOOSE.size)] = np.inf
         nearest = angle.min(axis=2)
         ok = np.isfinite(nearest)
@@ -217,7 +235,7 @@ def _refine(
         c = apply(T, centres)
         if np.any(c[chosen][:, 2] < 2 * radius_m):
             return None
-        r, _ = cone_residuals(seen.axes[pick], seen.frames[pick], seen.half_angles[pick], c[chosen], radius_m)
+        r, _ = seen.cones.take(pick).residuals(c[chosen], radius_m)
         own = np.sum((r / seen.sigma_rad[pick]) ** 2, axis=1)
         if own.max() > _OUTLINE_CHI2:
             if len(markers) < 5:
@@ -230,7 +248,7 @@ def _refine(
         fresh = np.array(list(more), dtype=np.int64)
         if len(fresh):
             at = c[np.array(list(more.values()))]
-            s, _ = cone_residuals(seen.axes[fresh], seen.frames[fresh], seen.half_angles[fresh], at, radius_m)
+            s, _ = seen.cones.take(fresh).residuals(at, radius_m)
             fits = np.sum((s / seen.sigma_rad[fresh]) ** 2, axis=1) < _OUTLINE_CHI2
             more = {int(d): more[int(d)] for d in fresh[fits]}
         if not more:

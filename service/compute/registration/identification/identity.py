@@ -291,19 +291,23 @@ def _read(T_world_scan: Transform, s: float, station: _Station) -> _Reading:
         c = _camera_centres(T_world_scan, s, pose, station.centres)
         pairs = match(sight, c, station.radius_m, ROBOT_GATE)
         markers.append({d: m for d, m, _ in pairs})
-        cost += sum(angle / sight.half_angles[d] for d, _, angle in pairs)
+        cost += sum(angle / sight.cones.half_angles[d] for d, _, angle in pairs)
         total += len(pairs)
     return _Reading(T_world_scan, s, tuple(markers), total, cost / max(total, 1))
 
 
 def _polish(reading: _Reading, station: _Station) -> _Reading:
-    """Least squares on the directions of all matched spheres, alternating with matching until nothing changes."""
+    """Least squares on the directions of all matched spheres, alternating with matching until nothing changes.
+
+    The residuals are those of `ObservedCones` in radii, but written out: with other rounding, recorded results could
+    not be computed again to their last digits, on which the noise estimated from nearly exact outlines depends.
+    """
     seen, poses, radius_m, metric = station.seen, station.poses, station.radius_m, station.metric
     for _ in range(4):
         index = [(k, d, m) for k, r in enumerate(reading.markers) for d, m in r.items()]
         image = np.array([k for k, _, _ in index])
-        axes = np.array([seen[k].axes[d] for k, d, _ in index])
-        half = np.array([seen[k].half_angles[d] for k, d, _ in index])
+        axes = np.array([seen[k].cones.axes[d] for k, d, _ in index])
+        half = np.array([seen[k].cones.half_angles[d] for k, d, _ in index])
         model = station.centres[[m for _, _, m in index]]
         R, origin = poses[image, :3, :3], poses[image, :3, 3]
         T0, s0 = reading.T_world_scan, reading.scale

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.compute.camera_model import CameraModel
+from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import SphereOutline
 from service.core.geometry import Array, Transform, apply
 
@@ -28,44 +29,36 @@ CONTROL_GATE = Gate(0.5, 0.15)  # if a control sphere is farther from its predic
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """The geometry of one image's detections: directions, sizes, and positions from the known radius."""
+    """The geometry of one image's detections: cones, and positions from the known radius."""
 
-    axes: Array  # (D, 3) unit vectors to the centres, which are not the ellipses' centres
-    half_angles: Array  # (D,)
+    cones: ObservedCones  # (D,)
     positions_m: Array  # (D, 3) in the camera frame, precise across the ray, imprecise along it
     depth_sigma_m: Array  # (D,)
-    frames: Array  # (D, 3, 2) first columns of the cones' frames
     sigma_rad: Array  # (D, 3) of tilt, tilt and half angle
 
 
 def sightings(outlines: Sequence[SphereOutline], radius_m: float, camera: CameraModel) -> Sightings:
     """The geometry of one image's outlines."""
-    if not outlines:
-        return Sightings(
-            np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3, 2)), np.zeros((0, 3))
-        )
-    axes = np.array([o.cone.axis for o in outlines])
-    half = np.array([o.cone.half_angle_rad for o in outlines])
-    distance = radius_m / np.sin(half)
+    cones = ObservedCones.of(o.cone for o in outlines)
+    distance = radius_m / np.sin(cones.half_angles)
     # Half a pixel of the radius covers an outline's systematic error; more if only a part is visible.
     sigma = 0.5 / camera.fx / np.array([max(o.coverage, 0.2) for o in outlines])
-    own = np.array([np.diag(o.cone_covariance) for o in outlines])
+    own = np.array([np.diag(o.cone_covariance) for o in outlines], dtype=np.float64).reshape(-1, 3)
     return Sightings(
-        axes, half, axes * distance[:, None], distance * sigma / half,
-        np.array([o.cone.frame()[:, :2] for o in outlines]), np.sqrt(own + _FLOOR_RAD**2),
-    )  # fmt: skip
+        cones, cones.axes * distance[:, None], distance * sigma / cones.half_angles, np.sqrt(own + _FLOOR_RAD**2)
+    )
 
 
 def match(seen: Sightings, centres_camera_m: Array, radius_m: float, gate: Gate) -> list[tuple[int, int, float]]:
     """Mutually nearest (detection, marker, angle in radians) within the gate; centres (M, 3) in the camera frame."""
-    if len(seen.axes) == 0:
+    if len(seen.cones) == 0:
         return []
     distance = np.linalg.norm(centres_camera_m, axis=1)
     front = (centres_camera_m[:, 2] > 0) & (distance > 2 * radius_m)
     safe = np.maximum(distance, 2 * radius_m)
     half = np.arcsin(radius_m / safe)
-    angle = np.arccos(np.clip(seen.axes @ (centres_camera_m / safe[:, None]).T, -1, 1))
-    ratio = seen.half_angles[:, None] / half
+    angle = np.arccos(np.clip(seen.cones.axes @ (centres_camera_m / safe[:, None]).T, -1, 1))
+    ratio = seen.cones.half_angles[:, None] / half
     angle[(angle > gate.place * half) | (np.abs(ratio - 1) > gate.size) | ~front[None, :]] = np.inf
     nearest = np.argmin(angle, axis=1)
     back = np.argmin(angle, axis=0)

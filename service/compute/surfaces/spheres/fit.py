@@ -66,7 +66,6 @@ class SphereFit:
 
     Attributes:
         centre: (3,), m.
-        band: residual beyond which a sample has no weight, m.
         rms: weighted root mean square distance of the inliers, m.
         radius_residual: radius of a free fit minus the known one, m; NaN if the inliers do not determine it.
         coverage: solid angle of the inliers, as a fraction of the whole sphere.
@@ -80,7 +79,6 @@ class SphereFit:
     """
 
     centre: Array
-    band: float
     rms: float
     radius_residual: float
     coverage: float
@@ -119,7 +117,6 @@ def fit_sphere(samples: Samples, start: Array, radius: float, band: float) -> Sp
     orientation = float(np.sum(w * outward) / max(np.sum(w * stated), 1e-300)) if np.any(stated > 0) else 0.0
     return SphereFit(
         centre=centre,
-        band=band,
         rms=float(np.sqrt(np.sum(w * r * r) / np.sum(w))),
         radius_residual=gain * _free_radius(u, r, w),
         coverage=coverage(u),

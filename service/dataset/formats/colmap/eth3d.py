@@ -7,7 +7,7 @@ import numpy as np
 from service.dataset.formats.colmap.model import write_images, write_model_text
 from service.dataset.formats.meshes import ply
 from service.dataset.posed.exporter import Exporter
-from service.dataset.posed.folder import ExportFolder
+from service.dataset.posed.folder import ExportFolder, Part
 from service.dataset.posed.records import DataSet, View
 
 _IMAGES = "dslr_images_undistorted"
@@ -24,7 +24,11 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     folder.file("dslr_scan_eval/scan1.ply", lambda: ply(dataset.mesh.vertices_m, dataset.mesh.faces, dataset.mark))
     write_images(dataset, folder, f"images/{_IMAGES}")
     for view in dataset.views:
-        folder.file(f"ground_truth_depth/{_IMAGES}/{view.file}", lambda view=view: _depth(dataset, view))
+        folder.file(
+            f"ground_truth_depth/{_IMAGES}/{view.file}",
+            lambda view=view: _depth(dataset, view),
+            Part("depth", view.name),
+        )
 
 
 def _depth(dataset: DataSet, view: View) -> bytes:

@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.poses.files.pose_files import HALF_PIXEL
+from service.core.errors import DataError
 from service.core.geometry import Array, Transform, inverse
-from service.dataset.posed.folder import ExportFolder
+from service.dataset.posed.folder import ExportFolder, Part
 from service.dataset.posed.records import DataSet, View
 
 _MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4, "FULL_OPENCV": 6}
@@ -24,11 +25,22 @@ NO_POINTS = "There are no points: the model holds nothing of the ground truth."
 def write_images(dataset: DataSet, folder: ExportFolder, place: str) -> None:
     """The picture files of all views."""
     for view in dataset.views:
-        folder.file(f"{place}/{view.file}", lambda view=view: dataset.pixels.picture(view))
+        folder.file(f"{place}/{view.file}", lambda view=view: dataset.pixels.picture(view), Part("image", view.name))
 
 
 def write_model_text(dataset: DataSet, folder: ExportFolder, place: str) -> None:
-    """cameras.txt, images.txt and an empty points3D.txt, as COLMAP's documentation describes them."""
+    """cameras.txt, images.txt and an empty points3D.txt, as COLMAP's documentation describes them.
+
+    Raises:
+        DataError: the name of a picture has white space, which ends a name in this format.
+    """
+    spaced = [view.file for view in dataset.views if view.file.split() != [view.file]]
+    if spaced:
+        raise DataError(
+            "COLMAP's text format cannot hold image names with spaces",
+            where=spaced[0],
+            remedy="Choose the format colmap-binary",
+        )
     head = f"# {dataset.mark}\n" * dataset.simulated
     cameras = camera_ids(dataset.views)
     rows = [
@@ -61,8 +73,12 @@ def write_model_binary(dataset: DataSet, folder: ExportFolder, place: str, point
         images += struct.pack("<I7dI", number, *q, *t, cameras[view.camera])
         images += view.file.encode() + b"\0" + struct.pack("<Q", 0)
     folder.file(f"{place}/images.bin", lambda: images)
-    points = [struct.pack("<Q3d3BdQ", k, *point, 128, 128, 128, 0.0, 0) for k, point in enumerate(points_m, start=1)]
-    folder.file(f"{place}/points3D.bin", lambda: struct.pack("<Q", len(points)) + b"".join(points))
+    folder.file(f"{place}/points3D.bin", lambda: _points(points_m))
+
+
+def _points(points_m: Array) -> bytes:
+    rows = (struct.pack("<Q3d3BdQ", k, *point, 128, 128, 128, 0.0, 0) for k, point in enumerate(points_m, start=1))
+    return struct.pack("<Q", len(points_m)) + b"".join(rows)
 
 
 def camera_ids(views: Sequence[View]) -> dict[CameraModel, int]:

@@ -11,7 +11,7 @@ from service.core.geometry import Array, inverse
 from service.dataset.formats.meshes import mask_png, png
 from service.dataset.formats.radiance.unit_box import unit_box
 from service.dataset.posed.exporter import Exporter
-from service.dataset.posed.folder import ExportFolder
+from service.dataset.posed.folder import ExportFolder, Part
 from service.dataset.posed.records import DataSet, View
 
 
@@ -23,8 +23,10 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     """
     folder.file("cameras.npz", lambda: _cameras(dataset))
     for k, view in enumerate(dataset.views):
-        folder.file(f"image/{k:06d}.png", lambda view=view: png(dataset.pixels.colours(view)))
-        folder.file(f"mask/{k:06d}.png", lambda view=view: mask_png(_shown(dataset, view)))
+        folder.file(
+            f"image/{k:06d}.png", lambda view=view: png(dataset.pixels.colours(view)), Part("image", view.name)
+        )
+        folder.file(f"mask/{k:06d}.png", lambda view=view: mask_png(_shown(dataset, view)), Part("mask", view.name))
 
 
 def _shown(dataset: DataSet, view: View) -> NDArray[np.bool_]:

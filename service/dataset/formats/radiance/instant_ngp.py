@@ -13,7 +13,7 @@ from service.dataset.posed.records import DataSet, only_camera
 
 
 def write(dataset: DataSet, folder: ExportFolder) -> None:
-    """`transforms.json`, `images/` and `unit_box.json`, which brings a mesh back (`world_of_ngp_mesh`).
+    """`transforms.json`, `images/` and `unit_box.json`, which says how a mesh comes back.
 
     The centring is in the poses and the three offsets are equal: Instant-NGP adds them before it cycles the axes.
 
@@ -41,7 +41,9 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
             ],
         },
     )
-    folder.json("unit_box.json", box.record(dataset))
+    # It cycles axes: (x, y, z) of its mesh is (Y, Z, X) of the poses that it was given (`nerf_matrix_to_ngp` in its
+    # include/neural-graphics-primitives/nerf_loader.h).
+    folder.json("unit_box.json", box.record(dataset, mesh_axes=(2, 0, 1)))
     write_images(dataset, folder, "images")
 
 

@@ -10,7 +10,7 @@ from service.core.units import metres
 from service.dataset.formats.colmap.model import write_images
 from service.dataset.formats.meshes import mask_png, png
 from service.dataset.posed.exporter import Exporter
-from service.dataset.posed.folder import ExportFolder
+from service.dataset.posed.folder import ExportFolder, Part
 from service.dataset.posed.records import DataSet
 
 PINHOLE_REMEDY = "Choose a format with undistorted images"
@@ -50,10 +50,15 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     folder.json("transforms.json", document)
     write_images(dataset, folder, "images")
     for view in dataset.views:
-        folder.file(f"depth/{view.name}.png", lambda view=view: png(coded_depth(dataset.pixels.depth_m(view))))
+        folder.file(
+            f"depth/{view.name}.png",
+            lambda view=view: png(coded_depth(dataset.pixels.depth_m(view))),
+            Part("depth", view.name),
+        )
         folder.file(
             f"masks/{view.name}.png",
             lambda view=view: mask_png(dataset.pixels.valid(view) & ~dataset.pixels.markers(view)),
+            Part("mask", view.name),
         )
 
 

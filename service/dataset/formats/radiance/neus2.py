@@ -8,13 +8,13 @@ from service.compute.poses.files.pose_files import HALF_PIXEL
 from service.dataset.formats.meshes import png
 from service.dataset.formats.radiance.unit_box import unit_box
 from service.dataset.posed.exporter import Exporter
-from service.dataset.posed.folder import ExportFolder
+from service.dataset.posed.folder import ExportFolder, Part
 from service.dataset.posed.records import DataSet, View, only_camera
 
 
 def write(dataset: DataSet, folder: ExportFolder) -> None:
     """`transform.json`, `images/*.png` with alpha 0 where no surface or a marker is seen, and `unit_box.json`,
-    which brings a mesh back (`world_of_neus2_mesh`).
+    which says how a mesh comes back.
 
     NeuS2 only tests whether `from_na` is there; camera to world, x right, y down, z forward.
 
@@ -46,9 +46,10 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
             ],
         },
     )
-    folder.json("unit_box.json", box.record(dataset))
+    # With `from_na` it cycles no axes.
+    folder.json("unit_box.json", box.record(dataset, mesh_axes=(0, 1, 2)))
     for view in dataset.views:
-        folder.file(f"images/{view.name}.png", lambda view=view: _with_alpha(dataset, view))
+        folder.file(f"images/{view.name}.png", lambda view=view: _with_alpha(dataset, view), Part("image", view.name))
 
 
 def _with_alpha(dataset: DataSet, view: View) -> bytes:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from service.core.geometry import Array, Transform
 from service.dataset.posed.records import DataSet, Mesh
 
@@ -23,13 +21,18 @@ class UnitBox:
         T[:3, 3] -= self.centre_m
         return T
 
-    def record(self, dataset: DataSet) -> dict[str, object]:
-        """As JSON, for whoever brings a mesh back."""
+    def record(self, dataset: DataSet, mesh_axes: tuple[int, int, int]) -> dict[str, object]:
+        """As JSON, for whoever brings a mesh back: which axes of the saved mesh are x, y and z of the world.
+
+        The programs take scale and offset out again when they save a mesh; its centre is all that is missing.
+        """
         return {
             "simulated": dataset.simulated,
             "centre_m": self.centre_m.tolist(),
             "scale_per_m": self.scale,
-            "meaning": "unit = scale_per_m * (world - centre_m)",
+            "mesh_axes": list(mesh_axes),
+            "meaning": "unit = scale_per_m * (world - centre_m); for a saved mesh, "
+            "world = mesh[:, mesh_axes] + centre_m",
         }
 
 
@@ -37,18 +40,3 @@ def unit_box(mesh: Mesh, fill: float = 0.9) -> UnitBox:
     """The box of a mesh, of whose half-edge the mesh fills this share."""
     low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
     return UnitBox((low + high) / 2, fill / float((high - low).max()))
-
-
-def world_of_ngp_mesh(vertices: Array, box: UnitBox) -> Array:
-    """World points (N, 3), in metres, of a mesh that Instant-NGP saved from our export.
-
-    It cycles axes: (x, y, z) of its mesh is (Y, Z, X) of the poses that it was given. Scale and the equal offsets of
-    the three axes are taken out again when it saves a mesh (`nerf_matrix_to_ngp` in its
-    include/neural-graphics-primitives/nerf_loader.h).
-    """
-    return np.stack([vertices[:, 2], vertices[:, 0], vertices[:, 1]], axis=1) + box.centre_m
-
-
-def world_of_neus2_mesh(vertices: Array, box: UnitBox) -> Array:
-    """World points (N, 3), in metres, of a mesh that NeuS2 saved from our export: `from_na` cycles no axes."""
-    return vertices + box.centre_m

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -24,11 +23,11 @@ from service.compute.planning.optics import depth_of_field
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from service.core.protocol.models import Motion
+from service.core.run import noted
 from service.core.units import metres, metres_of_um
 from service.rig import CollisionSection, OpticsSection
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import StationLayout, StepContext
-from service.steps.notes import MOTION_PLAN
 
 _EXPOSURE_S = 3.0  # estimate of settling, exposure and download at each viewpoint
 _ELBOW_UP_RAD = np.array([0.0, -1.6, 1.9, -1.9, -1.57, 0.0])
@@ -41,7 +40,7 @@ class StepPlan:
     viewpoints: tuple[Viewpoint, ...]  # in order; refused ones last
     refused: Mapping[str, str]
     text: str
-    record: Mapping[str, Any]
+    motions: tuple[noted.PlannedStation, ...]  # where the arm's kinematics are known
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +134,7 @@ def plan_step(
         arm = arm_at_station(context, station, T_flange_camera)
         if arm is None:
             why = "the kinematics of the arm are not known; its controller checks the reach at each viewpoint"
-            plans.append(StepPlan(tuple(mine), {}, f"{station}: {why}", {}))
+            plans.append(StepPlan(tuple(mine), {}, f"{station}: {why}", ()))
             continue
         context.busy("planning the motions of the arm")
         start_rad = context.devices.robot(station).state().sample.joints_rad
@@ -152,7 +151,7 @@ def plan_station(viewpoints: Sequence[Viewpoint], arm: ArmAtStation, situation: 
         for v in answer.views
     )
     refused = {v.name: v.reason for v in answer.refused}
-    return StepPlan(planned, refused, _text(answer), _record(answer, arm.layout.name))
+    return StepPlan(planned, refused, _text(answer), (_station(answer, arm.layout.name),))
 
 
 def _recorded(context: StepContext, plans: Sequence[StepPlan]) -> StepPlan:
@@ -161,10 +160,11 @@ def _recorded(context: StepContext, plans: Sequence[StepPlan]) -> StepPlan:
         tuple(v for plan in plans for v in plan.viewpoints),
         {name: reason for plan in plans for name, reason in plan.refused.items()},
         "; ".join(plan.text for plan in plans),
-        {"stations": [dict(plan.record) for plan in plans if plan.record]},
+        tuple(station for plan in plans for station in plan.motions),
     )
-    if whole.record["stations"]:
-        context.note(MOTION_PLAN, text=whole.text, **whole.record)
+    if whole.motions:
+        stations = [station.model_dump(mode="json") for station in whole.motions]
+        context.note(noted.MOTION_PLAN, text=whole.text, stations=stations)
     if whole.text:
         context.tell(whole.text)
     return whole
@@ -234,21 +234,22 @@ def _text(plan: MotionPlan) -> str:
     return "; ".join(parts)
 
 
-def _record(plan: MotionPlan, station: str) -> dict[str, Any]:
-    def view(v: PlannedView) -> dict[str, Any]:
-        joints = None if v.outcome == "refused" else [round(float(q), 6) for q in v.joints_rad]
-        return {
-            "viewpoint": v.name,
-            "outcome": v.outcome,
-            "reason": v.reason,
-            "nudge_deg": v.nudge_deg,
-            "joints_rad": joints,
-            "travel_s": round(v.travel_s, 2),
-        }
+def _station(plan: MotionPlan, station: str) -> noted.PlannedStation:
+    return noted.PlannedStation(
+        station=station,
+        order=plan.order,
+        estimated_s=round(plan.total_s, 1),
+        views=tuple(_view(view) for view in plan.views),
+    )
 
-    return {
-        "station": station,
-        "order": plan.order,
-        "estimated_s": round(plan.total_s, 1),
-        "views": [view(v) for v in plan.views],
-    }
+
+def _view(view: PlannedView) -> noted.PlannedView:
+    refused = view.outcome == "refused"
+    return noted.PlannedView(
+        viewpoint=view.name,
+        outcome=view.outcome,
+        reason=view.reason,
+        nudge_deg=view.nudge_deg,
+        joints_rad=None if refused else tuple(round(float(q), 6) for q in view.joints_rad),
+        travel_s=round(view.travel_s, 2),
+    )

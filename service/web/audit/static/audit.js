@@ -2,6 +2,10 @@
 "use strict";
 
 const WAIT_MS = 700;
+let pressed = false; // what is being pressed must not be replaced under the finger
+for (const [kind, now] of [["pointerdown", true], ["pointerup", false], ["pointercancel", false]]) {
+  addEventListener(kind, () => { pressed = now; }, { capture: true });
+}
 
 async function refill() {
   const pending = [...document.querySelectorAll("[data-pending][id]")];
@@ -11,7 +15,7 @@ async function refill() {
     const answer = await fetch(location.href, { headers: { Accept: "text/html" } });
     if (answer.ok) {
       const page = new DOMParser().parseFromString(await answer.text(), "text/html");
-      for (const place of pending) {
+      for (const place of pressed ? [] : pending) {
         const fresh = page.getElementById(place.id);
         if (!fresh) continue;
         const focused = place.contains(document.activeElement);

@@ -1,0 +1,1 @@
+"""Methods of reconstruction on simulated views."""

@@ -1,0 +1,46 @@
+"""The device interfaces (robot arm, camera, scanner, CT, light box) and the records that they exchange."""
+
+from __future__ import annotations
+
+from drivers.interfaces.camera import Camera, CameraSettings, CapturedFile, CapturedImage
+from drivers.interfaces.device import Array, Device, DeviceIdentity, DeviceReport, Transform
+from drivers.interfaces.lightbox import EnvironmentReading, Lightbox, TowerLight
+from drivers.interfaces.robot import (
+    Payload,
+    RobotArm,
+    RobotSample,
+    RobotState,
+    SafetyState,
+    SettleCriteria,
+    SettleReport,
+)
+from drivers.interfaces.surfaces import CtSeries, CtSource, CtVolume, Mesh, ScanExport, ScannedMesh, Scanner
+
+__all__ = [
+    "Array",
+    "Camera",
+    "CameraSettings",
+    "CapturedFile",
+    "CapturedImage",
+    "CtSeries",
+    "CtSource",
+    "CtVolume",
+    "Device",
+    "DeviceIdentity",
+    "DeviceReport",
+    "EnvironmentReading",
+    "Lightbox",
+    "Mesh",
+    "Payload",
+    "RobotArm",
+    "RobotSample",
+    "RobotState",
+    "SafetyState",
+    "ScanExport",
+    "ScannedMesh",
+    "Scanner",
+    "SettleCriteria",
+    "SettleReport",
+    "TowerLight",
+    "Transform",
+]

@@ -1,0 +1,96 @@
+"""The interfaces of a scanner and of a CT suite, and the meshes and volumes that they deliver."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.interfaces.device import Array, Device, Transform
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """A triangle mesh in metres."""
+
+    vertices_m: Array  # (V, 3)
+    faces: NDArray[np.int32]  # (F, 3)
+    normals: Array  # (V, 3), computed if the file had none
+
+
+@dataclass(frozen=True, slots=True)
+class ScanExport:
+    """A complete export found in the scanner's folder: the mesh file first, then its companions."""
+
+    name: str
+    files: tuple[Path, ...]
+    modified_utc: str
+
+
+@dataclass(frozen=True, slots=True)
+class ScannedMesh:
+    """A mesh read from a scan export, with its unit and its findings."""
+
+    mesh: Mesh
+    unit: str  # of the file: mm, m, …
+    unit_evidence: str  # how that unit was determined
+    findings: Mapping[str, float]  # holes, non_manifold_edges, components, degenerate_faces, normals_computed
+    source: ScanExport
+
+
+class Scanner(Device, Protocol):
+    """A hand scanner, accessed through the folder into which its software exports."""
+
+    def exports(self) -> tuple[ScanExport, ...]:
+        """Return the complete, stable exports, oldest first, without those that are still being written."""
+        ...
+
+    def read(self, export: ScanExport) -> ScannedMesh:
+        """Read one export. Raises UnreadableFileError or IncompleteExportError with the reason."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class CtSeries:
+    """One series of a DICOM folder."""
+
+    uid: str
+    description: str
+    modality: str
+    slices: int
+    files: tuple[Path, ...]
+    problems: tuple[str, ...]  # localiser, gap, mixed orientation, …; a series with problems is not read
+
+
+@dataclass(frozen=True, slots=True)
+class CtVolume:
+    """A volume in Hounsfield units; p_ct = T_ct_voxel @ (i, j, k) with i along columns, k along slices, metres."""
+
+    hounsfield: NDArray[np.int16]  # (K, J, I)
+    T_ct_voxel: Transform  # (4, 4), affine: spacing and direction included
+    spacing_m: tuple[float, float, float]  # i, j, k
+    series: CtSeries
+
+
+class CtSource(Device, Protocol):
+    """A CT suite, accessed through the DICOM folder that it delivers."""
+
+    def series(self) -> tuple[CtSeries, ...]:
+        """Return all series found, including those with problems."""
+        ...
+
+    def read(self, series: CtSeries) -> CtVolume:
+        """Read one series. Raises UnreadableFileError, which names the gap, the slice and the file."""
+        ...
+
+    def segmented_meshes(self) -> tuple[ScanExport, ...]:
+        """Return the meshes in the folder that were segmented elsewhere (e.g. Mimics STL), oldest first."""
+        ...
+
+    def read_mesh(self, export: ScanExport) -> ScannedMesh:
+        """Read one segmented mesh. Raises UnreadableFileError or IncompleteExportError with the reason."""
+        ...

@@ -1,0 +1,147 @@
+"""Plots of a benchmark of matching as PNG: curves of pose error and precision, and the matches of a pair."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from service.benchmark.matching.result import MethodResult
+from service.compute.matching.methods.method import Matches, Picture
+from service.compute.matching.pairs.difficulty import CLASSES
+from service.compute.matching.scores.evaluate import PairScore
+from service.compute.matching.scores.matches import PRECISION_PX
+from service.core.errors import ComputeError
+from service.core.geometry import Array
+
+Canvas = NDArray[np.uint8]
+Curve = tuple[Array, Array]  # x, and y from 0 to 1
+
+_PANEL, _LEFT, _TOP, _BOTTOM = 340, 52, 46, 48
+_LARGEST_DEG, _TICKS_DEG = 20.0, (0, 5, 10, 15, 20)
+_INK, _GREY = (40, 40, 40), (205, 205, 205)
+_COLOURS = ((180, 90, 20), (40, 90, 220), (60, 150, 60), (150, 60, 150), (30, 160, 200))  # blue first
+_GOOD, _BAD, _UNSCORED = (70, 170, 40), (50, 50, 220), (170, 170, 170)
+_RIGHT_PX = 3.0  # a match within is drawn as right
+_PICTURE_WIDTH, _MOST_LINES = 900, 120
+
+
+def curves_png(results: Sequence[MethodResult]) -> bytes:
+    """Panels by class: above, the share of pairs below each pose error; below, precision by distance.
+
+    Raises:
+        ComputeError: the picture cannot be encoded.
+    """
+    classes = [name for name in CLASSES if any(s.difficulty == name for r in results for s in r.scores)]
+    upper: list[Canvas] = []
+    lower: list[Canvas] = []
+    for name in classes:
+        scores = [[score for score in result.scores if score.difficulty == name] for result in results]
+        count = max(len(own) for own in scores)
+        panel = _Panel(f"{name} ({count} pairs)", "pose error, degrees", _LARGEST_DEG, _TICKS_DEG)
+        upper.append(panel.drawn([_pose_curve(own) for own in scores]))
+        panel = _Panel(name, "distance from the truth, px", PRECISION_PX[-1], (0, 1, 3, 5, 10))
+        lower.append(panel.drawn([_precision_curve(own) for own in scores]))
+    body = np.vstack([_titled("share of pairs", np.hstack(upper)), _titled("precision", np.hstack(lower))])
+    return png(np.vstack([body, _legend(results, body.shape[1])]))
+
+
+def _pose_curve(scores: Sequence[PairScore]) -> Curve:
+    worst = np.sort([score.pose.worst_deg for score in scores])
+    below = worst[worst < _LARGEST_DEG]
+    share = np.arange(len(below) + 1) / max(len(worst), 1)
+    return np.concatenate([[0.0], below, [_LARGEST_DEG]]), np.append(share, share[-1])
+
+
+def _precision_curve(scores: Sequence[PairScore]) -> Curve:
+    mean = np.mean([score.precision for score in scores], axis=0) if scores else np.zeros(len(PRECISION_PX))
+    return np.array([0.0, *PRECISION_PX]), np.concatenate([[0.0], mean])
+
+
+class _Panel:
+    """Axes from 0 to 1 upwards."""
+
+    def __init__(self, title: str, label: str, most: float, ticks: Sequence[int]) -> None:
+        self._title, self._label, self._most, self._ticks = title, label, most, ticks
+
+    def drawn(self, curves: Sequence[Curve]) -> Canvas:
+        canvas = np.full((_PANEL, _PANEL, 3), 255, dtype=np.uint8)
+        for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+            left, right = self._at(0.0, share), self._at(self._most, share)
+            cv2.line(canvas, left, right, _GREY, 1)
+            _text(canvas, f"{100 * share:.0f} %", (4, left[1] + 4))
+        for tick in self._ticks:
+            x, y = self._at(tick, 0.0)
+            cv2.line(canvas, (x, y), (x, y + 4), _INK, 1)
+            _text(canvas, str(tick), (x - 4 * len(str(tick)), y + 18))
+        _text(canvas, self._title, (_LEFT, _TOP - 14), 0.5)
+        _text(canvas, self._label, (_LEFT, _PANEL - 8))
+        for (x, y), colour in zip(curves, _cycled(len(curves)), strict=True):
+            line = np.array([self._at(a, b) for a, b in zip(x, y, strict=True)], dtype=np.int32)
+            cv2.polylines(canvas, [line], False, colour, 2, cv2.LINE_AA)
+        return canvas
+
+    def _at(self, x: float, y: float) -> tuple[int, int]:
+        width, height = _PANEL - _LEFT - 14, _PANEL - _TOP - _BOTTOM
+        return round(_LEFT + x / self._most * width), round(_PANEL - _BOTTOM - y * height)
+
+
+def matches_picture(first: Picture, second: Picture, found: Matches, errors_px: Array, caption: str) -> Canvas:
+    """Both pictures with some of the matches: green within 3 px, red beyond, grey without ground truth."""
+    scale = _PICTURE_WIDTH / first.shape[1]
+    height = round(scale * max(first.shape[0], second.shape[0]))
+    sides = [cv2.resize(picture, (_PICTURE_WIDTH, round(picture.shape[0] * scale))) for picture in (first, second)]
+    canvas = np.full((height + 34, 2 * _PICTURE_WIDTH, 3), 255, dtype=np.uint8)
+    for k, side in enumerate(sides):
+        canvas[34 : 34 + side.shape[0], k * _PICTURE_WIDTH : (k + 1) * _PICTURE_WIDTH] = side
+    _text(canvas, caption, (8, 22), 0.55)
+    step = max(1, len(errors_px) // _MOST_LINES)
+    for k in range(0, len(errors_px), step):
+        error = errors_px[k]
+        colour = _UNSCORED if np.isnan(error) else _GOOD if error < _RIGHT_PX else _BAD
+        a, b = (np.rint(scale * (pixel + 0.5) - 0.5).astype(int) for pixel in (found.first_px[k], found.second_px[k]))
+        ends = (int(a[0]), int(a[1]) + 34), (int(b[0]) + _PICTURE_WIDTH, int(b[1]) + 34)
+        cv2.line(canvas, *ends, colour, 1, cv2.LINE_AA)
+        for end in ends:
+            cv2.circle(canvas, end, 3, colour, 1, cv2.LINE_AA)
+    return canvas
+
+
+def png(canvas: Canvas) -> bytes:
+    """The picture as a PNG file.
+
+    Raises:
+        ComputeError: it cannot be encoded.
+    """
+    done, data = cv2.imencode(".png", canvas)
+    if not done:
+        raise ComputeError("a plot cannot be written as PNG")
+    return data.tobytes()
+
+
+def _titled(title: str, body: Canvas) -> Canvas:
+    head = np.full((30, body.shape[1], 3), 255, dtype=np.uint8)
+    _text(head, title, (8, 21), 0.6)
+    return np.vstack([head, body])
+
+
+def _legend(results: Sequence[MethodResult], width: int) -> Canvas:
+    mark = ["The data set is simulated."] if any(result.simulated for result in results) else []
+    canvas = np.full((26 * (len(results) + len(mark)) + 10, width, 3), 255, dtype=np.uint8)
+    for k, (result, colour) in enumerate(zip(results, _cycled(len(results)), strict=True)):
+        y = 20 + 26 * k
+        cv2.line(canvas, (12, y - 5), (44, y - 5), colour, 2, cv2.LINE_AA)
+        _text(canvas, f"{result.method}: {result.words}", (54, y), 0.5)
+    for sentence in mark:
+        _text(canvas, sentence, (12, 20 + 26 * len(results)), 0.5)
+    return canvas
+
+
+def _cycled(count: int) -> list[tuple[int, int, int]]:
+    return [_COLOURS[k % len(_COLOURS)] for k in range(count)]
+
+
+def _text(canvas: Canvas, text: str, at: tuple[int, int], size: float = 0.42) -> None:
+    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)

@@ -1,0 +1,208 @@
+"""The result of a method on a data set: scores of pairs, and of classes of pairs, as a file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from service.compute.matching.methods.method import Matcher
+from service.compute.matching.pairs.difficulty import CLASSES
+from service.compute.matching.pairs.loader import MatchingData
+from service.compute.matching.scores.evaluate import PairScore
+from service.compute.matching.scores.matches import PRECISION_PX
+from service.compute.matching.scores.pose import THRESHOLDS_DEG, PoseError, auc
+from service.core.errors import DataError
+
+ALL = "all"
+
+
+@dataclass(frozen=True, slots=True)
+class ClassScore:
+    """The score of a method on a class of pairs.
+
+    Attributes:
+        name: of the class, or ALL.
+        pairs: number of pairs.
+        auc: of the pose error at each of THRESHOLDS_DEG.
+        precision: at each of PRECISION_PX: mean over the pairs.
+        epipolar_px: median over the pairs of their medians; infinite if most have no match.
+        matches: mean number.
+        scored: share of the matches with ground truth.
+        seconds: mean for a pair.
+    """
+
+    name: str
+    pairs: int
+    auc: tuple[float, ...]
+    precision: tuple[float, ...]
+    epipolar_px: float
+    matches: float
+    scored: float
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class MethodResult:
+    """What a method scored.
+
+    Attributes:
+        method, words: its name, and what it is called in tables.
+        dataset_sha256: of the list of pairs.
+        simulated: no camera was in front of a specimen.
+        scores: of the pairs.
+    """
+
+    method: str
+    words: str
+    dataset_sha256: str
+    simulated: bool
+    scores: tuple[PairScore, ...] = field(repr=False)
+
+    @property
+    def classes(self) -> list[ClassScore]:
+        """The classes that have pairs, in order of difficulty, and all pairs together."""
+        by = {name: [score for score in self.scores if score.difficulty == name] for name in CLASSES}
+        return [class_score(name, scores) for name, scores in [*by.items(), (ALL, list(self.scores))] if scores]
+
+
+def class_score(name: str, scores: Sequence[PairScore]) -> ClassScore:
+    """The score of some pairs, at least one."""
+    worst = [score.pose.worst_deg for score in scores]
+    matches = sum(score.matches for score in scores)
+    return ClassScore(
+        name,
+        len(scores),
+        tuple(auc(worst, threshold) for threshold in THRESHOLDS_DEG),
+        tuple(float(v) for v in np.mean([score.precision for score in scores], axis=0)),
+        float(np.median([score.epipolar_px for score in scores])),
+        matches / len(scores),
+        sum(score.scored for score in scores) / max(matches, 1),
+        float(np.mean([score.seconds for score in scores])),
+    )
+
+
+def result_of(how: Matcher, folder: Path, data: MatchingData, scores: Sequence[PairScore]) -> MethodResult:
+    """The result of a method on the data set in a folder."""
+    sha256 = hashlib.sha256((folder / "pairs.json").read_bytes()).hexdigest()
+    return MethodResult(how.name, how.words, sha256, data.simulated, tuple(scores))
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class _PairRecord(_Record):
+    first: str
+    second: str
+    difficulty: str
+    matches: int
+    scored: int
+    precision: dict[str, float]
+    rotation_deg: float | None
+    translation_deg: float | None
+    inliers: int
+    epipolar_px: float | None
+    seconds: float
+
+
+class _ResultRecord(_Record):
+    method: str
+    words: str
+    dataset_sha256: str
+    simulated: bool
+    classes: dict[str, dict[str, Any]]
+    pairs: list[_PairRecord]
+
+
+def record(result: MethodResult) -> dict[str, Any]:
+    """The result as plain data; null stands for what is infinite."""
+    pairs = [
+        {
+            "first": score.first,
+            "second": score.second,
+            "difficulty": score.difficulty,
+            "matches": score.matches,
+            "scored": score.scored,
+            "precision": _by_threshold(PRECISION_PX, score.precision),
+            "rotation_deg": _finite(score.pose.rotation_deg),
+            "translation_deg": _finite(score.pose.translation_deg),
+            "inliers": score.inliers,
+            "epipolar_px": _finite(score.epipolar_px),
+            "seconds": score.seconds,
+        }
+        for score in result.scores
+    ]
+    return {
+        "method": result.method,
+        "words": result.words,
+        "dataset_sha256": result.dataset_sha256,
+        "simulated": result.simulated,
+        "classes": {one.name: _class_record(one) for one in result.classes},
+        "pairs": pairs,
+    }
+
+
+def read_result(path: Path) -> MethodResult:
+    """A result as `record` wrote it.
+
+    Raises:
+        DataError: the file is something else.
+    """
+    try:
+        found = _ResultRecord.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        raise DataError(
+            "this is not the result of a matching method", where=str(path), remedy="Run it again"
+        ) from error
+    scores = tuple(
+        PairScore(
+            pair.first,
+            pair.second,
+            pair.difficulty,
+            pair.matches,
+            pair.scored,
+            tuple(pair.precision.values()),
+            PoseError(_number(pair.rotation_deg), _number(pair.translation_deg)),
+            pair.inliers,
+            _number(pair.epipolar_px),
+            pair.seconds,
+        )
+        for pair in found.pairs
+    )
+    return MethodResult(found.method, found.words, found.dataset_sha256, found.simulated, scores)
+
+
+def write_result(path: Path, result: MethodResult) -> None:
+    """Write a result as JSON."""
+    path.write_text(json.dumps(record(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _class_record(one: ClassScore) -> dict[str, Any]:
+    return {
+        "pairs": one.pairs,
+        "auc": _by_threshold(THRESHOLDS_DEG, one.auc),
+        "precision": _by_threshold(PRECISION_PX, one.precision),
+        "epipolar_px": _finite(one.epipolar_px),
+        "matches": one.matches,
+        "scored": one.scored,
+        "seconds": one.seconds,
+    }
+
+
+def _by_threshold(thresholds: Sequence[float], values: Sequence[float]) -> dict[str, float]:
+    return {f"{threshold:g}": value for threshold, value in zip(thresholds, values, strict=True)}
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _number(value: float | None) -> float:
+    return float("inf") if value is None else value

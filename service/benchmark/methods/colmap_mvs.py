@@ -1,0 +1,32 @@
+"""COLMAP's multi-view stereo: PatchMatch depth maps, fused, and a Poisson mesh."""
+
+from __future__ import annotations
+
+from service.benchmark.method import Command, Method, Place
+from service.benchmark.shared_parts import at, triangulation
+
+DENSE, FUSED, MESH = "dense", "fused.ply", "mesh.ply"
+
+
+def commands(place: Place) -> tuple[Command, ...]:
+    """Features are triangulated with the given poses, as COLMAP's FAQ describes, since PatchMatch needs points."""
+    dense = str(place.work / DENSE)
+    workspace = ("--workspace_path", dense, "--workspace_format", "COLMAP")
+    fused, mesh = str(place.work / FUSED), str(place.work / MESH)
+    return (
+        triangulation(place, place.work / DENSE),
+        ("colmap", "patch_match_stereo", *workspace, "--PatchMatchStereo.geom_consistency", "true"),
+        ("colmap", "stereo_fusion", *workspace, "--input_type", "geometric", "--output_path", fused),
+        ("colmap", "poisson_mesher", "--input_path", fused, "--output_path", mesh),
+    )
+
+
+KIND = Method(
+    "colmap",
+    "COLMAP",
+    "COLMAP 3.8 or later, built with CUDA (colmap -h says so), and a CUDA GPU",
+    "colmap-pinhole",
+    commands,
+    at(MESH),
+    programs=("colmap",),
+)

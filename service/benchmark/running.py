@@ -1,0 +1,171 @@
+"""One method in one scenario: export, run or accept its mesh, bring it back, score it, keep the result."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+from drivers.meshes.surface_file import read_surface_file
+from service.benchmark.method import Command, Method, Place, missing, place_of
+from service.benchmark.programs import run_commands, this_machine
+from service.benchmark.records import RESULT, Effort, Result, Scenario, Score
+from service.benchmark.scoring import score_mesh, write_scored
+from service.compute.ground_truth.distances.chamfer import ChamferSettings
+from service.compute.ground_truth.ply import write_ply
+from service.compute.ground_truth.surface import Surface
+from service.core.errors import ComputeError, ConfigurationError, DataError
+from service.dataset.posed.exporter import exporter, write_data_set
+from service.dataset.posed.of_folder import scaled_data_set
+from service.dataset.posed.records import DataSet
+from service.store.durable_effects import DurableFiles
+from service.store.files.artefacts import hash_file
+
+_IDENTITY = "identity.txt"
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What is to be run.
+
+    Attributes:
+        method: of reconstruction.
+        scenario: the split of the data set that it gets.
+        out: folder of all results.
+        mesh: made elsewhere, as the method writes it; None to run the method here.
+        width: of the images in pixels; 0 for that of the data set.
+        settings: of the comparison.
+    """
+
+    method: Method
+    scenario: Scenario
+    out: Path
+    mesh: Path | None = None
+    width: int = 0
+    settings: ChamferSettings = field(default_factory=ChamferSettings)
+
+    @property
+    def folder(self) -> Path:
+        """Where its export, its mesh and its result are."""
+        return self.out / f"{self.method.name}-{self.scenario}"
+
+
+def run_trial(trial: Trial, whole: DataSet, progress: Progress = lambda _what, _done, _total: None) -> Result:
+    """Run a method, or take its mesh, and score that; the result is kept in the trial's folder.
+
+    A method that is installed and makes no mesh has a result without a score, as COLMAP in the paper's sparse
+    scenario.
+
+    Args:
+        trial: what to run.
+        whole: the data set, as `data_set_of_folder` reads it.
+        progress: called with what is being done.
+
+    Raises:
+        ConfigurationError: the method is not installed; what it reads has been exported, and the message has its
+            commands.
+        DataError: the data set or the mesh cannot be used.
+        ComputeError: the mesh cannot be compared.
+    """
+    dataset = whole.keeping(whole.splits.named()[trial.scenario])
+    if trial.width:
+        dataset = scaled_data_set(dataset, trial.width)
+    trial.folder.mkdir(parents=True, exist_ok=True)
+    place = place_of(trial.method, trial.folder)
+    progress("writing what the method reads", 0, 0)
+    _export(trial, dataset, place.data)
+    commands = trial.method.commands(place)
+    effort: Effort | None = None
+    mesh, failure = trial.mesh, ""
+    if mesh is None:
+        _require_installed(trial, commands)
+        progress(f"running {trial.method.words}", 0, 0)
+        try:
+            effort, mesh = _run(trial, place, commands)
+        except (ComputeError, DataError) as error:
+            failure = str(error)
+    truth = truth_file(trial.out, whole.identity)
+    if not truth.is_file():
+        write_ply(truth, Surface(whole.mesh.vertices_m, whole.mesh.faces), 1.0, {}, ["world frame, metres"])
+    score, sha256, faces = _scored(trial, mesh, dataset, progress) if mesh is not None else (None, "", 0)
+    result = Result(
+        method=trial.method.name,
+        scenario=trial.scenario,
+        dataset_sha256=whole.identity,
+        simulated=whole.simulated,
+        views=len(dataset.views),
+        width=dataset.views[0].camera.width,
+        height=dataset.views[0].camera.height,
+        commands=commands,
+        elsewhere=trial.mesh is not None,
+        effort=effort,
+        mesh_sha256=sha256,
+        faces=faces,
+        score=score,
+        failure=failure,
+        machine=this_machine(),
+        finished_utc=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+    )
+    _keep(trial.folder / RESULT, result)
+    return result
+
+
+def truth_file(out: Path, dataset_sha256: str) -> Path:
+    """The ground truth of a data set, which is kept beside the results for the figure."""
+    return out / f"truth-{dataset_sha256[:12]}.ply"
+
+
+def _export(trial: Trial, dataset: DataSet, data: Path) -> None:
+    """Write what the method reads, unless it is there already."""
+    identity = f"{trial.method.form} {trial.scenario} {dataset.identity}"
+    written = trial.folder / _IDENTITY
+    if data.is_dir() and written.is_file() and written.read_text(encoding="utf-8") == identity:
+        return
+    written.unlink(missing_ok=True)
+    if data.is_dir():
+        shutil.rmtree(data)
+    write_data_set(dataset, exporter(trial.method.form), data)
+    written.write_text(identity, encoding="utf-8")
+
+
+def _require_installed(trial: Trial, commands: tuple[Command, ...]) -> None:
+    lacks = missing(trial.method)
+    if lacks:
+        lines = "\n".join(f"    {' '.join(command)}" for command in commands)
+        raise ConfigurationError(
+            f"{trial.method.words} cannot run here: {lacks}",
+            where=f"--method {trial.method.name}",
+            remedy=f"It expects {trial.method.expects}. Install that, or run these commands elsewhere and give the "
+            f"mesh with --mesh:\n{lines}",
+        )
+
+
+def _run(trial: Trial, place: Place, commands: tuple[Command, ...]) -> tuple[Effort, Path]:
+    if place.work.exists():
+        shutil.rmtree(place.work)
+    place.work.mkdir()
+    effort = run_commands(commands, place.work, trial.folder / "output.txt")
+    return effort, trial.method.mesh(place)
+
+
+def _scored(trial: Trial, mesh: Path, dataset: DataSet, progress: Progress) -> tuple[Score, str, int]:
+    progress("comparing with the ground truth", 0, 0)
+    file = read_surface_file(mesh, "m")
+    if not len(file.faces):
+        raise DataError(
+            "a mesh with faces is needed", where=str(mesh), remedy="Give the method's mesh, not its cloud"
+        )
+    surface = Surface(trial.method.to_world(file.vertices_m, place_of(trial.method, trial.folder).data), file.faces)
+    scored = score_mesh(surface, dataset.mesh, trial.settings)
+    write_scored(scored, dataset.mesh, trial.folder, trial.settings)
+    return scored.score, hash_file(mesh)[0], len(file.faces)
+
+
+def _keep(path: Path, result: Result) -> None:
+    part = path.with_suffix(".part")
+    part.write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    DurableFiles().sync_file(part)
+    part.replace(path)

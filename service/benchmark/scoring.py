@@ -1,0 +1,107 @@
+"""Scores the mesh of a method, in the world frame: cut to the box of the truth, and compared as in the paper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+
+from service.benchmark.records import Score
+from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, chamfer
+from service.compute.ground_truth.distances.heat_map import HeatScale, heat_picture
+from service.compute.ground_truth.ply import write_ply
+from service.compute.ground_truth.surface import Surface
+from service.core.errors import DataError
+from service.core.geometry import Array, Transform, apply, inverse
+from service.core.units import mm
+from service.dataset.posed.records import Mesh
+
+MARGIN_M = 0.002
+_POINTS = 200_000  # of the truth, by which its box is found
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A box with its own axes.
+
+    Attributes:
+        T_world_box: pose of its centre.
+        half_m: (3,) half its edges.
+    """
+
+    T_world_box: Transform
+    half_m: Array
+
+    @classmethod
+    def around(cls, mesh: Mesh, margin_m: float = MARGIN_M) -> Box:
+        """The smallest box around a mesh, and a margin."""
+        points = mesh.vertices_m[:: max(1, len(mesh.vertices_m) // _POINTS)]
+        to_origin, extents = trimesh.bounds.oriented_bounds(points)
+        return cls(inverse(np.asarray(to_origin)), np.asarray(extents) / 2 + margin_m)
+
+    def cut(self, surface: Surface) -> Surface:
+        """The faces whose centres are within."""
+        centres = surface.vertices_m[surface.faces].mean(axis=1)
+        within = (np.abs(apply(inverse(self.T_world_box), centres)) <= self.half_m).all(axis=1)
+        kept, faces = np.unique(surface.faces[within], return_inverse=True)
+        return Surface(surface.vertices_m[kept], faces.reshape(-1, 3).astype(np.int64))
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """A mesh that was compared: what is left of it, with the comparison."""
+
+    surface: Surface = field(repr=False)
+    chamfer: ChamferScore = field(repr=False)
+    score: Score
+
+
+def score_mesh(found: Surface, truth: Mesh, settings: ChamferSettings | None = None) -> Scored:
+    """Compare a mesh with the truth; both in the world frame, metres.
+
+    What is outside the smallest box of the truth, and MARGIN_M more, is cut off first: methods see the whole room,
+    and the truth ends at its rim.
+
+    Raises:
+        DataError: nothing of the mesh is within the box.
+        ComputeError: the meshes cannot be compared.
+    """
+    cut = Box.around(truth).cut(found)
+    if not cut.is_mesh or not cut.area_m2 > 0:
+        raise DataError(
+            "the mesh has no face within the box of the ground truth",
+            remedy="Check that the mesh is the file as the method wrote it, and that it belongs to this data set",
+        )
+    whole = Surface(truth.vertices_m, truth.faces)
+    compared = chamfer(cut, whole, settings)
+    forth, back = compared.pred_to_gt, compared.gt_to_pred
+    consistency = [n for n in (forth.normal_consistency, back.normal_consistency) if n is not None]
+    f_score_05, f_score_10 = compared.f_scores
+    return Scored(
+        cut,
+        compared,
+        Score(
+            chamfer_mm=mm(compared.chamfer_m),
+            accuracy_mm=mm(forth.mean_m),
+            completeness_mm=mm(back.mean_m),
+            floor_mm=mm(compared.floor_m),
+            spacing_mm=mm((settings or ChamferSettings()).spacing_m),
+            f_score_05=f_score_05,
+            f_score_10=f_score_10,
+            normal_consistency=sum(consistency) / len(consistency),
+            outside_percent=100 * max(0.0, 1 - cut.area_m2 / found.area_m2),
+            excluded_percent=100 * (forth.excluded + back.excluded) / (forth.n + back.n),
+            seen_percent=100 * back.within[1],
+        ),
+    )
+
+
+def write_scored(scored: Scored, truth: Mesh, folder: Path, settings: ChamferSettings | None = None) -> None:
+    """Write the mesh as it was scored (`mesh.ply`, metres, world frame) and its heat maps (`heat_map.png`)."""
+    write_ply(folder / "mesh.ply", scored.surface, 1.0, {}, ["world frame, metres; cut to the box of the truth"])
+    scale = HeatScale.of(scored.chamfer, (settings or ChamferSettings()).outlier_m)
+    picture = heat_picture(scored.surface, Surface(truth.vertices_m, truth.faces), scored.chamfer, scale)
+    (folder / "heat_map.png").write_bytes(cv2.imencode(".png", picture)[1].tobytes())

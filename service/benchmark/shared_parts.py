@@ -1,0 +1,43 @@
+"""What several methods share: where they leave their meshes, and the triangulation that some begin with."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from service.benchmark.method import Command, Place
+from service.core.errors import DataError
+from service.core.geometry import Array
+
+
+def at(name: str) -> Callable[[Place], Path]:
+    """A mesh of this name in the method's folder."""
+    return newest(name)
+
+
+def newest(pattern: str) -> Callable[[Place], Path]:
+    """The youngest of the files in the method's folder that match a pattern."""
+
+    def find(place: Place) -> Path:
+        found = [path for path in place.work.glob(pattern) if path.is_file()]
+        if not found:
+            raise DataError(
+                "the method ended without a mesh", where=str(place.work / pattern), remedy="Read its output"
+            )
+        return max(found, key=lambda path: path.stat().st_mtime_ns)
+
+    return find
+
+
+def from_unit_box(vertices: Array, data: Path) -> Array:
+    """World points (N, 3), in metres, of a mesh that was made from an export with `unit_box.json` in its folder."""
+    box = json.loads((data / "unit_box.json").read_text(encoding="utf-8"))
+    return vertices[:, box["mesh_axes"]] + np.array(box["centre_m"])
+
+
+def triangulation(place: Place, dense: Path) -> Command:
+    """The command of ours that makes COLMAP's workspace `dense` of the export `colmap-pinhole` in `place.data`."""
+    return (place.python, "-m", "service.benchmark.triangulated", str(place.data), str(dense))

@@ -1,0 +1,158 @@
+"""The table of the benchmark, as Markdown and as plain data: like the paper's, with what else is known."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from service.benchmark.method import Method, Place, missing
+from service.benchmark.records import SCENARIOS, Result
+
+_NONE = "–"
+
+
+def table_record(results: Sequence[Result], known: Mapping[str, Method]) -> dict[str, Any]:
+    """Every result, and for each method without one what is missing, what it expects, and its commands."""
+    done = {(result.method, result.scenario) for result in results}
+    return {
+        "results": [result.model_dump(mode="json") for result in results],
+        "not_run": [
+            {
+                "method": name,
+                "scenarios": [scenario for scenario in SCENARIOS if (name, scenario) not in done],
+                "missing": missing(method),
+                "expects": method.expects,
+                "reads": method.form,
+                "commands": [shlex.join(command) for command in method.commands(_named(method))],
+            }
+            for name, method in sorted(known.items())
+            if any((name, scenario) not in done for scenario in SCENARIOS)
+        ],
+    }
+
+
+def table_markdown(results: Sequence[Result], known: Mapping[str, Method]) -> str:
+    """The same for people: Chamfer distances as in the paper, then details, commands, and what was not run."""
+    lines: list[str] = ["# Reconstruction from posed images", ""]
+    for dataset in dict.fromkeys(result.dataset_sha256 for result in results):
+        of = [result for result in results if result.dataset_sha256 == dataset]
+        lines += _chamfer(of, known) + _details(of, known) + _commands(of, known)
+    return "\n".join(lines + _not_run(table_record(results, known)["not_run"], known)) + "\n"
+
+
+def _chamfer(results: Sequence[Result], known: Mapping[str, Method]) -> list[str]:
+    by = {(result.method, result.scenario): result for result in results}
+    names = list(dict.fromkeys(result.method for result in results))
+    best = {
+        scenario: min(
+            (r.score.chamfer_mm for r in results if r.scenario == scenario and r.score is not None), default=0.0
+        )
+        for scenario in SCENARIOS
+    }
+    rows: list[str] = []
+    for name in names:
+        cells: list[str] = []
+        for scenario in SCENARIOS:
+            result = by.get((name, scenario))
+            if result is None or result.score is None:
+                cells.append(_NONE)
+                continue
+            text = f"{result.score.chamfer_mm:.2f}"
+            cells.append(f"**{text}**" if result.score.chamfer_mm == best[scenario] else text)
+        rows.append(f"| {_words(name, known)} | {' | '.join(cells)} |")
+    origin = " It was made by a simulated rig." if results[0].simulated else ""
+    return [
+        f"Data set {results[0].dataset_sha256[:12]}.{origin}",
+        "",
+        "| Chamfer distance (mm) | Dense | Sparse |",
+        "|---|---:|---:|",
+        *rows,
+        "",
+    ]
+
+
+def _details(results: Sequence[Result], known: Mapping[str, Method]) -> list[str]:
+    head = (
+        "method", "scenario", "views", "px", "Chamfer mm", "accuracy mm", "completeness mm", "F 0.5 mm", "F 1 mm",
+        "normals", "wall s", "CPU s", "memory MB",
+    )  # fmt: skip
+    rows: list[str] = []
+    for result in results:
+        score, effort = result.score, result.effort
+        scores = [_NONE] * 6
+        if score is not None:
+            scores = [
+                *(f"{x:.3f}" for x in (score.chamfer_mm, score.accuracy_mm, score.completeness_mm)),
+                *(f"{x:.3f}" for x in (score.f_score_05, score.f_score_10, score.normal_consistency)),
+            ]
+        took = [_NONE] * 3
+        if effort is not None:
+            took = [f"{effort.wall_s:.0f}", f"{effort.cpu_s:.0f}", f"{effort.peak_memory_mb:.0f}"]
+        size = f"{result.width} × {result.height}"
+        cells = [_words(result.method, known), result.scenario, str(result.views), size, *scores, *took]
+        rows.append(f"| {' | '.join(cells)} |")
+    floors = [result.score.floor_mm for result in results if result.score is not None]
+    machines = dict.fromkeys(
+        f"{m.processor}, {m.cores} cores, {m.memory_gb:g} GB, {m.gpu or 'no GPU'}"
+        for m in (result.machine for result in results)
+    )
+    told = [
+        f"Equal surfaces would give {min(floors):.3f} mm, by the sampling alone." if floors else "",
+        *(f"Machine: {machine}." for machine in machines),
+        *(
+            f"{_words(r.method, known)}, {r.scenario}: made elsewhere, mesh {r.mesh_sha256[:12]}."
+            for r in results
+            if r.elsewhere
+        ),
+        *(
+            f"{_words(r.method, known)}, {r.scenario}: no mesh. {' '.join(r.failure.split())}"
+            for r in results
+            if r.failure
+        ),
+    ]
+    return [
+        f"| {' | '.join(head)} |",
+        "|---|---|" + "---:|" * (len(head) - 2),
+        *rows,
+        "",
+        *(line for line in told if line),
+        "",
+    ]
+
+
+def _commands(results: Sequence[Result], known: Mapping[str, Method]) -> list[str]:
+    lines = ["Command lines:", "", "```"]
+    for result in results:
+        lines.append(f"# {_words(result.method, known)}, {result.scenario}, {result.finished_utc}")
+        lines += [shlex.join(command) for command in result.commands]
+    return [*lines, "```", ""]
+
+
+def _not_run(entries: Sequence[Mapping[str, Any]], known: Mapping[str, Method]) -> list[str]:
+    if not entries:
+        return []
+    lines = ["## Not run", ""]
+    for entry in entries:
+        why = entry["missing"] or "ready to run here"
+        lines += [
+            f"{_words(entry['method'], known)} ({', '.join(entry['scenarios'])}): {why}. "
+            f"It expects {entry['expects']}.",
+            "",
+            "```",
+            *entry["commands"],
+            "```",
+            "",
+        ]
+    return lines
+
+
+def _named(method: Method) -> Place:
+    """A place with names instead of folders, for commands that are only shown."""
+    checkout = f"${method.variable}" if method.variable else ""
+    return Place(Path("DATA"), Path("WORK"), Path(checkout), "python")
+
+
+def _words(name: str, known: Mapping[str, Method]) -> str:
+    return known[name].words if name in known else name

@@ -1,0 +1,1 @@
+"""`orthocapture benchmark`: methods compared on an exported data set."""

@@ -1,0 +1,1 @@
+"""Methods of feature matching, one file each."""

@@ -1,0 +1,1 @@
+"""Pairs of images: correspondences, overlap, difficulty and relative poses from depth and poses."""

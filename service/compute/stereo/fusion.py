@@ -1,0 +1,155 @@
+"""Fusion of depth maps in a truncated signed distance field, kept in blocks near the surface.
+
+Source: Curless and Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.stereo.matching import DepthMap
+from service.core.errors import ComputeError
+from service.core.geometry import Array, inverse
+
+SIDE = 8  # voxels of a block's edge
+TRUNCATION = 4.0  # voxels
+_STEP = 2  # every so many pixels of a map say where blocks are needed
+_AT_ONCE = 4000  # blocks
+_MOST_BLOCKS = 400_000
+_MOST_COLUMNS = 4096  # of the rectangle that lists are folded into for cv2.remap, which takes 32767 at most
+_OFFSET = 1 << 20  # makes the numbers of blocks positive
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """Signed distances in blocks of SIDE³ voxels, positive before the surface.
+
+    Attributes:
+        blocks: (B, 3) integer place of each block; voxel (i, j, k) of it is at (SIDE block + (i, j, k)) voxel_m.
+        distance: (B, SIDE³) in voxels, within ±TRUNCATION.
+        weight: (B, SIDE³).
+        maps: (B, SIDE³) how many depth maps said something.
+        voxel_m: edge of a voxel.
+    """
+
+    blocks: Ints = field(repr=False)
+    distance: NDArray[np.float32] = field(repr=False)
+    weight: NDArray[np.float32] = field(repr=False)
+    maps: NDArray[np.uint16] = field(repr=False)
+    voxel_m: float
+
+
+def fused(maps: Sequence[DepthMap], voxel_m: float, least_maps: int) -> Field:
+    """Fuse depth maps.
+
+    Args:
+        maps: of one scene.
+        voxel_m: edge of a voxel.
+        least_maps: blocks that fewer maps have a point in are left out.
+
+    Raises:
+        ComputeError: no surface is seen by so many maps, or the field would need too much memory.
+    """
+    blocks = _blocks(maps, voxel_m, least_maps)
+    if len(blocks) == 0:
+        raise ComputeError(
+            f"no place is seen by {least_maps} pairs of images", remedy="Use more images, at smaller angles"
+        )
+    if len(blocks) > _MOST_BLOCKS:
+        raise ComputeError("the scene is too large for this size of voxels", remedy="Use larger voxels")
+    shape = (len(blocks), SIDE**3)
+    out = Field(blocks, np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint16), voxel_m)
+    for one in maps:
+        _integrate(out, one)
+    return out
+
+
+def _blocks(maps: Sequence[DepthMap], voxel_m: float, least_maps: int) -> Ints:
+    """(B, 3) blocks within the truncation of points of enough maps."""
+    edge = SIDE * voxel_m
+    reach = TRUNCATION * voxel_m
+    found: list[Ints] = []
+    for one in maps:
+        points = one.points_m(_STEP)
+        toward = points - one.T_world_camera[:3, 3]
+        toward *= reach / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-12)
+        keys = [_key(np.floor((points + k * toward) / edge).astype(np.int64)) for k in (-1.0, 0.0, 1.0)]
+        found.append(np.unique(np.concatenate(keys)))
+    if not found:
+        return np.empty((0, 3), dtype=np.int64)
+    key, count = np.unique(np.concatenate(found), return_counts=True)
+    return _place(key[count >= least_maps])
+
+
+def _key(place: Ints) -> Ints:
+    shifted = place + _OFFSET
+    return (shifted[:, 0] << 42) | (shifted[:, 1] << 21) | shifted[:, 2]
+
+
+def _place(key: Ints) -> Ints:
+    mask = (1 << 21) - 1
+    return np.stack([key >> 42, (key >> 21) & mask, key & mask], axis=1) - _OFFSET
+
+
+def _integrate(out: Field, one: DepthMap) -> None:
+    """Add what one depth map says about the voxels before and shortly behind its surface."""
+    T = inverse(one.T_world_camera)
+    edge = SIDE * out.voxel_m
+    middle = (out.blocks + 0.5) * edge @ T[:3, :3].T + T[:3, 3]
+    pixels, z = _pixels(one, middle)
+    radius = np.sqrt(3) / 2 * edge
+    margin = one.camera.fx * radius / np.maximum(z, 1e-6)
+    height, width = one.depth_m.shape
+    inside = (z > radius) & (pixels[:, 0] > -margin) & (pixels[:, 0] < width + margin)
+    inside &= (pixels[:, 1] > -margin) & (pixels[:, 1] < height + margin)
+    chosen = np.flatnonzero(inside)
+    grid = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    local = (grid * out.voxel_m) @ T[:3, :3].T
+    for begin in range(0, len(chosen), _AT_ONCE):
+        part = chosen[begin : begin + _AT_ONCE]
+        corner = out.blocks[part] * edge @ T[:3, :3].T + T[:3, 3]
+        _add(out, one, part, (corner[:, None, :] + local[None]).astype(np.float32))
+
+
+def _add(out: Field, one: DepthMap, part: Ints, camera: NDArray[np.float32]) -> None:
+    """Add a map to some blocks, whose voxels (P, SIDE³, 3) are in the map's frame."""
+    flat = camera.reshape(-1, 3)
+    z = flat[:, 2]
+    u = flat[:, 0] / z * np.float32(one.camera.fx) + np.float32(one.camera.cx)
+    v = flat[:, 1] / z * np.float32(one.camera.fy) + np.float32(one.camera.cy)
+    distance = (_sampled(one.depth_m, u, v) - z) / np.float32(out.voxel_m)
+    said = (distance > -TRUNCATION).reshape(len(part), -1)
+    value = np.minimum(distance, np.float32(TRUNCATION)).reshape(len(part), -1)
+    weight = np.where(said, np.float32(one.weight), np.float32(0))
+    before = out.weight[part]
+    after = before + weight
+    mean = out.distance[part]
+    mean += np.where(said, weight / np.maximum(after, np.float32(1e-12)) * (value - mean), np.float32(0))
+    out.distance[part], out.weight[part] = mean, after
+    out.maps[part] += said
+
+
+def _pixels(one: DepthMap, points: Array) -> tuple[Array, Array]:
+    z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
+    with np.errstate(invalid="ignore"):
+        pixels = points[:, :2] / z[:, None] * np.diag(one.camera.matrix)[:2] + one.camera.matrix[:2, 2]
+    return np.nan_to_num(pixels, nan=-1e9), np.nan_to_num(z, nan=-1.0)
+
+
+def _sampled(depth: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Depth (N,) between pixels; NaN where one of the four around is unknown."""
+    columns = min(len(u), _MOST_COLUMNS)
+    rows = -(-len(u) // columns)
+    places = np.full((2, rows * columns), -10.0, dtype=np.float32)
+    places[0, : len(u)], places[1, : len(u)] = u, v
+    np.nan_to_num(places, copy=False, nan=-10.0)
+    x, y = places.reshape(2, rows, columns)
+    found = cv2.remap(depth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
+    return np.asarray(found, dtype=np.float32).reshape(-1)[: len(u)]

@@ -1,0 +1,112 @@
+"""Rectification of a pair by hand: rows along the baseline, both principal points moved to what is looked at.
+
+`cv2.stereoRectify` gives absurd images for steep pairs, because it keeps the principal points together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.stereo.pairs import StereoView
+from service.core.geometry import Array, Transform, transform
+
+_LARGEST = 1.5  # times the size of an image: what a tilted pair may be stretched to
+
+
+@dataclass(frozen=True, slots=True)
+class Rectified:
+    """A pair whose rows correspond.
+
+    Attributes:
+        left, right: (H, W) grey images.
+        seen: (H, W) pixels of the left image that the photograph has.
+        T_world_left: pose of the left camera, whose x runs along the baseline.
+        f_px: focal length of both.
+        left_px, right_px: x of the principal points; y_px of both.
+        baseline_m: between the cameras.
+    """
+
+    left: NDArray[np.uint8] = field(repr=False)
+    right: NDArray[np.uint8] = field(repr=False)
+    seen: NDArray[np.bool_] = field(repr=False)
+    T_world_left: Transform
+    f_px: float
+    left_px: float
+    right_px: float
+    y_px: float
+    baseline_m: float
+
+    def disparity(self, depth_m: float) -> float:
+        """Column in the left image minus that in the right one of a point at this depth, in pixels."""
+        return self.f_px * self.baseline_m / depth_m + self.left_px - self.right_px
+
+    def depth_m(self, disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Depth (H, W) of disparities (H, W); NaN where they are, and behind the camera."""
+        true = disparity_px - np.float32(self.left_px - self.right_px)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(true > 0, np.float32(self.f_px * self.baseline_m) / true, np.nan).astype(np.float32)
+
+
+def rectified(one: StereoView, two: StereoView, centre_m: Array) -> Rectified:
+    """Rectify two views of an object at `centre_m` (3,), which comes to the middle of both images."""
+    x = two.eye_m - one.eye_m
+    baseline = float(np.linalg.norm(x))
+    x = x / baseline
+    z = one.T_world_camera[:3, 2] + two.T_world_camera[:3, 2]
+    z = z - (z @ x) * x
+    z = z / np.linalg.norm(z)
+    R = np.stack([x, np.cross(z, x), z], axis=1)
+    f = 0.25 * (one.camera.fx + one.camera.fy + two.camera.fx + two.camera.fy)
+    corners = [_corners(view, R, f) for view in (one, two)]
+    centres = [_projected(centre_m - view.eye_m, R, f) for view in (one, two)]
+    about = [c - m for c, m in zip(corners, centres, strict=True)]
+    most = _LARGEST * max(one.camera.width, one.camera.height)
+    low = np.maximum(np.maximum(about[0].min(axis=0), about[1].min(axis=0)), -most / 2)
+    high = np.minimum(np.minimum(about[0].max(axis=0), about[1].max(axis=0)), most / 2)
+    size = np.maximum(np.ceil(high - low), 1).astype(int)
+    principal = [-(m + low) for m in centres]
+    warped = [
+        _warped(view, R, f, point, (int(size[0]), int(size[1])))
+        for view, point in zip((one, two), principal, strict=True)
+    ]
+    return Rectified(
+        left=warped[0][0],
+        right=warped[1][0],
+        seen=warped[0][1],
+        T_world_left=transform(R, one.eye_m),
+        f_px=f,
+        left_px=float(principal[0][0]),
+        right_px=float(principal[1][0]),
+        y_px=float(principal[0][1]),
+        baseline_m=baseline,
+    )
+
+
+def _projected(directions: Array, R: Array, f: float) -> Array:
+    """Pixels (..., 2) of directions (..., 3) of the world, from the principal point."""
+    p = directions @ R
+    return f * p[..., :2] / p[..., 2:]
+
+
+def _corners(view: StereoView, R: Array, f: float) -> Array:
+    """(4, 2) corners of an image in the rectified one, from its principal point."""
+    camera = view.camera
+    w, h = camera.width - 0.5, camera.height - 0.5
+    pixels = np.array([[-0.5, -0.5, 1.0], [w, -0.5, 1.0], [w, h, 1.0], [-0.5, h, 1.0]])
+    return _projected(pixels @ np.linalg.inv(camera.matrix).T @ view.T_world_camera[:3, :3].T, R, f)
+
+
+def _warped(
+    view: StereoView, R: Array, f: float, principal: Array, size: tuple[int, int]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """The image turned to the axes R, and where it has pixels."""
+    K = np.array([[f, 0.0, principal[0]], [0.0, f, principal[1]], [0.0, 0.0, 1.0]])
+    H = K @ R.T @ view.T_world_camera[:3, :3] @ np.linalg.inv(view.camera.matrix)
+    image = cv2.warpPerspective(view.image, H, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    whole = np.full(view.image.shape, 255, dtype=np.uint8)
+    seen = cv2.warpPerspective(whole, H, size, flags=cv2.INTER_NEAREST, borderValue=0) > 0
+    return np.asarray(image, dtype=np.uint8), np.asarray(seen, dtype=np.bool_)

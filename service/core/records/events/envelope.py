@@ -1,0 +1,116 @@
+"""The envelope of every event, and the union of all payloads."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, TypeAdapter
+
+from service.core.records.base import Record
+from service.core.records.entered import NoteTaken
+from service.core.records.events.jobs import JobEnqueued, JobFailed, JobFinished
+from service.core.records.events.operator import (
+    ActionRefused,
+    ControlTaken,
+    EvidenceExported,
+    ItemTicked,
+    OperatorAction,
+    RecordCorrected,
+    RegionDrawn,
+    RunReleased,
+)
+from service.core.records.events.run import (
+    DeviceOpened,
+    DeviceTrouble,
+    RunAborted,
+    RunCompleted,
+    RunStarted,
+    SessionStarted,
+)
+from service.core.records.events.site import (
+    AccountChanged,
+    ActionAfterEnd,
+    DataRestored,
+    KeyChanged,
+    LeftoversRemoved,
+    ProtocolApproved,
+    RunSigned,
+    ServiceStarted,
+    SignInRecorded,
+    SiteOpened,
+    TimeStampKept,
+)
+from service.core.records.events.steps import (
+    FilesKept,
+    GatesEvaluated,
+    StepFailed,
+    StepMeasured,
+    StepNote,
+    StepPassed,
+    StepRetried,
+    StepStarted,
+)
+from service.core.records.events.views import CaptureAsked, ViewHeld, ViewImported, ViewpointCaptured, ViewpointFailed
+
+Payload = Annotated[
+    OperatorAction
+    | ActionRefused
+    | RunStarted
+    | SessionStarted
+    | DeviceOpened
+    | DeviceTrouble
+    | StepStarted
+    | StepNote
+    | FilesKept
+    | ViewpointCaptured
+    | ViewImported
+    | ViewHeld
+    | CaptureAsked
+    | RegionDrawn
+    | ViewpointFailed
+    | StepMeasured
+    | StepFailed
+    | StepRetried
+    | GatesEvaluated
+    | StepPassed
+    | JobEnqueued
+    | JobFinished
+    | JobFailed
+    | RunCompleted
+    | RunAborted
+    | ItemTicked
+    | NoteTaken
+    | ControlTaken
+    | RecordCorrected
+    | RunReleased
+    | EvidenceExported
+    | SiteOpened
+    | ServiceStarted
+    | AccountChanged
+    | SignInRecorded
+    | KeyChanged
+    | RunSigned
+    | TimeStampKept
+    | LeftoversRemoved
+    | ActionAfterEnd
+    | ProtocolApproved
+    | DataRestored,
+    Field(discriminator="kind"),
+]
+PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)
+
+
+class Event(Record):
+    """One link of a run's chain.
+
+    `sha256` is SHA-256 over the RFC 8785 canonical JSON of every other field, `previous_sha256` included.
+    """
+
+    seq: int  # 1, 2, 3 … within the run
+    run_id: str
+    at_utc: str  # ISO 8601 with microseconds and Z
+    monotonic_s: float
+    actor: str  # person, device or process
+    payload: Payload
+    previous_sha256: str  # 64 zeros for the root
+    sha256: str

@@ -1,0 +1,129 @@
+"""Events of the site's own chain: the service, accounts, keys, approvals, restored data."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from service.core.records.base import Record
+from service.core.records.events.operator import Identified, OperatorVerb
+
+
+class SiteOpened(Record):
+    """Root of the site's chain."""
+
+    kind: Literal["site_opened"] = "site_opened"
+    software: dict[str, str]
+
+
+class ServiceStarted(Record):
+    """A web process started: what has changed since the last start, and which runs are open."""
+
+    kind: Literal["service_started"] = "service_started"
+    host: str
+    pid: int
+    address: str
+    software: dict[str, str]
+    changed: dict[str, tuple[str, str]]  # distribution or file → before, now ("" for none)
+    configuration: dict[str, str]  # rig and protocol files → SHA-256
+    boot: str  # boot id, "" where the system has none
+    clock_jump_s: float | None  # UTC against monotonic since the last start of this boot; None: not known
+    heads: dict[str, tuple[int, str]]  # run → number and hash of its last event, where it grew since the last start
+    unsigned_runs: tuple[str, ...]  # with events after their last checkpoint
+    open_runs: tuple[str, ...]
+
+
+class AccountChanged(Record):
+    """An account was made or changed; the event never holds a secret."""
+
+    kind: Literal["account_changed"] = "account_changed"
+    account: str
+    field: str  # created, role, state, password, pin, badge, lock_out, link
+    old: str
+    new: str
+    reason: str = ""
+    full_name: str = ""  # of a new account
+    # password_hash, pin_hash, badge_hash, token_sha256 → its SHA-256, which shows a secret not set by the software.
+    stored: dict[str, str] = Field(default_factory=dict)
+
+
+class SignInRecorded(Record):
+    """Somebody signed in or out, or failed to."""
+
+    kind: Literal["sign_in_recorded"] = "sign_in_recorded"
+    account: str
+    outcome: Literal["signed_in", "refused", "locked_out", "signed_out", "screen_locked", "screen_unlocked", "ended"]
+    screen: str = ""
+    address: str = ""
+    session_sha256: str = ""  # of the stored session, which shows one not made by the software
+
+
+class KeyChanged(Record):
+    """The key that signs checkpoints was made or replaced."""
+
+    kind: Literal["key_changed"] = "key_changed"
+    key_id: str  # SHA-256 of the raw public key
+    public_key: str  # base64 of the 32 raw bytes (RFC 8032)
+    previous_key_id: str  # "" for the first
+    reason: str
+
+
+class LeftoversRemoved(Record):
+    """Files left over from crashes, to which no record refers, were removed."""
+
+    kind: Literal["leftovers_removed"] = "leftovers_removed"
+    files: dict[str, int]  # path within the data folder → bytes
+
+
+class RunSigned(Record):
+    """A run's chain was signed up to an event; recorded in the same transaction in the site's chain."""
+
+    kind: Literal["run_signed"] = "run_signed"
+    run: str
+    seq: int
+    sha256: str  # of that event
+
+
+class TimeStampKept(Record):
+    """A time-stamp authority stamped a checkpoint; this event shows if the stamp is removed later."""
+
+    kind: Literal["time_stamp_kept"] = "time_stamp_kept"
+    run: str
+    seq: int  # of the checkpoint
+    authority: str
+    at_utc: str  # when it was asked
+    token_sha256: str  # of the token's text
+
+
+class ActionAfterEnd(Record):
+    """An action on a run that had ended. It has no effect and is not in the run's own chain, which is sealed."""
+
+    kind: Literal["action_after_end"] = "action_after_end"
+    run: str
+    action: OperatorVerb
+    step: str | None
+    why: str
+
+
+class ProtocolApproved(Record):
+    """A person approved a protocol for runs: exactly these bytes."""
+
+    kind: Literal["protocol_approved"] = "protocol_approved"
+    protocol: str  # its id
+    version: str
+    sha256: str
+    source: str  # the file's text, to compare with other content of the same id and version
+    instead_of: str = ""  # SHA-256 of the content approved before under this id and version, which it replaces
+    reason: str = ""  # required for a replacement
+    identified: Identified = ""
+
+
+class DataRestored(Record):
+    """This data folder was restored from a backup; what was recorded after the backup is not in it."""
+
+    kind: Literal["data_restored"] = "data_restored"
+    state: str  # name of the backup's state
+    at_utc: str  # when the backup was made
+    folder: str  # the data folder that was backed up
+    host: str

@@ -1,0 +1,84 @@
+"""Notes of steps that decisions and estimates depend on: advice that mends an attempt, and the motions planned."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict
+
+MOTION_PLAN = "motion_plan"  # name of the note
+
+
+class _NoteRecord(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class HandWork(_NoteRecord):
+    """What a technician should do by hand, for a simulated one; further fields are those of the action."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+    action: str  # of simulators/rig/world_server.py
+
+
+class Mending(_NoteRecord):
+    """What would bring an attempt of a step within its limits.
+
+    Attributes:
+        advice: what to do.
+        hands: the same for a simulated technician.
+        viewpoints: further views that a retry takes; only their number counts.
+        poses: further poses above the calibration board; only their number counts.
+        images: number of images that a retry takes again.
+    """
+
+    advice: str = ""
+    hands: tuple[HandWork, ...] = ()
+    viewpoints: tuple[object, ...] = ()
+    poses: tuple[object, ...] = ()
+    images: int = 0
+
+
+class PlannedView(_NoteRecord):
+    """A viewpoint in a motion plan.
+
+    Attributes:
+        viewpoint: its name.
+        outcome: feasible, nudged, or refused where the arm cannot take it.
+        reason: of a refusal.
+        nudge_deg: by how much it was turned along its arc so that the arm can take it.
+        joints_rad: of the arm there; None if refused.
+        travel_s: from the view before.
+    """
+
+    viewpoint: str
+    outcome: str
+    reason: str = ""
+    nudge_deg: float = 0.0
+    joints_rad: tuple[float, ...] | None = None
+    travel_s: float = 0.0
+
+
+class PlannedStation(_NoteRecord):
+    """The viewpoints of one station in the order of capture, and how long all of them take."""
+
+    station: str = ""
+    order: str = ""
+    estimated_s: float = 0.0
+    views: tuple[PlannedView, ...]
+
+
+class MotionPlan(_NoteRecord):
+    """How the arm moves in a capture."""
+
+    stations: tuple[PlannedStation, ...] = ()
+
+    @property
+    def views(self) -> tuple[PlannedView, ...]:
+        """All viewpoints in the order of capture."""
+        return tuple(view for station in self.stations for view in station.views)
+
+    @property
+    def view_s(self) -> float | None:
+        """Estimated seconds for one view; None without a plan."""
+        total_s = sum(station.estimated_s for station in self.stations)
+        able = sum(view.outcome != "refused" for view in self.views)
+        return total_s / able if total_s > 0 and able else None

@@ -1,0 +1,37 @@
+"""Plain files: original images, the camera, the poses and the mesh, as orthocapture's own commands read them."""
+
+from __future__ import annotations
+
+from service.compute.poses.files.camera_files import write_camera_json
+from service.compute.poses.files.pose_files import write_poses_csv, write_transforms_json
+from service.dataset.formats.colmap.model import write_images
+from service.dataset.formats.meshes import ply
+from service.dataset.posed.exporter import Exporter
+from service.dataset.posed.folder import ExportFolder
+from service.dataset.posed.records import DataSet, only_camera
+
+
+def write(dataset: DataSet, folder: ExportFolder) -> None:
+    """`images/`, `camera.json`, `poses.csv`, `transforms.json` and `mesh.ply`.
+
+    `poses.csv` is T_world_camera in metres, x right, y down, z forward, with the quaternion's scalar last.
+    `transforms.json` has the same poses with OpenGL's axes. In `camera.json` the centre of the first pixel is (0, 0),
+    in `transforms.json` it is (0.5, 0.5). `mesh.ply` is in metres.
+
+    Raises:
+        DataError: the views have several cameras.
+    """
+    camera = only_camera(dataset, "a plain data set")
+    poses = {view.file: view.T_world_camera for view in dataset.views}
+    in_images = {f"images/{name}": T for name, T in poses.items()}
+    folder.written_by("camera.json", lambda path: write_camera_json(path, camera))
+    folder.written_by("poses.csv", lambda path: write_poses_csv(path, poses))
+    simulated = dataset.simulated
+    folder.written_by(
+        "transforms.json", lambda path: write_transforms_json(path, camera, in_images, simulated=simulated)
+    )
+    folder.file("mesh.ply", lambda: ply(dataset.mesh.vertices_m, dataset.mesh.faces, dataset.mark))
+    write_images(dataset, folder, "images")
+
+
+KIND = Exporter("plain", "plain files: images, camera.json, poses.csv, transforms.json, mesh.ply", write)

@@ -1,0 +1,104 @@
+"""RO-Crate 1.1 metadata of an exported data set."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from service.dataset.package.crate_entities import (
+    CONTEXT,
+    Entity,
+    anchor,
+    descriptor,
+    device,
+    file_entity,
+    person,
+    software,
+)
+from service.dataset.package.listed import ListedFile
+from service.dataset.posed.about import About
+from service.dataset.posed.records import DataSet
+
+
+def crate(dataset: DataSet, words: str, files: Sequence[ListedFile], described: Mapping[str, str]) -> dict[str, Any]:
+    """The metadata as plain data.
+
+    Args:
+        dataset: as it is written.
+        words: the format in a few words.
+        files: of the folder, without this one.
+        described: what a file is, by its name.
+    """
+    about = dataset.about
+    people = [person(name, {}) for name in about.people]
+    devices = [device(one.name, one.model, one.firmware, one.serial) for one in about.devices]
+    makers = [_maker(name) for name in about.creators]
+    parts = [file_entity(file.path, file.sha256, file.size_bytes, described.get(file.path, "")) for file in files]
+    root = _root(dataset, words) | {
+        "creator": _ids(makers),
+        "contributor": _ids(people),
+        "hasPart": _ids(parts),
+        "mentions": _ids(devices),
+    }
+    run = _run(about, devices)
+    return {
+        "@context": CONTEXT,
+        "@graph": [
+            descriptor(),
+            root,
+            {"@id": "#licence", "@type": "CreativeWork", "name": "Licence", "description": about.licence},
+            {"@id": "#ethics", "@type": "CreativeWork", "name": "Ethics", "description": about.ethics},
+            software(about.software or "unknown"),
+            run,
+            *makers,
+            *people,
+            *devices,
+            *parts,
+        ],
+    }
+
+
+def _root(dataset: DataSet, words: str) -> Entity:
+    about = dataset.about
+    marked = "SIMULATED " if dataset.simulated else ""
+    return {
+        "@id": "./",
+        "@type": "Dataset",
+        "name": f"{marked}{about.title}",
+        "description": (
+            f"{marked}Posed images and a surface mesh in one frame. Format: {words}."
+            + (f" {dataset.mark}." if dataset.simulated else "")
+            + (f" {about.origin}." if about.origin else "")
+            + "".join(f" Deviation: {text}." for text in about.deviations)
+            + "".join(f" Accepted outside its limits: {text}." for text in about.accepted)
+            + "".join(f" Not in when this was made: {text}." for text in about.not_in_yet)
+        ),
+        "datePublished": about.published_utc,
+        "version": about.version,
+        "identifier": about.run,
+        "license": {"@id": "#licence"},
+        "subjectOf": {"@id": "#ethics"},
+        "creditText": about.citation,
+        "keywords": ["simulated"] if dataset.simulated else [],
+    }
+
+
+def _run(about: About, devices: Sequence[Entity]) -> Entity:
+    """The run that made the data set, and the head of its chain of evidence."""
+    return {
+        "@id": "#run",
+        "@type": "CreateAction",
+        "name": f"Run {about.run}".strip(),
+        "description": f"Protocol {about.protocol}. SHA-256 of the last event: {about.head_sha256}",
+        "instrument": [{"@id": "#software"}, *_ids(devices)],
+        "endTime": about.published_utc,
+        "result": {"@id": "./"},
+    }
+
+
+def _maker(name: str) -> Entity:
+    return {"@id": anchor("creator", name), "@type": "Organization", "name": name}
+
+
+def _ids(entities: Sequence[Entity]) -> list[dict[str, str]]:
+    return [{"@id": entity["@id"]} for entity in entities]

@@ -1,0 +1,110 @@
+"""What is known about a data set as a whole, for its data card and its metadata."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from service.core.records.data_set import FIRST_VERSION, DataSetStatement
+from service.jobs.registration.evaluate import ErrorBudget, Row
+
+NOT_STATED = "not stated"
+
+
+@dataclass(frozen=True, slots=True)
+class UsedDevice:
+    """A device as it stated itself when it was opened; "" for what it did not state or what is left out."""
+
+    name: str  # in rig.yaml
+    model: str
+    serial: str
+    firmware: str
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """A data set as a whole; everything but `stated` and `version` is from the record.
+
+    Attributes:
+        stated: title, licence, ethics, creators and citation, from the protocol or the export's options.
+        version: of the data set.
+        run: identifier of the run.
+        protocol: its id, version and SHA-256.
+        protocol_title: in words.
+        source: where the procedure comes from.
+        specimen: as entered at the start of the run.
+        purpose: likewise.
+        site: likewise.
+        origin: how the photographs came into the run, a sentence.
+        published_utc: time of the last event that the data set rests on.
+        head_sha256: hash of that event.
+        software: version of this program.
+        people: who took part; empty if personal data are left out.
+        devices: that were opened.
+        settings: of the camera and of the spheres, (name, value) in words.
+        accuracy: the run's own registration in the evaluation's table; None if there is none.
+        budget: of its error.
+        covariance: what the covariances of the poses hold, a sentence.
+        mesh: what the ground-truth mesh is, a sentence.
+        masks: what the masks hold.
+        gates: verdicts in words, by step.
+        accepted: gates accepted outside their limits, in words.
+        deviations: from the protocol, in words.
+        later: results that arrived after the evaluation, in words.
+        not_in_yet: results that had not arrived.
+    """
+
+    stated: DataSetStatement = field(default_factory=DataSetStatement)
+    version: str = FIRST_VERSION
+    run: str = ""
+    protocol: str = ""
+    protocol_title: str = ""
+    source: str = ""
+    specimen: str = ""
+    purpose: str = ""
+    site: str = ""
+    origin: str = ""
+    published_utc: str = ""
+    head_sha256: str = ""
+    software: str = ""
+    people: tuple[str, ...] = ()
+    devices: tuple[UsedDevice, ...] = ()
+    settings: tuple[tuple[str, str], ...] = ()
+    accuracy: Row | None = None
+    budget: ErrorBudget | None = None
+    covariance: str = ""
+    mesh: str = ""
+    masks: str = ""
+    gates: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    accepted: tuple[str, ...] = ()
+    deviations: tuple[str, ...] = ()
+    later: tuple[str, ...] = ()
+    not_in_yet: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """The title that was stated; else the protocol's, and the specimen."""
+        known = [self.protocol_title or "Posed images and a surface mesh", self.specimen]
+        return self.stated.title or ": ".join(filter(None, known))
+
+    @property
+    def licence(self) -> str:
+        """The licence in words."""
+        return self.stated.licence or "No licence was stated: ask the site that made the data set"
+
+    @property
+    def ethics(self) -> str:
+        """The ethics statement in words."""
+        return self.stated.ethics or "No ethics statement was given, neither in the protocol nor at the export"
+
+    @property
+    def creators(self) -> tuple[str, ...]:
+        """Who made the data set: as stated, else the site."""
+        return self.stated.creators or tuple(filter(None, (self.site,)))
+
+    @property
+    def citation(self) -> str:
+        """How to cite it: as stated, else put together from the record."""
+        if self.stated.cite:
+            return self.stated.cite
+        whose = f"{', '.join(self.creators)}: " if self.creators else ""
+        return f"{whose}{self.title}. Data set, version {self.version}" + (f", run {self.run}." if self.run else ".")

@@ -1,0 +1,164 @@
+"""The posed data set of an exported folder in the format `hdf5`, which holds all that other formats are made from."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.camera_model import CameraModel
+from service.compute.pixels.metadata import described
+from service.compute.pixels.splits import Splits
+from service.core.errors import DataError
+from service.dataset.formats.meshes import png
+from service.dataset.posed.folder import SUMS, check_folder
+from service.dataset.posed.records import DataSet, Mesh, View
+
+INDEX = "data.h5"
+_REMEDY = "Export it again with --format hdf5"
+
+
+def data_set_of_folder(folder: Path) -> DataSet:
+    """The data set that `orthocapture export --format hdf5` wrote; its identity is the SHA-256 of its `SHA256SUMS`.
+
+    Raises:
+        DataError: the folder is in another format, a file of it was changed or is missing, or it cannot be read.
+    """
+    if not (folder / INDEX).is_file() or not (folder / SUMS).is_file():
+        raise DataError("this is no data set in the format hdf5", where=str(folder), remedy=_REMEDY)
+    check_folder(folder)
+    try:
+        return _read(folder)
+    except (OSError, KeyError, ValueError) as error:
+        raise DataError(f"the data set cannot be read: {error}", where=str(folder), remedy=_REMEDY) from error
+
+
+class Stored:
+    """The pixel data of views, as `hdf5` holds them."""
+
+    def __init__(self, folder: Path, mark: str) -> None:
+        """Take the folder of the data set; `mark` is written into pictures where it is not empty."""
+        self._folder, self._mark = folder, mark
+
+    def picture(self, view: View) -> bytes:
+        """The pixels as PNG: the camera's own file is not in the folder."""
+        data = png(self.colours(view))
+        return described(data, self._mark, view.name) if self._mark else data
+
+    def colours(self, view: View) -> NDArray[np.uint8]:
+        """(H, W, 3) BGR."""
+        return np.ascontiguousarray(self._array(view, "image")[..., ::-1], dtype=np.uint8)
+
+    def depth_m(self, view: View) -> NDArray[np.float32]:
+        """(H, W) z of the mesh."""
+        return self._array(view, "depth_m").astype(np.float32)
+
+    def normal(self, view: View) -> NDArray[np.float32]:
+        """(H, W, 3) normals of the mesh."""
+        return self._array(view, "normal").astype(np.float32)
+
+    def valid(self, view: View) -> NDArray[np.bool_]:
+        """Pixels that the photograph has."""
+        return self._array(view, "valid").astype(np.bool_)
+
+    def markers(self, view: View) -> NDArray[np.bool_]:
+        """Spheres and posts."""
+        return self._array(view, "markers").astype(np.bool_)
+
+    def _array(self, view: View, name: str) -> NDArray[Any]:
+        try:
+            with h5py.File(self._folder / "views" / f"{view.name}.h5", "r") as file:
+                return np.asarray(file[name])
+        except (OSError, KeyError) as error:
+            raise DataError(f"{name} cannot be read: {error}", where=view.name, remedy=_REMEDY) from error
+
+
+def scaled_data_set(dataset: DataSet, width: int) -> DataSet:
+    """The same views with pictures, depth and masks of this width in pixels; wider ones are made smaller.
+
+    Raises:
+        DataError: a view is narrower.
+    """
+    narrow = min(view.camera.width for view in dataset.views)
+    if narrow < width:
+        raise DataError(f"an image is {narrow} px wide, less than {width} px", remedy="Ask for a smaller width")
+    views = tuple(
+        dataclasses.replace(view, camera=view.camera.scaled(width, _height(view.camera, width)))
+        for view in dataset.views
+    )
+    return dataclasses.replace(
+        dataset, identity=f"{dataset.identity} {width} px", views=views, pixels=_Scaled(dataset)
+    )
+
+
+class _Scaled:
+    """Smaller pictures of the views of a data set."""
+
+    def __init__(self, whole: DataSet) -> None:
+        self._whole, self._views = whole, {view.name: view for view in whole.views}
+
+    def picture(self, view: View) -> bytes:
+        data = png(self.colours(view))
+        return described(data, self._whole.mark, view.name) if self._whole.mark else data
+
+    def colours(self, view: View) -> NDArray[np.uint8]:
+        image = self._whole.pixels.colours(self._views[view.name])
+        size = (view.camera.width, view.camera.height)
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+    def depth_m(self, view: View) -> NDArray[np.float32]:
+        return self._nearest(self._whole.pixels.depth_m(self._views[view.name]), view).astype(np.float32)
+
+    def normal(self, view: View) -> NDArray[np.float32]:
+        return self._nearest(self._whole.pixels.normal(self._views[view.name]), view).astype(np.float32)
+
+    def valid(self, view: View) -> NDArray[np.bool_]:
+        return self._nearest(self._whole.pixels.valid(self._views[view.name]), view).astype(np.bool_)
+
+    def markers(self, view: View) -> NDArray[np.bool_]:
+        return self._nearest(self._whole.pixels.markers(self._views[view.name]), view).astype(np.bool_)
+
+    def _nearest(self, pixels: NDArray[Any], view: View) -> NDArray[Any]:
+        """The values (H, W, …) at the centres of the larger pixels."""
+        rows, columns = (
+            ((np.arange(small) + 0.5) * (large / small)).astype(np.int64)
+            for small, large in zip((view.camera.height, view.camera.width), pixels.shape[:2], strict=True)
+        )
+        return pixels[np.ix_(rows, columns)]
+
+
+def _height(camera: CameraModel, width: int) -> int:
+    return round(camera.height * width / camera.width)
+
+
+def _read(folder: Path) -> DataSet:
+    splits = json.loads((folder / "splits.json").read_text(encoding="utf-8"))
+    statement = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))
+    with h5py.File(folder / INDEX, "r") as file:
+        simulated = bool(file.attrs["simulated"])
+        mesh = Mesh(np.array(file["mesh/vertices_m"], dtype=np.float64), np.array(file["mesh/faces"], dtype=np.int64))
+    of = Splits(**{name: tuple(splits[name]) for name in ("dense", "sparse", "train", "test")})
+    views = tuple(_view(folder, name) for name in sorted({*of.dense, *of.train, *of.test}))
+    identity = hashlib.sha256((folder / SUMS).read_bytes()).hexdigest()
+    dataset = DataSet(identity, simulated, statement, views, Stored(folder, ""), mesh, of)
+    return dataclasses.replace(dataset, pixels=Stored(folder, dataset.mark))
+
+
+def _view(folder: Path, name: str) -> View:
+    with h5py.File(folder / "views" / f"{name}.h5", "r") as file:
+        K, terms = np.array(file["K"], dtype=np.float64), np.array(file["distortion"], dtype=np.float64)
+        height, width = np.asarray(file["valid"]).shape
+        k1, k2, p1, p2, k3, k4, k5, k6 = (float(term) for term in terms)
+        camera = CameraModel(
+            width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]),
+            k1, k2, p1, p2, k3, k4, k5, k6,
+        )  # fmt: skip
+        pose, covariance = np.array(file["T_world_camera"]), np.array(file["covariance"])
+    return View(name, ".png", camera, pose, covariance)

@@ -1,0 +1,169 @@
+"""Dense stereo on a processor: pairs, depth, fusion, and the whole method on images of a scene that is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from service.benchmark.method import methods, missing
+from service.benchmark.records import SCENARIOS, Scenario
+from service.benchmark.running import Trial, run_trial
+from service.compute.camera_model import CameraModel
+from service.compute.ground_truth.distances.chamfer import ChamferSettings
+from service.compute.pixels.ray_mesh import RayMesh
+from service.compute.pixels.splits import splits
+from service.compute.stereo.fusion import fused
+from service.compute.stereo.matching import DepthMap, depth_of_pair
+from service.compute.stereo.pairs import StereoView, looked_at_m, stereo_pairs
+from service.compute.stereo.rectify import rectified
+from service.compute.stereo.surface import surface_of
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, inverse, look_at
+from service.dataset.posed.pixels import Photographs
+from service.dataset.posed.records import DataSet, Mesh, View
+from tests.support.scenes.textured_scene import camera_of_width, render, ring_of_poses, slabs
+
+SCENE = slabs(3)
+PINHOLE = CameraModel(320, 240, 450.0, 450.0, 159.5, 119.5)
+UP = np.array([0.0, 1.0, 0.1])
+
+
+def truth() -> Mesh:
+    """The upper faces of the slabs, as far as the images show the table."""
+    corners: list[tuple[float, float, float]] = []
+    for slab in SCENE:
+        (x0, y0), (x1, y1) = np.clip(slab.low, -0.2, 0.2), np.clip(slab.high, -0.2, 0.2)
+        corners += [(x, y, slab.z) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+    first = 4 * np.arange(len(SCENE), dtype=np.int64)[:, None]
+    return Mesh(np.array(corners), np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])]))
+
+
+def height_m(places: Array) -> Array:
+    """Height of the uppermost slab at places (N, 2)."""
+    out = np.zeros(len(places))
+    for slab in SCENE:
+        inside = ((places > slab.low) & (places < slab.high)).all(axis=1)
+        out[inside] = np.maximum(out[inside], slab.z)
+    return out
+
+
+def eye_at(angle_deg: float, tilt_deg: float = 25.0) -> Transform:
+    angle, tilt = np.radians([angle_deg, tilt_deg])
+    out = np.array([np.sin(tilt) * np.cos(angle), np.sin(tilt) * np.sin(angle), np.cos(tilt)])
+    return look_at(0.6 * out, np.array([0.0, 0.0, 0.02]), UP)
+
+
+def seen_from(T_world_camera: Transform) -> StereoView:
+    return StereoView(render(SCENE, PINHOLE, T_world_camera, 1), PINHOLE, T_world_camera)
+
+
+def blank(T_world_camera: Transform) -> StereoView:
+    return StereoView(np.zeros((240, 320), dtype=np.uint8), PINHOLE, T_world_camera)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> DataSet:
+    """Distorted photographs of the slabs, twelve around them."""
+    folder, camera, mesh = tmp_path_factory.mktemp("slabs"), camera_of_width(320), truth()
+    poses = {f"view_{k:02d}": T for k, T in enumerate(ring_of_poses(12))}
+    views = tuple(View(name, ".png", camera, T, np.zeros((6, 6))) for name, T in poses.items())
+    for k, view in enumerate(views):
+        assert cv2.imwrite(str(folder / view.file), render(SCENE, camera, view.T_world_camera, k))
+    files = {view.name: folder / view.file for view in views}
+    sees: dict[str, NDArray[np.bool_]] = {view.name: np.ones(5, dtype=np.bool_) for view in views}
+    pixels = Photographs(files, RayMesh(mesh.vertices_m, mesh.faces), ())
+    return DataSet("slabs", True, {}, views, pixels, mesh, splits(sees))
+
+
+def test_the_cameras_look_at_one_point() -> None:
+    views = [blank(eye_at(angle)) for angle in (0, 80, 200)]
+    assert np.abs(looked_at_m(views) - [0, 0, 0.02]).max() < 1e-9
+    with pytest.raises(ComputeError, match="look in parallel"):
+        looked_at_m([views[0], blank(views[0].T_world_camera + np.eye(4, k=3) * 0.1)])
+
+
+def test_pairs_have_useful_angles_and_lonely_views_get_wider_ones() -> None:
+    near = [blank(eye_at(angle)) for angle in (0, 20, 40, 42)]
+    lonely = blank(eye_at(130))
+    pairs = stereo_pairs([*near, lonely])
+    assert (2, 3) not in pairs, "too narrow to measure depth"
+    assert {(0, 1), (1, 2)} <= set(pairs)
+    assert any(4 in pair for pair in pairs), "a lonely view has a partner"
+    with pytest.raises(ComputeError, match="no two images"):
+        stereo_pairs([blank(eye_at(0, 45)), blank(eye_at(180, 45))])
+
+
+def test_the_depth_of_a_pair_is_that_of_the_scene() -> None:
+    views = [seen_from(eye_at(0)), seen_from(eye_at(30))]
+    pair = rectified(views[0], views[1], looked_at_m(views))
+    found = depth_of_pair(pair, 0.58)
+    assert found is not None
+    points = found.points_m(1)
+    around = [height_m(points[:, :2] + step) for step in ((0, 0), (0.006, 0), (-0.006, 0), (0, 0.006), (0, -0.006))]
+    flat = (np.ptp(around, axis=0) == 0) & (np.abs(points[:, :2]).max(axis=1) < 0.15)  # no edge is near
+    error_m = np.abs(points[flat, 2] - around[0][flat])
+    assert flat.sum() > 10_000
+    assert np.isfinite(found.depth_m).mean() > 0.3
+    assert np.median(error_m) < 1e-3
+    assert np.mean(error_m < 5e-3) > 0.9
+
+
+def test_images_of_different_things_give_no_depth() -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (2, 240, 320)).astype(np.uint8)
+    views = [StereoView(noise[k], PINHOLE, eye_at(20.0 * k)) for k in range(2)]
+    assert depth_of_pair(rectified(views[0], views[1], looked_at_m(views)), 0.58) is None
+
+
+def sphere_seen(T_world_camera: Transform, radius_m: float) -> DepthMap:
+    """Exact depth of a sphere at the origin."""
+    camera = CameraModel(200, 200, 300.0, 310.0, 99.5, 98.0)
+    v, u = np.mgrid[:200, :200]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    centre = inverse(T_world_camera)[:3, 3]
+    a, b = np.sum(rays**2, axis=-1), rays @ centre
+    root = b**2 - a * (centre @ centre - radius_m**2)
+    depth = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, np.nan)
+    return DepthMap(depth.astype(np.float32), camera, T_world_camera, 1.0)
+
+
+def test_depth_maps_of_a_sphere_become_a_sphere_with_faces_outward() -> None:
+    eyes = [np.array(eye) * 0.3 for eye in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))]
+    maps = [sphere_seen(look_at(eye, np.zeros(3), np.array([0.3, 0.5, 0.8])), 0.05) for eye in eyes]
+    found = surface_of(fused(maps, 0.002, 1), 1)
+    radii = np.linalg.norm(found.vertices_m, axis=1)
+    assert np.median(np.abs(radii - 0.05)) < 1e-4
+    assert np.abs(radii - 0.05).max() < 1e-3, "half a voxel, where all maps see it at grazing angles"
+    assert abs(found.area_m2 - 4 * np.pi * 0.05**2) < 0.03 * found.area_m2
+    outward = np.einsum("ni,ni->n", found.face_normals, found.vertices_m[found.faces[:, 0]])
+    assert np.mean(outward > 0) > 0.99
+    # Tiles and blocks leave no seam: every edge has two faces.
+    edges = np.sort(np.concatenate([found.faces[:, [0, 1]], found.faces[:, [1, 2]], found.faces[:, [2, 0]]]), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).mean() > 0.99
+
+
+def test_a_place_that_too_few_maps_see_is_left_out() -> None:
+    one = sphere_seen(look_at(np.array([0.3, 0, 0]), np.zeros(3), UP), 0.05)
+    with pytest.raises(ComputeError, match="no place is seen by 2 pairs"):
+        fused([one], 0.002, 2)
+
+
+def test_the_method_needs_nothing_else() -> None:
+    assert missing(methods()["stereo"]) == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_the_benchmark_scores_the_stereo_method_on_images_alone(
+    dataset: DataSet, tmp_path: Path, scenario: Scenario
+) -> None:
+    trial = Trial(methods()["stereo"], scenario, tmp_path, settings=ChamferSettings(spacing_m=1e-3))
+    result = run_trial(trial, dataset)
+    assert result.score is not None, result.failure
+    assert result.views == (12 if scenario == "dense" else 8)
+    assert result.score.accuracy_mm < (1.2 if scenario == "dense" else 2.0)
+    assert result.score.chamfer_mm < (2.5 if scenario == "dense" else 5.0)
+    assert not list((tmp_path / f"stereo-{scenario}" / "data").rglob("*.ply")), "the truth is not among the files"

@@ -1,0 +1,223 @@
+"""The step that fuses CT and scan in a run: frames, measures, files, the wound, and a run without a CT."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drivers.interfaces import CtSource, Mesh, ScanExport, ScannedMesh, Scanner
+from service.compute.ground_truth.ply import read_ply
+from service.compute.ground_truth.surface import Surface
+from service.core.errors import ProtocolError
+from service.core.geometry import inverse, transform
+from service.core.protocol.models import parse_protocol
+from service.core.records.events import RegionDrawn
+from service.core.run.state import RunState
+from service.steps import params_models
+from service.store.store import Store
+from service.worker.job import JobContext
+from service.worker.loop import HANDLERS, work
+from tests.ground_truth.test_fuse_command import CENTRES_M, RADIUS_M, T_WORLD_CT, with_spheres
+from tests.ground_truth.test_fusion import ct_mesh, height, scan_mesh
+from tests.support.rig.bench_rig import BenchRig, ScriptedOperator, answer
+from tests.support.runs.bench_run import Bench, begin_run
+from tests.support.runs.registration_record import registration_record
+
+TAKEN_M = np.array([0.018, 0.012, 0.0360])  # a control sphere on the specimen, which the scan does not show
+PROTOCOL = """\
+id: truth
+version: "1"
+title: A CT and a scan
+spheres: {radius_mm: 6, registration: 5, control: 1}
+camera: {aperture_f: 22, exposure_s: 1/50, iso: 100}
+steps:
+  - id: ct
+    kind: ct_import
+    title: CT
+    params: {source: mesh, spheres: 6, wait_s: 5}
+    skippable: true
+  - id: scan
+    kind: scan_import
+    title: Scan
+    confirm: false
+    params: {spheres: 5, wait_s: 5}
+  - id: ground_truth
+    kind: ground_truth
+    title: Fuse
+    confirm: false
+    params:
+      ct: ct
+      scan: scan
+      chamfer_spacing_mm: 0.5
+      wound:
+        - {source: ct, frame: scan, centre_mm: [-20, -15, 30], size_mm: [6, 6, 20]}
+    gates:
+      - {measure: sphere_distance_change_max_mm, max: 0.3, unit: mm, unless_skipped: ct}
+      - {measure: folded_faces, max: 0, unit: faces, unless_skipped: ct}
+"""
+
+
+class Shelf:
+    """A scanner, or a CT suite, with one mesh."""
+
+    def __init__(self, file: Path, mesh: Surface) -> None:
+        self.file, self.mesh = file, mesh
+        file.write_bytes(b"as it was exported")
+
+    def exports(self) -> tuple[ScanExport, ...]:
+        return (ScanExport("mesh", (self.file,), "2036-11-21T10:00:00Z"),)
+
+    segmented_meshes = exports
+
+    def read(self, export: ScanExport) -> ScannedMesh:
+        vertices_m, faces = self.mesh.vertices_m, self.mesh.faces
+        return ScannedMesh(
+            Mesh(vertices_m, faces.astype(np.int32), np.zeros_like(vertices_m)), "m", "known", {}, export
+        )
+
+    read_mesh = read
+
+
+class TwoSurfaces(BenchRig):
+    """The bench with a scanner and a CT suite."""
+
+    shelf: Shelf
+    suite: Shelf
+
+    def scanner(self, name: str | None = None) -> Scanner:
+        return cast(Scanner, self.shelf)
+
+    def ct(self) -> CtSource:
+        return cast(CtSource, self.suite)
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    rig = TwoSurfaces()
+    rig.shelf = Shelf(tmp_path / "scan.ply", with_spheres(scan_mesh(), CENTRES_M))
+    in_ct = with_spheres(ct_mesh(), np.vstack([CENTRES_M, TAKEN_M]))
+    rig.suite = Shelf(tmp_path / "ct.stl", in_ct.moved(inverse(T_WORLD_CT)))
+    with Store.open(tmp_path / "data") as store:
+        made = replace(begin_run(store, PROTOCOL, tmp_path), rig=rig)
+
+        def compute(_seconds: float) -> None:
+            work(store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _all: None)
+
+        made.on_wait = compute
+        yield made
+
+
+def fused(bench: Bench) -> tuple[RunState, dict[str, Any], np.ndarray[Any, Any]]:
+    """The state, the fused mesh's properties, and its vertices in metres."""
+    state = bench.run()
+    assert state.status == "completed", state
+    (mesh,) = (ref for ref in state.steps["ground_truth"].artefacts if ref.kind == "ground_truth_mesh")
+    columns, faces = read_ply(bench.store.artefact_path(mesh.sha256))
+    points = 1e-3 * np.stack([np.asarray(columns[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+    assert faces.max() < len(points)
+    return state, dict(columns), points
+
+
+def test_a_run_with_a_ct_and_a_scan_makes_the_ground_truth(bench: Bench) -> None:
+    state, columns, points = fused(bench)
+    measures = state.steps["ground_truth"].measures
+    assert measures["spheres_compared"] == len(CENTRES_M)
+    assert measures["sphere_distance_change_max_mm"] < 0.02
+    assert measures["folded_faces"] == 0
+    assert measures["chamfer_floor_mm"] < measures["chamfer_ct_scan_mm"]
+    assert "loop_closure_mm" not in measures  # there are no images
+    details = state.steps["ground_truth"].result["details"]
+    assert np.array(details["T_scan_ct"]) == pytest.approx(T_WORLD_CT, abs=2e-5)
+    assert len(details["wound_m"]) >= 3
+    assert [(r["by"], r["source"]) for r in details["regions"]] == [("protocol truth 1", "ct")]
+    assert set(np.unique(columns["source"])) == {0, 1, 2}
+    assert np.all(columns["sigma_mm"] > 0)
+    boxed = np.all(np.abs(points - [-0.020, -0.015, 0.030]) < [0.0028, 0.0028, 0.0098], axis=1)
+    assert np.all(columns["source"][boxed] == 0)
+    picture = next(ref for ref in state.steps["ground_truth"].artefacts if ref.kind == "fusion_picture")
+    shown = cv2.imread(str(bench.store.artefact_path(picture.sha256)))
+    assert shown is not None
+    assert shown.std() > 10
+    bench.must_verify()
+
+
+def test_a_region_that_a_person_drew_is_used_with_the_name(bench: Bench) -> None:
+    corners = ((-0.022, 0.012, 0.03), (-0.016, 0.012, 0.03), (-0.016, 0.018, 0.03), (-0.022, 0.018, 0.03))
+    drawn = RegionDrawn(step="ground_truth", source="ct", corners_m=corners, seen_along=(0.0, 0.0, 1.0))
+    elsewhere = drawn.model_copy(update={"step": "another"})
+    bench.store.record(bench.run_id, [drawn, elsewhere], actor="grace")
+    state, columns, points = fused(bench)
+    regions = state.steps["ground_truth"].result["details"]["regions"]
+    assert [(r["by"], r["frame"]) for r in regions] == [("protocol truth 1", "scan"), ("grace", "scan")]
+    within = np.all(np.abs(points[:, :2] - [-0.019, 0.015]) < 0.0028, axis=1) & (points[:, 2] > 0.02)
+    assert within.any()
+    assert np.all(columns["source"][within] == 0)
+
+
+def test_a_sphere_that_was_taken_away_before_the_scan_is_not_in_the_ground_truth(bench: Bench) -> None:
+    state, _, points = fused(bench)
+    (number,) = state.steps["ground_truth"].result["details"]["taken_away"]
+    in_ct = np.array(state.steps["ct"].result["spheres_m"][number])
+    assert T_WORLD_CT[:3, :3] @ in_ct + T_WORLD_CT[:3, 3] == pytest.approx(TAKEN_M, abs=1e-4)
+    above = points[np.linalg.norm(points - TAKEN_M, axis=1) < RADIUS_M + 0.0008]
+    assert len(above) > 20  # the scan's surface, which the sphere nearly touched
+    assert above[:, 2] == pytest.approx(height(above[:, 0], above[:, 1]), abs=1e-4)
+
+
+def test_without_a_ct_the_step_says_so_and_passes(bench: Bench) -> None:
+    operator = ScriptedOperator()
+    operator.script = {("ct", "confirm"): [lambda q, _s: answer(q, "skip", reason="there is none")]}
+    bench.operator = operator
+    state = bench.run()
+    assert state.status == "completed"
+    assert state.steps["ground_truth"].result["without"] == "ct"
+    assert not state.steps["ground_truth"].artefacts
+
+
+def test_the_way_through_the_cameras_is_compared_with_the_spheres(bench: Bench, tmp_path: Path) -> None:
+    fused(bench)
+    (job,) = (j for j in bench.state().steps["ground_truth"].jobs.values() if j.kind == "fuse")
+    steps = bench.state().steps
+    off = transform(Rotation.identity(), np.array([2e-4, 0.0, 0.0]))
+    T_world_scan = transform(Rotation.from_rotvec([0.1, 0.2, 0.3]), np.array([1.0, 0.0, 0.5]))
+    arguments = {
+        **job.arguments,
+        "ct": dict(steps["ct"].result),
+        "scan": dict(steps["scan"].result),
+        "scan_registration": registration_record("robot", T_world_scan=T_world_scan.tolist()),
+        "ct_registration": registration_record("robot", T_world_scan=(T_world_scan @ off @ T_WORLD_CT).tolist()),
+        "regions": [
+            {
+                "source": "ct",
+                "frame": "world",
+                "by": "A. Surgeon",
+                "corners_m": [
+                    (T_world_scan[:3, :3] @ p + T_world_scan[:3, 3]).tolist()
+                    for p in ([-0.020, 0.012, 0.03], [-0.012, 0.012, 0.03], [-0.016, 0.020, 0.03])
+                ],
+                "below_m": 0.01,
+                "above_m": 0.01,
+            }
+        ],
+    }
+    done = HANDLERS["fuse"](JobContext(arguments, bench.store, tmp_path, lambda *_: None))
+    assert done.measures["loop_closure_mm"] == pytest.approx(0.2, abs=0.03)
+    assert done.measures["loop_closure_rms_mm"] == pytest.approx(0.2, abs=0.03)
+    columns, _ = read_ply(bench.store.artefact_path(done.artefacts[0].sha256))
+    x, y, z = (np.asarray(columns[axis], dtype=np.float64) for axis in "xyz")
+    middle = (np.hypot(x + 16, y - 14.5) < 1.5) & (z > 25)
+    assert middle.any()
+    assert np.all(columns["source"][middle] == 0)
+
+
+def test_a_region_is_a_polygon_or_a_box() -> None:
+    wrong = PROTOCOL.replace("centre_mm: [-20, -15, 30], size_mm: [6, 6, 20]", "corners_mm: [[0, 0, 0], [1, 0, 0]]")
+    with pytest.raises(ProtocolError, match="polygon of at least three"):
+        parse_protocol(wrong.encode(), params_models(), name="truth.yaml")

@@ -1,0 +1,167 @@
+"""Sign-ins: who gets in, who must wait, and when a screen locks."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from argon2 import PasswordHasher
+from argon2.low_level import Type
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.people.errors import NotSignedInError, PinRefusedError
+from service.people.sessions import People, wait_after_s
+from service.store.database.engine import database_path
+from tests.support.pages.web import PIN, password_of
+from tests.support.record.office import IDLE_S, Office, refused
+
+
+def test_sign_in_and_out(office: Office) -> None:
+    token, person = office.enter("Grace")
+    assert (person.account, person.role, person.locked) == ("grace", "technician", False)
+    assert person.csrf not in repr(person)
+    office.people.sign_out(person)
+    assert office.person(token) is None
+    assert office.outcomes("grace")[-2:] == ["signed_in", "signed_out"]
+
+
+def test_every_sign_in_has_its_own_tokens(office: Office) -> None:
+    (one, first), (two, second) = office.enter("grace"), office.enter("grace")
+    assert len({one, two, first.csrf, second.csrf}) == 4
+    assert first.screen != second.screen
+    third = office.people.sign_in("grace", password_of("grace"), replaces=one)
+    assert office.person(one) is None
+    assert office.person(two) is not None
+    assert office.person(third) is not None
+
+
+def test_a_sign_in_ends_after_twelve_hours_however_busy(office: Office) -> None:
+    token, _ = office.enter("grace")
+    for hour in range(1, 72):
+        office.clock.passed_s = 600 * hour - 1
+        assert office.person(token, deliberate=True) is not None
+    office.clock.passed_s = 12 * 3600
+    assert office.person(token, deliberate=True) is None
+    assert office.outcomes("grace")[-1] == "ended"
+
+
+def test_sign_ins_that_nobody_came_back_to_end_in_the_record_too(office: Office) -> None:
+    office.enter("grace")
+    office.clock.passed_s = 12 * 3600
+    office.enter("emmy")
+    assert office.people.screens("grace") == []
+    assert office.outcomes("grace") == ["signed_in", "ended"]
+
+
+def test_refusals_are_the_same_words_whatever_the_cause(office: Office) -> None:
+    _, administrator = office.enter("ada")
+    office.people.accounts.disable(administrator, "lise", "left the house")
+    causes = [
+        refused(lambda: office.people.sign_in("grace", "wrong")),
+        refused(lambda: office.people.sign_in("nobody", "wrong")),
+        refused(lambda: office.people.sign_in("lise", password_of("lise"))),
+        refused(lambda: office.people.sign_in("", "")),
+    ]
+    for _ in range(6):
+        causes.append(refused(lambda: office.people.sign_in("emmy", "wrong")))
+    causes.append(refused(lambda: office.people.sign_in("emmy", password_of("emmy"))))
+    assert len({str(error) for error in causes}) == 1
+
+
+def test_a_password_is_hashed_for_every_refusal(office: Office, monkeypatch: pytest.MonkeyPatch) -> None:
+    hashed: list[str] = []
+    real = PasswordHasher.verify
+
+    def verify_and_count(self: PasswordHasher, stored: str, given: str) -> bool:
+        hashed.append(given)
+        return bool(real(self, stored, given))
+
+    monkeypatch.setattr(PasswordHasher, "verify", verify_and_count)
+    for account in ("grace", "nobody", "grace", "grace", "grace", "grace", "grace"):  # waits at the end
+        refused(lambda account=account: office.people.sign_in(account, "wrong"))
+    assert hashed == ["wrong"] * 7
+
+
+def test_wrong_passwords_lock_out_with_growing_waits(office: Office) -> None:
+    waits: list[float] = []
+    for _ in range(4):
+        refused(lambda: office.people.sign_in("grace", "wrong"))
+    for _ in range(7):
+        refused(lambda: office.people.sign_in("grace", "wrong"))
+        now = office.clock.utc_now().timestamp()
+        until = office.people.accounts.get("grace").locked_until_utc_s
+        waits.append(round(until - now, 3))
+        refused(lambda: office.people.sign_in("grace", password_of("grace")))  # even with the right one
+        office.clock.passed_s += until - now
+    assert waits == [30, 60, 120, 240, 480, 900, 900]
+    office.enter("grace")
+    account = office.people.accounts.get("grace")
+    assert (account.failures, account.locked_until_utc_s) == (0, 0)
+    assert office.outcomes("grace").count("locked_out") == 14
+    assert office.outcomes("grace").count("refused") == 4
+
+
+@given(st.integers(0, 10**6))
+def test_waits_never_shrink_and_never_pass_a_quarter_of_an_hour(failures: int) -> None:
+    assert 0 <= wait_after_s(failures) <= wait_after_s(failures + 1) <= 900
+    assert (wait_after_s(failures) == 0) == (failures < 5)
+
+
+def test_a_wrong_password_of_a_signature_counts(office: Office) -> None:
+    office.people.check_password("grace", password_of("grace"))
+    for _ in range(5):
+        refused(lambda: office.people.check_password("grace", "wrong"))
+    refused(lambda: office.people.check_password("grace", password_of("grace")))
+    office.clock.passed_s += 30
+    office.people.check_password("grace", password_of("grace"))
+    assert office.people.accounts.get("grace").failures == 0
+
+
+def test_hashes_follow_the_parameters_of_today(office: Office, tmp_path: Path) -> None:
+    assert PasswordHasher().type is Type.ID
+    stronger = People(office.store, PasswordHasher(time_cost=2, memory_cost=16, parallelism=1))
+    stronger.sign_in("grace", password_of("grace"))
+    with closing(sqlite3.connect(database_path(office.data))) as connection:
+        stored = dict(connection.execute("SELECT account, password_hash FROM accounts"))
+    assert "m=16,t=2" in stored["grace"]
+    assert "m=8,t=1" in stored["emmy"]
+    office.enter("grace")  # and the old process still accepts it
+
+
+def test_an_idle_screen_locks_and_its_pin_opens_it(office: Office) -> None:
+    token, _ = office.enter("grace")
+    office.clock.passed_s = IDLE_S - 1
+    open_still = office.person(token, deliberate=True)
+    assert open_still
+    assert not open_still.locked
+    office.clock.passed_s += IDLE_S - 1
+    by_itself = office.person(token)  # the page reloads its parts, which does not count as activity
+    assert by_itself
+    assert not by_itself.locked
+    office.clock.passed_s += 1
+    locked = office.person(token, deliberate=True)
+    assert locked
+    assert locked.locked
+    with pytest.raises(PinRefusedError):
+        office.people.unlock(locked, "0000")
+    office.people.unlock(locked, PIN)
+    opened = office.person(token)
+    assert opened
+    assert not opened.locked
+    assert office.outcomes("grace")[-3:] == ["screen_locked", "refused", "screen_unlocked"]
+
+
+def test_five_wrong_pins_end_the_sign_in(office: Office) -> None:
+    token, person = office.enter("grace")
+    office.people.lock(person)
+    for _ in range(4):
+        with pytest.raises(PinRefusedError):
+            office.people.unlock(person, "0000")
+    with pytest.raises(NotSignedInError):
+        office.people.unlock(person, "0000")
+    assert office.person(token) is None
+    with pytest.raises(NotSignedInError):
+        office.people.unlock(person, PIN)

@@ -1,0 +1,89 @@
+"""An export that is killed at any of its operations on files leaves nothing that looks whole, and goes on."""
+
+from __future__ import annotations
+
+import random
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from service.dataset.posed.exporter import exporter, write_data_set
+from service.dataset.posed.folder import check_folder
+from service.dataset.posed.records import DataSet
+from tests.support.scenes.posed import posed_data_set
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+#: Exports into a folder and kills itself at the n-th operation on its files; says how many there were if it lives.
+CHILD = """
+import os, signal, sys
+from pathlib import Path
+from service.dataset.posed.exporter import exporter, write_data_set
+from tests.support.scenes.posed import posed_data_set
+
+photographs, out, name, death = Path(sys.argv[1]), sys.argv[2], sys.argv[3], int(sys.argv[4])
+done, at_work = 0, False
+
+def operation(event, arguments):
+    global done
+    if at_work and event in ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir"):
+        if any(os.path.basename(out) in str(argument) for argument in arguments):
+            done += 1
+            if done == death:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+sys.addaudithook(operation)
+dataset = posed_data_set(photographs)
+at_work = True
+write_data_set(dataset, exporter(name), Path(out))
+at_work = False
+print(done)
+"""
+
+
+def attempt(photographs: Path, out: Path, name: str, death: int) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", CHILD, str(photographs), str(out), name, str(death)]
+    return subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("photographs")
+
+
+@pytest.fixture(scope="module")
+def dataset(photographs: Path) -> DataSet:
+    return posed_data_set(photographs)
+
+
+@pytest.mark.parametrize("name", ["plain", "nerfstudio"])
+def test_deaths_at_random_points_leave_nothing_that_looks_whole(
+    dataset: DataSet, photographs: Path, tmp_path: Path, name: str
+) -> None:
+    write_data_set(dataset, exporter(name), tmp_path / "at_once")
+    counted = attempt(photographs, tmp_path / "counted", name, 0)
+    assert counted.returncode == 0, counted.stderr
+    operations = int(counted.stdout)
+    assert operations > 2 * len(contents(tmp_path / "at_once")), "each file is written and gets its name"
+    whole = contents(tmp_path / "at_once")
+    dice = random.Random(14)
+    deaths = [*dice.sample(range(1, operations), 5), operations - 1, operations]
+    for round_, death in enumerate(deaths):
+        out = tmp_path / f"killed_{round_}"
+        for point in (death, dice.randrange(1, operations // 2)):  # killed again while it goes on
+            died = attempt(photographs, out, name, point)
+            assert died.returncode in (-signal.SIGKILL, 0, 1), died.stderr
+            if out.exists():
+                assert check_folder(out) == len(whole) - 1
+                break
+        if not out.exists():
+            write_data_set(dataset, exporter(name), out)
+        assert contents(out) == whole
+        check_folder(out)
