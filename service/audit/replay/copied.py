@@ -11,7 +11,9 @@ from service.core.jobs.references import Reference
 from service.core.run.state import JobState
 
 _TELLING_DIGITS = 12  # a number with so many digits is recognised by its value, since nobody typed it
-_TELLING_BITS = 32  # what rounding leaves of zero (-7 / 2**55) prints many digits, but two computations often meet in it
+_TELLING_BITS = (
+    32  # what rounding leaves of zero (-7 / 2**55) prints many digits, but two computations often meet in it
+)
 
 
 @dataclass
