@@ -193,7 +193,7 @@ class StepEvidence:
             open_kinds = [mine[key].kind for key in keys if mine[key].status != "finished"]
             self.progress(", ".join(map(term, dict.fromkeys(open_kinds))) or "computed", done, len(keys))
             if done == len(keys):
-                return tuple(JobResult(mine[key].measures, mine[key].artefacts, mine[key].result) for key in keys)
+                return tuple(JobResult.of(mine[key]) for key in keys)
             self.wait(0.2)
 
     def enqueue(self, request: JobRequest, name: str) -> None:

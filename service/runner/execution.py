@@ -89,6 +89,7 @@ class StepExecution:
                 artefacts=outcome.artefacts,
                 result={} if outcome.result is None else recorded(outcome.result),
                 uncertainties=dict(outcome.uncertainties),
+                computed_by=outcome.computed_by,
             )
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, Self, TypeVar
 
 from drivers.interfaces import Camera, CtSource, Device, DeviceReport, Lightbox, RobotArm, Scanner, Transform
 from service.core.errors import OrthocaptureError
@@ -14,7 +14,7 @@ from service.core.jobs.references import Each, Reference
 from service.core.protocol.models import Protocol as LabProtocol
 from service.core.protocol.models import Step
 from service.core.protocol.step_params import StepParams
-from service.core.records.events import ArtefactRef, Payload, Record, StepNote, Uncertainty, View
+from service.core.records.events import ArtefactRef, ComputedBy, Payload, Record, StepNote, Uncertainty, View
 from service.core.records.import_list import ImportList
 from service.core.run.decide import RunState, StepState
 from service.core.run.state import JobState
@@ -154,9 +154,20 @@ class JobRequest:
 class JobResult:
     """The worker's answer to a job."""
 
+    job: str
     measures: Mapping[str, float]
     artefacts: tuple[ArtefactRef, ...]
     result: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, job: JobState) -> Self:
+        """The answer of a finished job."""
+        return cls(job.job, job.measures, job.artefacts, job.result)
+
+    @property
+    def source(self) -> ComputedBy:
+        """The job, for a step that gives its measures under their own names."""
+        return ComputedBy(job=self.job)
 
 
 class Evidence(Protocol):
@@ -241,12 +252,16 @@ class StepContext:
 
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
-    """What a step measured (gates judge it), the files it produced, and its Result."""
+    """What a step measured (gates judge it), the files it produced, its Result, and the jobs that computed them.
+
+    Audit and replay follow `computed_by` from a step's numbers to the jobs: name each job whose measures are given.
+    """
 
     measures: MeasureRecord
     artefacts: tuple[ArtefactRef, ...] = ()
     result: Record | None = None
     uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict[str, Uncertainty])  # of some measures
+    computed_by: tuple[ComputedBy, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,8 @@ from pydantic import BaseModel, ValidationError
 from service.core.errors import ConfigurationError, IntegrityError
 from service.core.jobs.references import Each, Reference
 from service.core.records.events import ArtefactRef, View, ViewHeld, ViewpointCaptured
-from service.core.run.state import JobState, StepState
+from service.core.run.computed import answered_by
+from service.core.run.state import JobState
 from service.jobs.calibration import calibrate
 from service.jobs.capture import hand_board, hand_view
 from service.jobs.kind import JobKind, JobRecord
@@ -48,15 +49,6 @@ def earlier_answer(context: StepContext, step_id: str, kind: JobKind[Any, R]) ->
             remedy="Name a step in the protocol that computes it",
         ) from error
     return EarlierAnswer(answer, answered_by(context.run.steps[step_id]))
-
-
-def answered_by(state: StepState) -> JobState | None:
-    """The newest job whose answer is part of the step's result; None if no job computed it."""
-    done = [job for job in state.jobs.values() if job.status == "finished" and job.result]
-    for job in sorted(done, key=lambda job: job.enqueued_seq, reverse=True):
-        if all(name in state.result and state.result[name] == value for name, value in job.result.items()):
-            return job
-    return None
 
 
 def _result_of(context: StepContext, step_id: str) -> Mapping[str, Any]:

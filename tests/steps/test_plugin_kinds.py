@@ -71,7 +71,9 @@ def execute(context, params):
     """Weigh the specimen some times."""
     readings = tuple(500.0 + k for k in range(params.times))
     (answer,) = context.evidence.run_jobs(JobRequest.of(WEIGH, Arguments(readings_g=readings)))
-    return StepOutcome(Measures.read(answer.measures), answer.artefacts, Result(**answer.result))
+    return StepOutcome(
+        Measures.read(answer.measures), answer.artefacts, Result(**answer.result), computed_by=(answer.source,)
+    )
 
 
 WEIGHING = StepKind(

@@ -13,9 +13,9 @@ from service.compute.evaluation.accuracy import true_error_m
 from service.core.geometry import apply
 from service.core.jobs.references import jobs_of, resolve
 from service.core.records.events import JobFinished
-from service.core.run.state import JobState, RunState
+from service.core.run.computed import computed_by
+from service.core.run.state import JobState, RunState, StepState
 from service.core.units import mm
-from service.dataset.registrations import registration_name
 from service.dataset.summary import RunSummary
 from service.jobs.registration import register
 from service.worker.job import JobAnswer
@@ -69,23 +69,17 @@ class RecomputedJobs:
             return [self._with_new_hashes(item) for item in cast("Sequence[Any]", value)]
         return self.renamed.get(value, value) if isinstance(value, str) else value
 
-    def measures_of(self, step: str, recorded: Mapping[str, float]) -> dict[str, float] | None:
-        """A step's measures with the recomputed measures of its jobs; None if no job of it was computed again.
-
-        A registration step puts a registration's name before the name of each of its measures.
-        """
-        pairs = [pair for pair in self.pairs if pair.step == step]
+    def measures_of(self, step: StepState) -> dict[str, float] | None:
+        """A step's measures with the recomputed measures of its jobs; None if no job of it was computed again."""
+        pairs = {pair.before.job: pair for pair in self.pairs if pair.step == step.step}
         if not pairs:
             return None
-        measures = dict(recorded)
-        for pair in pairs:
-            registered = pair.before.kind == register.KIND.name
-            prefix = f"{registration_name(register.KIND.read_answer(pair.before.result))}_" if registered else ""
-            for name, value in pair.before.measures.items():
-                own = prefix + name
-                if recorded.get(own) == value and name in pair.now.measures:
-                    measures[own] = float(pair.now.measures[name])
-        return measures
+        measures = dict(step.measures)
+        for source in computed_by(step):
+            if source.job in pairs:
+                again = pairs[source.job].now.measures
+                measures |= {source.prefix + name: float(value) for name, value in again.items()}
+        return {name: value for name, value in measures.items() if name in step.measures}
 
 
 def drifts(summary: RunSummary, recomputed: RecomputedJobs) -> Iterator[Drift]:

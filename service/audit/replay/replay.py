@@ -236,7 +236,7 @@ def _gates(run: RecordedRun, recomputed: RecomputedJobs) -> Iterator[GateReplay]
     others.
     """
     for step_id, state in run.state.steps.items():
-        measures = recomputed.measures_of(step_id, state.measures)
+        measures = recomputed.measures_of(state)
         if state.verdicts and measures is not None:
             judged = evaluate_gates(
                 run.protocol.step(step_id), state.attempt, measures, run.state.skipped, state.uncertainties

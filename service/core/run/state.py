@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from service.core.jobs.priorities import WAITED
-from service.core.records.events import ArtefactRef, GateVerdict, Identified, RegionDrawn, Uncertainty
+from service.core.records.events import ArtefactRef, ComputedBy, GateVerdict, Identified, RegionDrawn, Uncertainty
 from service.core.run.lifecycle import Phase
 from service.core.run.noted import MOTION_PLAN, Mending, MotionPlan
 from service.core.text.counts import counted
@@ -104,6 +104,7 @@ class StepState:
     artefacts: tuple[ArtefactRef, ...] = ()  # of this attempt's step_measured
     result: Mapping[str, Any] = field(default_factory=dict[str, Any])
     uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict[str, Uncertainty])
+    computed_by: tuple[ComputedBy, ...] | None = None  # jobs of the measures and the result; None: not recorded
     verdicts: tuple[GateVerdict, ...] = ()
     gates_passed: bool = False
     gates_sha256: str = ""  # of the gates_evaluated event: what a signature of this step binds

@@ -141,7 +141,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     measures |= answer.measures
     if capture is not None:
         mend_calibration(context, capture, measures)
-    return StepOutcome(Measures.read(measures), answer.artefacts, result)
+    return StepOutcome(Measures.read(measures), answer.artefacts, result, computed_by=(answer.source,))
 
 
 def board_of_protocol(context: StepContext) -> Board:

@@ -52,7 +52,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     result = Result.model_validate(answer.result)
     uncertainties = layout_uncertainties(result.details.layout)
     measured = Measures.read({**measures, **answer.measures})
-    return StepOutcome(measured, kept + answer.artefacts, result, uncertainties)
+    return StepOutcome(measured, kept + answer.artefacts, result, uncertainties, (answer.source,))
 
 
 def _mesh(context: StepContext, params: Params) -> tuple[JobRequest, tuple[ArtefactRef, ...], Mapping[str, float]]:

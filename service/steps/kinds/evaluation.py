@@ -100,7 +100,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     (answer,) = context.evidence.run_jobs(JobRequest.of(evaluate.KIND, arguments, references))
     result = Result.model_validate(answer.result)
     measures = Measures.read_all(answer.measures, registrations)
-    return StepOutcome(measures, answer.artefacts, result)
+    return StepOutcome(measures, answer.artefacts, result, computed_by=(answer.source,))
 
 
 KIND = StepKind(

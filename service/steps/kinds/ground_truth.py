@@ -139,7 +139,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         references |= {field: Reference(job.job, "result") for field, job in both.items()}
     (answer,) = context.evidence.run_jobs(JobRequest.of(fuse.KIND, arguments, references))
     result = Result(registration=name, details=fuse.KIND.read_answer(answer.result))
-    return StepOutcome(Measures.read(answer.measures), answer.artefacts, result)
+    return StepOutcome(Measures.read(answer.measures), answer.artefacts, result, computed_by=(answer.source,))
 
 
 def _regions(context: StepContext, params: Params) -> tuple[fuse.Region, ...]:

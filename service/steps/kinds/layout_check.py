@@ -94,7 +94,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     ).verdicts
     _advise(context, judged, result.details, len(images), params)
     measures = Measures.read(answer.measures)
-    return StepOutcome(measures, (*kept, *answer.artefacts), result, uncertainties)
+    return StepOutcome(measures, (*kept, *answer.artefacts), result, uncertainties, (answer.source,))
 
 
 def _earlier(context: StepContext) -> list[layout.LayoutPhotograph]:

@@ -14,7 +14,7 @@ from pydantic import field_validator
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.jobs.keys import arguments_name
 from service.core.protocol.step_params import RepeatedStep, StepParams
-from service.core.records.events import Record
+from service.core.records.events import ComputedBy, Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
 from service.jobs.records import Mounting, Photograph
@@ -192,7 +192,8 @@ def _outcome(found: RegistrationJobs) -> StepOutcome:
         registrations={name: register.KIND.read_answer(job.result) for name, job in found.arrived.items()},
     )
     artefacts = tuple(ref for _, job in done for ref in job.artefacts)
-    return StepOutcome(measures, artefacts, result)
+    sources = (ComputedBy(job=job.job, prefix=f"{name}_") for name, job in found.arrived.items())
+    return StepOutcome(measures, artefacts, result, computed_by=(ComputedBy(job=outlines.job), *sources))
 
 
 KIND = StepKind(

@@ -87,6 +87,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         kept + answer.artefacts,
         result,
         uncertainties,
+        (answer.source,),
     )
 
 

@@ -41,6 +41,7 @@ from service.core.records.events.site import (
     TimeStampKept,
 )
 from service.core.records.events.steps import (
+    ComputedBy,
     FilesKept,
     GatesEvaluated,
     GateVerdict,
@@ -69,6 +70,7 @@ __all__ = [
     "ActionRefused",
     "ArtefactRef",
     "CaptureAsked",
+    "ComputedBy",
     "ControlTaken",
     "DataRestored",
     "DeviceOpened",

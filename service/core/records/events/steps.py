@@ -46,6 +46,13 @@ class Uncertainty(Record):
     upper: float  # the true value is below this with 99 % confidence (one-sided)
 
 
+class ComputedBy(Record):
+    """A job whose measures, and whose answer, a step gave as its own."""
+
+    job: str
+    prefix: str = ""  # what the step put before the names of the job's measures: `colmap_`
+
+
 class StepMeasured(Record):
     """The work of a step is done: its numbers, before any gate (running → checking)."""
 
@@ -56,6 +63,7 @@ class StepMeasured(Record):
     artefacts: tuple[ArtefactRef, ...] = ()
     result: dict[str, Any] = Field(default_factory=dict)  # the step kind's Result as plain data
     uncertainties: dict[str, Uncertainty] = Field(default_factory=dict)  # of those measures that state one
+    computed_by: tuple[ComputedBy, ...] | None = None  # None: recorded before events named the jobs
 
 
 class StepFailed(Record):

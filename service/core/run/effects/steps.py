@@ -64,6 +64,7 @@ def step_measured(protocol: Protocol, state: RunState, event: Event, p: StepMeas
         artefacts=p.artefacts,
         result=p.result,
         uncertainties=p.uncertainties,
+        computed_by=p.computed_by,
         failures=0,
         worked_s=worked_s(state, event),
     )
