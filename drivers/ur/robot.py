@@ -12,6 +12,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from drivers.arm.latch import Latch
+from drivers.arm.stream import STREAM_HZ, PoseStream, driven, judge, ringing_s
 from drivers.errors import (
     DeviceError,
     DeviceFaultError,
@@ -34,10 +36,9 @@ from drivers.interfaces import (
 )
 from drivers.ur import UrConfig
 from drivers.ur import vendor as library
-from drivers.ur.latch import Latch
 from drivers.ur.link import VENDOR_ERRORS, ControllerFacts, connect_dashboard, probe, read_facts, vendor
+from drivers.ur.safety import safety_state
 from drivers.ur.script import ControlScript, wait
-from drivers.ur.stream import STREAM_HZ, PoseStream, driven, judge, ringing_s, safety_state
 from drivers.ur.watchdog import Watchdog
 from service.core.geometry import from_rotation_vector, inverse, to_rotation_vector
 

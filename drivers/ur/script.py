@@ -7,12 +7,12 @@ import logging
 import time
 from collections.abc import Callable, Generator
 
+from drivers.arm.latch import Latch
+from drivers.arm.stream import STREAM_HZ
 from drivers.errors import DeviceError, DeviceTimeoutError, DeviceUnavailableError
 from drivers.ur import UrConfig
 from drivers.ur import vendor as library
-from drivers.ur.latch import Latch
 from drivers.ur.link import vendor
-from drivers.ur.stream import STREAM_HZ
 from drivers.ur.watchdog import Watchdog
 
 SCRIPT_START_S = 5.0

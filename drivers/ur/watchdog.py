@@ -12,11 +12,11 @@ import threading
 import time
 from collections.abc import Callable, Generator
 
+from drivers.arm.latch import Latch
+from drivers.arm.stream import driven
 from drivers.interfaces import RobotSample
 from drivers.ur import vendor as library
-from drivers.ur.latch import Latch
 from drivers.ur.link import VENDOR_ERRORS
-from drivers.ur.stream import driven
 
 LATE = 0.8  # fraction of the watchdog's timeout; a longer gap between kicks explains why the program ended
 LAPSE_S = 2.0  # longest gap that counts as a busy machine if the arm stood still

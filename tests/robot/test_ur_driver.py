@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from drivers.arm.stream import judge, ringing_s
 from drivers.errors import (
     DeviceError,
     DeviceRefusedError,
@@ -24,7 +25,7 @@ from drivers.errors import (
 from drivers.host.hosted_device import hosted
 from drivers.interfaces import Array, Payload, RobotArm, RobotSample, SafetyState, SettleCriteria
 from drivers.ur import UrConfig
-from drivers.ur.stream import judge, ringing_s, safety_state
+from drivers.ur.safety import safety_state
 from service.core.geometry import inverse, rotation_angle_rad, transform
 from tests.support.processes.waiting import until
 from tests.support.rig.arm_watch import watched_arm

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from drivers.arm.stream import judge
 from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import RobotSample, SafetyState, SettleCriteria
-from drivers.ur.stream import judge
 from service.core.geometry import Array, rotation_angle_rad, transform
 from service.steps.capture.exposure import exposure_pose
 

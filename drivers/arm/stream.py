@@ -12,7 +12,7 @@ from itertools import takewhile
 import numpy as np
 
 from drivers.errors import DeviceUnavailableError
-from drivers.interfaces import RobotSample, SafetyState, SettleCriteria, SettleReport
+from drivers.interfaces import RobotSample, SettleCriteria, SettleReport
 from drivers.stillness import pose_spread
 
 BUFFER_S = 300.0  # an image's pose is looked up after its files arrived, which takes a while at 60 megapixels
@@ -25,28 +25,12 @@ TARGET_AT_REST_RAD_S = 1e-9  # above this target velocity the controller drives 
 _LOG = logging.getLogger(__name__)
 
 
-def safety_state(bits: int) -> SafetyState:
-    """Decode the controller's safety_status_bits (RTDE guide); the gravest state wins."""
-    for mask, state in (
-        (1 << 9 | 1 << 8, SafetyState.FAULT),  # fault, violation
-        (1 << 7 | 1 << 6 | 1 << 5, SafetyState.EMERGENCY_STOP),
-        (1 << 4, SafetyState.SAFEGUARD_STOP),
-        (1 << 2, SafetyState.PROTECTIVE_STOP),
-        (1 << 3, SafetyState.FAULT),  # recovery mode
-        (1 << 1, SafetyState.REDUCED),
-        (1 << 0, SafetyState.NORMAL),
-    ):
-        if bits & mask:
-            return state
-    return SafetyState.UNKNOWN
-
-
 class PoseStream:
     """Polls a source of samples in its own thread and keeps the last BUFFER_S seconds.
 
     Args:
-        read: returns the newest sample, or None while the controller's clock has not advanced, since the vendor's
-            getters keep returning old data when the link is dead.
+        read: returns the newest sample, or None while the controller's clock has not advanced, since a
+            dead link may keep returning old data.
         stale_after_s: age of the newest sample above which the stream counts as dead.
         where: address of the controller, for messages.
         vendor_errors: exceptions of `read` that end the stream.
@@ -67,7 +51,7 @@ class PoseStream:
         self._stop = threading.Event()
         self._death = ""
         self._looked_s = self._looking_since_s = -float("inf")  # time of the last poll; start of gapless polling
-        self._thread = threading.Thread(target=self._run, name="ur pose stream", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="pose stream", daemon=True)
         self._thread.start()
 
     def close(self) -> None:

@@ -1,0 +1,1 @@
+"""What every arm's driver shares: the latch of stops, the buffer of samples, and the judgement of stillness."""

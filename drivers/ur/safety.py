@@ -1,0 +1,21 @@
+"""Decodes the safety status of a Universal Robots controller."""
+
+from __future__ import annotations
+
+from drivers.interfaces import SafetyState
+
+
+def safety_state(bits: int) -> SafetyState:
+    """Decode the controller's safety_status_bits (RTDE guide); the gravest state wins."""
+    for mask, state in (
+        (1 << 9 | 1 << 8, SafetyState.FAULT),  # fault, violation
+        (1 << 7 | 1 << 6 | 1 << 5, SafetyState.EMERGENCY_STOP),
+        (1 << 4, SafetyState.SAFEGUARD_STOP),
+        (1 << 2, SafetyState.PROTECTIVE_STOP),
+        (1 << 3, SafetyState.FAULT),  # recovery mode
+        (1 << 1, SafetyState.REDUCED),
+        (1 << 0, SafetyState.NORMAL),
+    ):
+        if bits & mask:
+            return state
+    return SafetyState.UNKNOWN
