@@ -12,7 +12,8 @@ import numpy as np
 from simulators.serve import SimulatorError, Termination, announce
 from simulators.ur_controller.controller import Controller
 from simulators.ur_controller.kinematics import MODELS
-from simulators.ur_controller.server import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT, Server, WorldLink
+from simulators.ur_controller.server import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT, Server
+from simulators.world_link import WorldLink
 
 HOME_RAD = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
 

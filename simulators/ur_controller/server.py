@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import selectors
 import socket
@@ -14,45 +13,11 @@ from simulators.ur_controller import fields
 from simulators.ur_controller.controller import Controller
 from simulators.ur_controller.links import LineLink, Link, RtdeLink, ScriptLink
 from simulators.ur_controller.program import Interpreter
+from simulators.world_link import WorldLink
 
 _LOG = logging.getLogger(__name__)
 
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
-WORLD_MOVING_S, WORLD_STILL_S = 0.016, 0.1
-
-
-class WorldLink:
-    """Reports the arm's joints to the world; reconnects by itself and never blocks."""
-
-    def __init__(self, address: tuple[str, int], arm: str) -> None:
-        self._address, self._arm = address, arm
-        self._socket: socket.socket | None = None
-        self._next_s = 0.0
-        self._generation = -1
-
-    def push(self, controller: Controller, now_s: float) -> None:
-        """Send the joints if they changed, and otherwise now and then."""
-        moving = controller.generation != self._generation
-        if now_s < self._next_s - (WORLD_STILL_S - WORLD_MOVING_S if moving else 0.0):
-            return
-        self._next_s = now_s + WORLD_STILL_S
-        self._generation = controller.generation
-        message = {"op": "robot", "arm": self._arm, "q": list(controller.actual_q), "t": controller.time_s}
-        try:
-            if self._socket is None:
-                self._socket = socket.create_connection(self._address, timeout=0.2)
-                self._socket.setblocking(False)
-            self._socket.sendall(json.dumps(message).encode() + b"\n")
-        except OSError as error:
-            _LOG.warning("world %s:%d: %s", *self._address, error)
-            self.close()
-            self._next_s = now_s + 1.0
-
-    def close(self) -> None:
-        """Close the connection."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
 
 
 class Server:
@@ -140,7 +105,7 @@ class Server:
             self.interpreter.step()
             self._stream(now_s)
             if self._world is not None:
-                self._world.push(self.controller, now_s)
+                self._world.push([float(v) for v in self.controller.actual_q], self.controller.time_s, now_s)
 
     def _exchange(self, timeout_s: float) -> None:
         for key, _ in self._selector.select(timeout_s):

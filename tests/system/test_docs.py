@@ -337,6 +337,7 @@ RUN_ELSEWHERE = {
         "tests/system/test_docs.py::test_test_files_and_the_marker_are_there",
     ),
     "orthocapture act release": "tests/web/test_web_held.py::test_the_buttons_ask_the_step",
+    "orthocapture simulate kuka": "tests/robot/test_kuka_driver.py::test_a_day_without_trouble",
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/recovery/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
     ),

@@ -1,0 +1,41 @@
+"""KUKA LBR iiwa and LBR Med arms over our own Sunrise application: configuration and entry point."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from drivers.plugin import DriverConfig, DriverSpec
+
+if TYPE_CHECKING:
+    from drivers.interfaces import Device
+
+
+class KukaConfig(DriverConfig):
+    """A robot's section in rig.yaml."""
+
+    host: str = Field(description="address of the controller (Sunrise Cabinet)")
+    port: int = Field(default=30010, ge=1, le=65535, description="port of the Sunrise application")
+    connect_timeout_s: float = Field(
+        default=5.0, gt=0, description="longest wait for the connection and the greeting"
+    )
+    answer_timeout_s: float = Field(default=3.0, gt=0, description="longest wait for the answer to a request")
+    stale_after_s: float = Field(
+        default=1.0, gt=0, description="age of the newest sample above which the link counts as dead"
+    )
+    unattended_s: float = Field(
+        default=5.0,
+        gt=0,
+        description="time after which a moving arm is stopped whose program is alive but does not query it",
+    )
+
+
+def _build(config: KukaConfig) -> Device:
+    from drivers.kuka.robot import KukaRobot  # noqa: PLC0415 - only the child process needs it
+
+    return KukaRobot(config)
+
+
+# Hosted although there is no native library: the heartbeat of the program reaches only a driver's own process.
+DRIVER = DriverSpec(kind="robot", config=KukaConfig, build=_build, hosted=True, call_timeout_s=30.0)

@@ -1,0 +1,150 @@
+"""The lines of the KUKA wire (docs/kuka.md), checked and turned into records."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.interfaces import Array, SafetyState
+from service.core.geometry import Transform
+
+PROTOCOL = 1
+JOINTS = 7
+LONGEST_LINE = 65536
+Line = Mapping[str, object]
+
+_SAFETY = {
+    "normal": SafetyState.NORMAL,
+    "protective_stop": SafetyState.PROTECTIVE_STOP,
+    "external_stop": SafetyState.SAFEGUARD_STOP,
+    "enabling_switch": SafetyState.SAFEGUARD_STOP,
+    "emergency_stop": SafetyState.EMERGENCY_STOP,
+    "fault": SafetyState.FAULT,
+}
+
+
+class WireError(ValueError):
+    """A line of the controller that the protocol does not know; its text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """The controller's first line."""
+
+    model: str
+    serial: str
+    software: str
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """One line of the stream."""
+
+    number: int
+    time_s: float  # the controller's clock
+    joints_rad: Array  # (7,) measured
+    commanded_rad: Array  # (7,)
+    T_base_flange: Transform
+    mode: str
+    safety: SafetyState
+    ready: bool
+    locked: bool
+    motion: int  # 0: none
+    override: float
+
+
+def parse(raw: bytes) -> Line:
+    """The JSON object of one line. Raises WireError."""
+    try:
+        line: object = json.loads(raw)
+    except (ValueError, RecursionError) as error:
+        raise WireError(f"a line is not JSON: {raw[:60]!r}") from error
+    if not isinstance(line, dict) or not isinstance(line.get("is"), str):
+        raise WireError(f'a line is not an object with the field "is": {raw[:60]!r}')
+    return line
+
+
+def hello_of(line: Line) -> Hello:
+    """The greeting. Raises WireError if it is none, or of another version of the protocol."""
+    if line["is"] != "hello":
+        raise WireError(f"the first line is {line['is']!r}, not 'hello'")
+    if line.get("protocol") != PROTOCOL:
+        raise WireError(f"the application speaks version {line.get('protocol')!r} of the protocol, not {PROTOCOL}")
+    return Hello(_text(line, "model"), _text(line, "serial"), _text(line, "software"))
+
+
+def state_of(line: Line) -> State:
+    """A line of the stream. Raises WireError for a field that is missing or wrong."""
+    safety = _text(line, "safety")
+    return State(
+        number=whole(line, "n"),
+        time_s=float(_numbers(line, "time_s", 0)[0]),
+        joints_rad=_numbers(line, "q", JOINTS),
+        commanded_rad=_numbers(line, "q_command", JOINTS),
+        T_base_flange=from_abc(_numbers(line, "flange_xyz_m", 3), _numbers(line, "flange_abc_rad", 3)),
+        mode=_text(line, "mode"),
+        safety=_SAFETY.get(safety, SafetyState.UNKNOWN),
+        ready=_flag(line, "ready"),
+        locked=_flag(line, "locked"),
+        motion=whole(line, "motion"),
+        override=float(_numbers(line, "override", 0)[0]),
+    )
+
+
+def whole(line: Line, name: str) -> int:
+    """An integer field. Raises WireError."""
+    value = line.get(name)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise WireError(f"{line['is']}: {name} is {value!r}, not an integer")
+    return value
+
+
+def from_abc(xyz_m: Array, abc_rad: Array) -> Transform:
+    """Transform (4, 4) of KUKA's A, B, C: R = Rz(A) Ry(B) Rx(C)."""
+    (sa, sb, sc), (ca, cb, cc) = np.sin(abc_rad), np.cos(abc_rad)
+    T = np.eye(4)
+    T[:3, :3] = [
+        [ca * cb, ca * sb * sc - sa * cc, ca * sb * cc + sa * sc],
+        [sa * cb, sa * sb * sc + ca * cc, sa * sb * cc - ca * sc],
+        [-sb, cb * sc, cb * cc],
+    ]
+    T[:3, 3] = xyz_m
+    return T
+
+
+def to_abc(T: Transform) -> tuple[list[float], list[float]]:
+    """Position in metres and A, B, C in radians of a transform (4, 4)."""
+    R = T[:3, :3]
+    b = float(np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])))
+    if np.hypot(R[0, 0], R[1, 0]) < 1e-9:  # A and C turn about the same axis: C is taken as 0
+        return T[:3, 3].tolist(), [float(np.arctan2(-R[0, 1], R[1, 1])), b, 0.0]
+    return T[:3, 3].tolist(), [float(np.arctan2(R[1, 0], R[0, 0])), b, float(np.arctan2(R[2, 1], R[2, 2]))]
+
+
+def _text(line: Line, name: str) -> str:
+    value = line.get(name)
+    if not isinstance(value, str):
+        raise WireError(f"{line['is']}: {name} is {value!r}, not a text")
+    return value
+
+
+def _flag(line: Line, name: str) -> bool:
+    value = line.get(name)
+    if not isinstance(value, bool):
+        raise WireError(f"{line['is']}: {name} is {value!r}, not true or false")
+    return value
+
+
+def _numbers(line: Line, name: str, count: int) -> Array:
+    """`count` finite numbers as an array, or one number if the count is 0."""
+    value = line.get(name)
+    try:
+        found = np.asarray([value] if count == 0 else value, dtype=np.float64)
+    except (ValueError, TypeError):
+        found = np.zeros(0)
+    if found.shape != (max(count, 1),) or not np.all(np.isfinite(found)):
+        raise WireError(f"{line['is']}: {name} is {value!r}, not {max(count, 1)} finite numbers")
+    return found

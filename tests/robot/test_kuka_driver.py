@@ -1,0 +1,201 @@
+"""The KUKA driver in its hosted process against the simulated controller, over the real wire."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Callable, Generator
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drivers.errors import (
+    DeviceRefusedError,
+    DeviceUnavailableError,
+    LeaveNeededError,
+    SafetyStopError,
+    UnreachablePoseError,
+)
+from drivers.host.hosted_device import hosted
+from drivers.interfaces import Array, Payload, RobotArm, SafetyState, SettleCriteria
+from drivers.kuka import KukaConfig
+from service.core.geometry import inverse, rotation_angle_rad, transform
+from service.core.seven_axes import SEVEN_AXIS_ARMS, forward, nearest_posture, postures
+from simulators.kuka_controller.kinematics import MODELS, frames
+from tests.support.processes.waiting import until
+from tests.support.rig.kuka_simulator import pendant, simulated_kuka
+from tests.support.rig.ur_simulator import address
+
+PAYLOAD = Payload(1.6, (0.0, 0.0, 0.08))
+TCP = transform(Rotation.from_euler("z", 0.3), np.array([0.01, 0.0, 0.1]))
+
+
+@contextlib.contextmanager
+def opened(host: str, unattended_s: float = 5.0) -> Generator[RobotArm]:
+    arm = hosted(
+        RobotArm,
+        "drivers.kuka:DRIVER",
+        KukaConfig(host=host, unattended_s=unattended_s),
+        call_timeout_s=30,
+        name="robot",
+    )
+    try:
+        arm.open()
+        arm.let_move("Ada", time.monotonic())
+        yield arm
+    finally:
+        arm.close()
+
+
+def wait_for(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
+    until(condition, "waited in vain", timeout_s, every_s=0.02)
+
+
+def move(arm: RobotArm, joints: Array) -> None:
+    arm.move_joints(joints, speed_rad_s=1.0, acceleration_rad_s2=1.4)
+
+
+def travel(arm: RobotArm, joints: Array) -> None:
+    move(arm, joints)
+    wait_for(lambda: not arm.is_moving())
+
+
+def turned(arm: RobotArm, by_rad: float) -> Array:
+    joints = arm.state().sample.joints_rad.copy()
+    joints[0] += by_rad
+    return joints
+
+
+def test_a_day_without_trouble() -> None:
+    host = address(71)
+    with simulated_kuka(host), opened(host) as arm:
+        report = arm.report()
+        assert (report.identity.model, report.identity.driver, report.problems) == ("LBR Med 14", "kuka_sunrise", ())
+        arm.configure(PAYLOAD, TCP)
+        with pytest.raises(DeviceRefusedError, match="80 kg"):
+            arm.configure(Payload(80.0, (0.0, 0.0, 0.0)), TCP)
+        start = arm.state().sample
+        goal = start.T_base_flange @ transform(
+            Rotation.from_euler("xyz", [0.1, -0.1, 0.2]), np.array([0.05, 0, 0.02])
+        )
+        joints = arm.solve_ik(goal, start.joints_rad)
+        move(arm, joints)
+        assert arm.is_moving()
+        assert not arm.settle(SettleCriteria()).settled
+        wait_for(lambda: not arm.is_moving())
+        wait_for(lambda: arm.settle(SettleCriteria()).settled)
+        gap = inverse(goal) @ arm.settle(SettleCriteria()).T_base_flange
+        assert np.linalg.norm(gap[:3, 3]) < 1e-6
+        assert rotation_angle_rad(gap) < 1e-6
+        far = goal.copy()
+        far[0, 3] += 2.0
+        with pytest.raises(UnreachablePoseError):
+            arm.solve_ik(far, joints)
+        move(arm, turned(arm, 1.5))
+        arm.stop()
+        assert not arm.is_moving()
+        travel(arm, turned(arm, 0.05))
+
+
+def test_a_stop_latches_until_a_person_confirms_and_nothing_clears_it_by_itself() -> None:
+    host = address(72)
+    with simulated_kuka(host), opened(host) as arm:
+        move(arm, turned(arm, 1.5))
+        pendant(host, "stop external_stop")
+        with pytest.raises(SafetyStopError):
+            wait_for(lambda: not arm.is_moving())
+        assert arm.state().sample.safety is SafetyState.SAFEGUARD_STOP
+        with pytest.raises(SafetyStopError):
+            arm.let_move("Ada", time.monotonic())
+        arm.open()
+        assert arm.state().sample.safety is SafetyState.SAFEGUARD_STOP, "reconnecting does not help"
+        before = time.monotonic()
+        pendant(host, "release")
+        wait_for(lambda: arm.state().sample.safety is SafetyState.NORMAL)
+        stood = arm.state().sample.joints_rad
+        with pytest.raises(SafetyStopError, match="nobody has confirmed since"):
+            move(arm, turned(arm, 0.1))
+        with pytest.raises(SafetyStopError):
+            arm.let_move("Ada", before - 1.0)
+        np.testing.assert_array_equal(arm.state().sample.joints_rad, stood)
+        arm.let_move("Ada", time.monotonic())
+        travel(arm, turned(arm, 0.1))
+
+
+def test_a_moving_arm_that_nobody_looks_at_is_stopped() -> None:
+    host = address(73)
+    with simulated_kuka(host), opened(host, unattended_s=0.3) as arm:
+        start = arm.state().sample.joints_rad[0]
+        move(arm, turned(arm, 2.5))
+        time.sleep(1.5)
+        with pytest.raises(LeaveNeededError, match="nobody had looked"):
+            wait_for(lambda: not arm.is_moving())
+        assert arm.state().sample.joints_rad[0] - start < 2.0
+        with pytest.raises(LeaveNeededError):
+            move(arm, turned(arm, 0.1))
+        arm.let_move("Ada", time.monotonic())
+        travel(arm, turned(arm, 0.1))
+
+
+def test_a_wrong_load_is_felt_as_a_collision() -> None:
+    host = address(74)
+    with simulated_kuka(host, "--true-load-kg", "1.6"), opened(host) as arm:
+        with pytest.raises(SafetyStopError):
+            travel(arm, turned(arm, 0.5))
+        pendant(host, "release")
+        wait_for(lambda: arm.state().sample.safety is SafetyState.NORMAL)
+        arm.let_move("Ada", time.monotonic())
+        arm.configure(PAYLOAD, TCP)
+        travel(arm, turned(arm, 0.2))
+
+
+def test_t1_keeps_the_flange_below_250_mm_per_second() -> None:
+    host = address(75)
+    with simulated_kuka(host, "--mode", "T1"), opened(host) as arm:
+        assert any("T1" in problem for problem in arm.report().problems)
+        begin = time.monotonic()
+        travel(arm, turned(arm, 0.8))
+        fastest = max(s.tcp_speed_m_s for s in arm.samples(begin, time.monotonic()))
+        assert 0.2 < fastest < 0.26
+
+
+def test_a_lost_link_is_unavailable_and_opens_again() -> None:
+    host = address(76)
+    plan = json.dumps([{"device": "robot", "on": "move", "kind": "drop"}])
+    with simulated_kuka(host, "--faults", plan), opened(host) as arm:
+        with pytest.raises(DeviceUnavailableError):
+            travel(arm, turned(arm, 1.0))
+        arm.open()
+        with pytest.raises(LeaveNeededError):
+            move(arm, turned(arm, 0.1))
+        arm.let_move("Ada", time.monotonic())
+        travel(arm, turned(arm, 0.1))
+
+
+def test_seven_axes_reach_every_pose_within_their_limits() -> None:
+    arm, random = SEVEN_AXIS_ARMS[0], np.random.default_rng(7)
+    limits = np.array(arm.limits_rad)
+    for _ in range(100):
+        q = random.uniform(-limits, limits)
+        T = frames(MODELS[arm.name], q)[-1]
+        np.testing.assert_allclose(forward(arm, q), T, atol=1e-12)
+        found = postures(arm, T)
+        assert np.all(np.abs(found) <= limits + 1e-9)
+        for posture in found[::25]:
+            np.testing.assert_allclose(frames(MODELS[arm.name], posture)[-1], T, atol=1e-9)
+        nearest = nearest_posture(arm, T, q)
+        assert nearest is not None
+        np.testing.assert_allclose(nearest, q, atol=1e-6)
+
+
+def test_the_elbow_moves_clear_of_a_limit() -> None:
+    arm = SEVEN_AXIS_ARMS[0]
+    free = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 0.9, 0.0])
+    at_limit = postures(arm, forward(arm, free))
+    room = np.array(arm.limits_rad) - np.abs(at_limit)
+    tight = at_limit[int(np.argmin(room.min(axis=1)))]
+    found = nearest_posture(arm, forward(arm, free), free)
+    assert found is not None
+    assert (np.array(arm.limits_rad) - np.abs(found)).min() > (np.array(arm.limits_rad) - np.abs(tight)).min()

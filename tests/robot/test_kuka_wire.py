@@ -1,0 +1,124 @@
+"""Both ends of the KUKA wire against golden transcripts that neither was made from (docs/kuka.md)."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from drivers.interfaces import Payload, RobotArm
+from drivers.kuka import DRIVER, KukaConfig
+from drivers.kuka.wire import WireError, from_abc, hello_of, parse, state_of, to_abc
+from service.core.geometry import transform
+from tests.support.processes.waiting import until
+from tests.support.rig.kuka_simulator import agrees, simulated_kuka, transcript
+from tests.support.rig.ur_simulator import address
+
+
+@pytest.mark.parametrize("name", ["session.jsonl", "refusals.jsonl"])
+def test_the_simulator_answers_as_the_transcript(name: str) -> None:
+    host = address(70)
+    with (
+        simulated_kuka(host),
+        socket.create_connection((host, 30010), timeout=30) as connection,
+        connection.makefile("rb") as lines,
+    ):
+        for row in transcript(name):
+            if row["from"] == "client":
+                raw = row.get("raw") or json.dumps(row["line"])
+                connection.sendall(raw.encode() + b"\n")
+                continue
+            line = json.loads(lines.readline())
+            while line["is"] == "state" != row["line"]["is"]:
+                line = json.loads(lines.readline())
+            assert agrees(line, row["line"]), (line, row["line"])
+
+
+class _Golden(threading.Thread):
+    """The controller's side of a transcript: sends its lines, and collects what the client says."""
+
+    def __init__(self, host: str, rows: list[dict[str, Any]]) -> None:
+        super().__init__(daemon=True)
+        self._rows = rows
+        self._listener = socket.create_server((host, 0))
+        self.port: int = self._listener.getsockname()[1]
+        self.wrong: list[str] = []
+        self.complete = threading.Event()
+
+    def run(self) -> None:
+        with self._listener, self._listener.accept()[0] as connection:
+            self._play(connection)
+
+    def _play(self, connection: socket.socket) -> None:
+        sending = threading.Lock()
+        state = next(row["line"] for row in self._rows if row["line"].get("is") == "state")
+
+        def stream() -> None:
+            number = 0
+            while not self.complete.wait(0.01):
+                number += 1
+                live = {"n": number, "time_s": time.monotonic(), "flange_xyz_m": [0.5, 0, 0.5], "locked": number < 2}
+                send({**state, **live, "flange_abc_rad": [0, 3.0, 0]})
+
+        def send(line: dict[str, Any]) -> None:
+            filled = {k: (1.0 if k == "time_s" else "text") if v == "*" else v for k, v in line.items()}
+            with sending:
+                connection.sendall(json.dumps(filled).encode() + b"\n")
+
+        streaming = threading.Thread(target=stream, daemon=True)
+        with connection.makefile("rb") as lines:
+            for row in self._rows:
+                if row["from"] == "client":
+                    line = json.loads(lines.readline())
+                    if line != row["line"]:
+                        self.wrong.append(f"{line} instead of {row['line']}")
+                elif row["line"]["is"] == "state":
+                    streaming.start()
+                else:
+                    send(row["line"])
+        self.complete.set()
+        streaming.join()
+
+
+def test_the_driver_speaks_as_the_transcript() -> None:
+    golden = _Golden("127.0.0.1", transcript("session.jsonl"))
+    golden.start()
+    robot = cast(RobotArm, DRIVER.build(KukaConfig(host="127.0.0.1", port=golden.port)))
+    robot.open()
+    robot.let_move("Ada", time.monotonic())
+    robot.configure(Payload(1.6, (0.0, 0.0, 0.08)), transform(np.eye(3), np.array([0.0, 0.0, 0.1])))
+    goal = np.array([0.01, 0.5236, 0.0, -1.2217, 0.0, 1.3963, 0.0])
+    robot.move_joints(goal, speed_rad_s=0.5, acceleration_rad_s2=1.0)
+    until(lambda: not robot.is_moving(), "the motion did not end", 10, every_s=0.02)
+    robot.stop()
+    assert golden.complete.wait(10)
+    assert golden.wrong == []
+    robot.close()
+
+
+def test_a_line_that_the_protocol_does_not_know_is_refused() -> None:
+    state = next(row["line"] for row in transcript("session.jsonl") if row["line"].get("is") == "state")
+    whole = {**state, "n": 1, "time_s": 1.0, "flange_xyz_m": [0, 0, 1], "flange_abc_rad": [0, 0, 0]}
+    assert state_of(whole).safety.may_move
+    assert not state_of({**whole, "safety": "something new"}).safety.may_move
+    for name, value in (("q", [0.0] * 6), ("locked", 0), ("time_s", float("nan")), ("motion", True), ("mode", None)):
+        with pytest.raises(WireError, match=name):
+            state_of({**whole, name: value})
+    for raw in (b"nonsense", b"[]", b"{}"):
+        with pytest.raises(WireError):
+            parse(raw)
+    with pytest.raises(WireError, match="version"):
+        hello_of({"is": "hello", "protocol": 2})
+
+
+def test_abc_turns_about_z_then_y_then_x() -> None:
+    quarter = from_abc(np.array([1.0, 2.0, 3.0]), np.array([np.pi / 2, 0.0, 0.0]))
+    np.testing.assert_allclose(quarter @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-12)
+    for abc in ([0.3, -0.4, 2.0], [1.0, np.pi / 2, 0.0]):
+        T = from_abc(np.zeros(3), np.array(abc))
+        np.testing.assert_allclose(from_abc(*(np.array(v) for v in to_abc(T))), T, atol=1e-12)

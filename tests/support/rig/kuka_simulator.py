@@ -1,0 +1,49 @@
+"""Runs simulated KUKA controllers for tests, presses what is on their pendant, and reads the golden transcripts."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+TRANSCRIPTS = Path(__file__).parents[2] / "data" / "kuka"
+
+
+@contextlib.contextmanager
+def simulated_kuka(host: str, *options: str) -> Generator[dict[str, Any]]:
+    """Run `python -m simulators kuka`; yields its ready line."""
+    command = [sys.executable, "-m", "simulators", "kuka", "--host", host, "--parent", str(os.getpid()), *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            line = process.stdout.readline()
+            assert line, f"the simulator did not start: {' '.join(command)}"
+            yield json.loads(line)
+        finally:
+            process.terminate()
+            status = process.wait(10)
+    assert status == 0, f"the simulator ended with status {status}"
+
+
+def pendant(host: str, order: str) -> None:
+    """Do what a person does at the smartPAD."""
+    with socket.create_connection((host, 30011), timeout=30) as connection, connection.makefile("rw") as lines:
+        lines.write(order + "\n")
+        lines.flush()
+        assert lines.readline().strip() == "ok", order
+
+
+def transcript(name: str) -> list[dict[str, Any]]:
+    """The rows of a golden transcript."""
+    return [json.loads(row) for row in (TRANSCRIPTS / name).read_text().splitlines()]
+
+
+def agrees(line: dict[str, Any], golden: dict[str, Any]) -> bool:
+    """Whether a line has the fields of the golden one, and its values where that is not `*`."""
+    return line.keys() == golden.keys() and all(value in ("*", line[name]) for name, value in golden.items())
