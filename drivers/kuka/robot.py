@@ -39,7 +39,7 @@ from service.core.geometry import inverse, to_rotation_vector
 from service.core.seven_axes import SEVEN_AXIS_ARMS, SevenAxisArm, nearest_posture
 
 DRIVER_VERSION = "1"
-HEARTBEAT_S = 0.3  # without a line for so long the application stops the arm (docs/kuka.md)
+HEARTBEAT_S = 0.3  # without a line for so long the application stops the arm (docs/howto/kuka.md)
 SPEED_WINDOW_S = 0.05  # the wire has no speeds; over one period the encoders' steps would dominate
 LONGEST_RINGING_S = 10.0
 STOP_S = 5.0
