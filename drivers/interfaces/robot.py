@@ -151,7 +151,3 @@ class RobotArm(Device, Protocol):
     def settle(self, criteria: SettleCriteria) -> SettleReport:
         """Judge the last window of the pose stream against the criteria. Returns at once; meant to be polled."""
         ...
-
-    def set_digital_output(self, index: int, on: bool) -> None:
-        """Switch a standard digital output of the controller."""
-        ...

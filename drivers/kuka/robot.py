@@ -285,14 +285,6 @@ class KukaRobot:
         recent = stream.between(now_s - criteria.window_s - LONGEST_RINGING_S, now_s)
         return dataclasses.replace(report, ringing_s=ringing_s(recent, criteria))
 
-    def set_digital_output(self, index: int, on: bool) -> None:
-        """Refuse: what outputs a Sunrise controller has is decided in each station's own project."""
-        raise DeviceRefusedError(
-            f"there is no digital output {index} to switch {'on' if on else 'off'}",
-            where=self._where,
-            remedy="Release the camera by its own driver",
-        )
-
     # --- parts -------------------------------------------------------------------------------------------
 
     def _receive(self, state: State, now_s: float) -> None:

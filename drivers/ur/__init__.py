@@ -39,7 +39,7 @@ class UrConfig(DriverConfig):
     )
 
 
-_LIBRARY = ("dashboard_client", "rtde_control", "rtde_io", "rtde_receive")
+_LIBRARY = ("dashboard_client", "rtde_control", "rtde_receive")
 
 
 def _build(config: UrConfig) -> Device:

@@ -1,4 +1,4 @@
-"""The RobotArm driver over ur_rtde (receive, control, io and dashboard); runs in the child of drivers.host."""
+"""The RobotArm driver over ur_rtde (receive, control and dashboard); runs in the child of drivers.host."""
 
 from __future__ import annotations
 
@@ -66,7 +66,6 @@ VARIABLES = (
     "robot_mode",
     "runtime_state",
     "target_speed_fraction",
-    "actual_digital_output_bits",
 )
 READ_BACK_S = 1.0
 TOOL_CHANGE_S = 0.05  # by the controller's clock, until a new tool shows in the stream
@@ -88,7 +87,6 @@ class UrRobot:
         self._facts: ControllerFacts | None = None
         self._dashboard: library.Dashboard | None = None
         self._receive: library.Receive | None = None
-        self._io: library.InputOutput | None = None
         self._stream: PoseStream | None = None
         self._T_flange_tcp: Transform = np.eye(4)
         self._controller_time_s = -1.0
@@ -128,8 +126,6 @@ class UrRobot:
             where=self._where,
             vendor_errors=VENDOR_ERRORS,
         )
-        with vendor(self._where, "connecting the input/output interface"):
-            self._io = library.input_output(self._config.host)
         if not (self._obstacle() or self._latch.stop):
             self._perform("starting the control script", lambda _: None)  # sends the script and reads the tool
         return self._identity()
@@ -154,11 +150,11 @@ class UrRobot:
                 self._script.end()
         else:
             self._script.abandon()
-        for client in (self._io, self._receive, self._dashboard):
+        for client in (self._receive, self._dashboard):
             with contextlib.suppress(*VENDOR_ERRORS):
                 if client is not None and client.isConnected():
                     client.disconnect()
-        self._io = self._receive = self._dashboard = None
+        self._receive = self._dashboard = None
 
     def report(self) -> DeviceReport:
         """Return versions, clock offset, and what prevents the arm from moving."""
@@ -351,20 +347,6 @@ class UrRobot:
             return report
         recent = stream.between(now_s - criteria.window_s - LONGEST_RINGING_S, now_s)
         return dataclasses.replace(report, ringing_s=ringing_s(recent, criteria))
-
-    def set_digital_output(self, index: int, on: bool) -> None:
-        """Switch a standard digital output (0 to 7) and verify it by reading it back."""
-        if not 0 <= index <= 7:
-            raise DeviceRefusedError(
-                f"there is no standard digital output {index}", where=self._where, remedy="Choose one of 0 to 7"
-            )
-        io, receive = _opened(self._io, self._where), _opened(self._receive, self._where)
-        with vendor(self._where, "switching a digital output"):
-            if not io.setStandardDigitalOut(index, on):
-                raise DeviceRefusedError(
-                    f"digital output {index} was not switched", where=self._where, remedy=_SET_ELSEWHERE
-                )
-        self._read_back(lambda: bool(receive.getActualDigitalOutputBits() >> index & 1) == on, f"output {index}")
 
     # --- parts -------------------------------------------------------------------------------------------
 

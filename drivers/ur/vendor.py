@@ -6,12 +6,11 @@ from typing import Protocol, cast
 
 import dashboard_client
 import rtde_control
-import rtde_io
 import rtde_receive
 
 
 class Connection(Protocol):
-    """The methods that all four interfaces share."""
+    """The methods that all three interfaces share."""
 
     def isConnected(self) -> bool: ...  # noqa: D102 - the vendor's names and meanings
     def disconnect(self) -> None: ...  # noqa: D102
@@ -39,14 +38,7 @@ class Receive(Connection, Protocol):
     def getRobotMode(self) -> int: ...  # noqa: D102
     def getRuntimeState(self) -> int: ...  # noqa: D102
     def getTargetSpeedFraction(self) -> float: ...  # noqa: D102
-    def getActualDigitalOutputBits(self) -> int: ...  # noqa: D102
     def getPayload(self) -> float: ...  # noqa: D102
-
-
-class InputOutput(Connection, Protocol):
-    """rtde_io.RTDEIOInterface."""
-
-    def setStandardDigitalOut(self, output: int, on: bool) -> bool: ...  # noqa: D102
 
 
 class AsyncStatus(Protocol):
@@ -82,11 +74,6 @@ def dashboard(host: str) -> Dashboard:
 def receive(host: str, frequency_hz: float, variables: list[str]) -> Receive:
     """Connect the receive interface and stream these RTDE output fields. Raises RuntimeError."""
     return cast("Receive", rtde_receive.RTDEReceiveInterface(host, frequency_hz, variables))
-
-
-def input_output(host: str) -> InputOutput:
-    """Connect the input/output interface. Raises RuntimeError."""
-    return cast("InputOutput", rtde_io.RTDEIOInterface(host))
 
 
 def control(host: str, frequency_hz: float) -> Control:

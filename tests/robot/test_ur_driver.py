@@ -172,10 +172,6 @@ def test_unreachable_pose_is_refused_and_leaves_the_arm_fit(robot: RobotArm) -> 
 def test_wrong_requests_are_refused(robot: RobotArm) -> None:
     with pytest.raises(DeviceRefusedError, match="six finite numbers"):
         move(robot, np.zeros(5))
-    with pytest.raises(DeviceRefusedError, match="digital output 9"):
-        robot.set_digital_output(9, on=True)
-    robot.set_digital_output(2, on=True)
-    robot.set_digital_output(2, on=False)
 
 
 def test_refused_payload_leaves_a_usable_arm(robot: RobotArm) -> None:

@@ -136,9 +136,6 @@ class BenchArm:
         joints = self._joints(now)
         return SettleReport(still, 10, 0.0, 0.0, 0.0, 0.0, from_rotation_vector(joints), joints)
 
-    def set_digital_output(self, index: int, on: bool) -> None:
-        raise NotImplementedError
-
     def _answer(self) -> None:
         if not self.connected:
             raise DeviceUnavailableError("the arm is not connected", where="arm")
