@@ -26,13 +26,14 @@ from service.core.records.events import (
 from service.core.run.fold import DECISIVE_EVENTS, RUN_EVENTS, advance, initial_state
 from service.core.run.state import Deviation, RunState
 from service.dataset.late_results import LateResult, late_results
+from service.jobs.registration import evaluate
 from service.store.store import Store
 
 CHUNK = 300  # events in one step, after which waiting pages come first
 
 # Only these computations change the first page: results that arrived after the evaluation.
 _JOB_EVENTS = ("job_enqueued", "job_finished")
-_JOB_KINDS = ("evaluate",)
+_JOB_KINDS = (evaluate.KIND.name,)
 
 # The fold needs only step, attempt and viewpoint of these events.
 _VIEWS = {kind: payload for kind, payload in RUN_EVENTS.items() if issubclass(payload, View)}

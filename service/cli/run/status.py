@@ -57,7 +57,7 @@ def status_command(
     print_table(table)
     for name, entered in about_rows(root.about):
         console.print(f"{name}: {escape(entered)}")
-    live = [job for job in state.step.jobs.values() if job.kind == "live_view" and job.status != "enqueued"]
+    live = [job for job in state.step.jobs.values() if job.kind == live_view.KIND.name and job.status != "enqueued"]
     for job in live[-3:]:
         console.print(escape(describe_view(job)))
     for line in missing:

@@ -102,7 +102,7 @@ class BoardLooks:
             stop_for_lens(self.context, row)
 
     def _jobs(self, step: str) -> list[JobState]:
-        return [job for job in self.context.evidence.jobs(step) if job.kind == "board_view"]
+        return [job for job in self.context.evidence.jobs(step) if job.kind == board_view.KIND.name]
 
     def _by_image(self, step: str) -> dict[str, JobState]:
         return {image_of(j).sha256: j for j in self._jobs(step) if j.status != "enqueued"}

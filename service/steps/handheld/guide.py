@@ -25,7 +25,7 @@ from service.steps.inputs import artefact_of, held_views
 def failure_words(job: JobState) -> str:
     """Explains a failed job on the images: what it means, and what to do."""
     why = job.message.rstrip(".")
-    if job.kind == "coverage_points":
+    if job.kind == coverage_points.KIND.name:
         return (
             f"the coverage of the specimen cannot be computed: {why}. Images are judged without it. A gate on the "
             "coverage cannot pass: finish with the images so far, and the step offers what can be done"
@@ -76,7 +76,7 @@ class Guide:
                 self._reported.add(job.job)
                 self._report(job)
         for job in self.context.evidence.jobs(self.context.step.id):
-            if job.kind == "coverage_points" and job.status == "failed" and job.job not in self._reported:
+            if job.kind == coverage_points.KIND.name and job.status == "failed" and job.job not in self._reported:
                 self._reported.add(job.job)
                 self.context.tell(failure_words(job))
 
@@ -154,7 +154,7 @@ class Guide:
 
     def _surface(self) -> str | None:
         jobs = self.context.evidence.jobs(self.context.step.id)
-        done = [job for job in jobs if job.kind == "coverage_points" and job.status == "finished"]
+        done = [job for job in jobs if job.kind == coverage_points.KIND.name and job.status == "finished"]
         return done[-1].artefacts[0].sha256 if done else None
 
     def _enqueue(self, view: ViewHeld) -> None:

@@ -184,7 +184,7 @@ def _words(found: RegistrationJobs) -> str:
 def _outcome(found: RegistrationJobs) -> StepOutcome:
     """The registrations so far, including any that arrived although the step did not wait for them."""
     done = [(task, task.job) for task in found.tasks if task.job is not None and task.job.status == "finished"]
-    outlines = next(job for task, job in done if task.request.kind == "detect_spheres")
+    outlines = next(job for task, job in done if task.request.kind == detect_spheres.KIND.name)
     registrations = {name: OneRegistration.read(job.measures) for name, job in found.arrived.items()}
     measures = Measures.read(outlines.measures).model_copy(update={"registrations": registrations})
     result = Result(

@@ -16,7 +16,9 @@ from service.core.jobs.references import Jobs, jobs_of
 from service.core.protocol.models import Protocol, Step
 from service.core.run.state import RunState
 from service.jobs.kind import JobRecord, read_part
+from service.jobs.poses import features, hybrid, match, structure_from_motion
 from service.jobs.records import Camera, ImageFile
+from service.jobs.registration import detect_spheres, evaluate, register
 from service.steps.poses.due_jobs import evaluation_tasks
 from service.steps.poses.registration_jobs import RegistrationJobs, Task, recorded_registration_jobs
 from service.steps.poses.sources import WantedRegistrations, evaluations_of
@@ -31,17 +33,17 @@ _NAMES = {
     "hybrid": "images, robot and spheres together",
 }
 _GUESS_S = {  # per image
-    "detect_spheres": 0.3,
-    "register": 0.15,
-    "features": 1.5,
-    "match": 0.4,
-    "structure_from_motion": 1.5,
-    "hybrid": 0.5,
-    "evaluate": 0.1,
+    detect_spheres.KIND.name: 0.3,
+    register.KIND.name: 0.15,
+    features.KIND.name: 1.5,
+    match.KIND.name: 0.4,
+    structure_from_motion.KIND.name: 1.5,
+    hybrid.KIND.name: 0.5,
+    evaluate.KIND.name: 0.1,
 }
-_BY_PIXELS = frozenset({"detect_spheres", "features"})
+_BY_PIXELS = frozenset({detect_spheres.KIND.name, features.KIND.name})
 _PIXELS = 1920 * 1280
-_SEVERAL_CORES = frozenset({"detect_spheres"})
+_SEVERAL_CORES = frozenset({detect_spheres.KIND.name})
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +105,7 @@ class _Work(JobRecord):
 
     def count(self, kind: str) -> int:
         """Number of images, or of pairs."""
-        return len(self.pairs if kind == "match" else self.images)
+        return len(self.pairs if kind == match.KIND.name else self.images)
 
     def size(self, kind: str) -> float:
         """The number, weighted by their pixels for jobs whose duration depends on them."""
@@ -205,16 +207,21 @@ def _left_of(
             rest = _Work(images=first.images, poses=source)
             at_s += sum(clock.expected_s(kind, rest) for kind in _rest(source, last.kind))
         if evaluation is not None and any(task.request.priority != WAITED for task in steps):
-            at_s += clock.expected_s("evaluate", first)
+            at_s += clock.expected_s(evaluate.KIND.name, first)
         left.append(PendingResult(name, what, at_s))
     return left
 
 
-_MODELLED = ("features", "match", "structure_from_motion")
-_CHAINS = {"triangulated": _MODELLED, "colmap": _MODELLED, "glomap": _MODELLED, "hybrid": (*_MODELLED, "hybrid")}
+_MODELLED = (features.KIND.name, match.KIND.name, structure_from_motion.KIND.name)
+_CHAINS = {
+    "triangulated": _MODELLED,
+    "colmap": _MODELLED,
+    "glomap": _MODELLED,
+    "hybrid": (*_MODELLED, hybrid.KIND.name),
+}
 
 
 def _rest(source: str, last: str) -> tuple[str, ...]:
     """The kinds of jobs that follow the last one that is planned."""
-    chain = ("detect_spheres", *_CHAINS.get(source, ()), "register")
+    chain = (detect_spheres.KIND.name, *_CHAINS.get(source, ()), register.KIND.name)
     return chain[chain.index(last) + 1 :] if last in chain else ()

@@ -17,6 +17,7 @@ from service.core.run.state import JobState
 from service.jobs.capture import hand_board, hand_view
 from service.jobs.looks import image_of
 from service.jobs.records import Matrix
+from service.jobs.surfaces import coverage_points
 from service.run_record import RunRecord
 from service.steps.handheld.guide import failure_words
 from service.web.page.run_words import limit, measure_name
@@ -103,7 +104,8 @@ def held_now(log: RunRecord, step: Step) -> HandheldView:
     failed = [
         j
         for j in state.jobs.values()
-        if j.status == "failed" and (j.kind == "coverage_points" or (j.kind in _KINDS and j.enqueued_seq == newest))
+        if j.status == "failed"
+        and (j.kind == coverage_points.KIND.name or (j.kind in _KINDS and j.enqueued_seq == newest))
     ]
     running = log.state.current == step.id and state.phase == "running" and not log.state.paused
     captures = [c for c in captures_of(log, step.id) if c.replaced is None and isinstance(c.payload, ViewHeld)]

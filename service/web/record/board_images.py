@@ -51,7 +51,7 @@ def calibration_in(state: StepState) -> calibrate.Answer | None:
 def board_use(state: StepState, view: View) -> BoardUse:
     """Whether one image of a step is used."""
     sha256, name = view.artefacts[0].sha256, view.viewpoint
-    looks = [job for job in state.jobs.values() if job.kind == "board_view"]
+    looks = [job for job in state.jobs.values() if job.kind == board_view.KIND.name]
     look = next((job for job in looks if image_of(job).sha256 == sha256), None)
     answer = calibration_in(state)
     intrinsics = Intrinsics() if answer is None else answer.details.intrinsics or Intrinsics()

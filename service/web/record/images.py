@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 from service.core.records.events import View, ViewpointFailed
 from service.core.run.state import JobState, StepState, Superseded
+from service.jobs.capture import live_view
 from service.jobs.looks import image_of
 from service.run_record import RunRecord
 
@@ -116,7 +117,7 @@ def live_jobs(state: StepState) -> Mapping[str, JobState]:
     """The newest `live_view` job of each photograph, by SHA-256, finished or not."""
     found: dict[str, JobState] = {}
     for job in sorted(state.jobs.values(), key=lambda j: j.enqueued_seq):
-        if job.kind == "live_view":
+        if job.kind == live_view.KIND.name:
             found[image_of(job).sha256] = job
     return found
 
