@@ -17,6 +17,7 @@ from service.compute.ground_truth.distances.chamfer import ChamferSettings
 from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.splits import splits
 from service.compute.stereo.fusion import fused
+from service.compute.stereo.guided import guided_depth
 from service.compute.stereo.matching import DepthMap, depth_of_pair
 from service.compute.stereo.pairs import StereoView, looked_at_m, stereo_pairs
 from service.compute.stereo.rectify import rectified
@@ -110,6 +111,19 @@ def test_the_depth_of_a_pair_is_that_of_the_scene() -> None:
     assert np.isfinite(found.depth_m).mean() > 0.3
     assert np.median(error_m) < 1e-3
     assert np.mean(error_m < 5e-3) > 0.9
+
+
+def test_near_a_guess_that_is_wrong_by_millimetres_the_depth_is_found() -> None:
+    pair = rectified(seen_from(eye_at(0)), seen_from(eye_at(30)), np.array([0.0, 0.0, 0.02]))
+    guess = truth()
+    lifted = RayMesh(guess.vertices_m + np.array([0.0, 0.0, 0.012]), guess.faces)
+    found = guided_depth(pair, lifted, 0.58)
+    assert found is not None
+    points = found.points_m(3)
+    inside = np.abs(points[:, :2]).max(axis=1) < 0.12
+    error_m = np.abs(points[inside, 2] - height_m(points[inside, :2]))
+    assert np.median(error_m) < 6e-4
+    assert inside.sum() > 1500
 
 
 def test_images_of_different_things_give_no_depth() -> None:

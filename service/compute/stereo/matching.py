@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.stereo.rectify import Rectified
+from service.compute.stereo.subpixel import refined
 from service.core.geometry import Array, Transform
 
 Image = NDArray[np.uint8]
@@ -60,13 +61,16 @@ def depth_of_pair(pair: Rectified, distance_m: float) -> DepthMap | None:
     low, high = (float(x) for x in np.percentile(known, _SPAN))
     margin = 1.5 + 0.08 * (high - low)
     low, high = max(first, low - margin), min(last, high + margin)
-    found = _agreed(pair.left, pair.right, _COARSE * low, _COARSE * high, _BLOCK)
+    found = refined(pair.left, pair.right, _agreed(pair.left, pair.right, _COARSE * low, _COARSE * high, _BLOCK))
     found[~pair.seen] = np.nan
-    depth = pair.depth_m(_without_edges(found))
+    return depth_map(pair, found, distance_m)
+
+
+def depth_map(pair: Rectified, disparity_px: Disparity, distance_m: float) -> DepthMap:
+    """The depth of disparities (H, W) of a pair's left image that looks at an object at this distance."""
+    depth = pair.depth_m(_without_edges(disparity_px))
     slope = pair.f_px * pair.baseline_m / distance_m**2
-    height, width = depth.shape
-    camera = CameraModel(width, height, pair.f_px, pair.f_px, pair.left_px, pair.y_px)
-    return DepthMap(depth, camera, pair.T_world_left, slope**2)
+    return DepthMap(depth, pair.left_camera, pair.T_world_left, slope**2)
 
 
 def _reduced(image: Image) -> Image:
@@ -78,8 +82,20 @@ def _agreed(left: Image, right: Image, first_px: float, last_px: float, block: i
     """Disparities (H, W) of the left image that the right one confirms; NaN elsewhere."""
     lowest = int(np.floor(first_px))
     count = 16 * max(1, int(np.ceil((last_px - lowest + 1) / 16)))
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=lowest,
+    matcher = matcher_of(lowest, count, block)
+    # Columns without a partner within the range are not matched: a border on both sides keeps them.
+    border = max(0, lowest + count, -lowest)
+    a, b = (np.pad(image, ((0, 0), (border, border)), mode="edge") for image in (left, right))
+    forth = matched(matcher, a, b, lowest)
+    back = matched(matcher, np.ascontiguousarray(b[:, ::-1]), np.ascontiguousarray(a[:, ::-1]), lowest)[:, ::-1]
+    found = confirmed(forth, back)
+    return np.ascontiguousarray(found[:, border : border + left.shape[1]])
+
+
+def matcher_of(lowest_px: int, count: int, block: int) -> cv2.StereoSGBM:
+    """The search over so many disparities from the lowest one."""
+    return cv2.StereoSGBM.create(
+        minDisparity=lowest_px,
         numDisparities=count,
         blockSize=block,
         P1=8 * block**2,
@@ -88,13 +104,12 @@ def _agreed(left: Image, right: Image, first_px: float, last_px: float, block: i
         preFilterCap=31,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    # Columns without a partner within the range are not matched: a border on both sides keeps them.
-    border = max(0, lowest + count, -lowest)
-    a, b = (np.pad(image, ((0, 0), (border, border)), mode="edge") for image in (left, right))
-    forth = _matched(matcher, a, b, lowest)
-    back = _matched(matcher, np.ascontiguousarray(b[:, ::-1]), np.ascontiguousarray(a[:, ::-1]), lowest)[:, ::-1]
-    columns = np.arange(a.shape[1], dtype=np.float32)[None, :] - forth
-    rows = np.broadcast_to(np.arange(a.shape[0], dtype=np.float32)[:, None], forth.shape)
+
+
+def confirmed(forth: Disparity, back: Disparity) -> Disparity:
+    """The disparities (H, W) of the left image with which those of the right one agree; NaN elsewhere."""
+    columns = np.arange(forth.shape[1], dtype=np.float32)[None, :] - forth
+    rows = np.broadcast_to(np.arange(forth.shape[0], dtype=np.float32)[:, None], forth.shape)
     there = cv2.remap(
         np.ascontiguousarray(back),
         np.nan_to_num(columns, nan=-1.0),
@@ -102,12 +117,11 @@ def _agreed(left: Image, right: Image, first_px: float, last_px: float, block: i
         cv2.INTER_NEAREST,
         borderValue=float("nan"),
     )
-    agrees = np.abs(forth - there) <= _AGREE_PX
-    found = np.where(agrees, forth, np.float32(np.nan)).astype(np.float32)
-    return np.ascontiguousarray(found[:, border : border + left.shape[1]])
+    return np.where(np.abs(forth - there) <= _AGREE_PX, forth, np.float32(np.nan)).astype(np.float32)
 
 
-def _matched(matcher: cv2.StereoSGBM, left: Image, right: Image, lowest: int) -> Disparity:
+def matched(matcher: cv2.StereoSGBM, left: Image, right: Image, lowest: int) -> Disparity:
+    """Disparities (H, W) of the left image, NaN where none was found or only a speckle."""
     sixteenths = matcher.compute(left, right)
     none = 16 * (lowest - 1)
     cv2.filterSpeckles(sixteenths, none, _SPECKLE_PX, int(16 * _SPECKLE_STEP_PX))

@@ -1,4 +1,4 @@
-"""From posed images to a mesh: pairs, depth maps, fusion, surface."""
+"""From posed images to a mesh: pairs, depth maps, fusion, surface; then once more, finely, near that surface."""
 
 from __future__ import annotations
 
@@ -9,16 +9,21 @@ import cv2
 import numpy as np
 
 from service.compute.ground_truth.surface import Surface
+from service.compute.pixels.ray_mesh import RayMesh
+from service.compute.stereo.closed import closed
 from service.compute.stereo.fusion import fused
+from service.compute.stereo.guided import guided_depth
 from service.compute.stereo.matching import DepthMap, depth_of_pair
 from service.compute.stereo.pairs import StereoView, looked_at_m, stereo_pairs
 from service.compute.stereo.rectify import rectified
 from service.compute.stereo.surface import surface_of
 from service.core.errors import ComputeError
+from service.core.geometry import Array
 
-WIDTH_PX = 960  # of the images that are matched; larger ones are made smaller
+COARSE_PX, FINE_PX = 960, 1920  # width of the images that are matched at first and then; larger ones are made smaller
 VOXEL_PX = 1.5  # size of a voxel in pixels at the object
-_MANY = 24  # depth maps; a surface that so many could see must be seen by three
+_MANY = 24  # depth maps; a surface that so many could see must be seen by several
+_FEWEST_AT_FIRST, _FEWEST = 3, 2  # then
 
 Progress = Callable[[str, int, int], None]
 
@@ -26,31 +31,53 @@ Progress = Callable[[str, int, int], None]
 def reconstruct(views: Sequence[StereoView], progress: Progress) -> Surface:
     """The surface that posed images of pinhole cameras show, in the frame and unit of the poses.
 
+    A first surface from small images, closed where nothing was matched, is the guess around which larger images are
+    matched. The depth of both is fused: the first holds more of what is steep, the second is finer.
+
     Raises:
         ComputeError: no two images can be matched, or no surface comes out.
     """
-    small = [_smaller(view) for view in views]
+    small, large = ([_smaller(view, width) for view in views] for width in (COARSE_PX, FINE_PX))
     centre = looked_at_m(small)
     pairs = stereo_pairs(small)
-    maps: list[DepthMap] = []
+    coarse: list[DepthMap] = []
     for k, (one, two) in enumerate(pairs):
         progress("matching pairs", k, len(pairs))
-        distance = float(np.linalg.norm(0.5 * (small[one].eye_m + small[two].eye_m) - centre))
-        found = depth_of_pair(rectified(small[one], small[two], centre), distance)
-        if found is not None:
-            maps.append(found)
-    if not maps:
+        found = depth_of_pair(rectified(small[one], small[two], centre), _distance_m(small, one, two, centre))
+        coarse += [] if found is None else [found]
+    if not coarse:
         raise ComputeError("no pair of images could be matched", remedy="Use more images, at smaller angles")
-    footprint = np.median([np.linalg.norm(view.eye_m - centre) / view.camera.fx for view in small])
-    least = 3 if len(maps) >= _MANY else 1
+    many = len(coarse) >= _MANY
     progress("fusing depth maps", 0, 0)
-    return surface_of(fused(maps, VOXEL_PX * float(footprint), least), least)
+    first = _surface(coarse, VOXEL_PX * _footprint_m(small, centre), _FEWEST_AT_FIRST if many else 1)
+    guess = closed(first)
+    near = RayMesh(guess.vertices_m, guess.faces)
+    fine: list[DepthMap] = []
+    for k, (one, two) in enumerate(pairs):
+        progress("matching pairs near the first surface", k, len(pairs))
+        found = guided_depth(rectified(large[one], large[two], centre), near, _distance_m(large, one, two, centre))
+        fine += [] if found is None else [found]
+    progress("fusing all depth maps", 0, 0)
+    return _surface([*coarse, *fine], VOXEL_PX * _footprint_m(large, centre), _FEWEST if many else 1)
 
 
-def _smaller(view: StereoView) -> StereoView:
+def _surface(maps: Sequence[DepthMap], voxel_m: float, least: int) -> Surface:
+    return surface_of(fused(maps, voxel_m, least), least)
+
+
+def _distance_m(views: Sequence[StereoView], one: int, two: int, centre_m: Array) -> float:
+    return float(np.linalg.norm(0.5 * (views[one].eye_m + views[two].eye_m) - centre_m))
+
+
+def _footprint_m(views: Sequence[StereoView], centre_m: Array) -> float:
+    """What a pixel covers at the object."""
+    return float(np.median([np.linalg.norm(view.eye_m - centre_m) / view.camera.fx for view in views]))
+
+
+def _smaller(view: StereoView, width_px: int) -> StereoView:
     camera = view.camera
-    if camera.width <= WIDTH_PX:
+    if camera.width <= width_px:
         return view
-    size = (WIDTH_PX, round(camera.height * WIDTH_PX / camera.width))
+    size = (width_px, round(camera.height * width_px / camera.width))
     image = np.asarray(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     return dataclasses.replace(view, image=image, camera=camera.scaled(*size))

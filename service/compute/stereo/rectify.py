@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compute.camera_model import CameraModel
 from service.compute.stereo.pairs import StereoView
 from service.core.geometry import Array, Transform, transform
 
@@ -24,7 +25,7 @@ class Rectified:
     Attributes:
         left, right: (H, W) grey images.
         seen: (H, W) pixels of the left image that the photograph has.
-        T_world_left: pose of the left camera, whose x runs along the baseline.
+        T_world_left, T_world_right: poses of both cameras, whose x runs along the baseline.
         f_px: focal length of both.
         left_px, right_px: x of the principal points; y_px of both.
         baseline_m: between the cameras.
@@ -34,11 +35,23 @@ class Rectified:
     right: NDArray[np.uint8] = field(repr=False)
     seen: NDArray[np.bool_] = field(repr=False)
     T_world_left: Transform
+    T_world_right: Transform
     f_px: float
     left_px: float
     right_px: float
     y_px: float
     baseline_m: float
+
+    @property
+    def left_camera(self) -> CameraModel:
+        """The pinhole camera of the left image."""
+        height, width = self.left.shape
+        return CameraModel(width, height, self.f_px, self.f_px, self.left_px, self.y_px)
+
+    @property
+    def right_camera(self) -> CameraModel:
+        """The pinhole camera of the right image."""
+        return replace(self.left_camera, cx=self.right_px)
 
     def disparity(self, depth_m: float) -> float:
         """Column in the left image minus that in the right one of a point at this depth, in pixels."""
@@ -78,6 +91,7 @@ def rectified(one: StereoView, two: StereoView, centre_m: Array) -> Rectified:
         right=warped[1][0],
         seen=warped[0][1],
         T_world_left=transform(R, one.eye_m),
+        T_world_right=transform(R, two.eye_m),
         f_px=f,
         left_px=float(principal[0][0]),
         right_px=float(principal[1][0]),
