@@ -1,29 +1,45 @@
-"""Driver for a hand scanner, through the folder into which its software exports OBJ, PLY or STL files."""
+"""Driver for a hand scanner, through the folder into which its software exports meshes or single views."""
 
 from __future__ import annotations
 
 import shutil
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from drivers.errors import DeviceUnavailableError, IncompleteExportError
 from drivers.interfaces import DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
 from drivers.meshes.export_watch import ExportWatch
 from drivers.meshes.mesh_file import MeshUnit, read_mesh_file
 from drivers.plugin import DriverConfig, DriverSpec
+from drivers.scan_profiles import profile_named
+from drivers.scan_profiles.profile import ScanProfile
+from drivers.scan_profiles.reading import check_export, read_export
 
 
 class ScanFolderConfig(DriverConfig):
     """The scanner's section in rig.yaml."""
 
     folder: Path = Field(description="folder into which the scanner's software exports")
+    profile: str = Field(
+        default="",
+        description="the scanner that exports, such as artec_leo or zivid; empty: a mesh of any scanner",
+    )
     unit: MeshUnit = Field(
-        default="auto", description="unit of the exported coordinates: mm, m, or auto (from the size)"
+        default="auto",
+        description="unit of the exported coordinates: mm, m, or auto (the profile's; without one, from the size)",
     )
     only: str = Field(default="", description="file name of the only export to use; empty: use all exports")
     stable_s: float = Field(default=10.0, ge=0, description="how long an export must stay unchanged; 10 s on a share")
+
+    @field_validator("profile")
+    @classmethod
+    def _installed(cls, name: str) -> str:
+        if name:
+            profile_named(name)
+        return name
 
 
 class ScanFolder:
@@ -31,7 +47,12 @@ class ScanFolder:
 
     def __init__(self, config: ScanFolderConfig) -> None:
         self._config = config
+        self._profile: ScanProfile | None = None
         self._watch = ExportWatch(config.folder, config.stable_s)
+        if config.profile:
+            self._profile = profile_named(config.profile)
+            check = partial(check_export, self._profile)
+            self._watch = ExportWatch(config.folder, config.stable_s, suffixes=self._profile.suffixes, check=check)
 
     def open(self) -> DeviceIdentity:
         """Check that the folder exists and start watching it; raises DeviceUnavailableError if it does not."""
@@ -51,7 +72,7 @@ class ScanFolder:
             free_bytes=free_bytes(self._config.folder),
             details={
                 "exports": str(len(exports)),
-                "unit": self._config.unit,
+                **self._expected(),
                 "stable_s": f"{self._config.stable_s:g}",
             },
             problems=pending,
@@ -65,19 +86,27 @@ class ScanFolder:
     def read(self, export: ScanExport) -> ScannedMesh:
         """Read one export, in metres.
 
-        Raises IncompleteExportError if a file of it has gone, and otherwise as read_mesh_file does.
+        Raises IncompleteExportError if a file of it has gone, and otherwise as read_mesh_file and read_export do.
         """
         for path in export.files:
             if not path.is_file():
                 raise IncompleteExportError(
                     "a file of the export is gone", where=str(path), remedy="Export the scan again and keep it"
                 )
+        if self._profile is not None:
+            return read_export(self._profile, export, self._config.unit)
         return read_mesh_file(export.files[0], self._config.unit, export=export)
+
+    def _expected(self) -> dict[str, str]:
+        if self._profile is None:
+            return {"unit": self._config.unit}
+        units = ", ".join(f"{suffix[1:]} in {unit}" for suffix, unit in self._profile.units.items())
+        return {"unit": self._config.unit, "profile": f"{self._config.profile}: {units}. {self._profile.advice}"}
 
     def _identity(self) -> DeviceIdentity:
         return DeviceIdentity(
             kind="scanner",
-            model="export folder",
+            model="export folder" if self._profile is None else self._profile.scanner,
             serial="",
             firmware="",
             driver="scan_folder",

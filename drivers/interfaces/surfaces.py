@@ -38,7 +38,9 @@ class ScannedMesh:
     mesh: Mesh
     unit: str  # of the file: mm, m, …
     unit_evidence: str  # how that unit was determined
-    findings: Mapping[str, float]  # holes, non_manifold_edges, components, degenerate_faces, normals_computed
+    findings: Mapping[
+        str, float
+    ]  # holes, non_manifold_edges, components, degenerate_faces, normals_computed, textures
     source: ScanExport
 
 

@@ -24,14 +24,26 @@ class _Seen:
 class ExportWatch:
     """Finds the complete exports in a folder.
 
+    `check` says by an error that a file is incomplete, or cannot be used.
+
     An export counts as complete when this host has seen its sizes and modification times unchanged for `stable_s`.
     The age of a file is not used, because the clocks of the share and of this host may differ.
     """
 
-    def __init__(self, folder: Path, stable_s: float, monotonic: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        stable_s: float,
+        monotonic: Callable[[], float] = time.monotonic,
+        *,
+        suffixes: tuple[str, ...] = MESH_SUFFIXES,
+        check: Callable[[Path], None] = check_complete,
+    ) -> None:
         self._folder = folder
         self._stable_s = stable_s
         self._monotonic = monotonic
+        self._suffixes = suffixes
+        self._check = check
         self._seen: dict[Path, _Seen] = {}
 
     def poll(self) -> tuple[tuple[ScanExport, ...], tuple[str, ...]]:
@@ -40,7 +52,7 @@ class ExportWatch:
         Raises DeviceUnavailableError if the folder cannot be read.
         """
         now = self._monotonic()
-        present = mesh_files(self._folder)
+        present = mesh_files(self._folder, self._suffixes)
         self._seen = {path: seen for path, seen in self._seen.items() if path in present}
         exports: list[tuple[int, ScanExport]] = []
         pending: list[str] = []
@@ -71,7 +83,7 @@ class ExportWatch:
             return old
         try:
             if old is None or old.signature[:1] != own or old.trouble:
-                check_complete(path)
+                self._check(path)
             export = export_of(path)
             files = export.files
         except IncompleteExportError as error:
@@ -85,8 +97,10 @@ class ExportWatch:
         return seen
 
 
-def mesh_files(folder: Path) -> list[Path]:
-    """The mesh files in a folder and its subfolders, sorted, without hidden files and links that lead out of it.
+def mesh_files(folder: Path, suffixes: tuple[str, ...] = MESH_SUFFIXES) -> list[Path]:
+    """The files with these extensions in a folder and its subfolders, sorted.
+
+    Without hidden files, and without links that lead out of the folder.
 
     Raises DeviceUnavailableError if the folder cannot be read.
     """
@@ -95,7 +109,7 @@ def mesh_files(folder: Path) -> list[Path]:
         found = [
             path
             for path in sorted(folder.rglob("*"))
-            if path.suffix.lower() in MESH_SUFFIXES
+            if path.suffix.lower() in suffixes
             and not any(part.startswith((".", "~")) for part in path.relative_to(folder).parts)
             and path.is_file()
             and path.resolve().is_relative_to(root)

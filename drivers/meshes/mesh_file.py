@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Generator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -25,6 +27,7 @@ METRES_PER_UNIT = {"mm": 1e-3, "m": 1.0}
 SCENE_DIAGONAL_M = (0.1, 3.0)
 OBJECT_DIAGONAL_M = (0.02, 20.0)
 MESH_SUFFIXES = (".obj", ".ply", ".stl")
+TEXTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".tga")
 
 IntArray = NDArray[np.int64]
 
@@ -54,7 +57,8 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
     Returns:
         The mesh with bitwise equal vertices merged (STL facets, UV seams), vertex normals (V, 3) from the file or
         area-weighted from its faces, and `findings`, the numbers of: vertices, faces, holes, boundary_edges,
-        non_manifold_edges, components, degenerate_faces, unreferenced_vertices; normals_computed is 0 or 1.
+        non_manifold_edges, components, degenerate_faces, unreferenced_vertices, textures; normals_computed is 0
+        or 1.
 
     Raises:
         IncompleteExportError: truncated, still growing, locked, or a companion is missing.
@@ -66,11 +70,24 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
             where=str(path),
             remedy="Export the scan as OBJ, PLY or STL",
         )
-    try:
-        before = path.stat()
+    with unchanged(path):
         check_complete(path)
         export = export or export_of(path)
         vertices, faces, normals = parse_mesh(path)
+    return scanned_mesh(vertices, faces, normals, unit, export)
+
+
+@contextmanager
+def unchanged(path: Path) -> Generator[None]:
+    """While a file is read: it may not change.
+
+    Raises:
+        IncompleteExportError: it changed, or cannot be opened.
+        UnreadableFileError: there is no such file.
+    """
+    try:
+        before = path.stat()
+        yield
         after = path.stat()
     except FileNotFoundError as error:
         raise UnreadableFileError(
@@ -86,6 +103,16 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
         raise IncompleteExportError(
             "the file changed while it was read", where=str(path), remedy="Wait until the export has finished"
         )
+
+
+def scanned_mesh(
+    vertices: Array, faces: IntArray, normals: Array | None, unit: MeshUnit, export: ScanExport
+) -> ScannedMesh:
+    """Check what was read of an export, in the file's unit, and report on it as `read_mesh_file` does.
+
+    Raises UnreadableFileError as `check_mesh` and `credible_unit` do.
+    """
+    path = export.files[0]
     check_mesh(path, vertices, faces)
     found, evidence = credible_unit(path, vertices[np.unique(faces)], unit)
     vertices = vertices * METRES_PER_UNIT[found]
@@ -93,7 +120,11 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
     merged, faces = vertices[first], index[faces]
     computed = normals is None
     kept = vertex_normals(merged, faces) if normals is None else _unit_length(_summed(index, normals, len(merged)))
-    findings = {**mesh_findings(merged, faces), "normals_computed": float(computed)}
+    findings = {
+        **mesh_findings(merged, faces),
+        "normals_computed": float(computed),
+        "textures": float(sum(file.suffix.lower() in TEXTURE_SUFFIXES for file in export.files[1:])),
+    }
     return ScannedMesh(Mesh(merged, faces.astype(np.int32), kept), found, evidence, findings, export)
 
 

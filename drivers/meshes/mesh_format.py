@@ -28,8 +28,8 @@ _COUNTS = tuple(
 )
 
 
-def check_complete(path: Path) -> None:
-    """Check that a mesh file is complete and has faces.
+def check_complete(path: Path, *, points: bool = False) -> None:
+    """Check that a mesh file is complete and has faces; with `points`, a PLY file may have none.
 
     Raises:
         IncompleteExportError: the file is truncated.
@@ -41,7 +41,7 @@ def check_complete(path: Path) -> None:
         raise IncompleteExportError("the file is empty", where=str(path), remedy=_AGAIN)
     match path.suffix.lower():
         case ".ply":
-            _check_ply(path, size)
+            _check_ply(path, size, points=points)
         case ".stl":
             _check_stl(path, size)
         case ".obj":
@@ -189,11 +189,11 @@ def _ply_header(path: Path) -> _PlyHeader:
     return _PlyHeader(binary, elements, end.end())
 
 
-def _check_ply(path: Path, size: int) -> None:
+def _check_ply(path: Path, size: int, *, points: bool) -> None:
     header = _ply_header(path)
     counts = {element.name: element.count for element in header.elements}
-    if not counts.get("face"):
-        strips = "tristrips" in counts
+    strips = "tristrips" in counts
+    if not counts.get("face") and (strips or not points):
         raise UnreadableFileError(
             "the file holds triangle strips and no faces" if strips else "the file has no faces, only points",
             where=str(path),

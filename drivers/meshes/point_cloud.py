@@ -106,6 +106,15 @@ def _is_number(word: str) -> bool:
 
 
 def _ply(path: Path) -> tuple[Array, Array | None]:
+    points, normals = ply_points(path)
+    return points, _unit_normals(normals)
+
+
+def ply_points(path: Path) -> tuple[Array, Array | None]:
+    """The vertices (N, 3) of a PLY file as they are, also if not finite, and its normals (N, 3) or None.
+
+    Raises OSError, or one of PARSE_ERRORS if the file is damaged.
+    """
     with path.open("rb") as stream:
         loaded = cast("Any", trimesh.load(stream, file_type="ply", process=False))
     points = np.array(loaded.vertices, dtype=np.float64)
@@ -113,8 +122,7 @@ def _ply(path: Path) -> tuple[Array, Array | None]:
     names = () if raw is None else raw.dtype.names if hasattr(raw, "dtype") else tuple(raw)
     if raw is None or not {"nx", "ny", "nz"} <= set(names or ()):
         return points, None
-    columns = [np.asarray(raw[name], dtype=np.float64).ravel() for name in ("nx", "ny", "nz")]
-    return points, _unit_normals(np.stack(columns, axis=1))
+    return points, np.stack([np.asarray(raw[name], dtype=np.float64).ravel() for name in ("nx", "ny", "nz")], axis=1)
 
 
 def _unit_normals(columns: Array | None) -> Array | None:

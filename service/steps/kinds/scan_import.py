@@ -46,6 +46,7 @@ class Measures(SphereMeasures):
     scan_normals_computed: Annotated[Count, "1 if the scan came without normals and they were computed, else 0"] = (
         None
     )
+    scan_textures: Annotated[Count, "texture images that came with the scan"] = None
     faces: Annotated[Count, "faces of the mesh that is used"] = None
     since_application_min: Annotated[
         float | None, Measure("min", 0.1, 1e4), "time from the application of the coat to the arrival of the scan"

@@ -12,7 +12,10 @@ from service.compute.layout.confusions import SUBSET as LAYOUT_SUBSET
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.isosurface import surface
 from service.compute.surfaces.loop_closure import LoopClosure, close_loop
+from service.compute.surfaces.spheres.mesh_spheres import MeshSphere
 from service.compute.surfaces.spheres.mesh_spheres import locate_spheres as find_spheres
+from service.compute.surfaces.spheres.wrong_unit import wrong_unit
+from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.core.units import mm
 from service.jobs.records import LoopClosure as LoopClosureRecord
@@ -45,7 +48,7 @@ def locate_spheres(context: JobContext[locate_job.Arguments]) -> JobAnswer:
 
 def _search(arguments: ct_job.Arguments | locate_job.Arguments, vertices_m: Array, faces: Any) -> JobAnswer:
     radius_m = arguments.radius_m
-    spheres = find_spheres(vertices_m, faces, radius_m, arguments.expected)
+    spheres = _found(vertices_m, faces, radius_m, arguments.expected)
     centres = np.array([s.centre_m for s in spheres])
     covariances = np.array([s.covariance for s in spheres])
     layout = check_layout(centres, covariances, radius_m=radius_m) if len(spheres) >= LAYOUT_SUBSET else None
@@ -72,6 +75,22 @@ def _search(arguments: ct_job.Arguments | locate_job.Arguments, vertices_m: Arra
             measures["loop_closure_chi2"] = closure.chi2_per_dof
             details = details.model_copy(update={"loop_closure": _closure_record(closure)})
     return JobAnswer(measures, (), SpheresFound(spheres_m=centres.tolist(), details=details))
+
+
+def _found(vertices_m: Array, faces: Any, radius_m: float, expected: int) -> tuple[MeshSphere, ...]:
+    """The spheres; if they are missing because of the mesh's unit, the error says so."""
+    try:
+        return find_spheres(vertices_m, faces, radius_m, expected)
+    except ComputeError as error:
+        mistake = wrong_unit(vertices_m, faces, radius_m)
+        if mistake is None:
+            raise
+        raise ComputeError(
+            f"the mesh was read in the wrong unit: with its coordinates multiplied by {mistake.factor:g} it has "
+            f"{mistake.spheres} spheres of {mm(radius_m):g} mm radius, as it is it lacks some ({mistake.words})",
+            remedy="set the unit in the program that exported it, or in rig.yaml, and import it again; "
+            "nothing is scaled silently",
+        ) from error
 
 
 def _closure_record(closure: LoopClosure) -> LoopClosureRecord:
