@@ -71,6 +71,12 @@ class PoseStream:
         fresh = newest is not None and time.monotonic() - newest.monotonic_s <= self._stale_after_s
         return newest if fresh else None
 
+    def await_first(self, timeout_s: float) -> None:
+        """Wait for the first sample, which on a busy machine comes later than any other may."""
+        deadline_s = time.monotonic() + timeout_s
+        while not self._samples and not self._death and time.monotonic() < deadline_s:
+            time.sleep(POLL_S)
+
     def latest(self) -> RobotSample:
         """Return the newest sample. Raises DeviceUnavailableError if it is stale."""
         deadline_s = time.monotonic() + self._stale_after_s

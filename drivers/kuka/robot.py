@@ -90,6 +90,7 @@ class KukaRobot:
             where=self._where,
             vendor_errors=(ConnectionError,),
         )
+        self._stream.await_first(self._config.connect_timeout_s)
         self._stream.latest()
         return self._identity()
 

@@ -126,6 +126,7 @@ class UrRobot:
             where=self._where,
             vendor_errors=VENDOR_ERRORS,
         )
+        self._stream.await_first(self._config.connect_timeout_s)
         if not (self._obstacle() or self._latch.stop):
             self._perform("starting the control script", lambda _: None)  # sends the script and reads the tool
         return self._identity()
