@@ -1,5 +1,5 @@
-"""Scan profiles: exports as each scanner's program writes them, made by plyfile, trimesh and pye57, which we do not
-read with (but for pye57, the only E57 library that there is)."""
+"""Scan profiles: exports in the layouts of the scanners' programs, made by the tests. PLY views come from plyfile, which
+we do not read with; meshes come from trimesh and E57 files from pye57, which also read them."""
 
 from __future__ import annotations
 
