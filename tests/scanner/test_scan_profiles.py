@@ -1,5 +1,5 @@
-"""Scan profiles: exports in the layouts of the scanners' programs, made by the tests. PLY views come from plyfile, which
-we do not read with; meshes come from trimesh and E57 files from pye57, which also read them."""
+"""Scan profiles: exports in the layouts of the scanners' programs, made by the tests. PLY views come from plyfile,
+which we do not read with; meshes come from trimesh and E57 files from pye57, which also read them."""
 
 from __future__ import annotations
 
