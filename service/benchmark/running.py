@@ -1,4 +1,4 @@
-"""One method in one scenario: export, run or accept its mesh, bring it back, score it, keep the result."""
+"""Runs one method in one scenario: export, run (or take a given mesh), return to the world frame, score, store."""
 
 from __future__ import annotations
 

@@ -62,8 +62,8 @@ class Scored:
 def score_mesh(found: Surface, truth: Mesh, settings: ChamferSettings | None = None) -> Scored:
     """Compare a mesh with the truth; both in the world frame, metres.
 
-    What is outside the smallest box of the truth, and MARGIN_M more, is cut off first: methods see the whole room,
-    and the truth ends at its rim.
+    The mesh is first cropped to the smallest bounding box of the truth, enlarged by MARGIN_M: methods reconstruct the
+    whole room, the truth only the specimen.
 
     Raises:
         DataError: nothing of the mesh is within the box.

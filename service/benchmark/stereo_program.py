@@ -1,4 +1,4 @@
-"""Dense stereo on an exported folder, as a program of its own: it sees images and poses, and nothing else.
+"""Dense stereo on an exported folder, as a separate program, so that it sees only images and poses.
 
 Run: python -m service.benchmark.stereo_program DATA MESH
 """

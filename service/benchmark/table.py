@@ -34,7 +34,7 @@ def table_record(results: Sequence[Result], known: Mapping[str, Method]) -> dict
 
 
 def table_markdown(results: Sequence[Result], known: Mapping[str, Method]) -> str:
-    """The same for people: Chamfer distances as in the paper, then details, commands, and what was not run."""
+    """Format the results for people: the paper's Chamfer distances, then details, commands, and what was not run."""
     lines: list[str] = ["# Reconstruction from posed images", ""]
     for dataset in dict.fromkeys(result.dataset_sha256 for result in results):
         of = [result for result in results if result.dataset_sha256 == dataset]

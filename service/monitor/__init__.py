@@ -1,1 +1,1 @@
-"""What a runner shows on the screens while it works, the alerts it sends, and health checks; none of it evidence."""
+"""What a runner shows on the screens while it works, the alerts it sends, and health checks. None is evidence."""

@@ -1,4 +1,4 @@
-"""Approvals of protocols on this site: each content by its hash, recorded in the site's chain."""
+"""Approvals of protocols on this site. An approval names the hash of the file and is recorded in the site's chain."""
 
 from __future__ import annotations
 

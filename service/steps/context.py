@@ -171,7 +171,7 @@ class JobResult:
 
 
 class Evidence(Protocol):
-    """Where a step records what happens. What cannot be recorded is not done."""
+    """Where a step records what happens. It raises if recording fails, so that nothing is done unrecorded."""
 
     def record(self, *payloads: Payload, artefacts: tuple[NewArtefact, ...] = (), actor: str = "") -> None:
         """Append events (and artefact rows) in one transaction."""

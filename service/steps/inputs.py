@@ -32,7 +32,7 @@ class EarlierAnswer(Generic[R]):
     job: JobState | None  # None: no job of this run computed it
 
     def reference(self, field: str) -> Reference | None:
-        """A part of the answer (`details/spheres/*/covariance_m2`), "" for all of it; None without a job."""
+        """Refer to a part of the answer (`details/spheres/*/covariance_m2`; "": all of it); None without a job."""
         path = f"result/{field}" if field else "result"
         return None if self.job is None else Reference(self.job.job, path)
 
@@ -129,7 +129,7 @@ def _photograph(capture: View, step_id: str, look: hand_view.Answer | None) -> P
 
 
 def with_robot_pose(photograph: Photograph, view: View) -> Photograph:
-    """The photograph with the robot's pose; as it is if no robot held the camera."""
+    """Add the robot's pose to a photograph; return it unchanged if no robot held the camera."""
     if isinstance(view, ViewpointCaptured):
         return photograph.model_copy(update={"T_base_flange": view.T_base_flange, "joints_rad": view.joints_rad})
     return photograph

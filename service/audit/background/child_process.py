@@ -139,7 +139,7 @@ class ChildProcesses:
 
 
 def ends_tidily_when_stopped() -> None:
-    """In a child process: SIGTERM ends it as an exception does, so that it removes what it began."""
+    """In a child process, turn SIGTERM into an exception, so that unfinished files are removed on the way out."""
     signal.signal(signal.SIGTERM, lambda _number, _frame: sys.exit(STOPPED))
 
 

@@ -62,7 +62,7 @@ class _Entry(Generic[T]):
 class IncrementalResults(Generic[T]):
     """One value for each run, computed in chunks by `advance(run_id, value so far or None)`.
 
-    Nothing is written to disk: this process has read everything that a page shows from the evidence.
+    Nothing is cached on disk, so every value on a page was read from the evidence by this process.
     """
 
     def __init__(self, store: Store, advance: Callable[[str, T | None], PartialResult[T]], name: str) -> None:
@@ -102,7 +102,7 @@ class IncrementalResults(Generic[T]):
         return step.value if (step.seq, step.sha256) == (last, sha256) else Progress(min(step.seq, last), last)
 
     def warm(self, run_id: str) -> None:
-        """Compute the value when nobody waits for another one."""
+        """Compute the value in the background, after those that a page is waiting for."""
         self._submit(run_id, somebody_waits=False)
 
     def close(self) -> None:

@@ -110,7 +110,7 @@ def _about(root: RunStarted, dataset: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _artefact_entities(artefacts: Iterable[Artefact], present: set[str]) -> list[tuple[Artefact, dict[str, Any]]]:
-    """One entity a content; a recorded file that is not in the bundle is described, but is no File of it."""
+    """Describe each distinct content once. Recorded files that are not in the bundle are not of type File."""
     found: dict[str, tuple[Artefact, dict[str, Any]]] = {}
     for artefact in artefacts:
         ref = artefact.ref

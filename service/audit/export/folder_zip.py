@@ -1,4 +1,4 @@
-"""An exported folder as a zip file, made while it is sent: nothing of it is kept on the disk or in memory."""
+"""Streams an exported folder as a zip file, without keeping the zip file on disk or in memory."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _TEXT = frozenset({".json", ".txt", ".csv", ".md", ".xml", ".ply", ".py"})  # ot
 
 
 class _Sent(io.RawIOBase):
-    """What zipfile has written and nobody has fetched yet."""
+    """A write-only file for zipfile; `take` removes and returns the bytes written since the last call."""
 
     def __init__(self) -> None:
         self._kept = bytearray()

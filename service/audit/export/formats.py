@@ -28,7 +28,7 @@ class Formats:
         self._children = ChildProcesses("service.audit.export.formats", "list of formats", clock)
 
     def state(self) -> ChildState | None:
-        """How the listing stands, or how it ended; None before it was begun."""
+        """The progress or the outcome of the listing; None before it was begun."""
         return self._children.state(_KEY)
 
     def known(self, wait_s: float = 0.0) -> tuple[Format, ...]:

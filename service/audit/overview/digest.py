@@ -135,7 +135,7 @@ def _begin(digest: Digest, store: Store, connection: Connection) -> None:
 
 
 def _chunk_end(connection: Connection, run_id: str, after: int, last: int) -> int:
-    """The last event of a chunk. Only events that matter are counted; the others cost nothing."""
+    """The last event of the next chunk. The chunk's size counts only events that the digest reads."""
     found = connection.execute(
         text(
             "SELECT seq FROM event_index WHERE run_id = :run AND seq > :after "

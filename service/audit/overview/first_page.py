@@ -84,7 +84,10 @@ class Finding:
 
 
 def findings(digest: Digest, group: str = "") -> list[Finding]:
-    """Deviations and failed gates, accepted gates first: those of one group, or all of them without the notes."""
+    """Deviations and failed gates, with accepted gates first.
+
+    With `group`, only those of this group; otherwise all except notes.
+    """
     kinds = GROUPS[group][1] if group in GROUPS else None
     found = [
         Finding(d.seq, digest.times.get(d.seq, ""), d.kind, d.step or "", d.actor, d.text)
@@ -171,12 +174,12 @@ class ListedRun:
 
     @property
     def verified(self) -> str:
-        """The state of the verification as a word, by `verified`."""
+        """The state of the newest verification, as `verified` words it."""
         return verified(self.verification, self.basics.head_sha256)
 
 
 def verified(verification: Verification | None, head_sha256: str) -> str:
-    """never, faults, outdated (there are newer events) or current."""
+    """The state of a verification: "never", "faults", "outdated" (there are newer events) or "current"."""
     if verification is None:
         return "never"
     if not verification.ok:

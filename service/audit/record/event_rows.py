@@ -136,7 +136,7 @@ def _not_passed(verdicts: Any) -> str:
 
 
 def computed_sha256(run_id: str, row: EventRow) -> str:
-    """The hash of an event's content as it is now; an altered event has another hash than the recorded one."""
+    """Hash an event's present content. It differs from the recorded hash if the event was altered."""
     fields = {
         "seq": row.seq,
         "run_id": run_id,

@@ -55,7 +55,7 @@ class Difference:
 
     @property
     def within_tolerance(self) -> bool:
-        """Whether nothing but rounding, or the wording of an explanation, differs."""
+        """Whether at most rounding or the wording of an explanation differs."""
         return self.wording or (self.relative is not None and self.relative <= TOLERANCE)
 
 

@@ -251,7 +251,7 @@ class ZipBundle(Bundle):
             raise NotABundleError("the entries of the zip file overlap: nothing in it was read")
 
     def open(self, name: str) -> IO[bytes]:
-        """See Bundle."""
+        """Open a file of the zip archive for reading."""
         return self._zip.open(self._infos[name])
 
 
@@ -269,7 +269,7 @@ class FolderBundle(Bundle):
                 self.sizes[name] = path.stat().st_size
 
     def open(self, name: str) -> IO[bytes]:
-        """See Bundle."""
+        """Open a file of the folder for reading."""
         return (self._folder / name).open("rb")
 
 
@@ -368,7 +368,7 @@ class Check:
         return content
 
     def _check_files(self, bundle: Bundle) -> frozenset[str]:
-        """Both ways: every listed file is there as listed, and nothing else is. The names of those that are."""
+        """Check that exactly the listed files are present and unaltered. Returns the names of the intact ones."""
         whole: list[str] = []
         for name, (sha256, size) in self.files.items():
             if name not in bundle.sizes:
@@ -666,7 +666,7 @@ class Check:
 
 
 class Chain:
-    """A chain of events, checked while its lines pass by once; what other checks need of it is kept."""
+    """A chain of events, checked line by line in one pass. It keeps only what other checks need."""
 
     def __init__(self, check: Check, bundle: Bundle, file: str, run_id: str, whole: frozenset[str]) -> None:
         self.file, self.run_id = file, run_id
@@ -984,7 +984,7 @@ def report(check: Check) -> str:
 
 
 def shown(text: str) -> str:
-    """A line without what a terminal would obey rather than show: names in a bundle are whatever somebody chose."""
+    """Escape control characters, which a terminal would obey: names in a bundle may be chosen by an attacker."""
     return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
 
 

@@ -98,10 +98,10 @@ def locate_in_images(
 def _intersect(
     seen: Sequence[tuple[int, SphereOutline]], T_scan_camera: Array, start: Array, radius_m: float, least: int
 ) -> SeenSphere:
-    """One sphere, by Gauss–Newton steps with a loop of its own.
+    """Intersect the viewing cones of one sphere by Gauss–Newton.
 
-    Before each step, the outlines to keep and the factor on their variances are chosen again, so there is no fixed
-    cost to descend; the covariance follows from those of the last step.
+    Inliers and the variance factor are chosen anew before each step, so there is no fixed cost to minimise and
+    `descent` does not apply. The covariance uses those of the last step.
     """
     T = T_scan_camera[[i for i, _ in seen]]
     cones = ObservedCones.of(o.cone for _, o in seen)

@@ -14,7 +14,7 @@ from service.core.geometry import Array, Transform, apply, inverse, rotation_ang
 
 @dataclass(frozen=True, slots=True)
 class TransformLoop:
-    """T_scan_ct by spheres against the same by images (CT to cameras, cameras to scan).
+    """Comparison of T_scan_ct from the spheres with T_scan_ct from the images (CT to cameras, cameras to scan).
 
     Attributes:
         T_scan_scan: the way around the loop; the identity if both agree.

@@ -38,7 +38,7 @@ class ObservedCones:
 
     @classmethod
     def with_chords(cls, axes: Array, half_angles: Array) -> ObservedCones:
-        """With tilts along the camera's three axes: the differences of the unit vectors."""
+        """Convert tilts to the camera's three axes, where they are differences of unit vectors."""
         return cls(axes, half_angles, np.broadcast_to(np.eye(3), (len(axes), 3, 3)))
 
     def __len__(self) -> int:

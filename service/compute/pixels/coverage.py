@@ -17,7 +17,7 @@ _TOLERANCE_M = 1e-3  # a point so far behind the depth of its pixel is still on 
 def seen_points(
     points_m: Array, camera: CameraModel, T_world_camera: Transform, depth_m: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """(N,) whether a view sees points (N, 3) of the world: within the picture, and nothing lies before them.
+    """Whether (N,) a view sees points (N, 3) of the world: within the picture and not occluded.
 
     Args:
         points_m: on the surface that the depth is of.

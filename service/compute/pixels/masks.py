@@ -1,4 +1,4 @@
-"""The pixels that spheres and their posts cover in an image, from their known places; whatever stands before them."""
+"""The pixels that spheres and their posts cover in an image, from their known positions; occlusion is ignored."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ _SHORTEST_SOUGHT = 5  # a shorter value may stand anywhere by chance
 
 
 def without_personal_data(picture: bytes, where: str = "") -> bytes:
-    """The same JPEG or PNG, pixel for pixel, without GPS, owner, author, serial numbers, makers' notes and previews.
+    """Remove GPS, owner, author, serial numbers, makers' notes and previews from a JPEG or PNG, but change no pixel.
 
     XMP, IPTC and comments are removed as a whole, and whatever follows the picture in the file.
 
@@ -78,7 +78,7 @@ def with_metadata_of(original: bytes, resampled: bytes, *, personal: bool, where
 
 
 def described(picture: bytes, words: str, where: str = "") -> bytes:
-    """The same JPEG or PNG, pixel for pixel, with a description in its EXIF that every viewer shows.
+    """Write a description that every viewer shows into the EXIF of a JPEG or PNG, but change no pixel.
 
     Raises:
         DataError: it is not a picture.

@@ -12,7 +12,7 @@ from service.core.geometry import Array
 
 
 def with_joint_pose_covariance(registration: RegistrationResult, covariance: Array) -> RegistrationResult:
-    """The same solution with its covariance for poses whose errors come from one joint adjustment.
+    """Replace the covariance of a registration by the one for poses from a joint adjustment.
 
     Errors of neighbouring images in a reconstruction are correlated, so they do not average out like independent
     ones. The estimate is linear in them: with H the information on the common unknowns x, and xi the poses' errors,

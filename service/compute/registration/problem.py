@@ -125,7 +125,7 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Linearised:
-    """Rows of the outlines: r + J dx + A xi, where xi is the whole error of the image's pose (not a step of it)."""
+    """The linearised residuals of the outlines: r + J dx + A xi, where xi is the whole error of the image's pose."""
 
     J: Array  # (O, 3, n)
     A: Array  # (O, 3, 6)

@@ -220,7 +220,7 @@ def _solve(problem: Problem, start: State, noise: PoseNoise, *, robust: bool, co
 
 
 def _begin(problem: Problem, start: State) -> _Iterate:
-    """From the assignments' poses to the neighbourhood of the answer, outlines weighted equally but robustly."""
+    """Bring the poses of the assignments close to the solution, with equal but robust weights of the outlines."""
     none = np.zeros((problem.n_images, 6, 6))
     size = np.einsum("oij,oij->o", problem.whiten, problem.whiten)
 

@@ -55,7 +55,7 @@ def given_pose_noise(covariance: Array) -> PoseNoise:
 def estimate(
     blocks: Blocks, noise: PoseNoise, prior: Array, prior_gradient: Array, start: tuple[float, Array]
 ) -> tuple[float, Array]:
-    """Factor of the outlines' variance and factors (K,) of the pose noise, by restricted maximum likelihood.
+    """Estimate the variance factors of the outlines and of the pose noise (K,) by restricted maximum likelihood.
 
     Args:
         blocks: linearised at the current solution.

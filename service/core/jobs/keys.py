@@ -16,7 +16,7 @@ def arguments_name(arguments: Mapping[str, Any]) -> str:
 
 
 def key_stem(state: RunState, step: str, kind: str) -> str:
-    """With what the keys of a kind's jobs begin that were enqueued since the step's last redo."""
+    """The common prefix of the keys of all jobs of this kind that were enqueued since the step's last redo."""
     generation = sum(past.step == step and past.viewpoint is None for past in state.superseded)
     return f"{step}/{generation}/{kind}/"
 

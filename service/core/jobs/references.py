@@ -39,7 +39,9 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class Each:
-    """The same part of many earlier answers, in the order in which their jobs were enqueued. Its size is constant.
+    """One part of each of many earlier answers, in the order in which their jobs were enqueued.
+
+    It names the jobs by prefix, so its recorded size does not grow with their number.
 
     Attributes:
         jobs: prefixes of the jobs' keys (`step/generation/kind/`); the answers follow in the order of these prefixes.

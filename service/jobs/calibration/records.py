@@ -131,7 +131,7 @@ class Spread(JobRecord):
 
 
 class Residuals(JobRecord):
-    """How far each board image, by name, puts the board from where the others put it.
+    """Differences between the board pose from each image, by name, and the one from the other images.
 
     Attributes:
         mm: position, in the fit.
@@ -172,7 +172,7 @@ class ArmAnswer(ArmCorrection):
 
 
 class HandEye(JobRecord):
-    """Where the camera sits on the flange, and how it was found; T_flange_camera is for poses as reported."""
+    """The hand-eye calibration. `T_flange_camera` belongs to the poses that the arm reports, without correction."""
 
     T_flange_camera: Matrix
     T_base_board: Matrix | None = None

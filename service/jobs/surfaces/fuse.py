@@ -62,7 +62,7 @@ class Arguments(JobRecord):
 
 
 class Answer(JobRecord):
-    """How the ground truth came about.
+    """How the ground truth was made.
 
     Attributes:
         T_scan_ct: from sphere to sphere; the CT was moved by it.

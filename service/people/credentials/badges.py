@@ -41,7 +41,7 @@ class Badges:
         self._set(by, account, self._passwords.hash(plain), "enrolled")
 
     def revoke(self, by: Person, account: str, reason: str) -> None:
-        """Revoke an account's badge, which then signs nothing any more. Raises AccountError."""
+        """Revoke an account's badge, so that it can no longer sign. Raises AccountError."""
         self._set(by, account, "", "revoked", require_reason(reason))
 
     def _others(self, account: str) -> list[str]:

@@ -12,7 +12,7 @@ from service.steps.context import StepContext
 from service.steps.notes import SPOILT, images_to_repeat
 
 CLEAN: list[dict[str, str]] = [{"action": "clean_lens"}]  # for the simulated technician
-IN_A_ROW = 3  # so many spoilt images have a common cause
+IN_A_ROW = 3  # consecutive spoilt images: beyond chance, so they have a common cause
 _MOST_STOPS = 2  # of one step; after that, only the gates judge the images
 _FACTOR = 1.6  # of the edge width in the sharpest image of the step
 _WIDEST_PX, _WIDEST_SHARE = 7.0, 0.002  # the largest limit on an edge width, in px and as a share of the image width

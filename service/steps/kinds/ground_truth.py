@@ -32,7 +32,7 @@ _Mm = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class WoundRegion(Record):
-    """A part of space in which one source counts, whatever is proposed: a polygon seen from one side, or a box."""
+    """A part of space whose source a person chooses, against the proposal: an extruded polygon or a box."""
 
     source: Literal["ct", "scan"] = "ct"  # what counts there
     frame: fuse.Frame = "world"  # of the positions; world: the base of the first station
@@ -102,7 +102,7 @@ class Measures(MeasureRecord):
 
 
 class Result(Record):
-    """How the ground truth came about, as the job says it; without a CT there is none, and the scan stands alone."""
+    """How the ground truth was made, as the job reports it. Without a CT nothing is fused: the scan is the truth."""
 
     without: str = ""  # the skipped step that it would need
     registration: str = ""  # name of the registration that closed the loop

@@ -171,7 +171,7 @@ def _ask_for_photograph(context: StepContext, taken: int, *, unseen: bool) -> No
 
 
 def _move_hand(move: layout.SphereMove) -> dict[str, object]:
-    """For the simulated technician, who is told the sphere's place in the photograph, as a person is."""
+    """Tell the simulated technician where in the photograph the sphere is, as the screen tells a person."""
     return {
         "action": "move_sphere",
         "from": list(move.old_place),

@@ -254,7 +254,7 @@ class _Plan:
 
 
 def _copied(arguments: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    """Those of the recorded arguments that exist; references stay references."""
+    """Copy those of the recorded arguments that exist; references are not resolved."""
     return {name: arguments[name] for name in names if name in arguments}
 
 

@@ -113,7 +113,7 @@ class _Work(JobRecord):
 
 
 class _Search(_Work):
-    """The same for a job that searches whole images."""
+    """Work whose duration depends on the size of the images, because they are searched as a whole."""
 
     camera: Camera | None = None
     reduced_to: tuple[int, int] | None = None

@@ -40,7 +40,7 @@ _NUMBERS = ("user_version", "application_id")  # numbers in the database's heade
 
 
 def schema_faults(connection: Connection) -> Iterator[Fault]:
-    """Tables, indexes and triggers that differ from those of this software; a changed trigger may protect nothing."""
+    """Tables, indexes and triggers that differ from those of this software. A changed trigger may protect nothing."""
     for name in _NUMBERS:
         number = connection.execute(text(f"PRAGMA {name}")).scalar_one()
         if number != 0:

@@ -73,7 +73,8 @@ def _compared(connection: Connection, private: sqlite3.Connection) -> tuple[list
     if not _same(*(private.execute(f"SELECT term, doc, col, offset FROM {name}_places") for name in _BOTH)):
         wrong = [int(row[0]) for row in private.execute(_OTHER.format(*_BOTH))]
         return wrong, f"{_DAMAGED}: it does not hold the words of the events"
-    # Correct contents do not prove that a search works, which goes by the first words of the pages: try every word.
+    # A correct list of words does not prove that searching works: a search descends by the first words of the index's
+    # pages, which may be damaged. So search for every word.
     for (term,) in private.execute("SELECT term FROM words"):
         asked = (f"SELECT count(*) FROM {name} WHERE {name} MATCH ?" for name in _BOTH)
         found, awaited = (private.execute(ask, (f'"{term}"',)).fetchone()[0] for ask in asked)

@@ -40,7 +40,7 @@ _CONTENTS = text(
 
 
 def protocol_identity(store: Store, run_id: str, protocol: str, version: str) -> ProtocolIdentity:
-    """Read from the first events of all runs and from the site's chain."""
+    """Look up the contents that runs used under this protocol's name, and who approved each of them."""
     known = approvals(store, protocol, version)
     with store.database.reading() as connection:
         rows = connection.execute(_CONTENTS, {"site": SITE, "protocol": protocol, "version": version})

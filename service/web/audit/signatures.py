@@ -20,7 +20,7 @@ _READ = [Depends(requires("read"))]
     "/audit/runs/{run_id}/signatures", name="audit_signatures", dependencies=_READ, response_class=HTMLResponse
 )
 def signatures_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
-    """Who signed what, and whether it still stands."""
+    """Show who signed what, and whether the signature is still valid."""
     frame = audit_frame(audit, run_id, "/signatures")
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)

@@ -183,7 +183,7 @@ def recorded_file(site: Site, run_id: str, sha256: str) -> ArtefactRef:
 
 
 def mark_source(log: RunRecord, capture: Capture) -> str:
-    """The version of what would be drawn over an image; it changes when better outlines are known. "" for nothing."""
+    """A key of what would be drawn over an image, which changes when better outlines are known; "" for nothing."""
     from service.web.record.outlines import outlines_of  # noqa: PLC0415 - the matching of spheres, not needed to start
 
     found = outlines_of(log, capture)

@@ -1,4 +1,4 @@
-"""What the capture page shows, read from a run: its viewpoints and how each stands, and what is known of an image."""
+"""What the capture page shows, read from a run: the state of each viewpoint, and what is known of an image."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """One thing to know of an image: word, figures, and the guide or limit that it was held against."""
+    """One judgement of an image: word, figures, and the guide value or limit that it was compared with."""
 
     name: str
     passed: bool | None  # None: not known
@@ -170,7 +170,7 @@ def _refused(state: StepState) -> dict[str, str]:
 
 
 def _place(log: RunRecord, capture: Capture) -> tuple[Vector, Vector] | tuple[None, None]:
-    """Where a camera stood that no plan names, by the drawing of its mount."""
+    """Compute the camera position of an image that no plan lists, from the nominal T_flange_camera."""
     mount = nominal_T_flange_camera(log)
     if mount is None or not isinstance(capture.payload, ViewpointCaptured):
         return None, None
@@ -307,7 +307,7 @@ def redo_of(log: RunRecord, step: Step, view: View, account: str) -> Redo:
 
 
 def suggestions_of(log: RunRecord, step: Step) -> tuple[str, tuple[live_summary.Suggestion, ...]]:
-    """What the step's images lack, in words, and the views that would help most; "" and none if they lack nothing."""
+    """Say what the step's images lack and which views would help most; empty if they lack nothing."""
     state = log.state.steps[step.id]
     notes = suggested_views(state)
     if notes:

@@ -33,7 +33,7 @@ class Previews:
         return found
 
     def making(self, run_id: str) -> ChildState | None:
-        """How the making stands, or how it ended; None before the first."""
+        """The progress or the outcome of making the preview; None before the first time."""
         return self._children.state(run_id)
 
     def make(self, state: RunState) -> None:

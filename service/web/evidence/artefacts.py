@@ -46,7 +46,7 @@ def artefacts_page(
     "/audit/runs/{run_id}/artefacts/{sha256}", name="audit_artefact", dependencies=_READ, response_class=HTMLResponse
 )
 def artefact_page(request: Request, audit: CurrentAudit, run_id: str, sha256: str) -> Response:
-    """One file: what it is, where it came from, what was made of it."""
+    """Show one file: what it is, where it came from, and what was made from it."""
     frame = audit_frame(audit, run_id, "/artefacts")
     with audit.site.store.database.reading() as connection:
         found = origin(connection, run_id, sha256)
@@ -57,7 +57,7 @@ def artefact_page(request: Request, audit: CurrentAudit, run_id: str, sha256: st
     "/audit/runs/{run_id}/provenance", name="audit_provenance", dependencies=_READ, response_class=HTMLResponse
 )
 def provenance_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
-    """What came from what."""
+    """Show the provenance graph of a run."""
     frame = audit_frame(audit, run_id, "/provenance")
     graph = audit.graphs.get(run_id)
     known = None if isinstance(graph, Progress) else graph

@@ -64,7 +64,7 @@ class JudgedImage:
 
 @dataclass(frozen=True, slots=True)
 class HandheldView:
-    """One step of this kind as it stands."""
+    """The present state of a hand-held capture step."""
 
     step: Step
     running: bool
@@ -95,7 +95,7 @@ def step_to_show(log: RunRecord, wanted: str) -> Step | None:
 
 
 def held_now(log: RunRecord, step: Step) -> HandheldView:
-    """All of it, from the record alone."""
+    """Collect the state of the step from the record."""
     state = log.state.steps[step.id]
     jobs = {image_of(j).sha256: j for j in state.jobs.values() if j.kind in _KINDS}
     done = sorted((j for j in jobs.values() if j.status == "finished"), key=lambda j: j.enqueued_seq)
@@ -164,7 +164,7 @@ def _spots(places: Sequence[hand_view.ShownPlace], target: str) -> tuple[PlanMar
 
 
 def _spot(name: str, state: SpotState, T_level_camera: Matrix, lowest: float) -> PlanMarker:
-    """From above, the side of the person at the bottom."""
+    """Project a place onto the drawing: seen from above, with the person's side at the bottom."""
     x, y = T_level_camera[0][3], T_level_camera[1][3]
     scale = _REACH / lowest
     return PlanMarker(name, state, round(SIZE / 2 + scale * x, 1), round(SIZE / 2 - scale * y, 1))

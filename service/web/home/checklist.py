@@ -24,7 +24,7 @@ router = APIRouter(tags=["checklist"])
 def protocol_checklist(
     request: Request, site: CurrentSite, file: Annotated[str, Path(max_length=200)]
 ) -> HTMLResponse:
-    """Of a protocol that can be started. Raises ConfigurationError for any other file."""
+    """Show the checklist of a protocol that can be started. Raises ConfigurationError for any other file."""
     known = {path.name: path for path in site.protocol_files()}
     if file not in known:
         raise ConfigurationError(f"there is no protocol file {file!r}", where="protocols", remedy="Go to the runs")
@@ -34,7 +34,7 @@ def protocol_checklist(
 
 @router.get("/runs/{run_id}/checklist", name="run_checklist", dependencies=[Depends(requires("read"))])
 def run_checklist(request: Request, site: CurrentSite, run_id: Annotated[str, Path(max_length=64)]) -> HTMLResponse:
-    """Of the protocol that a run began with."""
+    """Show the checklist of the protocol that a run began with."""
     log = site.run(run_id)
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # checked when the run was read

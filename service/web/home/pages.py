@@ -117,7 +117,7 @@ def home(
 
 @router.get("/robots", name="robots", dependencies=[Depends(requires("read"))])
 def robots(request: Request, site: CurrentSite, but: Annotated[str, Query(max_length=64)] = "") -> HTMLResponse:
-    """How the robots stand that are driven now, for the script that keeps every page up to date."""
+    """The state of all robots that are being driven, for the script that keeps every page up to date."""
     return render(request, "page/robots.html.j2", others=driven_frames(site, but=but))
 
 
@@ -187,7 +187,7 @@ def _line(site: Site, row: RunRow) -> RunLine:
 
 
 def _standing(protocol: Protocol, state: RunState, *, driven: bool) -> tuple[tuple[str, str], str]:
-    """How a run that has not ended stands: word and tone; and why, where it is stopped."""
+    """The state of a run that has not ended, as a word and its tone; and the reason if it is stopped."""
     if not driven:
         return ("Stopped", "stop"), "the program that drives it does not run → open it and go on"
     if state.paused:
@@ -201,7 +201,7 @@ def _standing(protocol: Protocol, state: RunState, *, driven: bool) -> tuple[tup
 
 
 def startable_of(name: str, site: Site) -> StartableProtocol:
-    """A protocol file, and how it stands on the site."""
+    """Load a protocol file, and look up whether it is approved on this site and whether the disk has space for it."""
     try:
         loaded = load_protocol(site.protocols / name, params_models())
         space = forecast_of(site.store, loaded.protocol, simulated=site.rig.section.simulated)

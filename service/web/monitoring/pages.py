@@ -1,4 +1,4 @@
-"""For machines that watch this one: `/health` for everybody, `/metrics` for this machine and for readers."""
+"""Monitoring endpoints: `/health` for everybody, `/metrics` for this machine and for accounts that may read."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ def dots(
     limit: float | None = None,
     limit_text: str = "",
 ) -> Dots:
-    """One mark for each name and series. A limit far above all values is told, not drawn."""
+    """A dot plot with one mark for each name and series. A limit far above all values is stated, not drawn."""
     height = 300.0
     inner = height - _TOP - _BOTTOM
     known = [v for _, values in series for v in values if v is not None]

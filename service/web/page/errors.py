@@ -1,4 +1,4 @@
-"""Errors as people see them: what happened, where, what to do, whether the data is safe; nothing of the inside."""
+"""Errors as people see them: what happened, where, what to do, and whether the data is safe; no internals."""
 
 from __future__ import annotations
 

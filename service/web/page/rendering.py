@@ -66,7 +66,7 @@ def kept_in_a_row(rows: Sequence[EventRow], start: int) -> int:
 
 
 def entered_of(root: EventRow) -> list[tuple[str, str]]:
-    """What was entered of a run when it began, from its first event as it is in the database."""
+    """What was entered when a run began, read from its first event in the database."""
     try:
         return about_rows(RunAbout.model_validate(root.payload.get("about") or {}))
     except ValidationError:  # altered: the verification says so

@@ -1,4 +1,4 @@
-"""What stands around every page of a run: its name, its navigation, the robot banner."""
+"""The frame of every page of a run: its name, its navigation, the robot banner."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _AT_THE_ROBOT = "This software cannot clear a stop; a person does it at the robo
 
 @dataclass(frozen=True, slots=True)
 class Banner:
-    """How the robot stands, in words."""
+    """The state of the robot, in words."""
 
     key: str  # moving, standing, paused, pausing, protective_stop …
     tone: Tone
@@ -101,7 +101,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
 def _attention(  # noqa: PLR0911 - one return a case
     protocol: Protocol, state: RunState, snapshot: Snapshot, *, driven: bool
 ) -> Attention:
-    """How a run stands, for people who look elsewhere; from the record, so that a dead program is told as well."""
+    """The state of a run for alerts on other pages. It is read from the record, so a dead runner is reported too."""
     if state.terminal:
         return Attention("ended", f"The run is {state.status}.")
     if not driven:
@@ -195,9 +195,9 @@ def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner
 
 
 def busy_words(snapshot: Snapshot) -> str:
-    """What the program is in the midst of, and for how long; "" where it is quickly done.
+    """What the program is doing, and for how long; "" if it does not take long.
 
-    A call of which nothing was said is told by the work that it belongs to: a program that hangs is seen to hang.
+    A call without a description of its own is described by the work it belongs to, so that a hang is visible.
     """
     if snapshot.lasting:
         return f"{snapshot.activity}, for {snapshot.activity_s:.0f} s"

@@ -39,7 +39,7 @@ def limit(minimum: float | None, maximum: float | None, unit: str = "") -> str:
 
 
 def sentence(text: str) -> str:
-    """With a capital letter and a full stop."""
+    """Begin with a capital letter and end with a full stop."""
     text = text.strip()
     return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
 
@@ -68,7 +68,7 @@ def will_happen(step: Step, now: StepState) -> tuple[str, str]:
 
 
 def irreversible_warning(protocol: Protocol, step: Step) -> str:
-    """In plain words what cannot be undone after this step."""
+    """Say in plain words what cannot be undone after this step."""
     before = [s.title for s in protocol.steps[: protocol.index(step.id)] if s.photographs_specimen]
     words = step.cannot_be_undone or "This step changes the scene for good."
     tail = f" None of these can be done again: {', '.join(before)}." if before else ""
@@ -123,7 +123,7 @@ _STANDINGS: dict[Standing, tuple[str, str]] = {
 
 
 def gate_word(verdict: GateVerdict, *, accepted: bool = False) -> tuple[str, str]:
-    """How a gate came out: word and tone. `accepted`: a person let the step pass with its figures as they are."""
+    """The outcome of a gate as a word and its tone. `accepted`: a person accepted the figures outside the limits."""
     return _STANDINGS[standing(verdict, accepted=accepted)]
 
 

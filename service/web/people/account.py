@@ -76,7 +76,7 @@ def sign_in(
     password: Secret,
     next_page: Annotated[str, Form(alias="next", max_length=500)] = "/",
 ) -> Response:
-    """Sign in; the browser gets a new token, whatever it had before."""
+    """Sign in. The browser always gets a new token."""
     limiter, address = _limiter(request), _address(request)
     limiter.require(address)
     try:

@@ -55,7 +55,7 @@ def invite(
 
 @router.get("/accounts/{account}", name="account", dependencies=_ADMINISTER, response_class=HTMLResponse)
 def account_page(request: Request, site: CurrentSite, account: AccountName) -> HTMLResponse:
-    """One account and what can be changed of it."""
+    """Show an account and what can be changed about it."""
     return _one(request, site, account)
 
 
@@ -92,7 +92,7 @@ def change_role(
 def disable(
     request: Request, site: CurrentSite, person: SignedInPerson, account: AccountName, reason: Reason
 ) -> Response:
-    """Shut an account out."""
+    """Disable an account."""
     try:
         site.people.accounts.disable(person, account, reason)
     except AccountError as error:

@@ -32,7 +32,7 @@ def badges(request: Request, site: CurrentSite) -> HTMLResponse:
 def enrol(
     request: Request, site: CurrentSite, person: SignedInPerson, account: AccountName, password: Secret, badge: Secret
 ) -> Response:
-    """Give an account a badge; its owner stands there and types the account's password."""
+    """Give an account a badge. Its owner must be present, to type the account's password."""
     try:
         site.people.badges.enrol(person, account, password, badge)
     except (AccountError, SignInRefusedError) as error:
@@ -59,7 +59,7 @@ def revoke(
     response_class=RedirectResponse,
 )
 def report_lost(site: CurrentSite, person: SignedInPerson) -> Response:
-    """One's own badge is lost: it signs nothing from now on."""
+    """Report one's own badge lost; it can no longer sign."""
     site.people.badges.revoke(person, person.account, "reported lost by its owner")
     return RedirectResponse("/account?done=badge", status_code=303)
 

@@ -79,7 +79,7 @@ def board_use(state: StepState, view: View) -> BoardUse:
 
 
 def unused_count(run: RunState, events: Sequence[Event], step: str) -> int:
-    """How many valid board images of a step are known not to be used."""
+    """Count the valid board images of a step that are known not to be used."""
     return sum(use.used is False for use in board_uses(run, events, step).values())
 
 

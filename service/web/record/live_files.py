@@ -25,7 +25,7 @@ class LivePose(BaseModel):
 
 
 class LiveOutlines(LivePose):
-    """The same with the outlines of the spheres that the job found in the image."""
+    """Add the outlines of the spheres that the job found in the image."""
 
     outlines: tuple[OutlineRecord, ...]
 

@@ -45,10 +45,10 @@ def notes_of(events: Iterable[Event], step: str = "") -> tuple[Note, ...]:
 
 @router.post("/runs/{run_id}/notes", name="take_note", dependencies=[Depends(requires("operate"))])
 async def take(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId) -> RedirectResponse:
-    """Record a note. It needs no control of the run: whoever works at it may write something down.
+    """Record a note. This does not need control of the run: anybody who works on it may write one.
 
-    The form is read here, after the guard, and not as parameters of the route, which would be read before it: nobody
-    who is not signed in fills the disk with photographs.
+    The form is read here, after the guard. As parameters of the route it would be read before the guard, and clients
+    that are not signed in could fill the disk with photographs.
     """
     async with request.form() as form:
         text, step = (value if isinstance(value := form.get(name), str) else "" for name in ("text", "step"))

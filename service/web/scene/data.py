@@ -1,4 +1,4 @@
-"""The scene of a run as far as it is known: registered, provisionally placed during the capture, or planned."""
+"""The scene of a run as far as it is known: registered, provisionally registered during the capture, or planned."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def _bases(log: RunRecord, record: Registration) -> tuple[dict[str, Transform], 
 
 
 def _live(log: RunRecord) -> KnownScene | None:
-    """In the frame of the CT, by the newest provisional registration of each station; None while there is none."""
+    """The scene in the CT frame, by the newest provisional registration of each station; None while there is none."""
     records: dict[str, LivePose] = {}
     for step in log.protocol.steps:
         for capture in captures_of(log, step.id):

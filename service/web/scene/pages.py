@@ -19,7 +19,8 @@ router = APIRouter(tags=["scene"])
 
 RunId = Annotated[str, Path(max_length=64)]
 Theme = Annotated[Literal["auto", "light", "dark"], Query()]
-# For documents in a sandboxed frame: an origin of its own, no cookie, no way out. plotly compiles its shaders' glue.
+# For documents in a sandboxed frame, which has its own origin, gets no cookies and loads nothing from elsewhere.
+# plotly compiles JavaScript at run time for its shaders, hence 'unsafe-eval'.
 FRAME_HEADERS = {
     "Content-Security-Policy": "; ".join(
         (

@@ -122,7 +122,7 @@ def _require_own_form(request: Request, form: FormData, person: Person) -> None:
 
 
 def _keep_connection(request: Request) -> None:
-    """From now on this connection is not dropped to make room for strangers."""
+    """Protect this connection, now signed in, from being dropped in favour of clients that are not."""
     connection = getattr(request.state, "connection", None)  # none where no `Reception` stands before the application
     if isinstance(connection, Connection):
         connection.known = True

@@ -19,7 +19,7 @@ Peer = tuple[str, int]  # address and port, as the kernel writes them
 
 @dataclass(frozen=True, slots=True)
 class ConnectionLimits:
-    """What one server bears."""
+    """Limits on the connections of one server."""
 
     in_all: int = 400
     per_address: int = 64  # a browser opens six
@@ -111,7 +111,7 @@ class Connections:
 
     @contextmanager
     def answered(self, connection: Connection) -> Generator[None]:
-        """While a request is answered its connection waits for nothing."""
+        """Suspend the time-out of a connection while its request is being answered."""
         connection.answering += 1
         connection.stop_waiting()
         try:

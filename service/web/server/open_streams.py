@@ -1,4 +1,4 @@
-"""How many streams of news are open: a new one is always let in, and the oldest of the same sign-in ends for it."""
+"""Limits open event streams: a new one is always accepted, and the oldest of the same sign-in is closed for it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 @dataclass(eq=False, slots=True)
 class OpenStream:
-    """One page that listens."""
+    """The event stream of one page."""
 
     screen: str
     replaced: bool = False  # it is to say so and to end

@@ -67,7 +67,7 @@ def read_corners(record: job.Corners) -> BoardImage:
 def boards_of(
     context: JobContext[calibrate_job.Arguments], board: Board
 ) -> tuple[tuple[BoardImage, ...], dict[int, int]]:
-    """The board in every image of a `calibrate` job; and for images that show a part of it, the number of corners.
+    """Find the board in every image of a `calibrate` job, and count the corners in images that show a part of it.
 
     Images that `board_view` has searched are not searched again. Parts of the board are used if camera, mount and
     board are known well enough (`known`).

@@ -108,7 +108,7 @@ def _result(guide: Guide, why: str) -> job.Answer:
 
 
 def _refined(answer: job.Answer, guide: Guide, used: Sequence[HandheldImage]) -> job.Answer:
-    """With the spheres and all camera poses, which the images themselves determine."""
+    """Add the spheres and all camera poses, as estimated from the images, to the answer."""
     poses = {v.viewpoint: v.T_scene_camera for v in [*used, guide.new] if v.T_scene_camera is not None}
     spheres_m: tuple[Point, ...] = tuple((float(x), float(y), float(z)) for x, y, z in guide.scene.spheres_m)
     return answer.model_copy(update={"spheres_m": spheres_m, "T_scene_cameras": matrices(poses)})

@@ -83,7 +83,7 @@ class Guide:
         return words(here, target.T_level_camera) or "stay there and take it again", target
 
     def _lost(self) -> int:
-        """How many of the last images before this one do not show where the camera was."""
+        """Count the consecutive images just before this one from which no camera pose could be found."""
         lost = 0
         for view in reversed(self.earlier):
             if view.T_scene_camera is not None:

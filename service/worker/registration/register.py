@@ -122,7 +122,7 @@ def _posed_images(context: JobContext[job.Arguments]) -> _PosedImages:
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """Where the scan and the cameras are.
+    """The estimated poses of the scan and the cameras.
 
     Attributes:
         T_world_scan: the registration.
@@ -178,7 +178,7 @@ def _placed(context: JobContext[job.Arguments], images: _PosedImages, answer: Re
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """Where scan and cameras are, and how well that is known."""
+    """The poses of the scan and the cameras, with their uncertainty."""
 
     placed: _Placed
     components: Mapping[str, Array]

@@ -70,7 +70,7 @@ def layout(context: JobContext[job.Arguments]) -> JobAnswer:
 def _look(
     photographs: Sequence[NDArray[np.uint8]], focal_mm: Sequence[float], sensor_width_mm: float, expected: int | None
 ) -> tuple[list[tuple[CameraModel, Sequence[SphereOutline]]], NDArray[np.uint8]]:
-    """Nominal camera and outlines of each photograph, and the copy of the last photograph that was searched.
+    """Find the outlines in each photograph. Returns them with nominal cameras, and the searched copy of the last one.
 
     All copies have the same width, because the photographs are adjusted together: the largest at which all spheres
     are found, or otherwise the one at which most are.

@@ -64,7 +64,7 @@ def _devices(run: RecordedRun, known: CameraBodies) -> Table:
 
 
 def _stillness(captures: list[ViewpointCaptured]) -> str:
-    """How far the robot's clock drifted over the captures, and how still the flange stood."""
+    """The drift of the robot's clock over the captures, and the motion of the flange during exposures."""
     offsets = np.array([capture.clock_offset_s for capture in captures])
     sigma_m = max(capture.pose_sigma_m for capture in captures)
     return (

@@ -226,7 +226,7 @@ def _nearer_end(T_base_board: Transform, seen: Transform, board: Board) -> Trans
 def _same_way(
     T_camera_board: Transform, T_base_camera: Transform, T_base_board: Transform, turned: Transform
 ) -> Array:
-    """For a board that looks the same after half a turn: the orientation that agrees with the other views."""
+    """Choose the orientation that agrees with the other views, for a board that looks the same after half a turn."""
     expected = (inverse(T_base_camera) @ T_base_board)[:3, :3]
     ways = (T_camera_board, T_camera_board @ turned)
     return min(ways, key=lambda T: float(np.linalg.norm(T[:3, :3] - expected)))

@@ -1,4 +1,4 @@
-"""From where a board is to be photographed."""
+"""The range of viewing directions and distances from which a board is to be photographed."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def observability(hands: Array) -> tuple[float, float, float]:
 
 
 def untwist(hands: Array, boards: Array, T_board_turned: Transform) -> tuple[Array, NDArray[np.bool_]]:
-    """Turn back the views whose board was numbered from its other end, so that all agree with the robot.
+    """Correct the views whose board corners were numbered from the other end, so that all views agree with the robot.
 
     Between two views, flange and camera must rotate by the same angle. Which orientation fits each pair better gives
     a signed graph; its leading eigenvector splits the views into two groups, and the larger one is kept as it is.

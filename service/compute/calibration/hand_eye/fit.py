@@ -102,7 +102,7 @@ class HandEyeMeasurements:
     arm: ArmModel | None
 
     def take(self, which: NDArray[np.bool_]) -> HandEyeMeasurements:
-        """Only these views."""
+        """Select these views."""
         return HandEyeMeasurements(
             self.hands[which],
             self.boards[which],

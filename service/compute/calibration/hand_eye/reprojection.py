@@ -36,7 +36,7 @@ class BoardCorners:
             raise DataError(f"{self.corners_px.shape} corners for a board of {len(self.points_m)} points")
 
     def take(self, which: NDArray[np.bool_]) -> BoardCorners:
-        """Only these views."""
+        """Select these views."""
         return BoardCorners(self.points_m, self.corners_px[which], self.camera)
 
 

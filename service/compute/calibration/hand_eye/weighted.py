@@ -53,7 +53,7 @@ class Views:
     kind: NDArray[np.int64]
 
     def take(self, which: NDArray[np.bool_]) -> Views:
-        """Only these views."""
+        """Select these views."""
         return Views(
             self.T_base_flange[which],
             self.T_camera_board[which],

@@ -109,7 +109,7 @@ def heat_picture(
 
 
 def heat_row(panels: Sequence[Panel], gt: Surface, gt_points_m: Array, panel_px: int) -> Pixels:
-    """(H, W, 3) picture, blue first: surfaces beside one another, without the scale of colours.
+    """Render surfaces beside one another, without the colour bar, as a BGR picture (H, W, 3).
 
     All are seen along the direction in which the truth is seen best, and cut at its rim.
 

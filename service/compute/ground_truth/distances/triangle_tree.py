@@ -41,7 +41,7 @@ class TriangleTree:
             self._levels.append((low, high))
 
     def nearest(self, queries_m: Array, bounds_m: Array | None = None) -> OnSurface:
-        """The nearest place of the surface to each query (Q, 3).
+        """Find the point of the surface nearest to each query (Q, 3).
 
         Args:
             queries_m: (Q, 3).
@@ -83,7 +83,7 @@ class TriangleTree:
         return query, node
 
     def _closest(self, queries: Array, query: IntArray, leaf: IntArray) -> tuple[Array, Array, IntArray]:
-        """Of the faces in these leaves, the nearest to each query: distance, place and face."""
+        """Find the face of these leaves that is nearest to each query. Returns distance, nearest point and face."""
         distance = np.full(len(queries), np.inf)
         place, face = np.empty((len(queries), 3)), np.zeros(len(queries), dtype=np.int64)
         step = _PAIRS // _LEAF

@@ -207,7 +207,7 @@ class _Addition:
 
 
 def _with_scan_only(fused: Fused, carrier: Surface, addition: _Addition) -> Fused:
-    """With the faces of the scan that the CT lacks, as parts of their own."""
+    """Add the faces of the scan that the CT lacks, as separate parts."""
     scan, settings = addition.scan, addition.settings
     extra, _ = compact(scan.vertices_m, scan.faces[addition.taken(carrier)])
     n = len(extra.vertices_m)

@@ -20,7 +20,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class OverlapLimits:
-    """When the scan stands for the CT's surface; metres.
+    """Conditions under which the scan replaces the CT's surface, in metres.
 
     Attributes:
         distance_m: largest distance between the two; beyond, they show different surfaces.
@@ -74,7 +74,7 @@ def overlap(ct: Surface, scan: Surface, limits: OverlapLimits | None = None) -> 
 
 
 def _on_faces_around(surface: Surface, vertex: IntArray, points: Array) -> tuple[Array, IntArray]:
-    """Of the faces around a vertex (N,), the place nearest to a point (N, 3), and that face (N,).
+    """Find, among the faces around a vertex (N,), the place nearest to a point (N, 3), and the face (N,) that has it.
 
     With the vertex nearest to the point, that is nearly always the nearest place of the whole surface.
     """

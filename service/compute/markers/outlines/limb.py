@@ -320,7 +320,7 @@ class _Shown:
 
 
 def _shown(p: Array, blur: Array, model: _Model) -> _Shown:
-    """Light of sphere and surroundings, blurred by lens and pixel, then coded."""
+    """Predict grey values: the light of sphere and surroundings, blurred by lens and pixel, then gamma-encoded."""
     s = blur.astype(np.float32)[:, None, None]
     R = model.radius.astype(np.float32)[:, None, None]
     q = p.astype(np.float32)

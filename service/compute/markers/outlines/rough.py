@@ -1,4 +1,4 @@
-"""One disc in the reduced image: its rough outline, a larger one around it, and whether it can be a sphere."""
+"""One disc in the reduced image: its rough outline, a search for a larger one around it, and a test for a sphere."""
 
 from __future__ import annotations
 

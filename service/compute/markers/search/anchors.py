@@ -137,7 +137,10 @@ def _look_reduced(path: Path, camera: CameraModel, options: DetectionOptions) ->
 
 
 def spread_views(poses: Array, members: NDArray[np.int64], count: int) -> list[int]:
-    """`count` of the images `members`, spread over their poses: a central one, then always the farthest."""
+    """Choose up to `count` of the images `members` with widely spread poses, by farthest-point sampling.
+
+    The first is the one nearest to the median pose.
+    """
     place = poses[members, :3, 3]
     spread = float(np.median(np.linalg.norm(place - np.median(place, axis=0), axis=1)))
     views = np.hstack([place / max(spread, 1e-12), poses[members, :3, 2]])
@@ -151,7 +154,7 @@ def spread_views(poses: Array, members: NDArray[np.int64], count: int) -> list[i
 def _pose_error(
     outlines: Sequence[SphereOutline], assignment: Assignment, T: Array, spheres: Array, radius_m: float
 ) -> float:
-    """How far (in radii) the best pose from this image alone moves the spheres: the error of its given pose."""
+    """Estimate a given pose's error: how far (in radii) the best pose from this image alone moves the spheres."""
     index = list(assignment.markers.items())
     if len(index) < 4:
         return 0.0

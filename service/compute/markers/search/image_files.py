@@ -68,7 +68,7 @@ class LocatedOutlines:
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """One image file and the prediction for it; None: it is searched whole."""
+    """One image file and the prediction for it. Without a prediction (None), the whole image is searched."""
 
     path: Path
     expected: Prediction | None = None

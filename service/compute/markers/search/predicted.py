@@ -1,4 +1,4 @@
-"""Finds predicted spheres in one image by searching only their regions; nothing is forced to be found."""
+"""Finds predicted spheres in one image by searching only their regions; a sphere that is not visible is not found."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def find_spheres(
     expected: Prediction | None,
     options: DetectionOptions = DEFAULTS,
 ) -> ImageOutlines:
-    """Outlines in an image (H, W, 3) of the camera's size: where they are predicted, or by a search of all of it.
+    """Find outlines in an image (H, W, 3) of the camera's size: where they are predicted, or else in the whole image.
 
     The search of a capture under way and that of a registration are this one.
 

@@ -22,7 +22,7 @@ Floats = NDArray[np.float32]
 
 
 class Tensor(Interface):
-    """A tensor, as far as it is used here."""
+    """The part of torch.Tensor that is used here."""
 
     def numpy(self) -> NDArray[np.generic]:
         """Its values."""
@@ -42,14 +42,14 @@ class LoadReport(Interface):
 
 
 class Network(Interface):
-    """A module, as far as it is used here."""
+    """The part of torch.nn.Module that is used here."""
 
     def load_state_dict(self, state_dict: Weights, strict: bool) -> LoadReport:
         """Set the weights."""
         ...
 
     def named_parameters(self) -> Iterable[tuple[str, object]]:
-        """Names and values of what is learned."""
+        """Names and values of the learned parameters."""
         ...
 
     def eval(self) -> object:

@@ -44,7 +44,7 @@ class Covisibility:
 
 
 def points_seen(points_m: Array, view: View) -> NDArray[np.bool_]:
-    """(P,) points of the surface (P, 3) that a view shows: nothing is in front of them, and no marker covers them."""
+    """Mask (P,) of the surface points (P, 3) that a view shows: neither occluded nor covered by a marker."""
     return look_up(points_m, view)[1] == VISIBLE
 
 

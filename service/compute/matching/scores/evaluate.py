@@ -59,7 +59,7 @@ class PairScore:
 
 
 def chosen_pairs(pairs: Sequence[Pair], per_class: int) -> list[Pair]:
-    """At most so many pairs of each class, evenly from the list; 0: all. The same for every method."""
+    """Choose up to `per_class` pairs of each class (0: all), evenly from the list, so every method gets the same."""
     chosen: list[Pair] = []
     for name in CLASSES:
         same = [pair for pair in pairs if pair["difficulty"] == name]

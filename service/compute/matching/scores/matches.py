@@ -12,7 +12,7 @@ PRECISION_PX = (0.5, 1.0, 2.0, 3.0, 5.0, 10.0)  # at which precision is measured
 
 
 def match_errors_px(matches: Matches, first: View, second: View) -> Array:
-    """(M,) distance of each match in the second image from the place that corresponds to its pixel in the first.
+    """Errors (M,): distance of each match in the second image from the true correspondence of its pixel in the first.
 
     Infinite where the second image does not show the point, so that there is nothing to match. NaN without ground
     truth, such as beside the specimen or on a marker: such matches are not scored.

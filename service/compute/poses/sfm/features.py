@@ -153,7 +153,7 @@ def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> ND
 
 
 def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """For each descriptor of a, the nearest of b, and whether it is near and clearly nearer than the second."""
+    """Find the nearest descriptor of b for each of a, and whether it passes the limits on distance and ratio."""
     index = np.empty(len(a), dtype=np.int64)
     clear = np.empty(len(a), dtype=np.bool_)
     turned = np.ascontiguousarray(b.T)

@@ -72,7 +72,7 @@ def build_tracks(
 
 
 def thinned(sightings: Sightings, pixels: Array, share: int, pair_share: int, size: tuple[int, int]) -> Index:
-    """Numbers of the tracks that a mapper needs: the longest of each image and each pair, well spread.
+    """Select the tracks that a mapper needs: the longest ones of each image and pair, spread over the images.
 
     Args:
         sightings: all tracks.

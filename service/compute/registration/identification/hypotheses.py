@@ -84,7 +84,7 @@ def image_hypotheses(
 
 
 def rivals(readings: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Of assignments, best first: the best and those that contradict it and are not much less likely."""
+    """From assignments sorted best first, select the best and those that contradict it and are nearly as likely."""
     if not readings:
         return []
     best = readings[0]

@@ -50,7 +50,10 @@ def sightings(outlines: Sequence[SphereOutline], radius_m: float, camera: Camera
 
 
 def match(seen: Sightings, centres_camera_m: Array, radius_m: float, gate: Gate) -> list[tuple[int, int, float]]:
-    """Mutually nearest (detection, marker, angle in radians) within the gate; centres (M, 3) in the camera frame."""
+    """Pair detections with markers that are mutually nearest and within the gate.
+
+    The markers' centres (M, 3) are in the camera frame. Returns (detection, marker, angle in radians) of each pair.
+    """
     if len(seen.cones) == 0:
         return []
     distance = np.linalg.norm(centres_camera_m, axis=1)

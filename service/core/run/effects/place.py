@@ -1,4 +1,4 @@
-"""Whether an event has an effect where it stands in the chain: it may have been overtaken, or be impossible there."""
+"""Decides whether an event takes effect at its place in the chain, or was overtaken by another, or is impossible."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def triggered(protocol: Protocol, state: RunState, event: Event, trigger: str, *
 
 
 def without_effect(state: RunState, event: Event) -> RunState:
-    """The event stays in the evidence without effect."""
+    """Note that an event has no effect on the state; it stays in the evidence."""
     return replace(state, overtaken=(*state.overtaken, event.seq))
 
 
