@@ -52,7 +52,7 @@ def first_gaussians(torch: Any, points_m: Array) -> Any:
 
 
 class Splatting:
-    """Gaussians that are trained on posed images."""
+    """3D Gaussians, trained on posed images."""
 
     def __init__(self, views: Sequence[StereoView], points_m: Array) -> None:
         """Take the views, and points (N, 3) to begin with."""

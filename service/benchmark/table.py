@@ -14,7 +14,7 @@ _NONE = "–"
 
 
 def table_record(results: Sequence[Result], known: Mapping[str, Method]) -> dict[str, Any]:
-    """Every result, and for each method without one what is missing, what it expects, and its commands."""
+    """All results; for each method without a result, what is missing, what it expects, and its commands."""
     done = {(result.method, result.scenario) for result in results}
     return {
         "results": [result.model_dump(mode="json") for result in results],

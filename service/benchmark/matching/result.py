@@ -122,7 +122,7 @@ class _ResultRecord(_Record):
 
 
 def record(result: MethodResult) -> dict[str, Any]:
-    """The result as plain data; null stands for what is infinite."""
+    """The result as plain data; infinite numbers become null."""
     pairs = [
         {
             "first": score.first,

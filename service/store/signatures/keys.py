@@ -89,7 +89,7 @@ class KeyFolder:
         return sorted(path.stem for path in self._folder.glob(f"*{_SUFFIX}")) if self._folder.is_dir() else []
 
     def destroy_all_but(self, key_id: str) -> None:
-        """Remove every other key and partly written key files. Raises SigningKeyError."""
+        """Remove all other keys and partly written key files. Raises SigningKeyError."""
         try:
             others = [p for p in self._folder.iterdir() if p.suffix in (_SUFFIX, _PART) and p != self._path(key_id)]
             for path in others:

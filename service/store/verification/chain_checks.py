@@ -24,7 +24,7 @@ _JOB_COLUMNS = {"job": "job_id", "job_kind": "kind", "step": "step", "attempt": 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing that does not verify."""
+    """One fault found by the verification."""
 
     run_id: str | None
     seq: int | None  # of the event concerned

@@ -1,4 +1,4 @@
-"""What the audit's pages share: the computations of one data folder, and the frame of a run's pages."""
+"""Shared by the audit's pages: the background computations of a data folder, and the frame of a run's pages."""
 
 from __future__ import annotations
 

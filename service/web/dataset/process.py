@@ -1,4 +1,4 @@
-"""Makes a preview in a process of its own, so that pages stay fast: `python -m service.web.dataset.process`.
+"""Makes a preview in a separate process, so that pages stay fast: `python -m service.web.dataset.process`.
 
 It ends when the process that started it ends.
 """

@@ -100,7 +100,7 @@ def held_now(log: RunRecord, step: Step) -> HandheldView:
     jobs = {image_of(j).sha256: j for j in state.jobs.values() if j.kind in _KINDS}
     done = sorted((j for j in jobs.values() if j.status == "finished"), key=lambda j: j.enqueued_seq)
     last = done[-1] if done else None
-    newest = max((j.enqueued_seq for j in jobs.values()), default=0)  # what failed before it has been told
+    newest = max((j.enqueued_seq for j in jobs.values()), default=0)  # earlier failures have been shown already
     failed = [
         j
         for j in state.jobs.values()

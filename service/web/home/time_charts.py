@@ -55,7 +55,7 @@ class TimeChart:
 def time_chart(
     points: Sequence[TimePoint], *, title: str, unit: str, from_zero: bool = True, limit: float | None = None
 ) -> TimeChart | None:
-    """A chart of points in the order of time; None without any.
+    """A chart of points in order of time; None if there are no points.
 
     Args:
         points: oldest first.

@@ -70,7 +70,7 @@ def _forecasts(site: Site) -> dict[str, Forecast]:
 def _driven(site: Site) -> list[str]:
     try:
         return site.launcher.driven_runs()
-    except StoreError:  # which the health of the database tells
+    except StoreError:  # reported by the health check of the database
         return []
 
 

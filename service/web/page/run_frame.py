@@ -35,7 +35,7 @@ class Banner:
 
 @dataclass(frozen=True, slots=True)
 class Attention:
-    """What a screen tells by sound and notification, to whoever has chosen so."""
+    """What a screen reports by sound and notification, if alerts are switched on there."""
 
     key: Standing = "works"
     words: str = ""
@@ -52,7 +52,7 @@ class Tab:
 
 @dataclass(frozen=True, slots=True)
 class RunFrame:
-    """What base.html.j2 needs to know of a run."""
+    """What base.html.j2 needs to know about a run."""
 
     run_id: str
     name: str
@@ -61,7 +61,7 @@ class RunFrame:
     protocol_sha256: str
     simulated: bool
     imported: str  # the sentence that says so; "" for a run that captures its photographs itself
-    live: bool  # not ended: news may come
+    live: bool  # not ended, so there may be new events
     pausable: bool
     attention: Attention
     banner: Banner
@@ -202,7 +202,7 @@ def busy_words(snapshot: Snapshot) -> str:
     if snapshot.lasting:
         return f"{snapshot.activity}, for {snapshot.activity_s:.0f} s"
     if snapshot.quiet_s > STALE_S:
-        return f"{snapshot.what or 'something it does not tell of'}, for {snapshot.quiet_s:.0f} s"
+        return f"{snapshot.what or 'something that it does not report'}, for {snapshot.quiet_s:.0f} s"
     return ""
 
 

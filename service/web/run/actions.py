@@ -45,7 +45,7 @@ router = APIRouter(tags=["acting"])
 Short = Annotated[str, Form(max_length=200)]
 Words = Annotated[str, Form(max_length=2000)]
 Number = Annotated[int, Form(ge=0, le=2**31)]
-# Events that change nothing of what the person was looking at when deciding.
+# Events that change nothing on the page on which the person decided.
 _HARMLESS = (
     NoteTaken,
     ActionRefused,

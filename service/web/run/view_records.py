@@ -135,7 +135,7 @@ class Signature:
 
 @dataclass(frozen=True, slots=True)
 class Acceptance:
-    """What somebody could accept outside its limits now, and who."""
+    """The figures outside their limits that can be accepted now, and who may accept them."""
 
     sha256: str  # of the figures that the acceptance binds
     title: str

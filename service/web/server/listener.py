@@ -27,14 +27,14 @@ class Listener(socket.socket):
         self._exhausted = False
 
     def listen(self, backlog: int = _BACKLOG, /) -> None:
-        """Listen with a queue of at least _BACKLOG; asyncio's number only limits how many it accepts at once."""
+        """Listen with a queue of at least _BACKLOG; asyncio's own number is only how many it accepts at once."""
         super().listen(max(backlog, _BACKLOG))
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """The next connection that there is room for. Raises BlockingIOError when there is none, and OSError."""
+        """Accept the next connection. Raises BlockingIOError if there is none, or no room for it, and OSError."""
         if self._exhausted:
-            # asyncio tries as often as its backlog is long after an error of the system, and logs each, before the
-            # pause of a second that it makes: this ends its loop after the first.
+            # After a system error, asyncio calls accept again, backlog times in all, and logs each error before it
+            # pauses for a second. BlockingIOError ends that loop after the first error.
             self._exhausted = False
             raise BlockingIOError
         try:
@@ -48,7 +48,7 @@ class Listener(socket.socket):
         connection = self.connections.admit(accepted, (address[0], address[1]))
         if connection is None:
             accepted.close()
-            raise BlockingIOError  # for now: the event loop calls again at once while others wait
+            raise BlockingIOError  # the event loop calls again at once if other connections are waiting
         accepted.at_close(lambda: self.connections.leave(connection))
         return accepted, address
 

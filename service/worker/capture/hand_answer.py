@@ -26,10 +26,10 @@ _H = TypeVar("_H", bound=HeldArguments)
 
 @dataclass(frozen=True, slots=True)
 class NewImage:
-    """What the new image alone shows.
+    """What can be determined from the new image alone.
 
     Attributes:
-        T_scene_camera: None where it does not show where the camera was.
+        T_scene_camera: None if the pose cannot be determined.
         why: why it cannot be used; "" if it can.
         measures: numbers of this image.
         information: (6, 6) about the scan's pose.

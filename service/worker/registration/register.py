@@ -71,7 +71,7 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
 
 @dataclass(frozen=True, slots=True)
 class _PosedImages:
-    """The images that take part.
+    """The images that are registered.
 
     Attributes:
         images: N photographs.
