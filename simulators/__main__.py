@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import ctypes
 import importlib
+import importlib.util
 import json
 import logging
 import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Protocol, cast
 
 from simulators.faults import FaultPlan
@@ -29,7 +34,8 @@ class SimulatorModule(Protocol):
         ...
 
 
-SIMULATORS = {
+GROUP = "orthocapture.simulators"
+_SIMULATORS = {
     "ur": ("simulators.ur_controller", "a Universal Robots controller: RTDE, dashboard, script port"),
     "kuka": ("simulators.kuka_controller", "a KUKA controller with our Sunrise application"),
     "camera": ("simulators.sony_camera", "a Sony ILCE-7RM5 over PTP/IP"),
@@ -40,15 +46,29 @@ SIMULATORS = {
 }
 
 
+@cache
+def simulators() -> dict[str, tuple[str, str]]:
+    """Module and description of each simulator, by name: ours, and those with an entry point of GROUP.
+
+    The description of the latter is the first sentence of the module.
+    """
+    found = dict(_SIMULATORS)
+    for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
+        spec = importlib.util.find_spec(point.module)
+        words = ast.get_docstring(ast.parse(Path(spec.origin).read_text("utf-8"))) if spec and spec.origin else None
+        found.setdefault(point.name, (point.module, (words or point.module).partition("\n")[0].rstrip(".")))
+    return found
+
+
 def _load(name: str) -> SimulatorModule:
     # Imported on demand: most simulators need half a second of imports that the others do not.
-    return cast(SimulatorModule, importlib.import_module(SIMULATORS[name][0]))
+    return cast(SimulatorModule, importlib.import_module(simulators()[name][0]))
 
 
 def _parser(chosen: str | None) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="orthocapture simulate", description=__doc__)
     commands = parser.add_subparsers(dest="simulator", required=True, metavar="NAME")
-    for name, (_, what) in SIMULATORS.items():
+    for name, (_, what) in simulators().items():
         command = commands.add_parser(name, help=what, description=what, conflict_handler="resolve")
         _common(command)
         if name == chosen:
@@ -58,15 +78,15 @@ def _parser(chosen: str | None) -> argparse.ArgumentParser:
 
 def _described(name: str) -> dict[str, object]:
     """Return all simulators, or the options of one, as plain data, for other command lines to present."""
-    if name not in SIMULATORS:
-        return {"simulators": {known: what for known, (_, what) in SIMULATORS.items()}}
+    if name not in simulators():
+        return {"simulators": {known: what for known, (_, what) in simulators().items()}}
     options = argparse.ArgumentParser(add_help=False, conflict_handler="resolve")
     _common(options)
     _load(name).add_arguments(options)
     # argparse has no public list of a parser's options.
     actions: list[argparse.Action] = options._actions
     return {
-        "what": SIMULATORS[name][1],
+        "what": simulators()[name][1],
         "options": [
             {
                 "flags": list(action.option_strings),
@@ -102,7 +122,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if words[:1] == ["--describe"]:
         sys.stdout.write(json.dumps(_described(words[1] if len(words) > 1 else "")) + "\n")
         return 0
-    chosen = words[0] if words and words[0] in SIMULATORS else None
+    chosen = words[0] if words and words[0] in simulators() else None
     try:
         args = _parser(chosen).parse_args(words)
     except SimulatorError as error:

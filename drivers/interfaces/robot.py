@@ -40,7 +40,7 @@ class RobotSample:
 
     controller_time_s: float
     monotonic_s: float  # host time.monotonic() at arrival
-    joints_rad: Array  # (6,) or (7,)
+    joints_rad: Array  # (N,), one value an axis; metres for an axis that slides
     joint_velocities_rad_s: Array
     target_velocities_rad_s: Array
     T_base_flange: Transform  # as reported by the controller, with the tool offset removed
@@ -89,7 +89,10 @@ class SettleReport:
 
 
 class RobotArm(Device, Protocol):
-    """A six- or seven-axis arm.
+    """A device that changes the pose of the camera to the specimen: an arm, or a turntable, of N axes.
+
+    The base frame is rigid with the specimen, the flange with the camera. Where a turntable carries the specimen, the
+    base frame turns.
 
     Motion is asynchronous, so that `stop` always works, and needs a person's permission (`let_move`).
     """

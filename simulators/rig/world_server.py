@@ -203,7 +203,7 @@ class World:
 
 
 class WorldServer(socketserver.ThreadingTCPServer):
-    """JSON lines on a loopback port: `robot` (no answer), `view`, `act`, `shutter` (answers at a press)."""
+    """JSON lines on a loopback port: `robot`, `camera` (no answer), `view`, `act`, `shutter` (answers at a press)."""
 
     daemon_threads = True
     allow_reuse_address = True
@@ -241,9 +241,20 @@ def _answer(server: WorldServer, line: bytes) -> dict[str, Any] | None:
         if request.get("op") == "robot":
             server.world.arm_moved(str(request["arm"]), np.array(request["q"], dtype=np.float64))
             return None
+        if request.get("op") == "camera":  # a device other than an arm carries it
+            server.world.hold(_rigid(request["T_world_camera"]))
+            return None
         return _operation(server, request)
     except (ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
         return {"ok": False, "error": f"bad request: {error}"}
+
+
+def _rigid(rows: object) -> Array:
+    """A pose (4, 4). Raises ValueError if it is not one."""
+    T = np.array(rows, dtype=np.float64)
+    if T.shape != (4, 4) or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6):
+        raise ValueError("T_world_camera is not a rigid 4×4 transform")
+    return T
 
 
 def _operation(server: WorldServer, request: dict[str, Any]) -> dict[str, Any]:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import socket
+import threading
+from typing import Any
+
 import numpy as np
 import pytest
 
 from simulators.faults import Fault
 from simulators.geometry import Array, apply, inverse
 from simulators.rendering.picture_faults import Lens
-from simulators.rig.world_server import HELD_CAMERAS, World
+from simulators.rig.world_server import HELD_CAMERAS, World, WorldServer
 from simulators.scene.world import Scene, parse_moved
 
 
@@ -67,3 +72,28 @@ def test_other_faults_spoil_one_picture(world: World, kind: str, changed: float)
     spoilt = lens.picture(sharp, Fault(device="camera", on="image", kind=kind, value=0.5), world.view())
     assert np.mean((spoilt != sharp).any(axis=2)) == pytest.approx(changed, abs=0.1)
     np.testing.assert_array_equal(lens.picture(sharp, None, world.view()), sharp)
+
+
+def test_a_device_that_carries_the_camera_says_where_it_is(world: World) -> None:
+    server = WorldServer(world, world.act)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        world.act({"action": "hold_camera"})
+        answer = _asked(
+            server.address, {"op": "camera", "T_world_camera": HELD_CAMERAS["left"].tolist()}, {"op": "view"}
+        )
+        np.testing.assert_allclose(answer["T_world_camera"], HELD_CAMERAS["left"])
+        twice = (2 * HELD_CAMERAS["left"]).tolist()
+        assert "not a rigid" in _asked(server.address, {"op": "camera", "T_world_camera": twice})["error"]
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def _asked(address: str, *requests: dict[str, Any]) -> dict[str, Any]:
+    """Send the requests and return the first answer."""
+    host, _, port = address.rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=10) as link, link.makefile("rw") as lines:
+        lines.writelines(json.dumps(request) + "\n" for request in requests)
+        lines.flush()
+        return json.loads(lines.readline())

@@ -37,7 +37,7 @@ from service.station import layout_of
 from service.steps import params_models
 from service.steps.capture.plan.planning import ArmAtStation, usual_posture
 from service.steps.capture.plan.preview import preview_board_poses, preview_plans
-from service.steps.capture.plan.viewpoints import denser_viewpoints, plan_viewpoints
+from service.steps.capture.plan.viewpoints import Arc, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.context import StationLayout
 from service.steps.kinds import viewpoint_capture
 
@@ -222,6 +222,22 @@ def test_extra_viewpoints_keep_their_names_and_their_distance_from_planned_ones(
     planned_eyes = np.array([v.T_base_camera[:3, 3] for v in plan_viewpoints(one, LAYOUT)])
     for view in extra:
         assert np.linalg.norm(planned_eyes - view.T_base_camera[:3, 3], axis=1).min() > 0.03
+
+
+def test_beside_a_turntable_the_top_of_every_image_points_upwards() -> None:
+    arc = Arc(tilt_deg=40, azimuth_from_deg=-170, azimuth_to_deg=170, count=9, distance_m=0.5)
+    views = plan_viewpoints(ViewpointSet(station="s", prefix="t", arcs=(arc,), image_top="up"), LAYOUT)
+    poses = np.array([view.T_base_camera for view in views])
+    np.testing.assert_allclose(poses[:, 2, 0], 0.0, atol=1e-12)  # the image's rows are level
+    np.testing.assert_allclose(poses[:, 2, 1], -np.sin(np.radians(40)), atol=1e-4)
+    turned = poses[1:] @ np.linalg.inv(poses[:-1])
+    np.testing.assert_allclose(turned[:, :3, 2], np.tile([0.0, 0.0, 1.0], (8, 1)), atol=1e-4)  # about the vertical
+
+
+def test_an_image_from_straight_above_has_no_top_that_points_upwards() -> None:
+    arc = Arc(tilt_deg=0, azimuth_from_deg=0, azimuth_to_deg=0, count=1, distance_m=0.5)
+    with pytest.raises(ValueError, match="straight down"):
+        ViewpointSet(station="s", prefix="t", arcs=(arc,), image_top="up")
 
 
 # --- command -----------------------------------------------------------------------------------------------------

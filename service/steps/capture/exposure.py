@@ -174,7 +174,7 @@ class ExposurePose:
     """The mean pose of the flange during an exposure, its spread, and the clocks in the middle of the exposure."""
 
     spread: PoseSpread
-    joints_rad: Array  # (6,) or (7,), mean
+    joints_rad: Array  # (N,), mean
     controller_time_s: float
     clock_offset_s: float  # controller time minus host monotonic time
 

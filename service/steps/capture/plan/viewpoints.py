@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -44,6 +44,9 @@ class ViewpointSet(Record):
     prefix: str  # of the viewpoints' names
     arcs: tuple[Arc, ...]  # where the viewpoints lie
     rolls_deg: tuple[float, ...] = (0.0,)  # rolls of the camera, cycled over the viewpoints
+    # Where the top of the image points: away from the base, natural for an arm's wrist, or upwards, as it does for a
+    # camera beside a turntable.
+    image_top: Literal["away", "up"] = "away"
     aim_spread_m: float = 0.0  # spread of the aim point around the scene centre (for board images)
     aim_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the aim point, in the base frame
 
@@ -51,6 +54,14 @@ class ViewpointSet(Record):
     def count(self) -> int:
         """Number of viewpoints of the set."""
         return sum(arc.count for arc in self.arcs)
+
+    @model_validator(mode="after")
+    def _has_a_top(self) -> Self:
+        if self.image_top == "up" and any(arc.tilt_deg == 0 for arc in self.arcs):
+            raise ValueError(
+                "image_top: up needs arcs with tilt_deg above 0: straight down, nothing in an image is up"
+            )
+        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +100,8 @@ def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple
             eye = centre + arc.distance_m * (np.cos(tilt) * _UP + np.sin(tilt) * horizontal)
             aim = centre + viewpoint_set.aim_spread_m * _spread(i, approach, side)
             roll = np.deg2rad(viewpoint_set.rolls_deg[i % len(viewpoint_set.rolls_deg)])
-            # The top of the image points away from the base, which keeps the wrist in its natural posture.
-            T_base_camera = look_at(eye, aim, -approach) @ _rotation_about_axis(roll)
+            top = _UP if viewpoint_set.image_top == "up" else -approach
+            T_base_camera = look_at(eye, aim, top) @ _rotation_about_axis(roll)
             viewpoints.append(Viewpoint(f"{viewpoint_set.prefix}{i + 1:03d}", layout.name, T_base_camera))
     if not viewpoints:
         raise NoViewpointError(
