@@ -12,22 +12,28 @@ WORLD_MOVING_S, WORLD_STILL_S = 0.016, 0.1
 
 
 class WorldLink:
-    """Reports the arm's joints to the world; reconnects by itself and never blocks."""
+    """Reports a device's state to the world; reconnects by itself and never blocks."""
 
     def __init__(self, address: tuple[str, int], arm: str) -> None:
         self._address, self._arm = address, arm
         self._socket: socket.socket | None = None
         self._next_s = 0.0
-        self._joints: list[float] = []
+        self._place: object = None  # joints or pose, as last sent
 
     def push(self, joints_rad: list[float], time_s: float, now_s: float) -> None:
         """Send the joints at a controller's time if they changed, and otherwise now and then."""
-        moving = joints_rad != self._joints
+        self._push(joints_rad, {"op": "robot", "arm": self._arm, "q": joints_rad, "t": time_s}, now_s)
+
+    def push_camera(self, T_world_camera: list[list[float]], now_s: float) -> None:
+        """Send where the device carries the camera, (4, 4), if it moved, and otherwise now and then."""
+        self._push(T_world_camera, {"op": "camera", "T_world_camera": T_world_camera}, now_s)
+
+    def _push(self, place: object, message: dict[str, object], now_s: float) -> None:
+        moving = place != self._place
         if now_s < self._next_s - (WORLD_STILL_S - WORLD_MOVING_S if moving else 0.0):
             return
         self._next_s = now_s + WORLD_STILL_S
-        self._joints = joints_rad
-        message = {"op": "robot", "arm": self._arm, "q": joints_rad, "t": time_s}
+        self._place = place
         try:
             if self._socket is None:
                 self._socket = socket.create_connection(self._address, timeout=0.2)

@@ -40,14 +40,18 @@ class Latch:
         with self._lock:
             self._let_by = ""
 
-    def see(self, safety: SafetyState, at_s: float) -> None:
-        """Latch the arm if this sample of the stream shows a stop; `at_s` is its host time.monotonic()."""
+    def see(self, safety: SafetyState, at_s: float, what: str = "") -> None:
+        """Latch the arm if this sample of the stream shows a stop.
+
+        `at_s` is its host time.monotonic(), `what` the controller's own name of the stop, if it has one.
+        """
         if safety.may_move:
             return
+        name = what or _name(safety)
         with self._lock:
             if self._stop is None:
-                _LOG.warning("%s: %s; nothing moves until a person confirms", self._where, _name(safety))
-            self._stop = _Held(_name(safety), at_s)
+                _LOG.warning("%s: %s; nothing moves until a person confirms", self._where, name)
+            self._stop = _Held(name, at_s)
 
     def end(self, what: str) -> None:
         """Latch the arm because the controller's program ended unexpectedly; `what` is a sentence that says so."""
