@@ -337,6 +337,13 @@ RUN_ELSEWHERE = {
         "tests/system/test_docs.py::test_test_files_and_the_marker_are_there",
     ),
     "orthocapture act release": "tests/web/test_web_held.py::test_the_buttons_ask_the_step",
+    **dict.fromkeys(
+        (
+            "orthocapture simulate rig --scene 3 --dir rig --hand steady",
+            "orthocapture simulate grbl --link rig/table --world HOST:PORT",
+        ),
+        "tests/robot/test_grbl_run.py::test_a_run_with_the_turntable_instead_of_the_arm",
+    ),
     "orthocapture simulate kuka": "tests/robot/test_kuka_driver.py::test_a_day_without_trouble",
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/recovery/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"

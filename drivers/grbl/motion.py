@@ -1,0 +1,61 @@
+"""A straight motion as short jogs, handed over only a moment ahead: without its host the machine soon stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drivers.grbl.wire import jog
+from service.core.geometry import Array
+
+AHEAD_S = 0.4  # of motion in the controller's buffer beyond its braking distance; it moves as long without its host
+_PIECE_S = 0.1
+_BLOCKS = 10  # of the 15 that GRBL's planner holds
+ARRIVED = 0.02  # degrees or millimetres; positions are rounded to 0.001 and to whole steps
+
+
+@dataclass
+class Motion:
+    """A motion in machine coordinates (N,), degrees and millimetres.
+
+    Attributes:
+        letters: of the axes.
+        start: where it begins.
+        target: where it ends.
+        duration_s: at full speed; GRBL adds its own acceleration.
+        braking_s: braking distance, as the time that it takes at full speed.
+    """
+
+    letters: tuple[str, ...]
+    start: Array
+    target: Array
+    duration_s: float
+    braking_s: float
+    sent: float = field(init=False, default=0.0)  # fraction of the way that was handed over
+
+    @property
+    def all_sent(self) -> bool:
+        """Whether the last piece was handed over."""
+        return self.sent >= 1.0
+
+    def next_piece(self, position: Array) -> bytes | None:
+        """The next line to send when the axes are at `position` (N,); None if enough was sent."""
+        ahead_s = AHEAD_S + self.braking_s
+        if self.all_sent or (self.sent - self._done(position)) * self.duration_s >= ahead_s:
+            return None
+        piece = max(_PIECE_S, ahead_s / _BLOCKS) / self.duration_s
+        self.sent = 1.0 if self.sent + 1.5 * piece >= 1.0 else self.sent + piece
+        length = float(np.linalg.norm(self.target - self.start))
+        return jog(self.letters, self._at(self.sent).tolist(), 60.0 * length / self.duration_s)
+
+    def stands_at_its_end(self, position: Array) -> bool:
+        """Whether the axes are where the last piece that was sent ends."""
+        return bool(np.all(np.abs(position - self._at(self.sent)) <= ARRIVED))
+
+    def _at(self, fraction: float) -> Array:
+        return self.start + fraction * (self.target - self.start)
+
+    def _done(self, position: Array) -> float:
+        way = self.target - self.start
+        return float(np.clip((position - self.start) @ way / (way @ way), 0.0, 1.0))
