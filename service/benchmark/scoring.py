@@ -75,8 +75,24 @@ def score_mesh(found: Surface, truth: Mesh, settings: ChamferSettings | None = N
             "the mesh has no face within the box of the ground truth",
             remedy="Check that the mesh is the file as the method wrote it, and that it belongs to this data set",
         )
-    whole = Surface(truth.vertices_m, truth.faces)
-    compared = chamfer(cut, whole, settings)
+    return compare(cut, truth, settings, 100 * max(0.0, 1 - cut.area_m2 / found.area_m2))
+
+
+def compare(
+    cut: Surface, truth: Mesh, settings: ChamferSettings | None = None, outside_percent: float = 0.0
+) -> Scored:
+    """Compare a mesh with the truth as they are; both in the world frame, metres.
+
+    Args:
+        cut: the mesh without what the truth does not cover.
+        truth: what it is compared with.
+        settings: of the comparison.
+        outside_percent: of the method's surface, that was cut off before.
+
+    Raises:
+        ComputeError: the meshes cannot be compared.
+    """
+    compared = chamfer(cut, Surface(truth.vertices_m, truth.faces), settings)
     forth, back = compared.pred_to_gt, compared.gt_to_pred
     consistency = [n for n in (forth.normal_consistency, back.normal_consistency) if n is not None]
     f_score_05, f_score_10 = compared.f_scores
@@ -92,7 +108,7 @@ def score_mesh(found: Surface, truth: Mesh, settings: ChamferSettings | None = N
             f_score_05=f_score_05,
             f_score_10=f_score_10,
             normal_consistency=sum(consistency) / len(consistency),
-            outside_percent=100 * max(0.0, 1 - cut.area_m2 / found.area_m2),
+            outside_percent=outside_percent,
             excluded_percent=100 * (forth.excluded + back.excluded) / (forth.n + back.n),
             seen_percent=100 * back.within[1],
         ),
