@@ -32,6 +32,10 @@ from service.dataset.posed.records import Mesh
 from simulators.scene.world import POST_RADIUS_M
 
 WORK = REPOSITORY / "build" / "bench" / "reconstruction"
+HEADING = """# With and without spheres and posts
+
+"whole" is the score that `bench.reconstruction` kept; the same mesh was then scored with spheres and posts cut out of
+it and of the truth. Machine, revision and the meshes' SHA-256 are in the .json file."""
 
 
 def markers_of(folder: Path) -> tuple[Markers, Markers]:
@@ -116,7 +120,7 @@ def main() -> None:
         "rows": rows,
     }
     name.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    name.with_suffix(".md").write_text(f"# With and without spheres and posts\n\n{table(scored)}", encoding="utf-8")
+    name.with_suffix(".md").write_text(f"{HEADING}\n\n{table(scored)}", encoding="utf-8")
 
 
 if __name__ == "__main__":
