@@ -38,11 +38,19 @@ class SceneSphere:
 
 @dataclass(frozen=True, slots=True)
 class MeshColours:
-    """What a surface is coloured by: `values` (V,), what they are, and plotly's template of the text at a vertex."""
+    """What a surface is coloured by.
+
+    Attributes:
+        values: (V,), of each vertex; with classes, their indices.
+        title: what they are.
+        hover: plotly's template of the text at a vertex; "" for none.
+        classes: name and colour of each class; empty for values on a scale.
+    """
 
     values: Array = field(repr=False)
     title: str
     hover: str
+    classes: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,11 +197,30 @@ def _mesh(points: Array, mesh: SceneMesh) -> dict[str, object]:
     colours = mesh.coloured_by
     if colours is None:
         return trace | {"color": "#c9a58f", "hoverinfo": "skip"}
+    bar = {"title": {"text": colours.title, "side": "right"}, "len": 0.6, "thickness": 14, "x": 1}
+    if colours.classes:
+        return trace | _by_class(mesh, colours, bar)
     return trace | {
         "intensity": _packed(colours.values.astype(np.float32)),
         "colorscale": "Viridis",
-        "colorbar": {"title": {"text": colours.title, "side": "right"}, "len": 0.6, "thickness": 14, "x": 1},
+        "colorbar": bar,
         "hovertemplate": f"{colours.hover}<extra></extra>",
+    }
+
+
+def _by_class(mesh: SceneMesh, colours: MeshColours, bar: Mapping[str, object]) -> dict[str, object]:
+    """One colour for each triangle, that of its first corner: between two classes there is nothing."""
+    n = len(colours.classes)
+    steps = [[(k + end) / n, colour] for k, (_, colour) in enumerate(colours.classes) for end in (0, 1)]
+    names = {"tickvals": list(range(n)), "ticktext": [name for name, _ in colours.classes]}
+    return {
+        "intensity": _packed(colours.values[mesh.triangles[:, 0]].astype(np.float32)),
+        "intensitymode": "cell",
+        "cmin": -0.5,
+        "cmax": n - 0.5,
+        "colorscale": steps,
+        "colorbar": {**bar, **names},
+        "hoverinfo": "skip",
     }
 
 

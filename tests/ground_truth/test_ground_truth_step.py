@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +22,9 @@ from service.core.geometry import inverse, transform
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import RegionDrawn
 from service.core.run.state import RunState
+from service.dataset.preview.fusion import recorded_fusion
+from service.dataset.preview.surfaces import Simplified, fused_mesh, shown_distances
+from service.dataset.summary import summarise
 from service.steps import params_models
 from service.store.store import Store
 from service.worker.job import JobContext
@@ -146,6 +151,46 @@ def test_a_run_with_a_ct_and_a_scan_makes_the_ground_truth(bench: Bench) -> None
     assert shown is not None
     assert shown.std() > 10
     bench.must_verify()
+
+
+def test_the_screen_shows_sources_and_sigmas_and_the_recorded_distances(bench: Bench, tmp_path: Path) -> None:
+    state, columns, points = fused(bench)
+    loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="truth.yaml")
+    summary = summarise(bench.store, bench.run_id, loaded.protocol)
+    fusion = recorded_fusion(summary)
+    assert fusion is not None
+    mesh = Simplified(points, read_ply(bench.store.artefact_path(fusion.files["ground_truth_mesh"].sha256))[1])
+    truth, measures = fused_mesh(tmp_path, summary, fusion, mesh), state.steps["ground_truth"].measures
+    assert (truth.ct_share, truth.sigma_median_mm) == (measures["ct_share"], measures["sigma_median_mm"])
+    assert truth.ct_share + truth.scan_share + truth.blend_share == pytest.approx(1)
+    assert (truth.loop_closure_mm, truth.faces) == (None, measures["ground_truth_faces"])
+    assert [(region.source, region.by) for region in truth.regions] == [("ct", "protocol truth 1")]
+    sources, sigmas = (drawn(tmp_path / name) for name in (truth.sources, truth.sigmas))
+    assert sources["colorbar"]["ticktext"] == ["CT", "blend", "scan"]
+    assert unpacked(sources["intensity"]) == pytest.approx(
+        np.array([0, 2, 1])[columns["source"][mesh.triangles[:, 0]]]
+    )
+    assert unpacked(sigmas["intensity"]) == pytest.approx(
+        np.minimum(columns["sigma_mm"], truth.sigma_high_mm), rel=1e-6
+    )
+    distances = shown_distances(tmp_path, summary, fusion)
+    recorded = ("chamfer_ct_scan_mm", "ct_to_scan_mm", "scan_to_ct_median_mm", "spheres_rms_mm")
+    told = (distances.chamfer_mm, distances.ct_to_scan_mm, distances.scan_to_ct_median_mm, distances.spheres_rms_mm)
+    assert told == tuple(measures[name] for name in recorded)
+    assert (distances.step, distances.spacing_mm) == ("Fuse", 0.5)
+    off = unpacked(drawn(tmp_path / distances.figure)["intensity"])
+    assert 0.05 < float(np.median(off)) < 0.5  # the samples are 0.5 mm apart or more
+
+
+def drawn(path: Path) -> dict[str, Any]:
+    """The surface in a figure."""
+    (mesh, *_) = json.loads(path.read_text(encoding="utf-8"))["data"]
+    return cast(dict[str, Any], mesh)
+
+
+def unpacked(packed: dict[str, str]) -> np.ndarray[Any, Any]:
+    """An array as plotly has it in base64."""
+    return np.frombuffer(base64.b64decode(packed["bdata"]), dtype=packed["dtype"])
 
 
 def test_a_region_that_a_person_drew_is_used_with_the_name(bench: Bench) -> None:

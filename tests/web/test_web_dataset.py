@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,7 +15,14 @@ from service.audit.record.run import read_run
 from service.benchmark.records import Effort, Machine, Result, Score
 from service.core.records.events import EvidenceExported
 from service.dataset.posed.of_run import data_set_of
-from service.dataset.preview.records import Preview, ShownView, read_preview, write_preview
+from service.dataset.preview.records import (
+    DrawnRegion,
+    Preview,
+    ShownGroundTruth,
+    ShownView,
+    read_preview,
+    write_preview,
+)
 from service.web.dataset.previews import Previews
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.runs.reported_run import record_reported_run
@@ -122,6 +130,31 @@ def test_coverage_and_distances_are_told_and_drawn(web: WebSite, run: str, audit
         mesh = json.loads(found[1])["data"][0]
         assert (mesh["type"], "intensity" in mesh) == ("mesh3d", True)
     assert auditor.get(f"/runs/{run}/dataset/other/frame").status_code == 422
+
+
+def test_the_figures_of_a_fused_mesh_are_told(web: WebSite, run: str, auditor: Browser) -> None:
+    """Where there is no fusion, the page says that the mesh is the scan's."""
+    assert "this run has no step that fused CT and scan" in auditor.get(f"/runs/{run}/dataset").text
+    folder = next((web.site.data / "cache" / "dataset").glob(f"{run}-*"))
+    before = preview_of(web, run)
+    assert before.distances is not None
+    truth = ShownGroundTruth(
+        step="Fuse <both>", ct_share=0.125, scan_share=0.75, blend_share=0.125, sigma_median_mm=0.031,
+        sigma_high_mm=0.222, distance_change_max_mm=0.017, loop_closure_mm=0.043, faces=4711,
+        regions=(DrawnRegion("ct", "grace <b>"),), sources="sources.json", sigmas="sigmas.json",
+    )  # fmt: skip
+    distances = replace(before.distances, step="Fuse <both>", excluded=None)
+    try:
+        (folder / "sources.json").write_text('{"data": []}')
+        write_preview(folder, replace(before, ground_truth=truth, distances=distances))
+        page = auditor.get(f"/runs/{run}/dataset").text
+        for told in ("12.5 % of the vertices", "median 0.031 mm", "0.222 mm", "0.043 mm", "CT by grace &lt;b&gt;"):
+            assert told in page, told
+        assert page.count("Fuse &lt;both&gt;") == 2
+        assert auditor.get(f"/runs/{run}/dataset/sources/frame").status_code == 200
+        assert auditor.get(f"/runs/{run}/dataset/sigmas/frame").status_code == 404
+    finally:
+        write_preview(folder, before)
 
 
 @pytest.mark.parametrize("name", ["preview.json", "..%2Fpreview.json", "v0000-thumb.png", "x.jpg", "%00.jpg"])

@@ -94,6 +94,30 @@ def test_a_format_is_exported_recorded_and_fetched(web: WebSite, run: str, super
     assert not web.app.state.exports.unfinished(run)
 
 
+def test_what_the_form_states_is_in_the_card_and_the_metadata(web: WebSite, run: str, supervisor: Browser) -> None:
+    """What is left empty is the protocol's, or said to be missing."""
+    page_of(web, supervisor, run)
+    stated = {
+        "title": 'Spine <7> "b"',
+        "licence": "CC-BY-4.0",
+        "creators": "Ada L.\r\n\r\n Institute X ",
+        "version": "2.1.0",
+    }
+    assert ask(supervisor, run, "plain", **stated) == 303
+    page_of(web, supervisor, run)
+    event = web.store.events(run)[-1]
+    assert isinstance(event.payload, EvidenceExported)
+    files = fetch(supervisor, run, event.payload.file_name)
+    croissant = json.loads(files["croissant.json"])
+    assert croissant["name"] == 'SIMULATED Spine <7> "b"'
+    assert (croissant["license"], croissant["version"]) == ("CC-BY-4.0", "2.1.0")
+    assert [creator["name"] for creator in croissant["creator"]] == ["Ada L.", "Institute X"]
+    assert "No ethics statement was given" in croissant["description"]
+    card = files["DATACARD.md"].decode()
+    assert "Made by**: Ada L., Institute X" in card
+    assert "Version 2.1.0" in card
+
+
 def test_crops_that_do_not_fit_say_so_and_leave_nothing(web: WebSite, run: str, supervisor: Browser) -> None:
     assert ask(supervisor, run, "dtu", crop="9000x9000") == 303
     page = page_of(web, supervisor, run)
@@ -113,6 +137,9 @@ def test_crops_that_do_not_fit_say_so_and_leave_nothing(web: WebSite, run: str, 
         {"form": "colmap", "crops": "0"},
         {"form": "colmap", "crops": "17"},
         {"form": ""},
+        {"form": "colmap", "version": "1.0"},
+        {"form": "colmap", "title": "x" * 1001},
+        {"form": "colmap", "creators": "x" * 201},
     ],
 )
 def test_other_formats_and_options_are_refused(

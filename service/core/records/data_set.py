@@ -10,6 +10,7 @@ from service.core.records.base import Record
 
 FIRST_VERSION = "1.0.0"
 VERSION = r"^\d{1,6}\.\d{1,6}\.\d{1,6}$"  # of a data set: MAJOR.MINOR.PATCH
+LONGEST_NAME = 200  # of a creator, characters
 _Line = Annotated[str, Field(max_length=1000)]
 
 
@@ -19,7 +20,7 @@ class DataSetStatement(Record):
     title: _Line = ""  # of the data set; without it, the protocol's title and the specimen
     licence: _Line = ""  # SPDX identifier such as CC-BY-4.0, or the licence's address
     ethics: _Line = ""  # approval or waiver, with its number and the body that gave it
-    creators: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ()  # people or bodies
+    creators: tuple[Annotated[str, Field(min_length=1, max_length=LONGEST_NAME)], ...] = ()  # people or bodies
     cite: _Line = ""  # how the data set should be cited
 
     def or_else(self, other: DataSetStatement) -> DataSetStatement:

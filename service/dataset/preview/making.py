@@ -14,9 +14,10 @@ from service.compute.pixels.crops import marker_free_crops
 from service.core.errors import ComputeError, DataError
 from service.dataset.posed.of_run import data_set_of, specimen_pixels
 from service.dataset.posed.records import DataSet
+from service.dataset.preview.fusion import RecordedFusion, recorded_fusion
 from service.dataset.preview.pictures import CROPS, crop_size, small_pictures
 from service.dataset.preview.records import Preview, ShownView, write_preview
-from service.dataset.preview.surfaces import Simplified, shown_coverage, shown_distances
+from service.dataset.preview.surfaces import Simplified, fused_mesh, shown_coverage, shown_distances
 from service.dataset.summary import RunSummary
 
 Progress = Callable[[str, int, int], None]  # activity, amount done, total
@@ -51,8 +52,14 @@ def make_preview(summary: RunSummary, folder: Path, progress: Progress) -> Previ
     coverage = shown_coverage(folder, summary, dataset, mesh, counts)
     preview = dataclasses.replace(preview, coverage=coverage)
     write_preview(folder, preview)
+    fusion = recorded_fusion(summary)
+    if fusion is not None:
+        progress("colouring the ground truth", 0, 0)
+        truth = fused_mesh(folder, summary, fusion, mesh)
+        preview = dataclasses.replace(preview, ground_truth=truth)
+        write_preview(folder, preview)
     progress("comparing the CT with the scan", 0, 0)
-    preview = dataclasses.replace(_with_distances(preview, folder, summary, mesh), whole=True)
+    preview = dataclasses.replace(_with_distances(preview, folder, summary, fusion), whole=True)
     write_preview(folder, preview)
     return preview
 
@@ -75,8 +82,8 @@ def _begun(dataset: DataSet, crop: tuple[int, int]) -> Preview:
     return Preview(views, crop)
 
 
-def _with_distances(preview: Preview, folder: Path, summary: RunSummary, mesh: Simplified) -> Preview:
+def _with_distances(preview: Preview, folder: Path, summary: RunSummary, fusion: RecordedFusion | None) -> Preview:
     try:
-        return dataclasses.replace(preview, distances=shown_distances(folder, summary, mesh))
+        return dataclasses.replace(preview, distances=shown_distances(folder, summary, fusion))
     except (DataError, ComputeError) as error:
         return dataclasses.replace(preview, no_distances=error.what)

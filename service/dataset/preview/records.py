@@ -60,6 +60,44 @@ class ShownCoverage:
 
 
 @dataclass(frozen=True, slots=True)
+class DrawnRegion:
+    """A region in which a person or the protocol decided which source counts: `ct` or `scan`, and who it was."""
+
+    source: str
+    by: str
+
+
+@dataclass(frozen=True, slots=True)
+class ShownGroundTruth:
+    """The mesh that was fused from CT and scan, as its step recorded it.
+
+    Attributes:
+        step: title of the step.
+        ct_share, scan_share, blend_share: of the vertices, by what they come from.
+        sigma_median_mm: of the stated standard deviations of the vertices.
+        sigma_high_mm: which 99 % of them do not exceed.
+        distance_change_max_mm: of two spheres, from the CT to the scan: what the transport changed.
+        loop_closure_mm: largest way of a sphere from scan to CT and back by the cameras; None without images.
+        faces: of the mesh.
+        regions: corrections of the proposed wound.
+        sources, sigmas: files of the mesh, coloured by source and by standard deviation.
+    """
+
+    step: str
+    ct_share: float
+    scan_share: float
+    blend_share: float
+    sigma_median_mm: float
+    sigma_high_mm: float
+    distance_change_max_mm: float
+    loop_closure_mm: float | None
+    faces: int
+    regions: tuple[DrawnRegion, ...]
+    sources: str
+    sigmas: str
+
+
+@dataclass(frozen=True, slots=True)
 class ShownDistances:
     """The CT against the scan, in the frame of the scan.
 
@@ -68,12 +106,13 @@ class ShownDistances:
         ct_to_scan_mm, scan_to_ct_mm: means.
         ct_to_scan_median_mm, scan_to_ct_median_mm: of the same distances.
         floor_mm: what the Chamfer distance would be, by the sampling alone, if the surfaces were equal.
-        excluded: share of the samples beyond `outlier_mm`, in no mean.
+        excluded: share of the samples beyond `outlier_mm`, in no mean; None: the record does not say.
         outlier_mm, spacing_mm: of the comparison.
         spheres: by which the two were brought together, and their root mean square distance.
         spheres_rms_mm: of them.
         figure: file of the scan, coloured by its distance to the CT.
         picture: file of both, seen from above.
+        step: title of the step that recorded these figures; "": they were computed for the screen alone.
     """
 
     chamfer_mm: float
@@ -82,13 +121,14 @@ class ShownDistances:
     ct_to_scan_median_mm: float
     scan_to_ct_median_mm: float
     floor_mm: float
-    excluded: float
+    excluded: float | None
     outlier_mm: float
     spacing_mm: float
     spheres: int
     spheres_rms_mm: float
     figure: str
     picture: str
+    step: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +139,7 @@ class Preview:
         views: all of them.
         crop: width and height of the crops, px.
         coverage: None: not yet.
+        ground_truth: None: not yet, or the mesh is the scan's.
         distances: None: not yet, or `no_distances` says why not.
         no_distances: reason.
         whole: nothing more will come.
@@ -107,6 +148,7 @@ class Preview:
     views: tuple[ShownView, ...]
     crop: tuple[int, int]
     coverage: ShownCoverage | None = None
+    ground_truth: ShownGroundTruth | None = None
     distances: ShownDistances | None = None
     no_distances: str = ""
     whole: bool = False

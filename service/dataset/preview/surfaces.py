@@ -1,4 +1,4 @@
-"""Coloured surfaces of a data set: how many views see it, and how far the scan is from the CT."""
+"""Coloured surfaces of a data set: how many views see it, what it comes from, how far the scan is from the CT."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from service.compute.ground_truth.distances.chamfer import ChamferSettings, chamfer
 from service.compute.ground_truth.distances.heat_map import HeatScale, heat_picture
 from service.compute.ground_truth.distances.neighbours import PointIndex
+from service.compute.ground_truth.distances.sampling import sample
 from service.compute.ground_truth.surface import Surface
 from service.compute.pixels.coverage import covered_shares
 from service.compute.surfaces.constellations import match_constellations
@@ -19,7 +20,8 @@ from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 from service.core.units import metres, mm
 from service.dataset.posed.records import DataSet, Mesh
-from service.dataset.preview.records import AT_LEAST, ShownCoverage, ShownDistances, put
+from service.dataset.preview.fusion import MESH, PICTURE, RecordedFusion, shown_ground_truth, vertex_figures
+from service.dataset.preview.records import AT_LEAST, ShownCoverage, ShownDistances, ShownGroundTruth, put
 from service.dataset.registrations import last_result
 from service.dataset.scene_view import MeshColours, Scene, SceneMesh, SceneSphere, decimated, scene_json
 from service.dataset.summary import RunSummary
@@ -54,32 +56,70 @@ def shown_coverage(
     return ShownCoverage(shares, put(folder, "coverage.json", figure.encode()))
 
 
-def shown_distances(folder: Path, summary: RunSummary, mesh: Simplified) -> ShownDistances:
-    """Compare the CT with the scan, brought together by their spheres, and write both coloured by their distance.
+def fused_mesh(folder: Path, summary: RunSummary, fusion: RecordedFusion, mesh: Simplified) -> ShownGroundTruth:
+    """Write the fused mesh coloured by source and by standard deviation. Raises DataError if it has neither."""
+    figures, high_mm = vertex_figures(summary.store.artefact_path(fusion.files[MESH].sha256), mesh.points_m)
+    sources, sigmas = (
+        put(folder, f"{name}.json", scene_json(_scene(summary, mesh, colours, {})).encode())
+        for name, colours in (("sources", figures.sources), ("sigmas", figures.sigmas))
+    )
+    return shown_ground_truth(fusion, sources, sigmas, high_mm)
+
+
+def shown_distances(folder: Path, summary: RunSummary, fusion: RecordedFusion | None) -> ShownDistances:
+    """How far CT and scan are from each other, and the scan coloured by it.
+
+    The figures and the picture are those that the fusion recorded. Without a fusion, CT and scan are brought together
+    by their spheres and compared here, for the screen alone.
 
     Raises:
         DataError: the run has no CT.
         ComputeError: the spheres of the two do not agree, or the surfaces are not near each other.
     """
-    refs, scan_spheres = summary.artefacts("ct_mesh"), np.array(summary.scan_spheres_m())
-    found = last_result(summary.protocol, summary.state, "ct_surface", SpheresFound)
-    if not refs or found is None:
+    refs = summary.artefacts("ct_mesh")
+    if not refs:
         raise DataError("the run has no CT", where=summary.run_id)
-    match = match_constellations(scan_spheres, np.array(found.spheres_m))
-    ct = Surface.kept(summary.store.artefact_path(refs[-1].sha256)).moved(match.T_a_b)
+    ct = Surface.kept(summary.store.artefact_path(refs[-1].sha256))
     vertices_m, faces = summary.scan_mesh()  # not the data set's mesh, in which both may be fused
     scan = Surface(np.asarray(vertices_m, np.float64), np.asarray(faces, np.int64))
-    spacing_m = max(_SPACING_M, float(np.sqrt(max(ct.area_m2, scan.area_m2) / _SAMPLES)))
-    settings = ChamferSettings(spacing_m=spacing_m, to_faces=False)
+    if fusion is None:
+        return _compared(folder, summary, ct, scan)
+    ct = ct.moved(np.array(fusion.answer.T_scan_ct))
+    samples = sample(ct, _spacing_m(ct, scan), np.random.default_rng(0))
+    figure = _distance_figure(folder, summary, scan, samples.points_m)
+    picture = cv2.imread(str(summary.store.artefact_path(fusion.files[PICTURE].sha256)))
+    if picture is None:
+        raise DataError("the recorded picture of the fusion cannot be read", where=summary.run_id)
+    m = fusion.measures
+    return ShownDistances(
+        chamfer_mm=m["chamfer_ct_scan_mm"],
+        ct_to_scan_mm=m["ct_to_scan_mm"],
+        scan_to_ct_mm=m["scan_to_ct_mm"],
+        ct_to_scan_median_mm=m["ct_to_scan_median_mm"],
+        scan_to_ct_median_mm=m["scan_to_ct_median_mm"],
+        floor_mm=m["chamfer_floor_mm"],
+        excluded=None,
+        outlier_mm=mm(ChamferSettings().outlier_m),
+        spacing_mm=mm(fusion.spacing_m),
+        spheres=int(m["spheres_compared"]),
+        spheres_rms_mm=m["spheres_rms_mm"],
+        figure=figure,
+        picture=_put_picture(folder, np.asarray(picture, dtype=np.uint8)),
+        step=fusion.step,
+    )
+
+
+def _compared(folder: Path, summary: RunSummary, ct: Surface, scan: Surface) -> ShownDistances:
+    """Both brought together by their spheres, and compared; the CT in its own frame."""
+    found = last_result(summary.protocol, summary.state, "ct_surface", SpheresFound)
+    if found is None:
+        raise DataError("the run has no CT", where=summary.run_id)
+    match = match_constellations(np.array(summary.scan_spheres_m()), np.array(found.spheres_m))
+    ct = ct.moved(match.T_a_b)
+    settings = ChamferSettings(spacing_m=_spacing_m(ct, scan), to_faces=False)
     score = chamfer(ct, scan, settings)
-    scale = HeatScale(_FULL_M, settings.outlier_m)
-    picture = heat_picture(ct, scan, score, scale, ("CT", "scan"))
-    distance_m, _ = PointIndex(score.pred.samples.points_m).nearest(mesh.points_m)
-    values = mm(np.minimum(distance_m, scale.full_m))
-    title = f"distance to the CT (mm, at most {mm(scale.full_m):g})"
-    figure = scene_json(_scene(summary, mesh, MeshColours(values, title, "%{intensity:.3f} mm"), {}))
+    picture = heat_picture(ct, scan, score, HeatScale(_FULL_M, settings.outlier_m), ("CT", "scan"))
     n = score.pred_to_gt.n + score.gt_to_pred.n
-    _, encoded = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, 88))
     return ShownDistances(
         chamfer_mm=mm(score.chamfer_m),
         ct_to_scan_mm=mm(score.pred_to_gt.mean_m),
@@ -89,12 +129,30 @@ def shown_distances(folder: Path, summary: RunSummary, mesh: Simplified) -> Show
         floor_mm=mm(score.floor_m),
         excluded=(score.pred_to_gt.excluded + score.gt_to_pred.excluded) / max(n, 1),
         outlier_mm=mm(settings.outlier_m),
-        spacing_mm=mm(spacing_m),
+        spacing_mm=mm(settings.spacing_m),
         spheres=len(match.pairs),
         spheres_rms_mm=mm(match.rms_m),
-        figure=put(folder, "distances.json", figure.encode()),
-        picture=put(folder, "distances.jpg", encoded.tobytes()),
+        figure=_distance_figure(folder, summary, scan, score.pred.samples.points_m),
+        picture=_put_picture(folder, picture),
     )
+
+
+def _spacing_m(ct: Surface, scan: Surface) -> float:
+    return max(_SPACING_M, float(np.sqrt(max(ct.area_m2, scan.area_m2) / _SAMPLES)))
+
+
+def _distance_figure(folder: Path, summary: RunSummary, scan: Surface, ct_points_m: Array) -> str:
+    """Write the scan coloured by its distance to points (N, 3) on the CT. Returns the file's name."""
+    shown = Simplified(*decimated(scan.vertices_m, scan.faces))
+    distance_m, _ = PointIndex(ct_points_m).nearest(shown.points_m)
+    title = f"distance to the CT (mm, at most {mm(_FULL_M):g})"
+    colours = MeshColours(mm(np.minimum(distance_m, _FULL_M)), title, "%{intensity:.3f} mm")
+    return put(folder, "distances.json", scene_json(_scene(summary, shown, colours, {})).encode())
+
+
+def _put_picture(folder: Path, picture: NDArray[np.uint8]) -> str:
+    _, encoded = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, 88))
+    return put(folder, "distances.jpg", encoded.tobytes())
 
 
 def _scene(summary: RunSummary, mesh: Simplified, colours: MeshColours, poses: dict[str, Transform]) -> Scene:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Form, Path, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, StreamingResponse
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, field_validator
 
 from service.audit.export.exports import Exports, What
 from service.audit.export.folder_zip import zip_chunks
@@ -16,6 +16,7 @@ from service.audit.export.formats import Formats
 from service.audit.export.wanted import WantedExport
 from service.core.errors import ConfigurationError
 from service.core.gates.release import refuse_data_set, refuse_export, refuse_release
+from service.core.records.data_set import FIRST_VERSION, LONGEST_NAME, VERSION, DataSetStatement
 from service.core.records.events import RunReleased
 from service.store.signatures.signing import checkpoint
 from service.web.audit.frame import CurrentAudit, audit_frame
@@ -90,6 +91,8 @@ def exports_page(
         may_export=person.may("export"),
         exporting=exports.state(run_id),
         formats=formats.known(),
+        stated=log.protocol.data_set,
+        first_version=FIRST_VERSION,
         listing=formats.state(),
         unfinished=exports.unfinished(run_id),
         exports_folder=exports.folder,
@@ -140,7 +143,31 @@ class FormatForm(BaseModel):
     crop: str = Field("", pattern=r"^([1-9][0-9]{0,5}x[1-9][0-9]{0,5})?$")
     crops: int = Field(1, ge=1, le=16)
     anonymous: bool = False
+    title: str = Field("", max_length=1000)
+    licence: str = Field("", max_length=1000)
+    ethics: str = Field("", max_length=1000)
+    creators: str = Field("", max_length=4000)  # one a line
+    cite: str = Field("", max_length=1000)
+    version: str = Field(FIRST_VERSION, pattern=VERSION)
     csrf: str = ""
+
+    @field_validator("creators")
+    @classmethod
+    def _short_names(cls, text: str) -> str:
+        if any(len(name) > LONGEST_NAME for name in _lines(text)):
+            raise ValueError(f"a name has at most {LONGEST_NAME} characters; write one name on each line")
+        return text
+
+    def wanted(self) -> WantedExport:
+        """What is asked for. What the fields of the statement leave out is the protocol's."""
+        stated = DataSetStatement(
+            title=self.title.strip(),
+            licence=self.licence.strip(),
+            ethics=self.ethics.strip(),
+            creators=_lines(self.creators),
+            cite=self.cite.strip(),
+        )
+        return WantedExport(self.form, self.crop, self.crops, self.anonymous, stated, self.version)
 
 
 @router.post("/runs/{run_id}/exports/formats", name="start_format_export", dependencies=_EXPORT)
@@ -159,8 +186,7 @@ def start_format_export(
         raise refusal
     if asked.form not in {known.name for known in formats.known(wait_s=_LISTING_S)}:
         raise ConfigurationError("there is no such format", where=asked.form, remedy="Choose one of the list")
-    wanted = WantedExport(asked.form, asked.crop, asked.crops, asked.anonymous)
-    exports.start_format(run_id, wanted, person.account, simulated=log.state.simulated)
+    exports.start_format(run_id, asked.wanted(), person.account, simulated=log.state.simulated)
     return _back(run_id)
 
 
@@ -203,6 +229,11 @@ def exported_file(
         chunks = zip_chunks(path, record.sha256)
         return StreamingResponse(chunks, media_type="application/octet-stream", headers=headers)
     return FileResponse(path, filename=path.name, media_type="application/octet-stream", headers=headers)
+
+
+def _lines(text: str) -> tuple[str, ...]:
+    """The lines that are not empty."""
+    return tuple(filter(None, (line.strip() for line in text.splitlines())))
 
 
 def _back(run_id: str) -> RedirectResponse:

@@ -23,7 +23,12 @@ RunId = Annotated[str, Path(max_length=64)]
 Split = Annotated[Literal["dense", "sparse", "train", "test"], Query()]
 _READ = [Depends(requires("read"))]
 _TYPES = {"jpg": "image/jpeg", "webp": "image/webp"}
-_TITLES = {"coverage": "Coverage in 3D", "distances": "Distance of the scan to the CT in 3D"}
+_TITLES = {
+    "coverage": "Coverage in 3D",
+    "sources": "Sources of the ground truth in 3D",
+    "sigmas": "Standard deviation of the ground truth in 3D",
+    "distances": "Distance of the scan to the CT in 3D",
+}
 
 
 @router.get("/runs/{run_id}/dataset", name="data_set", dependencies=_READ, response_class=HTMLResponse)
@@ -82,7 +87,7 @@ def surface_frame(
     site: CurrentSite,
     previews: CurrentPreviews,
     run_id: RunId,
-    figure: Literal["coverage", "distances"],
+    figure: Literal["coverage", "sources", "sigmas", "distances"],
     theme: Theme = "auto",
 ) -> HTMLResponse:
     """A coloured surface alone, for its sandboxed frame."""
