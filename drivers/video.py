@@ -40,7 +40,7 @@ _CALL_S = 60.0  # usual longest call; opening a pipe waits for its writer
 
 
 class VideoConfig(DriverConfig):
-    """A video source in rig.yaml, with what it cannot be asked for."""
+    """A video source in rig.yaml, with the settings that the source cannot report."""
 
     port: str = Field(min_length=1, description="a device such as /dev/video0, a named pipe, or a recording")
     aperture_f: float = Field(gt=0, description="as it is set or built in")
