@@ -43,7 +43,7 @@ def rig_text() -> str:
 
 
 def _devices() -> str:
-    """A table for each installed driver."""
+    """A table for each installed driver, followed by the records that its keys are made of."""
     lines = [
         "## Devices",
         "",
@@ -55,7 +55,7 @@ def _devices() -> str:
         spec: DriverSpec = point.load()
         if point.value.startswith("drivers."):
             lines += [f"### {point.name}", "", f"A device of kind {spec.kind}. {docstring(spec.config)}", ""]
-            lines += [*field_table(spec.config), ""]
+            lines += [*field_table(spec.config), "", *record_sections(records_below(spec.config), "####")]
     return "\n".join(lines)
 
 
