@@ -179,7 +179,7 @@ def test_an_arm_whose_brakes_closed_moves_once_they_are_released() -> None:
         travel(arm, turned(arm, 0.1))
         time.sleep(6.0)  # the brakes close after 20 s, here 5 s
         start = arm.state().sample.joints_rad
-        goal = turned(arm, 0.1)
+        goal = turned(arm, 1.0)
         begin = time.monotonic()
         move(arm, goal)
         assert arm.is_moving()
