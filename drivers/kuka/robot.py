@@ -277,9 +277,12 @@ class KukaRobot:
         """Judge the last window of the pose stream against the criteria. Returns at once; meant to be polled."""
         self._attend()
         stream = self._streaming()
+        # Asked before the window is read: a motion that ends in between has left no trace in it. Stillness alone does
+        # not tell, as the brakes may still be on before a motion begins.
+        under_way = bool(self._motion) and self._linked().ended(self._motion) is None
         now_s = stream.latest().monotonic_s
         report = judge(stream.between(now_s - criteria.window_s, now_s), criteria)
-        if self._motion and self._linked().ended(self._motion) is None:  # the brakes may still be on before it begins
+        if under_way:
             report = dataclasses.replace(report, settled=False)
         if not report.settled:
             return report

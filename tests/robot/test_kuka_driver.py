@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import signal
 import time
 from collections.abc import Callable, Generator
 
 import numpy as np
+import psutil
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -47,6 +50,15 @@ def opened(host: str, unattended_s: float = 5.0) -> Generator[RobotArm]:
         yield arm
     finally:
         arm.close()
+
+
+def fresh(arm: RobotArm) -> bool:
+    """Whether the stream is up to date again."""
+    try:
+        arm.state()
+    except DeviceUnavailableError:
+        return False
+    return True
 
 
 def wait_for(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
@@ -137,6 +149,45 @@ def test_a_moving_arm_that_nobody_looks_at_is_stopped() -> None:
             move(arm, turned(arm, 0.1))
         arm.let_move("Ada", time.monotonic())
         travel(arm, turned(arm, 0.1))
+
+
+def test_a_driver_that_stands_still_sends_no_heartbeat_and_the_arm_stops() -> None:
+    host = address(77)
+    with simulated_kuka(host), opened(host) as arm:
+        children = psutil.Process().children(recursive=True)
+        (driver,) = [child.pid for child in children if "drivers.host" in " ".join(child.cmdline())]
+        start = arm.state().sample.joints_rad[0]
+        move(arm, turned(arm, 2.5))
+        os.kill(driver, signal.SIGSTOP)
+        try:
+            time.sleep(1.5)
+        finally:
+            os.kill(driver, signal.SIGCONT)
+        wait_for(lambda: fresh(arm))
+        with pytest.raises(LeaveNeededError, match="no line of its client"):
+            wait_for(lambda: not arm.is_moving())
+        assert arm.state().sample.joints_rad[0] - start < 2.0
+        with pytest.raises(LeaveNeededError):
+            move(arm, turned(arm, 0.1))
+        arm.let_move("Ada", time.monotonic())
+        travel(arm, turned(arm, 0.1))
+
+
+def test_an_arm_whose_brakes_closed_moves_once_they_are_released() -> None:
+    host = address(78)
+    with simulated_kuka(host, "--speed-up", "4"), opened(host) as arm:
+        travel(arm, turned(arm, 0.1))
+        time.sleep(6.0)  # the brakes close after 20 s, here 5 s
+        start = arm.state().sample.joints_rad
+        goal = turned(arm, 1.0)
+        begin = time.monotonic()
+        move(arm, goal)
+        assert arm.is_moving()
+        assert not arm.settle(SettleCriteria()).settled, "it stands, but has not arrived"
+        wait_for(lambda: not arm.is_moving())
+        np.testing.assert_allclose(arm.state().sample.joints_rad, goal, atol=1e-4)
+        left = [s for s in arm.samples(begin, time.monotonic()) if np.any(s.joints_rad != start)]
+        assert left[0].monotonic_s - begin > 0.12, "the brakes take 0.6 s, here 0.15 s"
 
 
 def test_a_wrong_load_is_felt_as_a_collision() -> None:
