@@ -56,8 +56,8 @@ EDGES = {
     "service/worker/capture/live_station.py": "writes and reads the file of an image of the robot",
     # messages of COLMAP's child process
     "service/compute/poses/colmap/process.py": "messages of a child process",
-    "service/compute/poses/sfm/adjustment.py": "messages of a child process",
-    "service/compute/poses/sfm/mapping.py": "messages of a child process",
+    "service/compute/poses/sfm/model/adjustment.py": "messages of a child process",
+    "service/compute/poses/sfm/model/mapping.py": "messages of a child process",
     # JSON that commands print
     "service/cli/compute/evaluate_chamfer.py": "prints JSON",
     "service/cli/compute/fuse.py": "prints JSON",

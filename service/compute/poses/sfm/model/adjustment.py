@@ -17,8 +17,8 @@ from service.compute.poses.colmap.convention import (
     to_colmap_pixels,
     to_colmap_pose,
 )
+from service.compute.poses.sfm.model.track_building import Index, Sightings, triangulate, wide_enough
 from service.compute.poses.sfm.options import Progress, reduction
-from service.compute.poses.sfm.track_building import Index, Sightings, triangulate, wide_enough
 from service.core.geometry import Array
 
 _LEAST = 30  # observations below which an image's pose is dropped

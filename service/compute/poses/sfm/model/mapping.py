@@ -23,9 +23,9 @@ from service.compute.poses.colmap.convention import (
     to_colmap_camera,
     to_colmap_pixels,
 )
-from service.compute.poses.sfm.adjustment import Features, adjust
+from service.compute.poses.sfm.model.adjustment import Features, adjust
+from service.compute.poses.sfm.model.track_building import Index, Sightings, build_tracks, thinned
 from service.compute.poses.sfm.options import Progress
-from service.compute.poses.sfm.track_building import Index, Sightings, build_tracks, thinned
 from service.core.geometry import Array, align_points
 
 _VERIFIED = 15  # least number of matches of a pair; COLMAP's own limit
