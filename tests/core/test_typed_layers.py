@@ -50,7 +50,7 @@ EDGES = {
     "service/benchmark/table.py": "writes the table of a benchmark",
     "service/dataset/package/crate.py": "writes ro-crate-metadata.json",
     "service/dataset/package/croissant.py": "writes croissant.json",
-    "service/dataset/posed/statement.py": "writes dataset.json",
+    "service/dataset/posed/of_run/statement.py": "writes dataset.json",
     "service/dataset/formats/radiance/unit_box.py": "writes unit_box.json",
     "service/worker/capture/held_images.py": "writes and reads the file of a hand-held image",
     "service/worker/capture/live_station.py": "writes and reads the file of an image of the robot",

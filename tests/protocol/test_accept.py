@@ -35,7 +35,7 @@ from service.core.run.decide import AskOperator
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_run import data_set_of
+from service.dataset.posed.of_run.data_set import data_set_of
 from service.monitor.devices import OpenDevices
 from service.monitor.reporter import Reporter
 from service.people.sessions import People

@@ -8,7 +8,7 @@ from typing import Any
 from service.core.gates.dependence import accepted_gates
 from service.core.gates.verdict import BOUNDS_HOLD
 from service.dataset.late_results import late_results
-from service.dataset.posed.about_run import gates_in_words, origin_sentence
+from service.dataset.posed.of_run.about_run import gates_in_words, origin_sentence
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary
 

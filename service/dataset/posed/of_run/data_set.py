@@ -20,12 +20,12 @@ from service.core.picture_files import PNG_BEGINS
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement
 from service.core.units import metres
 from service.dataset.control_spheres import control_centres
-from service.dataset.posed.about_run import about_run
+from service.dataset.posed.of_run.about_run import about_run
+from service.dataset.posed.of_run.pose_errors import own_pose_errors
+from service.dataset.posed.of_run.statement import described_run
+from service.dataset.posed.of_run.view_covariances import view_covariances
 from service.dataset.posed.pixels import Photographs
-from service.dataset.posed.pose_errors import own_pose_errors
 from service.dataset.posed.records import DataSet, Mesh, View
-from service.dataset.posed.statement import described_run
-from service.dataset.posed.view_covariances import view_covariances
 from service.dataset.registered_scan import control_scan
 from service.dataset.registrations import result_of_step
 from service.dataset.summary import RunSummary
