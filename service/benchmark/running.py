@@ -9,8 +9,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from drivers.meshes.surface_file import read_surface_file
+from service.benchmark.commands import run_commands, this_machine
 from service.benchmark.method import Command, Method, Place, missing, place_of
-from service.benchmark.programs import run_commands, this_machine
 from service.benchmark.records import RESULT, Effort, Result, Scenario, Score
 from service.benchmark.scoring import score_mesh, write_scored
 from service.compute.ground_truth.distances.chamfer import ChamferSettings

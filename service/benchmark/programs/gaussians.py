@@ -1,6 +1,6 @@
 """Gaussian splatting with gsplat, and a mesh of its depth maps, as a program of its own: needs torch and CUDA.
 
-Run: python -m service.benchmark.gaussians_program DATA MESH
+Run: python -m service.benchmark.programs.gaussians DATA MESH
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from service.benchmark.exported_views import views_of
+from service.benchmark.programs.exported_views import views_of
 from service.compute.ground_truth.ply import write_ply
 from service.compute.images.files import read_image
 from service.compute.poses.files.pose_files import HALF_PIXEL
@@ -32,7 +32,7 @@ VOXEL_PX = 1.5
 LEAST_MAPS = 3
 # Learning rates of 3D Gaussian splatting (Kerbl et al., SIGGRAPH 2023); that of the means is for a scene of size 1.
 _RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "colors": 2.5e-3}
-_USAGE = "usage: python -m service.benchmark.gaussians_program DATA MESH"
+_USAGE = "usage: python -m service.benchmark.programs.gaussians DATA MESH"
 
 
 def first_gaussians(torch: Any, points_m: Array) -> Any:

@@ -1,6 +1,6 @@
 """Dense stereo on an exported folder, as a separate program, so that it sees only images and poses.
 
-Run: python -m service.benchmark.stereo_program DATA MESH
+Run: python -m service.benchmark.programs.stereo DATA MESH
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from pathlib import Path
 
 import cv2
 
-from service.benchmark.exported_views import views_of
+from service.benchmark.programs.exported_views import views_of
 from service.compute.ground_truth.ply import write_ply
 from service.compute.memory import keep_freed_memory
 from service.compute.stereo.reconstruct import reconstruct
 from service.core.errors import OrthocaptureError
 
-_USAGE = "usage: python -m service.benchmark.stereo_program DATA MESH"
+_USAGE = "usage: python -m service.benchmark.programs.stereo DATA MESH"
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """Features triangulated with the given poses: the workspace that COLMAP's and OpenMVS's dense steps begin with.
 
-Run: python -m service.benchmark.triangulated DATA DENSE
+Run: python -m service.benchmark.programs.triangulated DATA DENSE
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pycolmap
 
-_USAGE = "usage: python -m service.benchmark.triangulated DATA DENSE"
+_USAGE = "usage: python -m service.benchmark.programs.triangulated DATA DENSE"
 
 
 def triangulate(data: Path, dense: Path) -> pycolmap.Reconstruction:
