@@ -63,16 +63,7 @@ def data_set_of(
     Raises:
         DataError: the run has no evaluated registration, no scan, or no registered image.
     """
-    own = summary.best()
-    spheres = summary.scan_spheres_m()
-    if own is None or not spheres:
-        raise DataError("the run has no evaluated registration", where=summary.run_id, remedy="Finish the run first")
-    registered = summary.registrations()[own]
-    files = _photographs(summary, registered)
-    if not files:
-        raise DataError(
-            "no image of the data set is registered", where=summary.run_id, remedy="Repeat the registration"
-        )
+    own, registered, files = _registered(summary)
     truth = summary.ground_truth()
     mesh = Mesh(truth.vertices_m, truth.faces)
     joint = own_pose_errors(summary, registered, sorted(files))
@@ -80,22 +71,12 @@ def data_set_of(
     views = tuple(
         _view(name, path, registered, stated_errors.covariance[name]) for name, (path, _) in sorted(files.items())
     )
-    balls, posts = _markers(summary, views)
-    simulated = summary.root.simulated
-    pixels = Photographs(
-        {name: path for name, (path, _) in files.items()},
-        RayMesh(mesh.vertices_m, mesh.faces),
-        balls,
-        posts,
-        personal=personal,
-        mark="SIMULATED" if simulated else "",
-    )
-    masks = _masked(balls, posts)
+    pixels, masks = _pixels(summary, files, views, mesh, personal=personal)
     hashes = {view.file: files[view.name][1] for view in views}
     about = about_run(summary, own, not_in_yet, stated=stated, version=version, personal=personal)
     return DataSet(
         identity=_identity(summary, own, registered, {**hashes, "mesh": truth.sha256}),
-        simulated=simulated,
+        simulated=summary.root.simulated,
         statement={
             **described_run(summary, own, not_in_yet, personal=personal),
             "mesh": truth.words,
@@ -117,6 +98,40 @@ def data_set_of(
 def specimen_pixels(summary: RunSummary, view: View) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """(H, W) pixels between the spheres, which stand around the specimen."""
     return hull_mask(view.camera, view.T_world_camera, np.array(summary.scan_spheres_m()))
+
+
+def _registered(summary: RunSummary) -> tuple[str, Registration, dict[str, tuple[Path, str]]]:
+    """The run's own registration with its name, and its images.
+
+    Raises:
+        DataError: there is none, no scan, or no image.
+    """
+    own = summary.best()
+    if own is None or not summary.scan_spheres_m():
+        raise DataError("the run has no evaluated registration", where=summary.run_id, remedy="Finish the run first")
+    registered = summary.registrations()[own]
+    files = _photographs(summary, registered)
+    if not files:
+        raise DataError(
+            "no image of the data set is registered", where=summary.run_id, remedy="Repeat the registration"
+        )
+    return own, registered, files
+
+
+def _pixels(
+    summary: RunSummary, files: dict[str, tuple[Path, str]], views: Sequence[View], mesh: Mesh, *, personal: bool
+) -> tuple[Photographs, str]:
+    """Photographs, depth and masks of the views, and what the masks hold, in words."""
+    balls, posts = _markers(summary, views)
+    pixels = Photographs(
+        {name: path for name, (path, _) in files.items()},
+        RayMesh(mesh.vertices_m, mesh.faces),
+        balls,
+        posts,
+        personal=personal,
+        mark="SIMULATED" if summary.root.simulated else "",
+    )
+    return pixels, _masked(balls, posts)
 
 
 def _photographs(summary: RunSummary, registered: Registration) -> dict[str, tuple[Path, str]]:
