@@ -39,7 +39,6 @@ from service.compute.calibration.intrinsics.adjustment import LensModel
 from service.compute.calibration.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics
 from service.compute.calibration.intrinsics.optics import Optics, compare_optics, states_focus, summary
 from service.compute.calibration.intrinsics.plots import calibration_plots
-from service.compute.calibration.intrinsics.record import intrinsics_record
 from service.compute.calibration.intrinsics.uncertainty import (
     ProjectionUncertainty,
     board_distance_m,
@@ -55,6 +54,8 @@ from service.compute.images.files import image_size
 from service.compute.images.folder import image_folder
 from service.core.errors import ComputeError, DataError
 from service.core.text.counts import counted
+from service.jobs.calibration.records import Intrinsics
+from service.worker.calibration.records import intrinsics_record
 
 _WITHOUT_EXIF = {".pgm", ".ppm", ".pnm"}
 
@@ -111,25 +112,22 @@ def intrinsics_command(
         excluded = dict(views.excluded) | {views.indices[view.index]: view.reason for view in result.excluded}
         optics, departures = _optics([files[k] for k in used], capture_images)
         warnings = [*calibration_warnings(result, validation, uncertainty), *departures]
-        record: dict[str, Any] = {
-            **result.camera.record(),
-            **intrinsics_record(
-                result,
-                validation,
-                uncertainty,
-                warnings,
-                [files[k].name for k in used],
-                folder.left_out | {files[k].name: excluded[k] for k in sorted(excluded)},
-            ),
-            "optics": optics,
-        }
+        intrinsics = intrinsics_record(
+            result,
+            validation,
+            uncertainty,
+            warnings,
+            [files[k].name for k in used],
+            folder.left_out | {files[k].name: excluded[k] for k in sorted(excluded)},
+        )
+        record: dict[str, Any] = {**result.camera.record(), **intrinsics.plain(), "optics": optics}
         _write(out, json_module.dumps(record, indent=1, allow_nan=False) + "\n")
         if report is not None:
             _write_plots(report, result, uncertainty)
         if json:
             print_json(record)
             return
-        _tell(record, result, validation, uncertainty)
+        _tell(intrinsics, result, validation, uncertainty)
         console.print(f"written: {out}")
 
 
@@ -208,7 +206,7 @@ def _write_plots(folder: Path, result: IntrinsicsResult, uncertainty: Projection
 
 
 def _tell(
-    record: dict[str, Any],
+    record: Intrinsics,
     result: IntrinsicsResult,
     validation: CrossValidation | None,
     uncertainty: ProjectionUncertainty,
@@ -222,7 +220,7 @@ def _tell(
         f"({uncertainty.centre_mm:.4f} mm) at the centre, {uncertainty.worst_px:.3f} px "
         f"({uncertainty.worst_mm:.4f} mm) at worst"
     )
-    for view in record["excluded"]:
-        console.print(f"[yellow]left out[/] {escape(view['image'])}: {escape(view['reason'])}")
-    for warning in record["warnings"]:
+    for view in record.excluded:
+        console.print(f"[yellow]left out[/] {escape(view.image)}: {escape(view.reason)}")
+    for warning in record.warnings:
         console.print(f"[yellow]warning[/] {escape(warning)}")
