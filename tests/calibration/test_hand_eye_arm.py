@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from service.cli.compute.calibrate import calibrate_app
+from service.cli.calibrate.group import calibrate_app
 from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm.joint_file import read_joints_csv
 from service.compute.arm.kinematics import (

@@ -11,16 +11,7 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from service.cli.common import (
-    JsonOption,
-    StrictOption,
-    console,
-    print_json,
-    progress_bar,
-    reporting_errors,
-    require_writable,
-)
-from service.cli.compute.board_options import (
+from service.cli.calibrate.board_options import (
     DEFAULT_DICTIONARY,
     BoardOption,
     DictionaryOption,
@@ -30,6 +21,15 @@ from service.cli.compute.board_options import (
     SquareOption,
     described_board,
     require_board,
+)
+from service.cli.common import (
+    JsonOption,
+    StrictOption,
+    console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+    require_writable,
 )
 from service.compute.arm.joint_file import read_joints_csv
 from service.compute.arm.kinematics import ARM_MODELS, ArmModel, arm_model, matching_arm, solve_joints

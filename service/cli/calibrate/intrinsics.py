@@ -13,17 +13,7 @@ from rich.markup import escape
 
 from drivers.errors import UnreadableFileError
 from drivers.photos.photo_file import read_exif
-from service.cli.common import (
-    JsonOption,
-    StrictOption,
-    console,
-    print_json,
-    progress_bar,
-    reporting_errors,
-    require_writable,
-    require_writable_folder,
-)
-from service.cli.compute.board_options import (
+from service.cli.calibrate.board_options import (
     DEFAULT_DICTIONARY,
     BoardOption,
     DictionaryOption,
@@ -33,6 +23,16 @@ from service.cli.compute.board_options import (
     SquareOption,
     described_board,
     require_board,
+)
+from service.cli.common import (
+    JsonOption,
+    StrictOption,
+    console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+    require_writable,
+    require_writable_folder,
 )
 from service.compute.calibration.board.images import UsableViews, find_boards, usable_views
 from service.compute.calibration.intrinsics.adjustment import LensModel
