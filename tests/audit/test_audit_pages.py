@@ -36,7 +36,7 @@ from service.web.evidence import artefacts, events
 from tests.support.pages.web import WebSite, web_site
 from tests.support.processes.waiting import until
 from tests.support.record.store import rows, tamper
-from tests.support.runs.large_run import Sizes, write_large_run
+from tests.support.recorded.large_run import Sizes, write_large_run
 from tests.support.runs.recorded_run import record_run
 
 SMALL = Sizes(

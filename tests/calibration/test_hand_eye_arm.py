@@ -36,8 +36,8 @@ from service.core.geometry import Array, inverse
 from simulators.scene.world import Scene
 from simulators.ur_controller.kinematics import MODELS
 from simulators.ur_controller.kinematics import forward as simulated_forward
-from tests.support.scenes.board_images import checkerboard, photograph
-from tests.support.scenes.board_sessions import (
+from tests.support.boards.board_images import checkerboard, photograph
+from tests.support.boards.board_sessions import (
     BOARD,
     T_FLANGE_CAMERA,
     OddScene,

@@ -45,9 +45,9 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import WebSite, password_of, web_site
 from tests.support.record.core import TOY, Log, load, toy_protocol
+from tests.support.recorded.reported_run import record_reported_run
 from tests.support.rig.bench_rig import BenchRig
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
-from tests.support.runs.reported_run import record_reported_run
 
 ROOT = Path(__file__).parents[2]
 TOY_ACCEPTING = TOY.replace("min: 3, unit: views}", "min: 3, unit: views, accept_by: supervisor}").replace(

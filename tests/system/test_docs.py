@@ -244,7 +244,7 @@ RUN_ELSEWHERE = {
         ),
         "tests/benchmark/test_benchmark_command.py::test_methods_are_run_scored_and_put_into_the_table",
     ),
-    "orthocapture layout --spheres spheres.json": "tests/steps/test_layout.py::test_command",
+    "orthocapture layout --spheres spheres.json": "tests/layout/test_layout.py::test_command",
     "orthocapture export latest --format colmap --out dataset --data runs": (
         "tests/dataset/test_export_command.py::test_a_run_is_exported_recorded_and_still_verifies"
     ),
