@@ -40,7 +40,7 @@ def pdf(report: Report) -> bytes:
 
 @pytest.fixture
 def no_dejavu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a machine where DejaVu is not installed."""
+    """Hide DejaVu, as on a machine where it is not installed."""
     monkeypatch.setattr("service.audit.report.output.pdf._FONT_FOLDERS", ())
 
 
