@@ -175,12 +175,11 @@ class Mover:
             raise LeaveNeededError("the position of the axes is not known", where=self._where, remedy=remedy)
         state = self.status.state if self.status is not None else "silent"
         if self.moving or state != "Idle":
-            raise DeviceBusyError(
-                f"the controller is {state}", where=self._where, remedy="Wait until the axes stand still"
-            )
+            remedy = "Wait until the axes stand still"
+            raise DeviceBusyError(f"the controller is {state}", where=self._where, remedy=remedy)
 
     def begin(self, target: Array, speeds: Array) -> None:
-        """Start a motion to machine coordinates (N,). No axis exceeds its speed of `speeds` (N,), in units per second."""
+        """Start a motion to machine coordinates (N,), at most at `speeds` (N,), in units of each axis per second."""
         setup, position = self._setup, self.position
         if setup is None or position is None:
             raise DeviceUnavailableError("the axes are not connected", where=self._where, remedy="Open them first")

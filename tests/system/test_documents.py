@@ -96,3 +96,12 @@ def test_make_targets_do_what_the_documents_say() -> None:
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         assert done.stdout.splitlines()[-1] == last
+
+
+def test_the_map_of_the_readme_names_every_module_of_the_service() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^\| `service/([a-z_]+)(?:/|\.py)` \|", text, re.MULTILINE))
+    there = {
+        path.stem for path in (ROOT / "service").iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()
+    }
+    assert listed == there - {"__init__"}
