@@ -20,7 +20,7 @@ from service.compute.calibration.hand_eye.answers import HandEyeResult
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.core.geometry import Array
 from simulators.scene.world import Scene
-from tests.support.scenes.board_sessions import (
+from tests.support.boards.board_sessions import (
     T_FLANGE_CAMERA,
     OddScene,
     Session,

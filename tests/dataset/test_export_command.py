@@ -26,9 +26,9 @@ from service.dataset.posed.records import Mesh
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.store import tamper
+from tests.support.recorded.reported_run import record_reported_run
+from tests.support.recorded.unpacked_run import unpack_recorded_run
 from tests.support.runs.bench_run import record_runs
-from tests.support.runs.reported_run import record_reported_run
-from tests.support.runs.unpacked_run import unpack_recorded_run
 
 pytestmark = pytest.mark.timeout(300)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as json_module
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,17 +12,7 @@ from rich.markup import escape
 
 from drivers.errors import UnreadableFileError
 from drivers.photos.photo_file import read_exif
-from service.cli.common import (
-    JsonOption,
-    StrictOption,
-    console,
-    print_json,
-    progress_bar,
-    reporting_errors,
-    require_writable,
-    require_writable_folder,
-)
-from service.cli.compute.board_options import (
+from service.cli.calibrate.board_options import (
     DEFAULT_DICTIONARY,
     BoardOption,
     DictionaryOption,
@@ -32,9 +21,18 @@ from service.cli.compute.board_options import (
     PatternOption,
     SquareOption,
     described_board,
-    require_board,
+    searched,
 )
-from service.compute.calibration.board.images import UsableViews, find_boards, usable_views
+from service.cli.common import (
+    JsonOption,
+    StrictOption,
+    console,
+    print_json,
+    reporting_errors,
+    require_writable,
+    require_writable_folder,
+)
+from service.compute.calibration.board.images import UsableViews
 from service.compute.calibration.intrinsics.adjustment import LensModel
 from service.compute.calibration.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics
 from service.compute.calibration.intrinsics.optics import Optics, compare_optics, states_focus, summary
@@ -92,15 +90,7 @@ def intrinsics_command(
         require_writable(out)
         if report is not None:
             require_writable_folder(report)
-        require_board(files, seen)
-        with progress_bar(quiet=json) as progress:
-            found = find_boards(
-                files,
-                seen,
-                workers=os.cpu_count() or 1,
-                progress=lambda done, total: progress("board images", done, total),
-            )
-        views = usable_views(found)
+        views = searched(files, seen, quiet=json)
         try:
             result = calibrate_intrinsics(views.views, seen, views.size, model=model)
         except ComputeError as error:
@@ -111,18 +101,10 @@ def intrinsics_command(
         excluded = dict(views.excluded) | {views.indices[view.index]: view.reason for view in result.excluded}
         optics, departures = _optics([files[k] for k in used], capture_images)
         warnings = [*calibration_warnings(result, validation, uncertainty), *departures]
-        record: dict[str, Any] = {
-            **result.camera.record(),
-            **intrinsics_record(
-                result,
-                validation,
-                uncertainty,
-                warnings,
-                [files[k].name for k in used],
-                folder.left_out | {files[k].name: excluded[k] for k in sorted(excluded)},
-            ),
-            "optics": optics,
-        }
+        names = [files[k].name for k in used]
+        left_out = folder.left_out | {files[k].name: excluded[k] for k in sorted(excluded)}
+        stated = intrinsics_record(result, validation, uncertainty, warnings, names, left_out)
+        record: dict[str, Any] = {**result.camera.record(), **stated, "optics": optics}
         _write(out, json_module.dumps(record, indent=1, allow_nan=False) + "\n")
         if report is not None:
             _write_plots(report, result, uncertainty)

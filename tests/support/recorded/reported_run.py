@@ -36,7 +36,7 @@ from service.store.records import NewArtefact
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from tests.support.record.core import EYE
-from tests.support.runs.registration_record import registration_record
+from tests.support.recorded.registration_record import registration_record
 
 PROTOCOL = """\
 id: reported

@@ -25,8 +25,8 @@ from service.dataset.preview.records import (
 )
 from service.web.dataset.previews import Previews
 from tests.support.pages.web import Browser, WebSite, web_site
-from tests.support.runs.reported_run import record_reported_run
-from tests.support.runs.unpacked_run import unpack_recorded_run
+from tests.support.recorded.reported_run import record_reported_run
+from tests.support.recorded.unpacked_run import unpack_recorded_run
 
 pytestmark = pytest.mark.timeout(600)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import typer
 
-from service.cli.compute.calibrate_hand_eye import hand_eye_command
-from service.cli.compute.calibrate_intrinsics import intrinsics_command
+from service.cli.calibrate.hand_eye import hand_eye_command
+from service.cli.calibrate.intrinsics import intrinsics_command
 
 calibrate_app = typer.Typer(
     help="Calibrate a camera and its mounting from images of a board.",

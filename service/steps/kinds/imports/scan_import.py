@@ -14,7 +14,7 @@ from service.jobs.surfaces import locate_spheres
 from service.steps.arrivals import keep_mesh, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import earlier_answer, earlier_result
-from service.steps.kinds import timed_application
+from service.steps.kinds.by_hand import timed_application
 from service.steps.layouts import layout_uncertainties
 from service.steps.measures import Count, Measure, SphereMeasures
 

@@ -33,8 +33,8 @@ from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact
 from service.store.signatures.signing import checkpoint
+from tests.support.boards.board_sessions import BOARD, Session, noisy_session
 from tests.support.pages.web import WebSite
-from tests.support.scenes.board_sessions import BOARD, Session, noisy_session
 
 RIG = """\
 name: small

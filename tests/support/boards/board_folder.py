@@ -15,7 +15,7 @@ from service.compute.calibration.board.board import Board
 from service.compute.camera_model import CameraModel
 from service.compute.poses.files.pose_files import write_poses_csv
 from service.core.geometry import Array, inverse, transform
-from tests.support.scenes.board_images import Shade, checkerboard, photograph, printed
+from tests.support.boards.board_images import Shade, checkerboard, photograph, printed
 
 CAMERA = CameraModel(900, 600, 1260, 1261, 452.0, 301.0, -0.045, 0.03, 4e-4, -5e-4)
 T_FLANGE_CAMERA = transform(

@@ -22,7 +22,7 @@ from service.dataset.posed.exporter import exporters
 from service.dataset.posed.folder import SUMS
 from service.store.verification.verify import verify
 from tests.support.pages.web import Browser, WebSite, web_site
-from tests.support.runs.reported_run import record_reported_run
+from tests.support.recorded.reported_run import record_reported_run
 
 pytestmark = pytest.mark.timeout(600)  # each export loads the numerics in a process of its own
 

@@ -13,9 +13,9 @@ from service.compute.calibration.board.board import Board
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Transform, apply, inverse, transform
 from service.worker.loop import work
+from tests.support.boards.board_images import checkerboard, photograph
 from tests.support.rig.bench_rig import BenchRig
 from tests.support.runs.bench_run import Bench
-from tests.support.scenes.board_images import checkerboard, photograph
 
 BOARD = Board(7, 10, 0.030)
 LENS = CameraModel(900, 600, 1272.0, 1272.5, 452.0, 297.0, -0.05, 0.02, 2e-4, -2e-4)

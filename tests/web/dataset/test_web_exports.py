@@ -22,9 +22,9 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.audit.exports import MEANINGS
 from tests.support.pages.web import Browser, WebSite, password_of, web_site
+from tests.support.recorded.registration_record import CAMERA
+from tests.support.recorded.reported_run import T_SCAN_CAMERA, record_reported_run
 from tests.support.runs.bench_run import PROTOCOL
-from tests.support.runs.registration_record import CAMERA
-from tests.support.runs.reported_run import T_SCAN_CAMERA, record_reported_run
 
 NEEDS_RELEASE = PROTOCOL.replace("steps:", "release: second_person\nsteps:", 1)
 

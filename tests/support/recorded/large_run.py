@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from service.audit.background.incremental import Progress
+from service.audit.overview.digest import Digest, digests
 from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.models import Step, load_protocol
 from service.core.records.events import (
@@ -287,3 +289,26 @@ def _job(run: LargeRun, step: Step, images: list[str]) -> None:
 def database_bytes(data: Path) -> int:
     """Size of the database."""
     return database_path(data).stat().st_size
+
+
+SMALL = Sizes(
+    events=1200,
+    slices=20,
+    viewpoints=30,
+    jobs=12,
+    failures=14,
+    troubles=5,
+    pauses=8,
+    refused=9,
+    redone_viewpoints=4,
+    corrections=3,
+)
+
+
+def digest_of(store: Store, run: str) -> Digest:
+    """The digest of a run, waited for."""
+    computed = digests(store)
+    value = computed.get(run, wait_s=60.0)
+    computed.close()
+    assert not isinstance(value, Progress)
+    return value

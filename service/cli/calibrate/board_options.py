@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from service.cli.common import progress_bar
 from service.compute.calibration.board.board import Board, Pattern
-from service.compute.calibration.board.images import probe_board
+from service.compute.calibration.board.images import UsableViews, find_boards, probe_board, usable_views
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.units import metres, mm
 
@@ -63,8 +65,24 @@ def described_board(
     return Board(int(columns), int(rows), metres(square_mm), pattern, marker_m, dictionary, legacy)
 
 
-def require_board(files: Sequence[Path], board: Board) -> None:
-    """Raise ComputeError if a sample of the images shows a board other than the one described."""
+def searched(files: Sequence[Path], board: Board, *, quiet: bool) -> UsableViews:
+    """The views of a board that can be used, of images searched under a progress bar.
+
+    Raises:
+        ComputeError: a sample of the images shows a board other than the one described, or no view can be used.
+    """
+    _require(files, board)
+    with progress_bar(quiet=quiet) as progress:
+        found = find_boards(
+            files,
+            board,
+            workers=os.cpu_count() or 1,
+            progress=lambda done, total: progress("board images", done, total),
+        )
+    return usable_views(found)
+
+
+def _require(files: Sequence[Path], board: Board) -> None:
     if board.pattern == "charuco":
         board.charuco()
     wrong = probe_board(files, board)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as json_module
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,16 +10,7 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from service.cli.common import (
-    JsonOption,
-    StrictOption,
-    console,
-    print_json,
-    progress_bar,
-    reporting_errors,
-    require_writable,
-)
-from service.cli.compute.board_options import (
+from service.cli.calibrate.board_options import (
     DEFAULT_DICTIONARY,
     BoardOption,
     DictionaryOption,
@@ -29,11 +19,18 @@ from service.cli.compute.board_options import (
     PatternOption,
     SquareOption,
     described_board,
-    require_board,
+    searched,
+)
+from service.cli.common import (
+    JsonOption,
+    StrictOption,
+    console,
+    print_json,
+    reporting_errors,
+    require_writable,
 )
 from service.compute.arm.joint_file import read_joints_csv
 from service.compute.arm.kinematics import ARM_MODELS, ArmModel, arm_model, matching_arm, solve_joints
-from service.compute.calibration.board.images import find_boards, usable_views
 from service.compute.calibration.board_poses.plan import SuggestedPose, suggest_board_poses
 from service.compute.calibration.board_poses.plan_plot import draw_board_plan
 from service.compute.calibration.hand_eye.answers import HandEyeResult
@@ -88,62 +85,40 @@ def hand_eye_command(
     """Calibrate the camera's pose on the robot's flange, with its uncertainty."""
     with reporting_errors(json):
         target = described_board(board, square_mm, pattern, marker_mm, dictionary, legacy=legacy)
-        if setup == "eye-to-hand" and (joints is not None or arm is not None):
-            raise typer.BadParameter("--joints and --arm are for a camera on the flange, not for --setup eye-to-hand")
-        if setup == "eye-to-hand" and preview is not None:
-            raise typer.BadParameter("--preview shows suggested poses of a camera that the robot moves")
-        if arm is not None:
-            arm_model(arm)  # refuse an unknown model before searching images
+        _require_possible(setup, joints, arm, preview)
         model = read_camera_json(camera)
         folder = image_folder(images, size=(model.width, model.height), strict=strict)
         known, folder = posed_images(robot_poses, folder, images, strict=strict)
         files = folder.files
-        for file in (out, preview):
-            if file is not None:
-                require_writable(file)
-        require_board(files, target)
-        with progress_bar(quiet=json) as progress:
-            found = find_boards(
-                files,
-                target,
-                workers=os.cpu_count() or 1,
-                progress=lambda done, total: progress("board images", done, total),
-            )
-        usable = usable_views(found)
+        for file in filter(None, (out, preview)):
+            require_writable(file)
+        usable = searched(files, target, quiet=json)
         names = [files[k].name for k in usable.indices]
         T_base_flange = np.array([known[name] for name in names])
+        T_camera_board = np.array([locate_view(view, target, model)[0] for view in usable.views])
         joints_rad, kinematics = _arm(joints, arm, names, T_base_flange)
         corners = board_corners(usable.views, target, model)
         result = calibrate_hand_eye(
-            HandEyeViews(
-                T_base_flange,
-                np.array([locate_view(view, target, model)[0] for view in usable.views]),
-                corners=corners,
-                joints_rad=joints_rad,
-                arm=kinematics,
-            ),
+            HandEyeViews(T_base_flange, T_camera_board, corners=corners, joints_rad=joints_rad, arm=kinematics),
             method=method,
             T_board_turned=target.half_turn(),
             setup=setup,
             camera_covariance=read_camera_covariance(camera),
         )
         best = result if result.corrected is None else result.corrected
-        # Suggestions are poses of the camera, so there are none for a camera that stands still.
         suggested = suggest_board_poses(
             best,
             T_base_flange,
             corners.points_m,
             model,
             corner_sigma_px=result.corner_sigma_px or 0.0,
-            count=suggest if setup == "eye-in-hand" else 0,
-            reachable=None
-            if kinematics is None or joints_rad is None
-            else _Reachability(kinematics, joints_rad, T_base_flange),
+            count=suggest if setup == "eye-in-hand" else 0,  # a camera that stands still has no poses to suggest
+            reachable=_reachability(kinematics, joints_rad, T_base_flange),
         )
-        record: dict[str, Any] = {
-            **hand_eye_record(result, names, setup),
+        without_board = {files[k].name: reason for k, reason in sorted(usable.excluded.items())}
+        record = hand_eye_record(result, names, setup) | {
             "left_out": folder.left_out,
-            "images_without_board": {files[k].name: reason for k, reason in sorted(usable.excluded.items())},
+            "images_without_board": without_board,
             "suggested_poses": [_suggestion(pose) for pose in suggested],
             "suggestions_reachable": kinematics is not None,
         }
@@ -158,6 +133,16 @@ def hand_eye_command(
         console.print(f"written: {out}")
 
 
+def _require_possible(setup: Setup, joints: Path | None, arm: str | None, preview: Path | None) -> None:
+    """Refuse options that exclude each other, and an unknown arm, before the images are searched."""
+    if setup == "eye-to-hand" and (joints is not None or arm is not None):
+        raise typer.BadParameter("--joints and --arm are for a camera on the flange, not for --setup eye-to-hand")
+    if setup == "eye-to-hand" and preview is not None:
+        raise typer.BadParameter("--preview shows suggested poses of a camera that the robot moves")
+    if arm is not None:
+        arm_model(arm)
+
+
 class _Reachability:
     """Whether an arm can reach a pose from the joint positions of the nearest recorded pose."""
 
@@ -169,6 +154,10 @@ class _Reachability:
         away = np.linalg.norm(self._poses[:, :3, 3] - T_base_flange[:3, 3], axis=1)
         nearest = int(np.argmin(away + 0.5 * np.arccos(np.clip((turn - 1) / 2, -1, 1))))
         return solve_joints(self._arm, T_base_flange, self._joints[nearest]) is not None
+
+
+def _reachability(arm: ArmModel | None, joints_rad: Array | None, T_base_flange: Array) -> _Reachability | None:
+    return None if arm is None or joints_rad is None else _Reachability(arm, joints_rad, T_base_flange)
 
 
 def _arm(
