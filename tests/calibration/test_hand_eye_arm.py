@@ -16,7 +16,6 @@ from service.cli.compute.calibrate import calibrate_app
 from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm.joint_file import read_joints_csv
 from service.compute.arm.kinematics import (
-    arm_model,
     chain,
     dh_jacobian,
     forward,
@@ -31,6 +30,7 @@ from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrat
 from service.compute.calibration.hand_eye.record import hand_eye_record, read_arm_correction
 from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.poses.files.pose_files import write_poses_csv
+from service.core.arms.known import arm_model
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, inverse
 from simulators.scene.world import Scene
@@ -246,7 +246,7 @@ def test_an_empty_correction_changes_nothing(q: Array) -> None:
     [
         ("name,q1,q2,q3,q4,q5,q6\n", "first line"),
         ("image,q1,q2,q3,q4,q5,q6\na.jpg,90,0,0,0,0,0\n", "not a joint angle"),
-        ("image,q1,q2,q3,q4,q5,q6\na.jpg,0,0,0,0,0\n", "six finite"),
+        ("image,q1,q2,q3,q4,q5,q6\na.jpg,0,0,0,0,0\n", "not 6 finite"),
         ("image,q1,q2,q3,q4,q5,q6\na.jpg,0,0,0,0,0,x\n", "not a number"),
         ("image,q1,q2,q3,q4,q5,q6\nb.jpg,0,0,0,0,0,0\n", "no joints: a.jpg"),
     ],
