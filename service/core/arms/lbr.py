@@ -47,7 +47,7 @@ def lbr(
             Link("base", 0, (0, 0, -_BASE_DEPTH_M), (0, 0, 0.16), 0.10),
             Link("shoulder", 0, (0, 0, 0.16), (0, 0, base), 0.09),
             Link("upper arm", 2, (0, 0, 0), (0, 0, upper), 0.085),
-            Link("forearm", 4, (0, 0, 0), (0, 0, fore), 0.075),
+            Link("forearm", 4, (0, 0, 0), (0, 0, fore - 0.08), 0.075),  # what is beyond turns with the hand
             Link("hand", 6, (0, 0, 0), (0, 0, hand), 0.065),
         ),
         allowed=_ALLOWED,
