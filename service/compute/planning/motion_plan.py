@@ -17,7 +17,8 @@ from service.core.geometry import Array, Transform, inverse, transform
 Order = Literal["as_listed", "shortest"]
 
 _NUDGES_DEG = tuple(sign * step for step in (2.5, 5.0, 7.5, 10.0, 12.5, 15.0) for sign in (1, -1))
-_PATH_STEP_RAD = np.radians(3.0)
+#: Spacing of the configurations that are checked on the way from one viewpoint to the next.
+PATH_STEP_RAD = np.radians(3.0)
 _AT_ONCE = 24  # postures that are checked together: seven axes have hundreds for one pose
 _MOST_WAYS = 36  # postures to which a way is looked for if the straight one to the best posture is blocked
 _ROOM_M = 0.05  # clearance beyond which more is not better
@@ -251,7 +252,7 @@ def _other_way(here: Array, view: PlannedView, situation: Situation) -> Array | 
 
 def _blocked(here: Array, there: Array, situation: Situation) -> str:
     # Both ends are free, or the arm is there already.
-    way = straight_path(here, there, float(_PATH_STEP_RAD))[1:-1]
+    way = straight_path(here, there, float(PATH_STEP_RAD))[1:-1]
     if not len(way):
         return ""
     contacts = nearest_contacts(situation.body, situation.obstacles, way)
