@@ -35,8 +35,10 @@ from drivers.interfaces import (
 from drivers.kuka import KukaConfig
 from drivers.kuka.link import Link
 from drivers.kuka.wire import JOINTS, State, to_abc
+from service.core.arms.known import known_arms
+from service.core.arms.model import ArmModel
 from service.core.geometry import inverse, to_rotation_vector
-from service.core.seven_axes import SEVEN_AXIS_ARMS, SevenAxisArm, nearest_posture
+from service.core.seven_axes import nearest_posture
 
 DRIVER_VERSION = "1"
 HEARTBEAT_S = 0.3  # without a line for so long the application stops the arm (docs/howto/kuka.md)
@@ -55,7 +57,7 @@ class KukaRobot:
         self._latch = Latch(self._where)
         self._link: Link | None = None
         self._stream: PoseStream | None = None
-        self._arm: SevenAxisArm = SEVEN_AXIS_ARMS[0]
+        self._arm: ArmModel | None = None  # as the application states it
         self._arrived: deque[RobotSample] = deque()  # from the link's thread to the stream's
         self._recent: deque[State] = deque()  # over SPEED_WINDOW_S
         self._state: State | None = None
@@ -78,7 +80,7 @@ class KukaRobot:
         self._recent.clear()
         address = (self._config.host, self._config.port)
         self._link = link = Link(address, self._config.connect_timeout_s, self._receive)
-        known = {arm.name: arm for arm in SEVEN_AXIS_ARMS}
+        known = {arm.name: arm for arm in known_arms() if arm.family == "seven_axes"}
         if link.hello.model not in known:
             self.close()
             remedy = f"Known are {', '.join(known)}"
@@ -212,7 +214,7 @@ class KukaRobot:
         Raises UnreachablePoseError if there are none.
         """
         near = np.array(self._joints(near_rad))
-        joints = nearest_posture(self._arm, np.asarray(T_base_flange, dtype=np.float64), near)
+        joints = nearest_posture(self._arm or self._not_open(), np.asarray(T_base_flange, dtype=np.float64), near)
         if joints is None:
             x, y, z = T_base_flange[:3, 3]
             raise UnreachablePoseError(
