@@ -16,15 +16,17 @@ from drivers.kuka import DRIVER, KukaConfig
 from drivers.kuka.wire import WireError, from_abc, hello_of, parse, state_of, to_abc
 from service.core.geometry import transform
 from tests.support.processes.waiting import until
-from tests.support.rig.kuka_simulator import agrees, simulated_kuka, transcript
+from tests.support.rig.kuka_simulator import Controller, agrees, simulated_kuka, transcript
+from tests.support.rig.sunrise import sunrise_engine
 from tests.support.rig.ur_simulator import address
 
 
 @pytest.mark.parametrize("name", ["session.jsonl", "refusals.jsonl"])
-def test_the_simulator_answers_as_the_transcript(name: str) -> None:
+@pytest.mark.parametrize("controller", [simulated_kuka, sunrise_engine])
+def test_simulator_and_application_answer_as_the_transcript(controller: Controller, name: str) -> None:
     host = address(70)
     with (
-        simulated_kuka(host),
+        controller(host),
         socket.create_connection((host, 30010), timeout=30) as connection,
         connection.makefile("rb") as lines,
     ):
