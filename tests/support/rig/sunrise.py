@@ -30,7 +30,19 @@ def compile_java(target: Path, *folders: Path) -> None:
     helped = subprocess.run([javac, "--help"], capture_output=True, text=True, timeout=60, check=True).stdout
     release = helped.partition("Supported releases: ")[2].partition(",")[0]
     sources = [str(path) for folder in folders for path in sorted(folder.rglob("*.java"))]
-    command = [javac, "--release", release, "-encoding", "UTF-8", "-Xlint:all,-options", "-Werror", "-d", str(target)]
+    quick = "-J-XX:TieredStopAtLevel=1"
+    command = [
+        javac,
+        quick,
+        "--release",
+        release,
+        "-encoding",
+        "UTF-8",
+        "-Xlint:all,-options",
+        "-Werror",
+        "-d",
+        str(target),
+    ]
     done = subprocess.run([*command, *sources], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
 
@@ -48,18 +60,24 @@ _FOLDERS: list[tempfile.TemporaryDirectory[str]] = []
 
 
 @contextlib.contextmanager
-def sunrise_engine(host: str) -> Generator[dict[str, Any]]:
-    """Run the application's engine at the ports of `simulated_kuka`; yields its ready line."""
+def java_program(name: str, *words: str, stdin: int | None = None) -> Generator[subprocess.Popen[str]]:
+    """Run a main class of tests/sunrise/simulated; its standard output is a pipe."""
     java = shutil.which("java")
     assert java is not None, _NO_JDK
-    main = "orthocapture.sunrise.simulated.Main"
-    command = [java, *_JVM, "-cp", str(engine_classes()), main, host]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
+    command = [java, *_JVM, "-cp", str(engine_classes()), f"orthocapture.sunrise.simulated.{name}", *words]
+    with subprocess.Popen(command, stdin=stdin, stdout=subprocess.PIPE, encoding="utf-8") as process:
         try:
-            line = process.stdout.readline()
-            assert line, "the engine did not start"
-            yield json.loads(line)
-            assert process.poll() is None, "the engine ended by itself"
+            yield process
         finally:
             process.kill()
+
+
+@contextlib.contextmanager
+def sunrise_engine(host: str) -> Generator[dict[str, Any]]:
+    """Run the application's engine at the ports of `simulated_kuka`; yields its ready line."""
+    with java_program("Main", host) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line, "the engine did not start"
+        yield json.loads(line)
+        assert process.poll() is None, "the engine ended by itself"
