@@ -165,13 +165,16 @@ class KukaRobot:
             what, _, remedy = problems[0].partition(". ")
             raise DeviceFaultError(f"FRI's poses would be in another frame: {what}", where=self._where, remedy=remedy)
         host = self._config.fri_host or link.local_host
-        self._fri = FriPoses((host, port), self._arm, self._newest)
+        self._fri = FriPoses((host, port), self._pose_of, self._newest)
         self._request("fri", host=host, port=port, period_ms=self._config.fri_period_ms)
         self._fri.await_first(self._config.connect_timeout_s)
 
+    def _pose_of(self, joints_rad: Array) -> Transform:
+        return forward(self._arm, joints_rad)
+
     def _frame_problems(self, state: State) -> list[str]:
         """Whether the flange is where the joints have it; not asked of a moving arm, as the two are read in turn."""
-        apart_m = float(np.linalg.norm((forward(self._arm, state.joints_rad) - state.T_base_flange)[:3, 3]))
+        apart_m = float(np.linalg.norm((self._pose_of(state.joints_rad) - state.T_base_flange)[:3, 3]))
         if state.motion or apart_m < FRAME_TOLERANCE_M:
             return []
         return [

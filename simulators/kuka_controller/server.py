@@ -23,6 +23,7 @@ _LOG = logging.getLogger(__name__)
 
 PERIOD_S = 0.01
 LONGEST_LINE = 1 << 16
+GIVES_WAY_S = 5.0  # a client that is silent for so long gives way to a new one
 MAX_BACKLOG_BYTES = 1 << 18
 
 
@@ -148,6 +149,10 @@ class Server:
         client = _Client(connection, pendant)
         if not pendant and self._client is not None:
             self._read(self._client)  # it may have hung up just before
+        present = self._client
+        if not pendant and present is not None and self.controller.silent_s > GIVES_WAY_S:
+            present.dead = True
+            self.controller.lose_client()
         if not pendant and self._client is not None:
             client.send(_error(None, "taken", "another client is connected"))
             connection.close()

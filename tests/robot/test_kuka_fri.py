@@ -7,6 +7,7 @@ import json
 import socket
 import time
 from collections.abc import Generator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from drivers.kuka.fri.wire import FriError, Monitoring, decode, reply
 from service.core.seven_axes import SEVEN_AXIS_ARMS, forward
 from tests.support.processes.waiting import until
 from tests.support.rig.kuka_simulator import pendant, simulated_kuka, transcript
+from tests.support.rig.rig import orthocapture
 from tests.support.rig.ur_simulator import address
 
 GOLDEN = transcript("fri.jsonl")
@@ -199,6 +201,19 @@ def test_an_application_without_fri_and_a_port_in_use_are_refused() -> None:
         other.bind((host, 30200))
         with pytest.raises(DeviceUnavailableError, match="in use"), opened(host):
             pass
+
+
+def test_doctor_says_how_fri_fares(tmp_path: Path) -> None:
+    host = address(96)
+    rig = tmp_path / "rig.yaml"
+    keys = f"driver: kuka_sunrise, host: {host}, fri_port: 30200, fri_host: {host}, connect_timeout_s: 20"
+    rig.write_text(f"name: FRI\ndevices:\n  robot: {{{keys}}}\n")
+    with simulated_kuka(host, "--fri-version", "2.7"):
+        done = orthocapture("doctor", "--rig", str(rig), "--data", str(tmp_path), "--json", timeout_s=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    told = json.loads(done.stdout)["devices"]["robot"]
+    assert told["problems"] == []
+    assert "every 10 ms" in told["details"]["FRI"]
 
 
 def test_its_process_ends_with_the_driver() -> None:

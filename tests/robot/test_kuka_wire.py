@@ -41,6 +41,21 @@ def test_simulator_and_application_answer_as_the_transcript(controller: Controll
             assert agrees(line, row["line"]), (line, row["line"])
 
 
+@pytest.mark.parametrize("controller", [simulated_kuka, sunrise_engine])
+def test_a_client_that_stays_silent_gives_way_to_a_new_one(controller: Controller) -> None:
+    host = address(70)
+    said: list[str] = []
+
+    def second_is_greeted() -> bool:
+        with socket.create_connection((host, 30010), timeout=30) as second, second.makefile("rb") as lines:
+            said.append(json.loads(lines.readline()).get("code", "hello"))
+        return said[-1] == "hello"
+
+    with controller(host), socket.create_connection((host, 30010), timeout=30):
+        until(second_is_greeted, "the first client stays", 60)
+    assert said[0] == "taken"
+
+
 class _Golden(threading.Thread):
     """The controller's side of a transcript: sends its lines, and collects what the client says."""
 

@@ -15,12 +15,11 @@ import numpy as np
 
 from drivers.arm.stream import BUFFER_S, within
 from drivers.errors import DeviceUnavailableError
-from drivers.interfaces import RobotSample, SafetyState
+from drivers.interfaces import Array, RobotSample, SafetyState, Transform
 from drivers.kuka.fri.sample import SIZE, FriSample, unpack
 from drivers.kuka.fri.wire import Session
 from drivers.kuka.speeds import Speeds
 from drivers.kuka.wire import State
-from service.core.seven_axes import SevenAxisArm, forward
 
 LONGEST_GAP_S = 0.1  # with a longer one the samples of FRI are not used
 STALE_S = 1.0
@@ -34,16 +33,18 @@ class FriPoses:
 
     Args:
         address: host and UDP port of this machine.
-        arm: whose kinematics make poses of joints.
+        pose_of: T_base_flange (4, 4) of joints (7,).
         newest: the application's newest state, which has what FRI does not tell.
 
     Raises:
         DeviceUnavailableError: the port cannot be listened at.
     """
 
-    def __init__(self, address: tuple[str, int], arm: SevenAxisArm, newest: Callable[[], State]) -> None:
+    def __init__(
+        self, address: tuple[str, int], pose_of: Callable[[Array], Transform], newest: Callable[[], State]
+    ) -> None:
         self._where = f"{address[0]}:{address[1]}"
-        self._arm, self._newest = arm, newest
+        self._pose_of, self._newest = pose_of, newest
         self._lock = threading.Lock()
         self._speeds = Speeds()
         self._samples: deque[RobotSample] = deque()
@@ -140,7 +141,7 @@ class FriPoses:
             time_s=told.time_s,
             joints_rad=joints,
             commanded_rad=now.commanded_rad if told.commanded_rad is None else np.array(told.commanded_rad),
-            T_base_flange=forward(self._arm, joints),
+            T_base_flange=self._pose_of(joints),
             mode=now.mode,
             safety=SafetyState.PROTECTIVE_STOP if stopped else now.safety,
             ready=now.ready,
