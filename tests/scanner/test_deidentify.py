@@ -128,7 +128,7 @@ def test_the_texts_of_a_nifti_file_go_and_its_voxels_stay(tmp_path: Path, name: 
     write_nifti(path, T, LABELS.transpose(2, 1, 0), descrip="DOE spine", intent_name="secret", aux_file="nickname")
     image = nibabel.load(path)
     assert isinstance(image, nibabel.Nifti1Image)
-    image = nibabel.Nifti1Image(np.array(image.dataobj), image.affine, image.header)
+    image = nibabel.Nifti1Image(np.asarray(image.dataobj).copy(), image.affine, image.header)
     image.header.extensions.append(Nifti1Extension("comment", b"DOE^JOHN"))
     nibabel.save(image, path)
     (tmp_path / "clean").mkdir()

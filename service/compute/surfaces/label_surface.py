@@ -10,7 +10,7 @@ from service.compute.surfaces.isosurface import surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply
 
-SIGMA_VOXELS = 1.0  # of the smoothing, without which the surface would be the steps of the voxels
+SIGMA_VOXELS = 0.7  # of the smoothing, without which the surface would be the steps of the voxels
 LEAST_CONTRAST_HU = 100.0  # of a sphere to its surroundings; the mean over a sphere has a noise of a few HU
 _FULL = 1000
 _HALO = 4  # slices on each side that the smoothing reaches
@@ -21,7 +21,7 @@ def label_surface(inside: NDArray[np.bool_], T_ct_voxel: Transform) -> tuple[Arr
     """Triangles around the segmented voxels.
 
     The surface is where the segmentation, smoothed by a Gaussian of SIGMA_VOXELS, has the value ½. That moves a
-    curved surface inwards by σ² H (H: its mean curvature), for a sphere of 15 mm in voxels of 0.4 mm by 0.01 mm; what
+    curved surface inwards by σ² H (H: its mean curvature), for a sphere of 15 mm in voxels of 0.4 mm by 0.005 mm; what
     is thinner than about two voxels vanishes.
 
     Args:
