@@ -72,6 +72,10 @@ _COMMANDS = {
         "service.cli.site.doctor:doctor_command",
         "Open every device of a rig; report versions, clock offsets, free space and problems.",
     ),
+    "dicom-listen": _Command(
+        "service.cli.site.dicom_listen:dicom_listen_command",
+        "Receive CT series and segmentations that a CT suite sends (DICOM C-STORE), until it is terminated.",
+    ),
     "calibrate": _Command(
         "service.cli.compute.calibrate:calibrate_app", "Calibrate a camera and its mounting from images of a board."
     ),

@@ -78,6 +78,11 @@ def gigabytes(size_bytes: float) -> float:
     return size_bytes / 1e9
 
 
+def bytes_of_gigabytes(size_gb: float) -> int:
+    """Bytes of a number of gigabytes (10^9 bytes)."""
+    return round(size_gb * 1e9)
+
+
 def megapixels(width_px: int, height_px: int) -> float:
     """Megapixels of an image of this size."""
     return width_px * height_px / 1e6

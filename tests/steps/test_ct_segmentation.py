@@ -32,6 +32,7 @@ from tests.scanner.test_ct_labels import write_nifti
 from tests.support.rig.bench_rig import BenchRig
 from tests.support.runs.bench_run import Bench, begin_run, say
 
+pytestmark = pytest.mark.slow
 VOXEL_M = 0.8e-3
 FIRST_M = np.array([-0.08, -0.08, 0.0])  # voxel (0, 0, 0) in the world
 SHAPE = (80, 200, 200)  # K, J, I
