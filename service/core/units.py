@@ -63,6 +63,11 @@ def seconds_of_us(duration_us: float) -> float:
     return duration_us / 1e6
 
 
+def nanoseconds(duration_s: float) -> int:
+    """Whole nanoseconds of a duration in seconds."""
+    return round(duration_s * 1e9)
+
+
 def seconds_of_ns(duration_ns: float) -> float:
     """Seconds of a duration in nanoseconds."""
     return duration_ns / 1e9
