@@ -79,6 +79,10 @@ _COMMANDS = {
     "calibrate": _Command(
         "service.cli.compute.calibrate:calibrate_app", "Calibrate a camera and its mounting from images of a board."
     ),
+    "import-ros": _Command(
+        "service.cli.compute.import_ros:import_ros_command",
+        "Take images, robot poses, camera and mount from a recording of ROS 2; the files fit the other commands.",
+    ),
     "sfm": _Command(
         "service.cli.compute.sfm:sfm_command",
         "Estimate camera poses with fixed, calibrated intrinsics; use the model with register --estimate-scale.",

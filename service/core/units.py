@@ -58,6 +58,11 @@ def ms(duration_s: float) -> float:
     return 1e3 * duration_s
 
 
+def seconds_of_ms(duration_ms: float) -> float:
+    """Seconds of a duration in milliseconds."""
+    return duration_ms / 1e3
+
+
 def seconds_of_us(duration_us: float) -> float:
     """Seconds of a duration in microseconds."""
     return duration_us / 1e6

@@ -1,6 +1,6 @@
 """Common Data Representation (CDR), the encoding of ROS 2 messages: primitives, aligned, little- or big-endian.
 
-Source: OMG, "Common Object Request Broker Architecture", part 2, 9.3 (CDR); encapsulation as in OMG's DDSI-RTPS, 10.2.
+Source: OMG, "Common Object Request Broker Architecture", part 2, 9.3; encapsulation as in OMG's DDSI-RTPS, 10.2.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The tree of frames of a recording, and the pose of one frame in another at a time; nothing is interpolated unasked."""
+"""The tree of frames of a recording, and poses in it at a time; nothing is interpolated unasked."""
 
 from __future__ import annotations
 
@@ -165,5 +165,5 @@ def _interpolated(T_before: Transform, T_after: Transform, share: float) -> Tran
     """The pose in between: the position on the line, the rotation about the axis that leads from one to the other."""
     from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 - half a second
 
-    turned = Slerp([0.0, 1.0], Rotation.from_matrix([T_before[:3, :3], T_after[:3, :3]]))(share)
+    turned = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([T_before[:3, :3], T_after[:3, :3]])))(share)
     return transform(turned, (1 - share) * T_before[:3, 3] + share * T_after[:3, 3])

@@ -156,7 +156,7 @@ def _messages(path: Path) -> Iterator[tuple[str, str, bytes]]:
 
 
 def _records(path: Path) -> Iterator[Any]:
-    """The records of a file, with those in chunks; the sizes that chunks state are checked before they are unpacked."""
+    """The records of a file and of its chunks; the sizes that chunks state are checked before they are unpacked."""
     from lz4.frame import get_frame_info  # noqa: PLC0415 - come with mcap
     from mcap.records import Chunk  # noqa: PLC0415
     from mcap.stream_reader import StreamReader, breakup_chunk  # noqa: PLC0415
