@@ -28,6 +28,7 @@ class View:
         camera: at the size of the picture; pixel centres at integer coordinates.
         T_world_camera: (4, 4) m; x right, y down, z forward.
         covariance: (6, 6) of (d, w): exp([w]x) R, t + d in the axes of the world, m and rad.
+        taken: time that the photograph states, as EXIF has it; "" if it states none.
     """
 
     name: str
@@ -35,6 +36,7 @@ class View:
     camera: CameraModel
     T_world_camera: Transform
     covariance: Array
+    taken: str = ""
 
     @property
     def file(self) -> str:
