@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from typing import Annotated, Literal, TypeVar
@@ -104,8 +103,8 @@ def _read_direction(text: str) -> _Point:
 
 def _read(kind: TypeAdapter[_T], text: str) -> _T:
     try:
-        return kind.validate_python(json.loads(text))
-    except (ValidationError, json.JSONDecodeError) as error:
+        return kind.validate_json(text)
+    except ValidationError as error:
         raise _unusable("the drawn polygon cannot be read") from error
 
 
