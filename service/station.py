@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import socket
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -184,7 +186,7 @@ class Station:
         """Lock a device that acts for this process; folders may be read by several processes."""
         spec, _ = self._spec(name)
         settings = self._config(name, spec).model_dump()
-        where = next((str(settings[field]) for field in _ADDRESS_FIELDS if settings.get(field)), "")
+        where = next((_one_name(field, str(settings[field])) for field in _ADDRESS_FIELDS if settings.get(field)), "")
         if spec.kind in _ACTING:
             self._locks[name] = DeviceLock.take(f"{self.rig.section.devices[name]['driver']} {where}".strip(), name)
 
@@ -249,6 +251,16 @@ class Station:
             problems = [problem_of(details, tree, spec.config, at) for details in error.errors()]
             remedy = "Compare it with the example in docs/howto/your_hardware.md"
             refuse(problems, what="rig file", name=str(self.rig.path), remedy=remedy, error=ConfigurationError)
+
+
+def _one_name(field: str, address: str) -> str:
+    """The same text for a device whatever name it is given: a link to its port, the name of its host."""
+    if field != "host":
+        return address if ":" in address else os.path.realpath(address)
+    try:
+        return socket.gethostbyname(address)
+    except OSError:  # to open it will fail, with an error that says so
+        return address
 
 
 def layout_of(rig: Rig, station: str) -> StationLayout:
