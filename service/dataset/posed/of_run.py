@@ -74,7 +74,7 @@ def data_set_of(
             "no image of the data set is registered", where=summary.run_id, remedy="Repeat the registration"
         )
     truth = summary.ground_truth()
-    mesh = Mesh(truth.vertices_m, truth.faces)
+    mesh = Mesh(truth.vertices_m, truth.faces, truth.source, truth.sigma_m)
     joint = own_pose_errors(summary, registered, sorted(files))
     stated_errors = view_covariances(summary, own, registered, sorted(files), joint)
     views = tuple(
