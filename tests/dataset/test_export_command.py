@@ -191,6 +191,7 @@ def test_what_the_options_state_stands_in_the_metadata(recorded: Path, tmp_path:
         (("--format", "nonsense"), "there is no format 'nonsense'"),
         (("--format", "gltf", "--crop", "wide"), "'wide' is not a size"),
         (("--format", "gltf", "--crop", "99999x10"), "does not fit"),
+        (("--format", "gltf", "--crops", "2"), "1920 × 1080 px does not fit"),
     ],
 )
 def test_what_cannot_be_is_refused(recorded: Path, tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:

@@ -46,10 +46,19 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """The ground truth: vertices (V, 3) in the world frame, m, and faces (F, 3)."""
+    """The ground truth.
+
+    Attributes:
+        vertices_m: (V, 3) in the world frame.
+        faces: (F, 3).
+        source: (V,) where each vertex comes from, 0: CT, 1: scan, 2: blend; None: all from the scan.
+        sigma_m: (V,) stated standard deviation along the normal; None: not stated.
+    """
 
     vertices_m: Array
     faces: NDArray[np.int64]
+    source: NDArray[np.uint8] | None = None
+    sigma_m: Array | None = None
 
 
 class Pixels(Interface):

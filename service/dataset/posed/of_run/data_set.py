@@ -65,7 +65,7 @@ def data_set_of(
     """
     own, registered, files = _registered(summary)
     truth = summary.ground_truth()
-    mesh = Mesh(truth.vertices_m, truth.faces)
+    mesh = Mesh(truth.vertices_m, truth.faces, truth.source, truth.sigma_m)
     joint = own_pose_errors(summary, registered, sorted(files))
     stated_errors = view_covariances(summary, own, registered, sorted(files), joint)
     taken = {capture.viewpoint: str(capture.camera.get("exif_time") or "") for capture in summary.captures()}
