@@ -1,7 +1,7 @@
 """The detectors side by side under hard conditions: white on white cloth, blood, occlusion, hard light.
 
-`grounded` and `vote` take part where ORTHOCAPTURE_GROUNDED names a folder with their weights; elsewhere the table says
-that they did not. Seconds are of the process on all its threads, or of the wall clock with a GPU.
+`grounded` and `vote` take part where ORTHOCAPTURE_GROUNDED names a folder with their weights; elsewhere the table
+says that they did not. Seconds are of the process on all its threads, or of the wall clock with a GPU.
 """
 
 from __future__ import annotations
@@ -77,9 +77,10 @@ def main() -> None:
     weights = "" if "grounded" in able else f" `grounded` and `vote` did not run: {VARIABLE} names no weights here."
     lines = [
         "# Detectors under hard conditions", "",
-        f"`python -m bench.markers.detectors`, {today}, commit {commit()}, {machine()['processor']}. {options.images} "
-        f"images a condition, {options.width} px wide, {options.spheres} spheres each.{weights}", "",
-        "| condition | detector | found | recall | false | rms px | CPU-s an image |", "|---|---|---:|---:|---:|---:|---:|",
+        f"`python -m bench.markers.detectors`, {today}, commit {commit()}, {machine()['processor']}. "
+        f"{options.images} images a condition, {options.width} px wide, {options.spheres} spheres each.{weights}", "",
+        "| condition | detector | found | recall | false | rms px | CPU-s an image |",
+        "|---|---|---:|---:|---:|---:|---:|",
     ]  # fmt: skip
     for name, look in HARD.items():
         for word, detector in able.items():
