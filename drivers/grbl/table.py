@@ -22,7 +22,7 @@ from drivers.errors import (
 from drivers.grbl import GrblConfig
 from drivers.grbl.axes import Axes
 from drivers.grbl.link import Link
-from drivers.grbl.mover import Mover
+from drivers.grbl.mover import REACTION_S, Mover
 from drivers.grbl.setup import Setup, setup_of
 from drivers.grbl.wire import FEED_HOLD, JOG_CANCEL, Message, Status
 from drivers.interfaces import (
@@ -222,7 +222,9 @@ class GrblTable:
         speeds = np.array(
             [np.degrees(speed_rad_s) if a.turns else 1e3 * self._config.slide_speed_m_s for a in self._config.axes]
         )
-        self._mover.begin(target, speeds)
+        # From a higher speed they would not stand in time if nobody were left to stop them.
+        fastest = setup.acceleration * (self._config.rest_within_s - REACTION_S)
+        self._mover.begin(target, np.minimum(speeds, fastest))
 
     def stop(self) -> None:
         """Hold, drop what is left of the motion, and return when the axes stand.

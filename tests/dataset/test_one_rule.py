@@ -24,7 +24,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.record.known_spheres import best_registration, scan_spheres
 from service.web.scene.data import scene_of
-from tests.support.runs.unpacked_run import unpack_recorded_run
+from tests.support.recorded.unpacked_run import unpack_recorded_run
 
 pytestmark = pytest.mark.timeout(300)
 

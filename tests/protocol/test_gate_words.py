@@ -25,8 +25,8 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import WebSite, web_site
 from tests.support.processes.waiting import until
-from tests.support.runs.calibrated_run import begin_calibrated_run
-from tests.support.runs.reported_run import record_reported_run
+from tests.support.recorded.calibrated_run import begin_calibrated_run
+from tests.support.recorded.reported_run import record_reported_run
 
 BOUNDED = "0.340 mm, 0.300 to 0.380"
 

@@ -45,7 +45,7 @@ def export_data_set(
         SpaceShortError: it would use the space that is reserved for the evidence. Nothing was written.
         DataError: the folder exists, or the run does not have what the format needs.
     """
-    how, size = exporter(wanted.form), crop_size(wanted.crop)
+    how, size = exporter(wanted.form), crop_size(wanted.crop_px)
     require_version(wanted.version)
     require_export_space(store, run_id, target)
     require_exportable(store, run_id, progress)

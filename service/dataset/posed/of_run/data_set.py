@@ -65,11 +65,13 @@ def data_set_of(
     """
     own, registered, files = _registered(summary)
     truth = summary.ground_truth()
-    mesh = Mesh(truth.vertices_m, truth.faces)
+    mesh = Mesh(truth.vertices_m, truth.faces, truth.source, truth.sigma_m)
     joint = own_pose_errors(summary, registered, sorted(files))
     stated_errors = view_covariances(summary, own, registered, sorted(files), joint)
+    taken = {capture.viewpoint: str(capture.camera.get("exif_time") or "") for capture in summary.captures()}
     views = tuple(
-        _view(name, path, registered, stated_errors.covariance[name]) for name, (path, _) in sorted(files.items())
+        _view(name, path, registered, stated_errors.covariance[name], taken[name])
+        for name, (path, _) in sorted(files.items())
     )
     pixels, masks = _pixels(summary, files, views, mesh, personal=personal)
     hashes = {view.file: files[view.name][1] for view in views}
@@ -145,12 +147,12 @@ def _photographs(summary: RunSummary, registered: Registration) -> dict[str, tup
     return found
 
 
-def _view(name: str, path: Path, registered: Registration, covariance: Array) -> View:
+def _view(name: str, path: Path, registered: Registration, covariance: Array, taken: str) -> View:
     with path.open("rb") as file:
         suffix = ".png" if file.read(len(PNG_BEGINS)) == PNG_BEGINS else ".jpg"
     camera = CameraModel.from_record((registered.full_camera or registered.camera).model_dump())
     T_scan_camera = np.array(registered.T_scan_camera[name])
-    return View(name, suffix, camera, T_scan_camera, covariance)
+    return View(name, suffix, camera, T_scan_camera, covariance, taken)
 
 
 def _markers(summary: RunSummary, views: Sequence[View]) -> tuple[tuple[Ball, ...], tuple[Post, ...]]:
