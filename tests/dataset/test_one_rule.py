@@ -15,9 +15,9 @@ from service.audit.report.output.html import render_html
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array
 from service.core.run.state import RunState
-from service.dataset.posed.of_run import data_set_of
+from service.dataset.posed.of_run.data_set import data_set_of
+from service.dataset.posed.of_run.view_covariances import pose_covariance
 from service.dataset.posed.records import DataSet
-from service.dataset.posed.view_covariances import pose_covariance
 from service.dataset.registrations import own_registration, registrations, signed_rows
 from service.run_record import RunRecord
 from service.store.store import Store

@@ -50,14 +50,14 @@ EDGES = {
     "service/benchmark/table.py": "writes the table of a benchmark",
     "service/dataset/package/crate.py": "writes ro-crate-metadata.json",
     "service/dataset/package/croissant.py": "writes croissant.json",
-    "service/dataset/posed/statement.py": "writes dataset.json",
+    "service/dataset/posed/of_run/statement.py": "writes dataset.json",
     "service/dataset/formats/radiance/unit_box.py": "writes unit_box.json",
     "service/worker/capture/held_images.py": "writes and reads the file of a hand-held image",
     "service/worker/capture/live_station.py": "writes and reads the file of an image of the robot",
     # messages of COLMAP's child process
     "service/compute/poses/colmap/process.py": "messages of a child process",
-    "service/compute/poses/sfm/adjustment.py": "messages of a child process",
-    "service/compute/poses/sfm/mapping.py": "messages of a child process",
+    "service/compute/poses/sfm/model/adjustment.py": "messages of a child process",
+    "service/compute/poses/sfm/model/mapping.py": "messages of a child process",
     # JSON that commands print
     "service/cli/compute/evaluate_chamfer.py": "prints JSON",
     "service/cli/compute/fuse.py": "prints JSON",

@@ -30,7 +30,7 @@ from service.cli.common import (
     require_writable,
 )
 from service.compute.arm.joint_file import read_joints_csv
-from service.compute.arm.kinematics import ARM_MODELS, ArmModel, arm_model, matching_arm, solve_joints
+from service.compute.arm.kinematics import matching_arm, solve_joints
 from service.compute.calibration.board_poses.plan import SuggestedPose, suggest_board_poses
 from service.compute.calibration.board_poses.plan_plot import draw_board_plan
 from service.compute.calibration.hand_eye.answers import HandEyeResult
@@ -43,6 +43,8 @@ from service.compute.camera_covariance import read_camera_covariance
 from service.compute.images.folder import image_folder
 from service.compute.poses.files.camera_files import read_camera_json
 from service.compute.poses.files.pose_files import posed_images
+from service.core.arms.known import arm_model
+from service.core.arms.model import ArmModel
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform
 from service.core.text.counts import counted
@@ -69,11 +71,11 @@ def hand_eye_command(
     method: Annotated[Method, typer.Option("--method", help="The method that gives the result.")] = "weighted",
     joints: Annotated[
         Path | None,
-        typer.Option("--joints", help="CSV image,q1,…,q6 in radians; the arm's own error is then estimated too."),
+        typer.Option("--joints", help="CSV image,q1,…,qN in radians; the arm's own error is then estimated too."),
     ] = None,
     arm: Annotated[
         str | None,
-        typer.Option("--arm", help=f"Arm model: {', '.join(ARM_MODELS)}; default: found from the joints."),
+        typer.Option("--arm", help="Arm model, such as UR10e or LBR Med 14; default: found from the joints."),
     ] = (None),
     suggest: Annotated[int, typer.Option("--suggest", help="Number of further board poses to suggest.", min=0)] = 6,
     preview: Annotated[

@@ -17,6 +17,7 @@ from service.compute.calibration.board_poses.plan import SuggestedPose, suggest_
 from service.compute.calibration.hand_eye.answers import HandEyeAnswer
 from service.compute.calibration.hand_eye.record import read_arm_correction
 from service.compute.camera_model import CameraModel
+from service.core.arms.known import known_arm
 from service.core.errors import OrthocaptureError
 from service.core.geometry import Array, Transform, inverse
 from service.core.protocol.models import Board as BoardSection
@@ -24,7 +25,6 @@ from service.core.records.events import ViewpointCaptured
 from service.core.units import deg, metres, mm
 from service.jobs.calibration.records import ArmAnswer, HandEye
 from service.jobs.records import Camera
-from service.steps.capture.plan.planning import known_arm
 from service.web.record.pictures import cached
 
 POSES = 6

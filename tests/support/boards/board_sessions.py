@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,17 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from service.compute.arm.inverse_kinematics import nearest_posture
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.board_poses.design import CalibrationTargets
 from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.camera_model import CameraModel
+from service.core.arms.known import arm_model
 from service.core.geometry import Array, align_points, apply, inverse, look_at, transform
 from service.rig import LensSection
 from service.steps.board.plan import Planner, nominal_board, nominal_camera, preview_board
 from service.steps.board.poses import BoardPoses
+from service.steps.capture.plan.planning import usual_posture
 from service.steps.capture.plan.viewpoints import ViewpointSet, flange_target, plan_viewpoints
 from service.steps.context import StationLayout
 from simulators.scene.arm import ARM_MODEL
@@ -67,8 +70,9 @@ def plan(scene: Scene, protocol: str, *steps: str) -> list[Shot]:
         for record in params.get("viewpoints", ()):
             wanted = ViewpointSet.model_validate(record)
             layout = _layout(scene, wanted.station)
+            joints = _joints(scene, layout)
             for viewpoint in plan_viewpoints(wanted, layout):
-                q = joints_for(ARM_MODEL, flange_target(viewpoint.T_base_camera, nominal_hand_eye()), _NEAR)
+                q = joints(viewpoint.T_base_camera)
                 if q is not None:
                     shots.append(Shot(wanted.station, q))
     return shots
@@ -83,14 +87,21 @@ def planned_board_shots(scene: Scene, wanted: BoardPoses, solve: Sequence[str]) 
     board, layout, mount = Board(16, 23, 0.015), _layout(scene, wanted.station), nominal_hand_eye()
     lens = LensSection(focal_length_mm=50, sensor_width_mm=35.7, image_px=(4752, 3168))
     known = nominal_board(wanted, board, layout, mount, *nominal_camera(lens))
-
-    def joints(T_base_camera: Array) -> Array | None:
-        return joints_for(ARM_MODEL, flange_target(T_base_camera, mount), _NEAR)
-
+    joints = _joints(scene, layout)
     aims = CalibrationTargets("intrinsics" in solve, "hand_eye" in solve, wanted.coverage)
     planner = Planner(wanted, board, aims, np.array(layout.approach), mount, lambda T: joints(T) is not None)
     found = [joints(T) for T in preview_board(planner, known).T_base_camera]
     return [Shot(wanted.station, q) for q in found if q is not None]
+
+
+def _joints(scene: Scene, layout: StationLayout) -> Callable[[Array], Array | None]:
+    """The joints with which the scene's arm takes a T_base_camera; None out of reach."""
+    mount = nominal_hand_eye()
+    if scene.arm.name == ARM_MODEL.name:
+        return lambda T: joints_for(ARM_MODEL, flange_target(T, mount), _NEAR)
+    arm = arm_model(scene.arm.name)
+    start = usual_posture(arm, layout, mount)
+    return lambda T: nearest_posture(arm, flange_target(T, mount), start)
 
 
 def _layout(scene: Scene, station: str) -> StationLayout:

@@ -14,7 +14,7 @@ import pytest
 from service.audit.record.run import read_run
 from service.benchmark.records import Effort, Machine, Result, Score
 from service.core.records.events import EvidenceExported
-from service.dataset.posed.of_run import data_set_of
+from service.dataset.posed.of_run.data_set import data_set_of
 from service.dataset.preview.records import (
     DrawnRegion,
     Preview,

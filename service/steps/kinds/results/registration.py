@@ -58,7 +58,9 @@ class Params(StepParams):
     scan: str  # step that imported the scan
     poses: tuple[Source, ...] = DEFAULT_SOURCES  # where the camera poses come from; each gives a registration
     structure_from_motion: StructureFromMotion = StructureFromMotion()  # sizes and numbers of features
-    detector: Literal["classical", "paper"] = "classical"  # "paper" searches every image whole, for comparison
+    # The others search every image whole: "paper" is the published method without its networks, "grounded" has
+    # Grounding DINO and SAM 2, and in "vote" it and the classical one must agree.
+    detector: detect_spheres.DetectorName = "classical"
     reduced: tuple[str, ...] = ()  # such as 1920x1080: lower resolutions, for the paper's comparison
     reduced_poses: tuple[Literal["colmap", "glomap"], ...] = ("colmap",)  # sources of poses for the reduced images
 
