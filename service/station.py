@@ -272,4 +272,6 @@ def layout_of(rig: Rig, station: str) -> StationLayout:
             f"the rig has no station {station!r}", where=str(rig.path), remedy=f"Stations: {known}"
         )
     azimuth = math.radians(section.approach_azimuth_deg)
-    return StationLayout(station, section.robot, section.scene_centre_m, (math.cos(azimuth), math.sin(azimuth), 0.0))
+    approach = (math.cos(azimuth), math.sin(azimuth), 0.0)
+    obstacles = tuple(section.obstacles.items())
+    return StationLayout(station, section.robot, section.scene_centre_m, approach, obstacles)

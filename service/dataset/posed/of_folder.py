@@ -149,11 +149,18 @@ def _read(folder: Path) -> DataSet:
         raise ValueError("dataset.json is not a JSON object")
     with h5py.File(folder / INDEX, "r") as file:
         simulated = bool(file.attrs["simulated"])
-        mesh = Mesh(np.array(file["mesh/vertices_m"], dtype=np.float64), np.array(file["mesh/faces"], dtype=np.int64))
+        mesh = _mesh(file["mesh"])
     views = tuple(_view(folder, name) for name in sorted({*of.dense, *of.train, *of.test}))
     identity = hashlib.sha256((folder / SUMS).read_bytes()).hexdigest()
     dataset = DataSet(identity, simulated, statement, views, Stored(folder, ""), mesh, of)
     return dataclasses.replace(dataset, pixels=Stored(folder, dataset.mark))
+
+
+def _mesh(stored: Any) -> Mesh:
+    source = np.array(stored["source"], dtype=np.uint8) if "source" in stored else None
+    sigma_m = np.array(stored["sigma_m"], dtype=np.float64) if "sigma_m" in stored else None
+    vertices_m, faces = np.array(stored["vertices_m"], dtype=np.float64), np.array(stored["faces"], dtype=np.int64)
+    return Mesh(vertices_m, faces, source, sigma_m)
 
 
 def _view(folder: Path, name: str) -> View:
