@@ -51,10 +51,15 @@ steps:
       - {measure: moved_during_exposure, max: 0}
     recovery: {retries: 1, wait_s: 0.2}
 """
-TABLE = PROTOCOL.replace("prefix: v\n", "prefix: v\n          image_top: up\n").replace(
-    "{tilt_deg: 20, azimuth_from_deg: -40, azimuth_to_deg: 40, count: 3, distance_m: DISTANCE}",
-    "{tilt_deg: 35, azimuth_from_deg: 60, azimuth_to_deg: 120, count: 3, distance_m: 0.62}",
-).replace("acceleration_rad_s2: 1.5", "acceleration_rad_s2: 20").replace("window_s: 0.1", "window_s: 0.3")
+TABLE = (
+    PROTOCOL.replace("prefix: v\n", "prefix: v\n          image_top: up\n")
+    .replace(
+        "{tilt_deg: 20, azimuth_from_deg: -40, azimuth_to_deg: 40, count: 3, distance_m: DISTANCE}",
+        "{tilt_deg: 35, azimuth_from_deg: 60, azimuth_to_deg: 120, count: 3, distance_m: 0.62}",
+    )
+    .replace("acceleration_rad_s2: 1.5", "acceleration_rad_s2: 20")
+    .replace("window_s: 0.1", "window_s: 0.3")
+)
 SCAN = """\
 id: faults
 version: "1"

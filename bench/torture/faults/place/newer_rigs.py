@@ -8,6 +8,7 @@ import signal
 import socket
 import time
 from contextlib import closing, suppress
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,7 +55,7 @@ def kuka_rig(trial: Trial, plan: list[str]) -> dict[str, Any]:
     trial.wired(Wire("kuka", "kuka", (near, 30010), (trial.arm_host, 30010)))
     trial.watch(eye)
     host = near if trial.proxy else trial.arm_host
-    return {"driver": "kuka_sunrise", "host": host, "connect_timeout_s": 2.0, "answer_timeout_s": 1.0}
+    return {"driver": "kuka_sunrise", "host": host, "connect_timeout_s": 4.0, "answer_timeout_s": 2.0, "stale_after_s": 4.0}
 
 
 def pendant(trial: Trial, order: str) -> None:
@@ -73,13 +74,14 @@ class Film:
 
     def __init__(self, pipe: Path) -> None:
         self.pipe = pipe
-        self._process: multiprocessing.process.BaseProcess | None = None
+        self._process: BaseProcess | None = None
 
     def run(self, how: str = "") -> None:
         """Begin, or begin anew: `frozen`, `damaged`, `other_size` or `noise` say what is wrong with the images."""
         self.end()
-        self._process = multiprocessing.get_context("fork").Process(target=_write, args=(self.pipe, how), daemon=True)
-        self._process.start()
+        process = multiprocessing.get_context("fork").Process(target=_write, args=(self.pipe, how), daemon=True)
+        process.start()
+        self._process = process
 
     def end(self) -> None:
         """End it, as a camera that is pulled."""

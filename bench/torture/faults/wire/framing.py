@@ -81,7 +81,7 @@ class Lines(_Buffered):
         return found
 
 
-_GRBL = {b"<": "status", b"$": "setting", b"G": "welcome", b"o": "answer", b"e": "answer", b"A": "alarm", b"[": "said"}
+_GRBL = {b"<": "status", b"$": "setting", b"G": "welcome", b"o": "answer", b"e": "answer"}  # by the first letter
 _AT_ONCE = b"\x18?!~\x85"  # commands of one byte
 
 
@@ -206,7 +206,7 @@ class PtpIp(_Buffered):
 _ACCESS_DENIED = 0x200F
 
 
-def refused(device: str, kind: str, message: bytes) -> bytes:
+def refused(device: str, kind: str, message: bytes) -> bytes:  # noqa: PLR0911 - one for each device
     """The message with which this device refuses a request. Raises KeyError if the device cannot refuse it."""
     if device == "camera":
         if kind in ("connect", "event_connect"):

@@ -299,7 +299,7 @@ class Proxy:
             journal.write(json.dumps({"at_s": time.monotonic(), "what": what, **more}) + "\n")
 
 
-def _framer(wire: Wire, link: _Link, *, answers: bool) -> Framer:
+def _framer(wire: Wire, link: _Link, *, answers: bool) -> Framer:  # noqa: PLR0911 - one for each wire
     match wire.protocol:
         case "rtde":
             return Rtde(answers=answers)
