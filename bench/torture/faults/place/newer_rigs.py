@@ -55,7 +55,13 @@ def kuka_rig(trial: Trial, plan: list[str]) -> dict[str, Any]:
     trial.wired(Wire("kuka", "kuka", (near, 30010), (trial.arm_host, 30010)))
     trial.watch(eye)
     host = near if trial.proxy else trial.arm_host
-    return {"driver": "kuka_sunrise", "host": host, "connect_timeout_s": 4.0, "answer_timeout_s": 2.0, "stale_after_s": 4.0}
+    return {
+        "driver": "kuka_sunrise",
+        "host": host,
+        "connect_timeout_s": 4.0,
+        "answer_timeout_s": 2.0,
+        "stale_after_s": 4.0,
+    }
 
 
 def pendant(trial: Trial, order: str) -> None:
