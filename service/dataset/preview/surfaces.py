@@ -20,8 +20,9 @@ from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 from service.core.units import metres, mm
 from service.dataset.posed.records import DataSet, Mesh
-from service.dataset.preview.fusion import MESH, PICTURE, RecordedFusion, shown_ground_truth, vertex_figures
+from service.dataset.preview.fusion import PICTURE, shown_ground_truth, vertex_figures
 from service.dataset.preview.records import AT_LEAST, ShownCoverage, ShownDistances, ShownGroundTruth, put
+from service.dataset.recorded_fusion import MESH, RecordedFusion
 from service.dataset.registrations import last_result
 from service.dataset.scene_view import MeshColours, Scene, SceneMesh, SceneSphere, decimated, scene_json
 from service.dataset.summary import RunSummary
