@@ -30,7 +30,7 @@ from tests.support.scenes.posed import posed_data_set, scene
 
 NAMES = {
     "colmap", "colmap-binary", "colmap-pinhole", "sugar", "eth3d", "nerfstudio", "instant-ngp", "neus2", "dtu", "bop",
-    "hdf5", "gltf", "plain", "matching",
+    "hdf5", "gltf", "plain", "matching", "mcap",
 }  # fmt: skip
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 

@@ -102,6 +102,8 @@ def test_the_wound_that_the_last_fusion_used_is_outlined(shown: tuple[WebSite, B
         {"corners": "[[0, 0, 1e9], [0, 1, 0], [1, 0, 0]]"},
         {"corners": "{"},
         {"corners": '"x"'},
+        {"corners": "[" * 39_000},
+        {"corners": f"[[{'9' * 5_000}, 0, 0], [0, 1, 0], [1, 0, 0]]"},
         {"along": "[0, 0, 0]"},
         {"along": "[0, NaN, 0]"},
         {"source": "air"},
