@@ -161,6 +161,7 @@ def test_the_screen_shows_sources_and_sigmas_and_the_recorded_distances(bench: B
     fusion = recorded_fusion(summary)
     assert fusion is not None
     exported = summary.ground_truth()
+    assert exported.source is not None
     assert np.array_equal(exported.source, columns["source"])
     assert exported.sigma_m == pytest.approx(1e-3 * columns["sigma_mm"], rel=1e-6)
     mesh = Simplified(points, read_ply(bench.store.artefact_path(fusion.files["ground_truth_mesh"].sha256))[1])
