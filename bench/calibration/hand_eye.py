@@ -20,7 +20,7 @@ from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrat
 from service.core.arms.known import arm_model
 from service.core.geometry import Array
 from simulators.scene.world import ARMS, Scene
-from tests.support.scenes.board_sessions import (
+from tests.support.boards.board_sessions import (
     T_FLANGE_CAMERA,
     OddScene,
     Session,

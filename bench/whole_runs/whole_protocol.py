@@ -16,7 +16,7 @@ from typing import Any
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.whole_runs.whole_run import whole_run
-from tests.support.runs.shortened import shortened
+from tests.support.protocols.shortened import shortened
 
 PROTOCOL = REPOSITORY / "protocols" / "exvivo_spine.yaml"
 

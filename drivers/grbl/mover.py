@@ -19,7 +19,7 @@ from drivers.grbl.setup import Setup
 from drivers.grbl.wire import JOG_CANCEL, Alarm, Message, Refused, Status, Welcome
 from drivers.interfaces import Array, SafetyState
 
-HEARTBEAT_S = 0.5  # without a sign of life of the program for so long the axes are stopped
+HEARTBEAT_S = 0.5  # the axes are stopped after so long without a sign of life from the program
 _UNANSWERED = 3  # lines that fit into the controller's 128 bytes
 _DRIVEN = ("Run", "Jog", "Home")
 _DOOR = "A person must close the safety door, and then confirm"
@@ -175,10 +175,11 @@ class Mover:
             raise LeaveNeededError("the position of the axes is not known", where=self._where, remedy=remedy)
         state = self.status.state if self.status is not None else "silent"
         if self.moving or state != "Idle":
-            raise DeviceBusyError(f"the controller is {state}", where=self._where, remedy="Wait until the axes stand")
+            remedy = "Wait until the axes stand still"
+            raise DeviceBusyError(f"the controller is {state}", where=self._where, remedy=remedy)
 
     def begin(self, target: Array, speeds: Array) -> None:
-        """Start a motion to machine coordinates (N,), with a highest speed (N,) of each axis a second."""
+        """Start a motion to machine coordinates (N,), at most at `speeds` (N,), in units of each axis per second."""
         setup, position = self._setup, self.position
         if setup is None or position is None:
             raise DeviceUnavailableError("the axes are not connected", where=self._where, remedy="Open them first")

@@ -271,14 +271,6 @@ class GrblTable:
         recent = stream.between(now_s - criteria.window_s - LONGEST_RINGING_S, now_s)
         return dataclasses.replace(report, ringing_s=ringing_s(recent, criteria))
 
-    def set_digital_output(self, index: int, on: bool) -> None:
-        """Refuse: a coolant pin is the only output, and not made for this."""
-        raise DeviceRefusedError(
-            f"there is no digital output {index} to switch {'on' if on else 'off'}",
-            where=self._where,
-            remedy="Release the camera by its own driver",
-        )
-
     # --- parts -------------------------------------------------------------------------------------------
 
     def _receive(self, message: Message, at_s: float) -> None:

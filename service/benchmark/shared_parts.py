@@ -40,4 +40,4 @@ def from_unit_box(vertices: Array, data: Path) -> Array:
 
 def triangulation(place: Place, dense: Path) -> Command:
     """The command of ours that makes COLMAP's workspace `dense` of the export `colmap-pinhole` in `place.data`."""
-    return (place.python, "-m", "service.benchmark.triangulated", str(place.data), str(dense))
+    return (place.python, "-m", "service.benchmark.programs.triangulated", str(place.data), str(dense))

@@ -73,7 +73,7 @@ _COMMANDS = {
         "Open every device of a rig; report versions, clock offsets, free space and problems.",
     ),
     "calibrate": _Command(
-        "service.cli.compute.calibrate:calibrate_app", "Calibrate a camera and its mounting from images of a board."
+        "service.cli.calibrate.group:calibrate_app", "Calibrate a camera and its mounting from images of a board."
     ),
     "sfm": _Command(
         "service.cli.compute.sfm:sfm_command",

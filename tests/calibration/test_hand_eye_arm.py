@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from service.cli.compute.calibrate import calibrate_app
+from service.cli.calibrate.group import calibrate_app
 from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm.joint_file import read_joints_csv
 from service.compute.arm.kinematics import (
@@ -37,8 +37,8 @@ from service.core.geometry import Array, inverse
 from simulators.scene.world import Scene
 from simulators.ur_controller.kinematics import MODELS
 from simulators.ur_controller.kinematics import forward as simulated_forward
-from tests.support.scenes.board_images import checkerboard, photograph
-from tests.support.scenes.board_sessions import (
+from tests.support.boards.board_images import checkerboard, photograph
+from tests.support.boards.board_sessions import (
     BOARD,
     T_FLANGE_CAMERA,
     OddScene,

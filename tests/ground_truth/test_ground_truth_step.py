@@ -31,9 +31,9 @@ from service.worker.job import JobContext
 from service.worker.loop import HANDLERS, work
 from tests.ground_truth.test_fuse_command import CENTRES_M, RADIUS_M, T_WORLD_CT, with_spheres
 from tests.ground_truth.test_fusion import ct_mesh, height, scan_mesh
+from tests.support.recorded.registration_record import registration_record
 from tests.support.rig.bench_rig import BenchRig, ScriptedOperator, answer
 from tests.support.runs.bench_run import Bench, begin_run
-from tests.support.runs.registration_record import registration_record
 
 TAKEN_M = np.array([0.018, 0.012, 0.0360])  # a control sphere on the specimen, which the scan does not show
 PROTOCOL = """\

@@ -6,7 +6,7 @@ import json as json_module
 import os
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -33,7 +33,7 @@ from service.compute.markers.search.image_files import (
     searched_whole,
 )
 from service.compute.markers.search.paper_files import detect_file_by_masks, read_boxes
-from service.compute.pipeline import register_images
+from service.compute.pipeline import PipelineResult, register_images
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
 from service.compute.poses.files.pose_files import posed_images
 from service.compute.scene import PosedImages, ScanSpheres
@@ -111,51 +111,42 @@ def register_command(
         registration_m, control_m, radius_m = _spheres(mesh, spheres, radius_mm, mesh_unit, control, seeds)
         T_world_camera = np.array([known[file.name] for file in files])
         processes = min(len(files), workers or os.cpu_count() or 1)
+        names = [file.name for file in files]
+        posed = PosedImages(T_world_camera, model, metric=not estimate_scale, names=names)
+        scanned = ScanSpheres(registration_m, radius_m, control_m=control_m)
         with progress_bar(quiet=json) as progress:
 
             def show(done: int, total: int) -> None:
                 progress("spheres in images", done, total)
 
             if full_search or detector == "paper":
-                detected = detect_all(files, model, options, processes, show, detect=detect)
-                located = searched_whole(detected)
+                located = searched_whole(detect_all(files, model, options, processes, show, detect=detect))
             else:
-                located = locate_outlines(
-                    files,
-                    PosedImages(T_world_camera, model, metric=not estimate_scale),
-                    ScanSpheres(registration_m, radius_m, control_m=control_m),
-                    options=options,
-                    workers=processes,
-                    progress=show,
-                )
-        result = register_images(
-            located.outlines,
-            PosedImages(T_world_camera, model, metric=not estimate_scale, names=[file.name for file in files]),
-            ScanSpheres(registration_m, radius_m, control_m=control_m),
-            assignments=located.assignments,
-        )
+                located = locate_outlines(files, posed, scanned, options=options, workers=processes, progress=show)
+        result = register_images(located.outlines, posed, scanned, assignments=located.assignments)
         record = result.as_json(model)
-        record["spheres_mm"] = {
-            "registration": mm(registration_m).tolist(),
-            "control": mm(control_m).tolist(),
-        }
+        record["spheres_mm"] = {"registration": mm(registration_m).tolist(), "control": mm(control_m).tolist()}
         record["left_out"] = folder.left_out
-        record["search"] = _search(located, [file.name for file in files])
+        record["search"] = _search(located, names)
         out.write_text(json_module.dumps(record, indent=1), encoding="utf-8")
         if json:
             print_json(record)
             return
-        console.print(
-            f"{record['n_images']} images, {len(result.markers)} spheres, {result.registration.rms_px:.3f} px rms, "
-            f"predicted error at their centre {record['predicted_error_mm']:.3f} mm"
-        )
-        if result.evaluation is not None:
-            evaluation = result.evaluation
-            console.print(
-                f"control spheres: {evaluation.mean_radial_error_mm:.3f} mm mean radial error, "
-                f"{evaluation.mean_reprojection_error_px:.2f} px mean reprojection error"
-            )
+        _tell(result, record)
         console.print(f"written: {out}")
+
+
+def _tell(result: PipelineResult, record: dict[str, Any]) -> None:
+    console.print(
+        f"{record['n_images']} images, {len(result.markers)} spheres, {result.registration.rms_px:.3f} px rms, "
+        f"predicted error at their centre {record['predicted_error_mm']:.3f} mm"
+    )
+    if result.evaluation is not None:
+        evaluation = result.evaluation
+        console.print(
+            f"control spheres: {evaluation.mean_radial_error_mm:.3f} mm mean radial error, "
+            f"{evaluation.mean_reprojection_error_px:.2f} px mean reprojection error"
+        )
 
 
 def _file_detector(detector: DetectorName, boxes: Path | None, names: list[str]) -> DetectFile | None:

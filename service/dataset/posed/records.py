@@ -118,7 +118,7 @@ class DataSet:
         return self.pose_errors[np.ix_(rows, rows)]
 
     def keeping(self, names: tuple[str, ...]) -> DataSet:
-        """The same data set with these views only; the splits are cut to them."""
+        """This data set with only these views, also in its splits."""
         chosen = set(names)
         cut = {key: tuple(n for n in split if n in chosen) for key, split in self.splits.named().items()}
         kept = [k for k, view in enumerate(self.views) if view.name in chosen]

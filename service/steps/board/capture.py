@@ -154,7 +154,7 @@ class BoardCapture:
         enough: Callable[[Prediction, Prediction], bool] | None = None,
         advise: Callable[[int, str, str], str] | None = None,
     ) -> tuple[Viewpoint, ...]:
-        """Plan poses, record and tell them; none if the arm can reach no further pose that shows the board."""
+        """Plan board poses, record them and tell the operator; none if the arm can reach no other useful pose."""
         self.context.progress("planning board poses", 0, 1)
         self.context.busy("planning board poses")
         known = self._knowledge(looks)

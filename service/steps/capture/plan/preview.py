@@ -26,8 +26,8 @@ from service.steps.board.plan import (
 from service.steps.capture.plan.planning import ArmAtStation, StepPlan, plan_station, usual_posture
 from service.steps.capture.plan.viewpoints import plan_viewpoints
 from service.steps.context import StationLayout
-from service.steps.kinds import calibration
-from service.steps.kinds.viewpoint_capture import Params
+from service.steps.kinds.captures import calibration
+from service.steps.kinds.captures.viewpoint_capture import Params
 from service.steps.notes import BoardPrediction
 
 
