@@ -28,7 +28,7 @@ from service.steps.capture.plan.planning import ArmAtStation, usual_posture
 from service.steps.capture.plan.preview import preview_plans
 from service.steps.capture.plan.viewpoints import ViewpointSet, plan_viewpoints
 from service.steps.context import StationLayout
-from service.steps.kinds import viewpoint_capture
+from service.steps.kinds.captures import viewpoint_capture
 
 PROTOCOL = Path(__file__).parents[2] / "protocols" / "exvivo_spine.yaml"
 MOUNT = transform(np.eye(3), np.array([0.0, -0.055, 0.095]))
