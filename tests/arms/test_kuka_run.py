@@ -26,6 +26,8 @@ BOARD_POSES = {
     "station": "station_1", "prefix": "b", "count": 24, "tilts_deg": [8, 20, 32, 38],
     "rolls_deg": [0, 12, -12, 180, 168], "distances_m": [0.62, 0.68, 0.74], "above_scene_m": 0.09, "coverage": 0.9,
 }  # fmt: skip
+# With eight views a station, the poses of an arm that repeats to 0.15 mm are not what the demonstration asks for.
+WIDER = {"predicted_target_error_mm": 1.0, "loop_closure_mm": 1.0, "robot_corrected_rms_px": 2.0}
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Generator[Run]:
     (calibration,) = (step for step in record["steps"] if step["kind"] == "calibration")
     del calibration["params"]["viewpoints"]
     calibration["params"]["board_poses"] = BOARD_POSES
+    for gate in (gate for step in record["steps"] for gate in step.get("gates", [])):
+        gate["max"] = WIDER.get(gate["measure"], gate.get("max"))
+        if gate["max"] is None:
+            del gate["max"]
     protocol.write_text(yaml.safe_dump(record, sort_keys=False, allow_unicode=True), encoding="utf-8")
     options = ("--scene", "7", "--image-width", "960", "--ct-voxel-mm", "1.0", "--speed-up", "10", "--arm", ARM)
     with simulated_rig(folder, *options, host="127.0.0.44") as rig:
