@@ -73,8 +73,8 @@ def test_it_comes_to_its_end_with_every_view(run: Run) -> None:
     assert not any(step.skipped_viewpoints for step in state.steps.values())
     captured = [e.payload for e in run.summary.events if isinstance(e.payload, ViewpointCaptured)]
     assert all(len(one.joints_rad) == 7 for one in captured)
-    robots = [device for device in run.doctor["devices"] if device.get("driver") == "kuka_sunrise"]
-    assert len(robots) == 1
+    robot = run.doctor["devices"]["robot"]
+    assert (robot["ok"], robot["identity"]["model"], robot["identity"]["driver"]) == (True, ARM, "kuka_sunrise")
 
 
 def test_its_errors_are_those_of_a_good_data_set(run: Run) -> None:
