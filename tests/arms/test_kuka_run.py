@@ -40,6 +40,13 @@ class Run:
     doctor: dict[str, Any]
 
 
+def patient(rig: Path) -> None:
+    """A busy machine is no dead link: wait longer for the arm's stream than at a real one."""
+    record = yaml.safe_load(rig.read_text(encoding="utf-8"))
+    record["devices"]["robot"] |= {"stale_after_s": 20.0, "answer_timeout_s": 20.0, "unattended_s": 20.0}
+    rig.write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Generator[Run]:
     folder = tmp_path_factory.mktemp("kuka")
@@ -55,6 +62,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Generator[Run]:
     protocol.write_text(yaml.safe_dump(record, sort_keys=False, allow_unicode=True), encoding="utf-8")
     options = ("--scene", "7", "--image-width", "960", "--ct-voxel-mm", "1.0", "--speed-up", "10", "--arm", ARM)
     with simulated_rig(folder, *options, host="127.0.0.44") as rig:
+        patient(Path(rig["rig"]))
         doctor = orthocapture("doctor", "--rig", rig["rig"], "--json")
         answer = orthocapture(
             "run", str(protocol), "--rig", rig["rig"], "--data", str(data), "--operator", "Ada", "--auto-confirm",
