@@ -341,7 +341,7 @@ RUN_ELSEWHERE = {
         "tests/robot/test_grbl_run.py::test_a_run_with_the_turntable_instead_of_the_arm",
     ),
     'orthocapture simulate rig --scene 7 --dir rig --arm "LBR Med 14"': (
-        "tests/robot/test_kuka_run.py::test_it_comes_to_its_end_with_every_view"
+        "tests/arms/test_kuka_run.py::test_it_comes_to_its_end_with_every_view"
     ),
     "orthocapture simulate kuka": "tests/robot/test_kuka_driver.py::test_a_day_without_trouble",
     "orthocapture simulate rig --scene 7 --dir rig": (
