@@ -24,6 +24,7 @@ from service.dataset.posed.about_run import about_run
 from service.dataset.posed.pixels import Photographs
 from service.dataset.posed.pose_errors import own_pose_errors
 from service.dataset.posed.records import DataSet, Mesh, View
+from service.dataset.posed.scan_files import scan_files
 from service.dataset.posed.statement import described_run
 from service.dataset.posed.view_covariances import view_covariances
 from service.dataset.registered_scan import control_scan
@@ -113,6 +114,7 @@ def data_set_of(
             about, masks=masks, mesh=f"{truth.words}, in the frame of the scan", covariance=stated_errors.words
         ),
         pose_errors=joint,
+        scan_files=scan_files(summary),
     )
 
 
