@@ -110,10 +110,7 @@ class PoseStream:
     def between(self, start_s: float, end_s: float) -> tuple[RobotSample, ...]:
         """Return the samples that arrived between two host times (time.monotonic()), oldest first."""
         with self._lock:
-            # Search from the newest backwards: the buffer is long, and callers nearly always want recent samples.
-            recent = takewhile(lambda s: s.monotonic_s >= start_s, reversed(self._samples))
-            found = [s for s in recent if s.monotonic_s <= end_s]
-        return tuple(reversed(found))
+            return within(self._samples, start_s, end_s)
 
     def clear(self) -> None:
         """Discard all samples, because the tool offset behind their flange poses has changed."""
@@ -145,6 +142,13 @@ class PoseStream:
                 self._samples.append(sample)
                 while self._samples[0].monotonic_s < sample.monotonic_s - BUFFER_S:
                     self._samples.popleft()
+
+
+def within(samples: deque[RobotSample], start_s: float, end_s: float) -> tuple[RobotSample, ...]:
+    """Return the samples of a buffer between two host times (time.monotonic()), oldest first."""
+    # Search from the newest backwards: the buffer is long, and callers nearly always want recent samples.
+    recent = takewhile(lambda s: s.monotonic_s >= start_s, reversed(samples))
+    return tuple(reversed([s for s in recent if s.monotonic_s <= end_s]))
 
 
 def judge(samples: Sequence[RobotSample], criteria: SettleCriteria) -> SettleReport:

@@ -99,8 +99,13 @@ class Link:
                 raise self.error(str(line.get("code")), str(line.get("what")))
             return hello_of(line)
         except WireError as error:
-            remedy = "Install the application of this version of orthocapture (docs/kuka.md)"
+            remedy = "Install the application of this version of orthocapture (docs/howto/kuka.md)"
             raise DeviceFaultError(str(error), where=self._where, remedy=remedy) from error
+
+    @property
+    def local_host(self) -> str:
+        """Address of this machine in the network of the controller."""
+        return str(self._socket.getsockname()[0])
 
     def beat(self) -> None:
         """Send a sign of life; a dead connection is noticed elsewhere."""

@@ -77,7 +77,7 @@ _COMMANDS = {
         "Receive CT series and segmentations that a CT suite sends (DICOM C-STORE), until it is terminated.",
     ),
     "calibrate": _Command(
-        "service.cli.compute.calibrate:calibrate_app", "Calibrate a camera and its mounting from images of a board."
+        "service.cli.calibrate.group:calibrate_app", "Calibrate a camera and its mounting from images of a board."
     ),
     "import-ros": _Command(
         "service.cli.compute.import_ros:import_ros_command",

@@ -16,7 +16,7 @@ from drivers.interfaces import Scanner
 from drivers.scan_folder import ScanFolder, ScanFolderConfig
 from service.core.protocol.models import parse_protocol
 from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.scan_files import scan_files
+from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.summary import summarise
 from service.steps import params_models
 from service.store.store import Store
