@@ -17,7 +17,7 @@ from pathlib import Path
 from bench.machine import RESULTS, commit, machine
 from service.dataset.preview.records import Preview, read_preview, write_preview
 from tests.support.pages.web import Browser, web_site
-from tests.support.runs.unpacked_run import unpack_recorded_run
+from tests.support.recorded.unpacked_run import unpack_recorded_run
 
 LIMIT_MS = 200.0
 VIEWS = 108  # of the paper's protocol

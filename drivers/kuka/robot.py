@@ -37,8 +37,10 @@ from drivers.kuka.fri.poses import FriPoses
 from drivers.kuka.link import Link
 from drivers.kuka.speeds import Speeds
 from drivers.kuka.wire import JOINTS, State, to_abc
+from service.core.arms.known import known_arms
+from service.core.arms.model import ArmModel
 from service.core.geometry import to_rotation_vector
-from service.core.seven_axes import SEVEN_AXIS_ARMS, SevenAxisArm, forward, nearest_posture
+from service.core.seven_axes import forward, nearest_posture
 from service.core.units import mm
 
 DRIVER_VERSION = "1"
@@ -58,7 +60,7 @@ class KukaRobot:
         self._latch = Latch(self._where)
         self._link: Link | None = None
         self._stream: PoseStream | None = None
-        self._arm: SevenAxisArm = SEVEN_AXIS_ARMS[0]
+        self._arm: ArmModel | None = None  # as the application states it
         self._arrived: deque[RobotSample] = deque()  # from the link's thread to the stream's
         self._speeds = Speeds()
         self._fri: FriPoses | None = None
@@ -83,7 +85,7 @@ class KukaRobot:
         self._speeds = Speeds()
         address = (self._config.host, self._config.port)
         self._link = link = Link(address, self._config.connect_timeout_s, self._receive)
-        known = {arm.name: arm for arm in SEVEN_AXIS_ARMS}
+        known = {arm.name: arm for arm in known_arms() if arm.family == "seven_axes"}
         if link.hello.model not in known:
             self.close()
             remedy = f"Known are {', '.join(known)}"
@@ -170,7 +172,7 @@ class KukaRobot:
         self._fri.await_first(self._config.connect_timeout_s)
 
     def _pose_of(self, joints_rad: Array) -> Transform:
-        return forward(self._arm, joints_rad)
+        return forward(self._arm or self._not_open(), joints_rad)
 
     def _frame_problems(self, state: State) -> list[str]:
         """Whether the flange is where the joints have it; not asked of a moving arm, as the two are read in turn."""
@@ -250,7 +252,7 @@ class KukaRobot:
         Raises UnreachablePoseError if there are none.
         """
         near = np.array(self._joints(near_rad))
-        joints = nearest_posture(self._arm, np.asarray(T_base_flange, dtype=np.float64), near)
+        joints = nearest_posture(self._arm or self._not_open(), np.asarray(T_base_flange, dtype=np.float64), near)
         if joints is None:
             x, y, z = T_base_flange[:3, 3]
             raise UnreachablePoseError(

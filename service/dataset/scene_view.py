@@ -87,6 +87,7 @@ class Scene:
         stations: station of each viewpoint.
         bases: T_frame_base by station, where known.
         up: unit vector (3,).
+        outlines: (K, 3) corners of closed polygons on the surface, by what they surround.
     """
 
     cameras: Mapping[str, Transform]
@@ -97,6 +98,7 @@ class Scene:
     planned: Mapping[str, Transform] = field(default_factory=dict[str, Transform])
     bases: Mapping[str, Transform] = field(default_factory=dict[str, Transform])
     up: tuple[float, float, float] | None = None
+    outlines: Mapping[str, Array] = field(default_factory=dict[str, Array])
 
 
 def decimated(vertices_m: Array, faces: Any, most: int = FACES_SHOWN) -> tuple[Array, NDArray[np.int64]]:
@@ -148,6 +150,7 @@ def scene_json(scene: Scene) -> str:
         mine = [s for s in scene.spheres if s.kind == kind]
         if mine:
             data += _spheres(in_view_mm(np.array([s.centre_m for s in mine])), mine, mm(scene.radius_m))
+    data += [_outline(in_view_mm(corners), what) for what, corners in scene.outlines.items()]
     data.append(_scale_bar(in_view_mm(_centre(scene))))
     names = sorted({*scene.stations.values(), *scene.bases})
     for i, station in enumerate(names):
@@ -285,6 +288,11 @@ def _base(at: Array, station: str, colour: str) -> dict[str, object]:
         "marker": {"size": 9, "color": colour, "symbol": "square"},
         "hoverinfo": "text",
     }
+
+
+def _outline(corners: Array, what: str) -> dict[str, object]:
+    line = {"mode": "lines", "line": {"color": "#c2352b", "width": 7}, "hoverinfo": "skip"}
+    return {"type": "scatter3d", "name": what, **line, **_xyz(np.vstack([corners, corners[:1]]))}
 
 
 def _scale_bar(centre: Array) -> dict[str, object]:

@@ -31,9 +31,9 @@ from service.worker.job import JobContext
 from service.worker.loop import HANDLERS, work
 from tests.ground_truth.test_fuse_command import CENTRES_M, RADIUS_M, T_WORLD_CT, with_spheres
 from tests.ground_truth.test_fusion import ct_mesh, height, scan_mesh
+from tests.support.recorded.registration_record import registration_record
 from tests.support.rig.bench_rig import BenchRig, ScriptedOperator, answer
 from tests.support.runs.bench_run import Bench, begin_run
-from tests.support.runs.registration_record import registration_record
 
 TAKEN_M = np.array([0.018, 0.012, 0.0360])  # a control sphere on the specimen, which the scan does not show
 PROTOCOL = """\
@@ -159,6 +159,9 @@ def test_the_screen_shows_sources_and_sigmas_and_the_recorded_distances(bench: B
     summary = summarise(bench.store, bench.run_id, loaded.protocol)
     fusion = recorded_fusion(summary)
     assert fusion is not None
+    exported = summary.ground_truth()
+    assert np.array_equal(exported.source, columns["source"])
+    assert exported.sigma_m == pytest.approx(1e-3 * columns["sigma_mm"], rel=1e-6)
     mesh = Simplified(points, read_ply(bench.store.artefact_path(fusion.files["ground_truth_mesh"].sha256))[1])
     truth, measures = fused_mesh(tmp_path, summary, fusion, mesh), state.steps["ground_truth"].measures
     assert (truth.ct_share, truth.sigma_median_mm) == (measures["ct_share"], measures["sigma_median_mm"])

@@ -23,7 +23,8 @@ from drivers.kuka import KukaConfig
 from drivers.kuka.fri.listener import Listener
 from drivers.kuka.fri.sample import unpack
 from drivers.kuka.fri.wire import FriError, Monitoring, decode, reply
-from service.core.seven_axes import SEVEN_AXIS_ARMS, forward
+from service.core.arms.known import arm_model
+from service.core.seven_axes import forward
 from tests.support.processes.waiting import until
 from tests.support.rig.kuka_simulator import pendant, simulated_kuka, transcript
 from tests.support.rig.rig import orthocapture
@@ -153,7 +154,7 @@ def test_its_samples_are_the_pose_stream(version: str) -> None:
         until(lambda: listened(last_second(arm)), "FRI has gaps", 60)
         sample = last_second(arm)[-1]
         np.testing.assert_allclose(sample.joints_rad, goal, atol=1e-4)
-        np.testing.assert_allclose(sample.T_base_flange, forward(SEVEN_AXIS_ARMS[0], sample.joints_rad), atol=1e-12)
+        np.testing.assert_allclose(sample.T_base_flange, forward(arm_model("LBR Med 14"), sample.joints_rad), atol=1e-12)
         assert sample.controller_time_s == pytest.approx(time.time(), abs=5.0)
         report = arm.report()
         assert report.problems == ()

@@ -123,6 +123,10 @@ def test_a_line_that_the_protocol_does_not_know_is_refused() -> None:
     whole = {**state, "n": 1, "time_s": 1.0, "flange_xyz_m": [0, 0, 1], "flange_abc_rad": [0, 0, 0]}
     assert state_of(whole).safety.may_move
     assert not state_of({**whole, "safety": "something new"}).safety.may_move
+    large, text, flags = [10**400] * 7, ["1"] * 7, [True] * 7
+    for name, value in (("q", large), ("q", text), ("q", flags), ("time_s", 10**400), ("override", "0x1")):
+        with pytest.raises(WireError, match=name):
+            state_of({**whole, name: value})
     for name, value in (("q", [0.0] * 6), ("locked", 0), ("time_s", float("nan")), ("motion", True), ("mode", None)):
         with pytest.raises(WireError, match=name):
             state_of({**whole, name: value})

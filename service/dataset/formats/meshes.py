@@ -9,12 +9,25 @@ from numpy.typing import NDArray
 from service.compute.ground_truth.ply import ply_bytes
 from service.core.errors import DataError
 from service.core.geometry import Array
+from service.dataset.posed.records import Mesh
 
 
 def ply(vertices: Array, faces: NDArray[np.int64], comment: str) -> bytes:
     """A binary PLY with vertices (V, 3) in double precision and faces (F, 3), in the unit that they have."""
     columns = {name: vertices[:, k].astype("<f8") for k, name in enumerate("xyz")}
     return ply_bytes(columns, faces, [comment] if comment else [])
+
+
+def ground_truth_ply(mesh: Mesh, comment: str) -> bytes:
+    """A binary PLY of the ground truth in metres; if they are known, with `source` and `sigma_m` of each vertex."""
+    columns: dict[str, NDArray[np.generic]] = {
+        name: mesh.vertices_m[:, k].astype("<f8") for k, name in enumerate("xyz")
+    }
+    comments = [comment] if comment else []
+    if mesh.source is not None and mesh.sigma_m is not None:
+        columns |= {"source": mesh.source.astype(np.uint8), "sigma_m": mesh.sigma_m.astype("<f4")}
+        comments.append("source 0: CT, 1: scan, 2: blend; sigma along the normal")
+    return ply_bytes(columns, mesh.faces, comments)
 
 
 def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:

@@ -28,6 +28,7 @@ class View:
         camera: at the size of the picture; pixel centres at integer coordinates.
         T_world_camera: (4, 4) m; x right, y down, z forward.
         covariance: (6, 6) of (d, w): exp([w]x) R, t + d in the axes of the world, m and rad.
+        taken: time that the photograph states, as EXIF has it; "" if it states none.
     """
 
     name: str
@@ -35,6 +36,7 @@ class View:
     camera: CameraModel
     T_world_camera: Transform
     covariance: Array
+    taken: str = ""
 
     @property
     def file(self) -> str:
@@ -44,10 +46,19 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """The ground truth: vertices (V, 3) in the world frame, m, and faces (F, 3)."""
+    """The ground truth.
+
+    Attributes:
+        vertices_m: (V, 3) in the world frame.
+        faces: (F, 3).
+        source: (V,) where each vertex comes from, 0: CT, 1: scan, 2: blend; None: all from the scan.
+        sigma_m: (V,) stated standard deviation along the normal; None: not stated.
+    """
 
     vertices_m: Array
     faces: NDArray[np.int64]
+    source: NDArray[np.uint8] | None = None
+    sigma_m: Array | None = None
 
 
 class Pixels(Interface):
@@ -118,7 +129,7 @@ class DataSet:
         return self.pose_errors[np.ix_(rows, rows)]
 
     def keeping(self, names: tuple[str, ...]) -> DataSet:
-        """The same data set with these views only; the splits are cut to them."""
+        """This data set with only these views, also in its splits."""
         chosen = set(names)
         cut = {key: tuple(n for n in split if n in chosen) for key, split in self.splits.named().items()}
         kept = [k for k, view in enumerate(self.views) if view.name in chosen]

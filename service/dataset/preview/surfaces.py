@@ -110,7 +110,7 @@ def shown_distances(folder: Path, summary: RunSummary, fusion: RecordedFusion | 
 
 
 def _compared(folder: Path, summary: RunSummary, ct: Surface, scan: Surface) -> ShownDistances:
-    """Both brought together by their spheres, and compared; the CT in its own frame."""
+    """CT and scan, aligned by their spheres and compared, and the CT in its own frame."""
     found = last_result(summary.protocol, summary.state, "ct_surface", SpheresFound)
     if found is None:
         raise DataError("the run has no CT", where=summary.run_id)

@@ -81,7 +81,7 @@ def _hand_eye(
     T_base_flange = np.array([image.T_base_flange for image in used])
     T_camera_board = np.array([locate_view(view, board, camera)[0] for view in usable.views])
     joints = np.array([image.joints_rad for image in used], dtype=np.float64)
-    arm = matching_arm(joints, T_base_flange) if joints.shape == (len(used), 6) else None
+    arm = matching_arm(joints, T_base_flange) if joints.ndim == 2 else None
     solved = calibrate_hand_eye(
         HandEyeViews(
             T_base_flange,

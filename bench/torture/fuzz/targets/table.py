@@ -7,7 +7,7 @@ from typing import cast
 
 from bench.torture.fuzz.targets.target import Target
 
-_MODULES = ("written", "delivered", "records", "wires", "hostile")  # each has a tuple TARGETS
+_MODULES = ("written", "delivered", "viewed", "exported", "records", "wires", "movers", "hostile")  # each has a tuple TARGETS
 GROUPS = tuple(f"bench.torture.fuzz.targets.{name}" for name in _MODULES)
 
 

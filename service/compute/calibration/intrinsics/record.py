@@ -52,29 +52,35 @@ def intrinsics_record(
         "coverage": {"share": result.coverage, "corners": result.coverage_map.tolist()},
         "residuals": {"corners": counts.tolist(), "mean_px": np.round(residuals, 5).tolist()},
         "tilt": {"largest_deg": float(result.tilt_deg.max()), "spread_deg": result.tilt_spread_deg},
-        "cross_validation": None
-        if validation is None
-        else {
-            "folds": validation.folds,
-            "five_fold_rms_px": validation.five_fold_rms_px,
-            "five_fold_view_px": validation.five_fold_view_px.tolist(),
-            "leave_one_out_rms_px": _number(validation.leave_one_out_rms_px),
-            "leave_one_out_view_px": [_number(value) for value in validation.leave_one_out_view_px],
-        },
-        "uncertainty": {
-            "distance_m": uncertainty.distance_m,
-            "centre_px": uncertainty.centre_px,
-            "worst_px": uncertainty.worst_px,
-            "rms_px": uncertainty.rms_px,
-            "centre_mm": uncertainty.centre_mm,
-            "worst_mm": uncertainty.worst_mm,
-            "rms_mm": uncertainty.rms_mm,
-            "x_px": uncertainty.pixels[0, :, 0].tolist(),
-            "y_px": uncertainty.pixels[:, 0, 1].tolist(),
-            "sigma_px": _rounded(uncertainty.sigma_px),
-            "sigma_mm": _rounded(uncertainty.sigma_mm),
-        },
+        "cross_validation": None if validation is None else _cross_validation(validation),
+        "uncertainty": _uncertainty(uncertainty),
         "warnings": list(warnings),
+    }
+
+
+def _cross_validation(validation: CrossValidation) -> dict[str, Any]:
+    return {
+        "folds": validation.folds,
+        "five_fold_rms_px": validation.five_fold_rms_px,
+        "five_fold_view_px": validation.five_fold_view_px.tolist(),
+        "leave_one_out_rms_px": _number(validation.leave_one_out_rms_px),
+        "leave_one_out_view_px": [_number(value) for value in validation.leave_one_out_view_px],
+    }
+
+
+def _uncertainty(uncertainty: ProjectionUncertainty) -> dict[str, Any]:
+    return {
+        "distance_m": uncertainty.distance_m,
+        "centre_px": uncertainty.centre_px,
+        "worst_px": uncertainty.worst_px,
+        "rms_px": uncertainty.rms_px,
+        "centre_mm": uncertainty.centre_mm,
+        "worst_mm": uncertainty.worst_mm,
+        "rms_mm": uncertainty.rms_mm,
+        "x_px": uncertainty.pixels[0, :, 0].tolist(),
+        "y_px": uncertainty.pixels[:, 0, 1].tolist(),
+        "sigma_px": _rounded(uncertainty.sigma_px),
+        "sigma_mm": _rounded(uncertainty.sigma_mm),
     }
 
 

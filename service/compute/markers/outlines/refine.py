@@ -18,7 +18,8 @@ from service.compute.markers.outlines.edges import (
     sample_averaged,
     sample_sharp,
 )
-from service.compute.markers.outlines.limb import LimbFit, LimbProfiles, fit_limb, masked_median
+from service.compute.markers.outlines.limb import LimbFit, fit_limb, masked_median
+from service.compute.markers.outlines.limb_model import LimbProfiles
 from service.compute.markers.records import DEFAULTS, DetectionOptions, Evidence, SphereOutline, outline_from_cone
 from service.core.geometry import Array
 
