@@ -109,55 +109,18 @@ class Trial:
         return ["--faults", json.dumps(list(self.case.faults))] if self.case.faults else []
 
     def _laboratory(self) -> Laboratory:
+        devices = {
+            "arm": self._arm_devices,
+            "camera": self._camera_devices,
+            "lightbox": self._lightbox_devices,
+            "scan": self._scan_devices,
+            "ct": self._ct_devices,
+            "table": lambda: {"robot": table_rig(self, self._plan())},
+            "kuka": lambda: {"robot": kuka_rig(self, self._plan())},
+            "video": lambda: {"camera": video_rig(self)},
+        }
         scene = self.case.scene
-        devices: dict[str, Any] = {}
-        near = self.arm_host[:-1] + "2"
-        if scene == "arm":
-            self.simulators.start("ur", "--host", self.arm_host, "--speed-up", "3", *self._plan(), *self.case.options)
-            self.wired(
-                Wire("robot", "rtde", (near, 30004), (self.arm_host, 30004)),
-                Wire("robot", "dashboard", (near, 29999), (self.arm_host, 29999)),
-                Wire("robot", "script", (near, 30003), (self.arm_host, 30003)),
-            )
-            devices["robot"] = {
-                "driver": "ur",
-                "host": near if self.proxy else self.arm_host,
-                "connect_timeout_s": 2.0,
-                "watchdog_s": 1.0,
-                "stale_after_s": 2.0,
-            }
-        if scene == "camera":
-            words = ("camera", "--port", "0", "--fast", "--image-width", "96", *self._plan(), *self.case.options)
-            ready = self.simulators.start(*words)
-            port, near_port = int(ready["port"]), 15740
-            self.wired(Wire("camera", "ptpip", (near, near_port), ("127.0.0.1", port)))
-            address = f"ptpip:{near}:{near_port}" if self.proxy else str(ready["gphoto_port"])
-            devices["camera"] = {"driver": "gphoto", "port": address, "capture_timeout_s": 5.0}
-        if scene == "lightbox":
-            far, line = self.folder / "far", self.folder / "line"
-            self.simulators.start("lightbox", "--link", str(far), *self._plan(), *self.case.options)
-            self.wired(Wire("lightbox", "serial", str(line), str(far)))
-            devices["lightbox"] = {
-                "driver": "lightbox",
-                "port": str(line if self.proxy else far),
-                "timeout_s": 0.3,
-            }
-        if scene == "scan":
-            scan_folder(self.scene_folder, self.material)
-            devices["scanner"] = {"driver": "scan_folder", "folder": str(self.scene_folder), "stable_s": 0.5}
-        if scene == "ct":
-            ct_folder(self.scene_folder, self.material)
-            scans = self.folder / "scans"
-            scans.mkdir()
-            devices["scanner"] = {"driver": "scan_folder", "folder": str(scans), "stable_s": 0.5}
-            devices["ct"] = {"driver": "dicom_folder", "folder": str(self.scene_folder), "stable_s": 0.5}
-        if scene == "table":
-            devices["robot"] = table_rig(self, self._plan())
-        if scene == "kuka":
-            devices["robot"] = kuka_rig(self, self._plan())
-        if scene == "video":
-            devices["camera"] = video_rig(self)
-        rig = write_rig(self.folder, devices, **STATIONS.get(scene, {}))
+        rig = write_rig(self.folder, devices[scene]() if scene in devices else {}, **STATIONS.get(scene, {}))
         self.arm = arm = None if scene in ("arm", "table", "kuka") else BenchArm()
         self.shutter = shutter = None if scene in ("camera", "video") else BenchCamera(picture=exposed)
         if arm is not None:
@@ -167,6 +130,50 @@ class Trial:
             self.ends.append(eye.close)
             self._eye = eye
         return Laboratory(rig, arm, shutter)
+
+    @property
+    def _near_host(self) -> str:
+        """Address of the driver's end of a wire."""
+        return self.arm_host[:-1] + "2"
+
+    def _arm_devices(self) -> dict[str, Any]:
+        near = self._near_host
+        self.simulators.start("ur", "--host", self.arm_host, "--speed-up", "3", *self._plan(), *self.case.options)
+        self.wired(
+            Wire("robot", "rtde", (near, 30004), (self.arm_host, 30004)),
+            Wire("robot", "dashboard", (near, 29999), (self.arm_host, 29999)),
+            Wire("robot", "script", (near, 30003), (self.arm_host, 30003)),
+        )
+        host = near if self.proxy else self.arm_host
+        limits = {"connect_timeout_s": 2.0, "watchdog_s": 1.0, "stale_after_s": 2.0}
+        return {"robot": {"driver": "ur", "host": host, **limits}}
+
+    def _camera_devices(self) -> dict[str, Any]:
+        words = ("camera", "--port", "0", "--fast", "--image-width", "96", *self._plan(), *self.case.options)
+        ready = self.simulators.start(*words)
+        port, near_port = int(ready["port"]), 15740
+        self.wired(Wire("camera", "ptpip", (self._near_host, near_port), ("127.0.0.1", port)))
+        address = f"ptpip:{self._near_host}:{near_port}" if self.proxy else str(ready["gphoto_port"])
+        return {"camera": {"driver": "gphoto", "port": address, "capture_timeout_s": 5.0}}
+
+    def _lightbox_devices(self) -> dict[str, Any]:
+        far, line = self.folder / "far", self.folder / "line"
+        self.simulators.start("lightbox", "--link", str(far), *self._plan(), *self.case.options)
+        self.wired(Wire("lightbox", "serial", str(line), str(far)))
+        return {"lightbox": {"driver": "lightbox", "port": str(line if self.proxy else far), "timeout_s": 0.3}}
+
+    def _scan_devices(self) -> dict[str, Any]:
+        scan_folder(self.scene_folder, self.material)
+        return {"scanner": {"driver": "scan_folder", "folder": str(self.scene_folder), "stable_s": 0.5}}
+
+    def _ct_devices(self) -> dict[str, Any]:
+        ct_folder(self.scene_folder, self.material)
+        scans = self.folder / "scans"
+        scans.mkdir()
+        return {
+            "scanner": {"driver": "scan_folder", "folder": str(scans), "stable_s": 0.5},
+            "ct": {"driver": "dicom_folder", "folder": str(self.scene_folder), "stable_s": 0.5},
+        }
 
     # --- the run ------------------------------------------------------------------------------------------
 
