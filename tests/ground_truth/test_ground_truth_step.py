@@ -22,7 +22,7 @@ from service.core.geometry import inverse, transform
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import RegionDrawn
 from service.core.run.state import RunState
-from service.dataset.posed.about_run import about_run
+from service.dataset.posed.of_run.about_run import about_run
 from service.dataset.preview.surfaces import Simplified, fused_mesh, shown_distances
 from service.dataset.recorded_fusion import recorded_fusion
 from service.dataset.summary import summarise
