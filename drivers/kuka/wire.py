@@ -1,4 +1,4 @@
-"""The lines of the KUKA wire (docs/howto/kuka.md), checked and turned into records."""
+"""The lines of the KUKA wire (docs/reference/kuka_protocol.md), checked and turned into records."""
 
 from __future__ import annotations
 

@@ -154,7 +154,9 @@ def test_its_samples_are_the_pose_stream(version: str) -> None:
         until(lambda: listened(last_second(arm)), "FRI has gaps", 60)
         sample = last_second(arm)[-1]
         np.testing.assert_allclose(sample.joints_rad, goal, atol=1e-4)
-        np.testing.assert_allclose(sample.T_base_flange, forward(arm_model("LBR Med 14"), sample.joints_rad), atol=1e-12)
+        np.testing.assert_allclose(
+            sample.T_base_flange, forward(arm_model("LBR Med 14"), sample.joints_rad), atol=1e-12
+        )
         assert sample.controller_time_s == pytest.approx(time.time(), abs=5.0)
         report = arm.report()
         assert report.problems == ()
