@@ -73,6 +73,11 @@ def nanoseconds(duration_s: float) -> int:
     return round(duration_s * 1e9)
 
 
+def nanoseconds_of_us(duration_us: int) -> int:
+    """Nanoseconds of whole microseconds, exactly."""
+    return duration_us * 1000
+
+
 def seconds_of_ns(duration_ns: float) -> float:
     """Seconds of a duration in nanoseconds."""
     return duration_ns / 1e9

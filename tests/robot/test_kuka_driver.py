@@ -24,7 +24,7 @@ from drivers.errors import (
 from drivers.host.hosted_device import hosted
 from drivers.interfaces import Array, Payload, RobotArm, SafetyState, SettleCriteria
 from drivers.kuka import KukaConfig
-from service.core.arms.models.lbr_med_14 import ARM as LBR_MED_14
+from service.core.arms.kuka.lbr_med_14 import ARM as LBR_MED_14
 from service.core.geometry import inverse, rotation_angle_rad, transform
 from service.core.seven_axes import forward, nearest_posture, postures
 from simulators.kuka_controller.kinematics import MODELS, frames

@@ -24,7 +24,7 @@ from service.compute.poses.ros.messages import (
     encode_tf,
 )
 from service.core.errors import ConfigurationError
-from service.core.units import nanoseconds
+from service.core.units import nanoseconds, nanoseconds_of_us
 from service.dataset.formats.meshes import ply
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder
@@ -87,7 +87,7 @@ def _time_ns(taken: str) -> int | None:
         except ValueError:
             continue
         moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-        return (moment - _EPOCH) // timedelta(microseconds=1) * 1000
+        return nanoseconds_of_us((moment - _EPOCH) // timedelta(microseconds=1))
     return None
 
 

@@ -146,7 +146,7 @@ def _read(folder: Path) -> DataSet:
     of = _SPLITS.validate_json((folder / "splits.json").read_bytes())
     statement = parse_json((folder / "dataset.json").read_bytes(), name="dataset.json", remedy=_REMEDY)
     if not isinstance(statement, dict):
-        raise ValueError("dataset.json is not a JSON object")
+        raise TypeError("dataset.json is not a JSON object")
     with h5py.File(folder / INDEX, "r") as file:
         simulated = bool(file.attrs["simulated"])
         mesh = _mesh(file["mesh"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 from typing import Protocol as Interface
 
@@ -61,6 +62,14 @@ class Mesh:
     sigma_m: Array | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class ScanFile:
+    """A file of the scanner's own export: in the frame of the scan and in the unit that the scanner wrote."""
+
+    name: str  # relative, with `/`
+    path: Path
+
+
 class Pixels(Interface):
     """What belongs to the pixels of a view; read or computed at each call, at the size of `view.camera`."""
 
@@ -104,6 +113,7 @@ class DataSet:
         pose_errors: (6 V, 6 V) joint covariance of the poses in the views' order, as a view's covariance, but without
             the errors that are common to all views; None where it is not stated.
         about: the data set as a whole, for its data card and metadata.
+        scan_files: the scanner's own export, with its textures.
     """
 
     identity: str
@@ -115,6 +125,7 @@ class DataSet:
     splits: Splits
     pose_errors: Array | None = None
     about: About = field(default_factory=About)
+    scan_files: tuple[ScanFile, ...] = ()
 
     @property
     def mark(self) -> str:

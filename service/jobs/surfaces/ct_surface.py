@@ -9,7 +9,7 @@ from service.jobs.records import Hash, Matrix, SpheresFound
 class Arguments(JobRecord):
     """The decoded volume: `hounsfield` is a NumPy array, `T_ct_voxel` maps its indices to metres.
 
-    With `labels`, an array of the same shape, the surface is that of the segmented voxels, not that at `threshold_hu`.
+    With `labels`, an array of the same shape, the surface is that of the segmented voxels, not at `threshold_hu`.
     """
 
     radius_m: float

@@ -45,7 +45,7 @@ def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
     mesh = context.keep_bytes(
         buffer.getvalue(), kind="ct_mesh", media_type="application/x-npz", name="ct_surface.npz"
     )
-    measures, found = _search(arguments, vertices_m, faces)
+    measures, found = search_spheres(arguments, vertices_m, faces)
     measures["surface_faces"] = float(len(faces))
     if arguments.labels is not None:
         measures["label_contrast_hu"] = _contrast(arguments, hounsfield, T_ct_voxel, np.array(found.spheres_m))
@@ -81,11 +81,11 @@ def _contrast(arguments: ct_job.Arguments, hounsfield: Any, T_ct_voxel: Array, c
 def locate_spheres(context: JobContext[locate_job.Arguments]) -> JobAnswer:
     """Find the spheres of a mesh; with `reference_m`, also how they moved since an earlier measurement."""
     with np.load(context.input(context.arguments.mesh), allow_pickle=False) as mesh:
-        measures, found = _search(context.arguments, mesh["vertices_m"], mesh["faces"])
+        measures, found = search_spheres(context.arguments, mesh["vertices_m"], mesh["faces"])
     return JobAnswer(measures, (), found)
 
 
-def _search(
+def search_spheres(
     arguments: ct_job.Arguments | locate_job.Arguments, vertices_m: Array, faces: Any
 ) -> tuple[dict[str, float], SpheresFound]:
     """The measures and the spheres of a mesh."""

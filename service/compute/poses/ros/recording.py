@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 from service.compute.camera_model import CameraModel
 from service.compute.poses.ros.cdr import CdrError
@@ -160,25 +160,40 @@ def _records(path: Path) -> Iterator[Any]:
     from lz4.frame import get_frame_info  # noqa: PLC0415 - come with mcap
     from mcap.records import Chunk  # noqa: PLC0415
     from mcap.stream_reader import StreamReader, breakup_chunk  # noqa: PLC0415
-    from zstandard import frame_content_size  # noqa: PLC0415
+    from zstandard import ZstdError, frame_content_size  # noqa: PLC0415
 
     sizes: dict[str, Callable[[bytes], int]] = {
         "zstd": frame_content_size,
         "lz4": lambda data: get_frame_info(data)["content_size"],
     }
+    size = path.stat().st_size
     with path.open("rb") as file:
-        limit = path.stat().st_size
-        for record in StreamReader(file, emit_chunks=True, record_size_limit=limit).records:
+        bounded = cast("IO[bytes]", _Bounded(file, size))
+        for record in StreamReader(bounded, emit_chunks=True, record_size_limit=size).records:
             if not isinstance(record, Chunk):
                 yield record
                 continue
-            size_of = sizes.get(record.compression)
-            size = (
-                record.uncompressed_size if size_of is None else max(size_of(record.data), record.uncompressed_size)
-            )
-            if size > _LARGEST_CHUNK:
-                raise ValueError(f"a chunk claims to have {size:,} bytes")
-            yield from breakup_chunk(record, validate_crc=True)
+            size_of = sizes.get(record.compression, len)
+            try:
+                unpacked = max(size_of(record.data), record.uncompressed_size)
+                if unpacked > _LARGEST_CHUNK:
+                    raise ValueError(f"a chunk claims to have {unpacked:,} bytes")
+                yield from breakup_chunk(record, validate_crc=True)
+            except ZstdError as error:
+                raise ValueError(_plain(error)) from error
+
+
+class _Bounded:
+    """Reads no more than a file holds: a wrong length would set gigabytes aside."""
+
+    def __init__(self, file: IO[bytes], size: int) -> None:
+        self._file, self._left = file, size
+
+    def read(self, count: int) -> bytes:
+        """At most so many bytes."""
+        data = self._file.read(min(count, self._left))
+        self._left -= len(data)
+        return data
 
 
 def _plain(error: BaseException) -> str:

@@ -22,6 +22,7 @@ from service.core.units import metres
 from service.dataset.control_spheres import control_centres
 from service.dataset.posed.of_run.about_run import about_run
 from service.dataset.posed.of_run.pose_errors import own_pose_errors
+from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.posed.of_run.statement import described_run
 from service.dataset.posed.of_run.view_covariances import view_covariances
 from service.dataset.posed.pixels import Photographs
@@ -94,6 +95,7 @@ def data_set_of(
             about, masks=masks, mesh=f"{truth.words}, in the frame of the scan", covariance=stated_errors.words
         ),
         pose_errors=joint,
+        scan_files=scan_files(summary),
     )
 
 

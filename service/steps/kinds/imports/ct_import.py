@@ -90,8 +90,9 @@ def _series(context: StepContext, params: Params) -> tuple[JobRequest, tuple[Art
         hounsfield=array.sha256,
         T_ct_voxel=volume.T_ct_voxel.tolist(),
         threshold_hu=params.threshold_hu,
-        labels=labels[-1].sha256 if labels else None,
     )
+    if labels:
+        arguments = arguments.model_copy(update={"labels": labels[-1].sha256})
     measures = {
         **found,
         "slices": float(series.slices),

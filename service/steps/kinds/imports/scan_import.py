@@ -5,18 +5,20 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Annotated, Any, ClassVar
 
+from pydantic import Field
+
 from service.core.jobs.references import Reference
 from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, Record
 from service.core.units import metres
 from service.jobs.records import Point, SphereDetails
-from service.jobs.surfaces import locate_spheres
+from service.jobs.surfaces import locate_spheres, merge_scans
 from service.steps.arrivals import keep_mesh, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import earlier_answer, earlier_result
 from service.steps.kinds.by_hand import timed_application
 from service.steps.layouts import layout_uncertainties
-from service.steps.measures import Count, Measure, SphereMeasures
+from service.steps.measures import Count, ErrorMm, Measure, SphereMeasures
 
 
 class Params(StepParams):
@@ -26,6 +28,7 @@ class Params(StepParams):
     repeated: ClassVar = RepeatedStep("Scan again, export the scan, and import it")
 
     spheres: int  # number of spheres in the scan
+    parts: int = Field(default=1, ge=1)  # exports that together are the scan; each shares four spheres with another
     wait_s: float = 1800.0  # longest wait until the export is complete
     device: str | None = None  # name of the scanner in rig.yaml; None: the only one
     application: str | None = None  # the step whose coat is still on the specimen
@@ -47,6 +50,12 @@ class Measures(SphereMeasures):
         None
     )
     scan_textures: Annotated[Count, "texture images that came with the scan"] = None
+    scan_parts: Annotated[Count, "exports that were merged by their spheres"] = None
+    part_spheres_shared: Annotated[Count, "spheres that two parts or more show"] = None
+    part_residual_rms_mm: Annotated[
+        ErrorMm, "rms distance of a shared sphere in a part from its mean over the parts, after merging"
+    ] = None
+    part_residual_max_mm: Annotated[ErrorMm, "largest distance of that kind"] = None
     faces: Annotated[Count, "faces of the mesh that is used"] = None
     since_application_min: Annotated[
         float | None, Measure("min", 0.1, 1e4), "time from the application of the coat to the arrival of the scan"
@@ -69,19 +78,28 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     since = "" if importing else max((step.ended_utc for step in context.run.steps.values()), default="")
 
     def fresh() -> list[Any]:
-        return [e for e in scanner.exports() if not since or _time(e.modified_utc) >= _time(since)]
+        found = [e for e in scanner.exports() if not since or _time(e.modified_utc) >= _time(since)]
+        return [found[-params.parts :]] if len(found) >= params.parts else []
 
-    scan = scanner.read(wait_for(context, fresh, params.wait_s, "a complete scan export"))
-    found = {f"scan_{name}": float(value) for name, value in scan.findings.items()}
+    wanted = "a complete scan export" if params.parts == 1 else f"{params.parts} complete scan exports"
+    scans = [scanner.read(export) for export in wait_for(context, fresh, params.wait_s, wanted)]
+    found = {f"scan_{name}": sum(float(scan.findings[name]) for scan in scans) for name in scans[0].findings}
     measures = {name: value for name, value in found.items() if name in Measures.declared()}  # a driver may find more
-    measures["faces"] = float(len(scan.mesh.faces))
+    measures["faces"] = float(sum(len(scan.mesh.faces) for scan in scans))
     if params.application is not None:
         applied_s = earlier_result(context, params.application, timed_application.Result).applied_monotonic_s
         measures["since_application_min"] = (context.monotonic_s() - applied_s) / 60
-    mesh, kept = keep_mesh(context, scan, device="scanner", kind="scan_mesh")
-    arguments, references = _arguments(context, params, mesh)
-    (answer,) = context.evidence.run_jobs(JobRequest.of(locate_spheres.KIND, arguments, references))
-    result = Result.model_validate(answer.result)
+    kind = "scan_mesh" if params.parts == 1 else "scan_part"
+    pairs = [keep_mesh(context, scan, device="scanner", kind=kind) for scan in scans]
+    kept = tuple(ref for _, refs in pairs for ref in refs)
+    request = _request(context, params, [mesh for mesh, _ in pairs])
+    (answer,) = context.evidence.run_jobs(request)
+    if params.parts > 1:
+        merged = merge_scans.KIND.read_answer(answer.result)
+        context.note("parts merged", T_mesh_part=merged.T_mesh_part)
+        result = Result(spheres_m=merged.spheres_m, details=merged.details)
+    else:
+        result = Result.model_validate(answer.result)
     uncertainties = layout_uncertainties(result.details.layout)
     return StepOutcome(
         Measures.read({**measures, **answer.measures}),
@@ -90,6 +108,21 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         uncertainties,
         (answer.source,),
     )
+
+
+def _request(context: StepContext, params: Params, meshes: list[ArtefactRef]) -> JobRequest:
+    """The search in the only mesh, or the merging of several and the search in what results."""
+    arguments, references = _arguments(context, params, meshes[0])
+    if len(meshes) == 1:
+        return JobRequest.of(locate_spheres.KIND, arguments, references)
+    merging = merge_scans.Arguments(
+        meshes=tuple(mesh.sha256 for mesh in meshes),
+        radius_m=arguments.radius_m,
+        expected=arguments.expected,
+        reference_m=arguments.reference_m,
+        reference_covariances_m2=arguments.reference_covariances_m2,
+    )
+    return JobRequest.of(merge_scans.KIND, merging, references)
 
 
 def _arguments(
