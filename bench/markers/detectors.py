@@ -69,6 +69,7 @@ def main() -> None:
     parser.add_argument("--images", type=int, default=5, help="images per condition")
     parser.add_argument("--width", type=int, default=1000)
     parser.add_argument("--spheres", type=int, default=7, help="spheres per image")
+    parser.add_argument("--only", default="", help="part of a condition's name")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     cv2.setNumThreads(1)
@@ -83,6 +84,8 @@ def main() -> None:
         "|---|---|---:|---:|---:|---:|---:|",
     ]  # fmt: skip
     for name, look in HARD.items():
+        if options.only not in name:
+            continue
         for word, detector in able.items():
             tally = measured(name, look, detector, options.images, options.width, options.spheres)
             rms_px = float(np.sqrt(np.mean(np.square(tally.errors_px)))) if tally.errors_px else float("nan")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bench.markers.detectors import main
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.grounded.boxes import LAST_THRESHOLD, find_boxes, normalised, tiles_of
 from service.compute.markers.grounded.detector import GroundedDetector, voted
@@ -187,3 +188,16 @@ def test_a_vote_keeps_what_both_find_and_what_one_finds_clearly() -> None:
     assert voted([clear, faint], []) == (clear,)
     assert {id(o) for o in voted([faint], [faint, elsewhere])} == {id(faint)}
     assert voted([], [clear, faint]) == (clear,)
+
+
+@pytest.mark.slow
+def test_all_detectors_are_measured_side_by_side(
+    tiny: Weights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(VARIABLE, str(tiny.folder))
+    size = ("--images", "1", "--width", "400", "--only", "behind tissue", "--out", str(tmp_path))
+    monkeypatch.setattr("sys.argv", ["detectors", *size])
+    main()
+    (table,) = tmp_path.glob("detectors-*.md")
+    rows = [line.split("|")[2].strip() for line in table.read_text().splitlines() if line.startswith("| green")]
+    assert rows == ["classical", "paper", "grounded", "vote"]

@@ -253,6 +253,14 @@ RUN_ELSEWHERE = {
     'pip install "kornia==0.9.0" "torch>=2.5.1"': (  # needs a package index, which tests have not
         "tests/matching/test_methods.py::test_a_learned_method_says_what_to_install_and_which_file_to_give"
     ),
+    'pip install "orthocapture[grounded]"': (  # the same
+        "tests/markers/test_grounded.py::test_without_weights_the_message_names_the_files_and_their_place"
+    ),
+    "orthocapture register --images DIR --camera camera.json --poses poses.csv --mesh scan.ply --radius-mm 15 "
+    "--detector grounded --weights WEIGHTS --out result.json": (
+        "tests/registration/test_register_command.py::test_grounded_and_vote_record_the_hashes_of_their_weights"
+    ),
+    "python -m bench.markers.detectors": "tests/markers/test_grounded.py::test_all_detectors_are_measured_side_by_side",
     "orthocapture demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     "make demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     'python -m pip install ".[fuzz]"': (  # needs a package index, which tests have not
@@ -390,7 +398,9 @@ def test_commands_are_found_in_blocks_tables_and_text() -> None:
 
 def test_the_extras_that_documents_install_are_declared() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    named = {name for text in RUN_ELSEWHERE for name in re.findall(r'pip install "\.\[(\w+)\]"', text)}
+    named = {
+        name for text in RUN_ELSEWHERE for name in re.findall(r'pip install "(?:\.|orthocapture)\[(\w+)\]"', text)
+    }
     assert named
     assert named <= set(project["optional-dependencies"])
 
