@@ -25,7 +25,7 @@ from service.compute.poses.ros.messages import (
 )
 from service.core.errors import ConfigurationError
 from service.core.units import nanoseconds, nanoseconds_of_us
-from service.dataset.formats.meshes import ply
+from service.dataset.formats.meshes import ground_truth_ply
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder
 from service.dataset.posed.records import DataSet, View
@@ -67,8 +67,8 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     """
     stamps = stamps_ns(dataset.views)
     folder.written_by(FILE, lambda path: _recording(path, dataset, stamps))
-    folder.text("metadata.yaml", _metadata(stamps))
-    folder.file("mesh.ply", lambda: ply(dataset.mesh.vertices_m, dataset.mesh.faces, dataset.mark))
+    folder.text("metadata.yaml", (f"# {dataset.mark}\n" if dataset.mark else "") + _metadata(stamps))
+    folder.file("mesh.ply", lambda: ground_truth_ply(dataset.mesh, dataset.mark))
 
 
 def stamps_ns(views: Sequence[View]) -> dict[str, int]:
