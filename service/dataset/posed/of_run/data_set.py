@@ -22,11 +22,11 @@ from service.core.units import metres
 from service.dataset.control_spheres import control_centres
 from service.dataset.posed.of_run.about_run import about_run
 from service.dataset.posed.of_run.pose_errors import own_pose_errors
+from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.posed.of_run.statement import described_run
 from service.dataset.posed.of_run.view_covariances import view_covariances
 from service.dataset.posed.pixels import Photographs
 from service.dataset.posed.records import DataSet, Mesh, View
-from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.registered_scan import control_scan
 from service.dataset.registrations import result_of_step
 from service.dataset.summary import RunSummary
