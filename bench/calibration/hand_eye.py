@@ -156,10 +156,10 @@ def arm_as_markdown(record: dict[str, Any]) -> str:
     lines = [
         f"# Hand-eye calibration of a simulated {record['arm']}, {record['date']}",
         "",
-        f"Commit {record['commit']}. Geometry only: a board of 24 × 17 squares of 15 mm at 4752 × 3168 px, corner noise "
-        "0.05 px for each axis. The arm's errors are not of the form that is estimated: links displaced in all "
-        "directions (0.5 mm rms at the flange), gears with waves between whole periods (0.5 mm), joints that yield to "
-        "gravity (0.3 mm), and a repeatability of ±0.15 mm (0.07 mm rms).",
+        f"Commit {record['commit']}. Geometry only: a board of 24 × 17 squares of 15 mm at 4752 × 3168 px, "
+        "corner noise 0.05 px for each axis. The arm's errors are not of the form that is estimated: links displaced "
+        "in all directions (0.5 mm rms at the flange), gears with waves between whole periods (0.5 mm), joints that "
+        "yield to gravity (0.3 mm), and a repeatability of ±0.15 mm (0.07 mm rms).",
         "",
         *_viewpoints(record["systematic"]),
     ]

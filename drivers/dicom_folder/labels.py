@@ -77,9 +77,7 @@ def _coincide(T_voxel_block: Transform, shape: tuple[int, ...]) -> bool:
     return float(np.abs(corners @ (T_voxel_block - whole)[:3].T).max()) <= _TOLERANCE
 
 
-def _elsewhere(
-    block: Block, shape: tuple[int, int, int], T_ct_voxel: Transform, where: Path
-) -> UnreadableFileError:
+def _elsewhere(block: Block, shape: tuple[int, int, int], T_ct_voxel: Transform, where: Path) -> UnreadableFileError:
     """Why the voxels of a block are not those of the series."""
     negated = _in_voxels(T_ct_voxel, LPS_FROM_RAS @ block.T_ct_block)
     ends = np.array([[0, 0, 0, 1], [*(n - 1 for n in block.inside.shape), 1]]) @ negated[:3].T

@@ -89,8 +89,8 @@ class GrblConfig(DriverConfig):
     rest_within_s: float = Field(
         default=0.5,
         ge=0.4,
-        description="longest time until the axes stand after the death of program, driver or line; it limits their speed "
-        "to one from which they brake in time",
+        description="longest time until the axes stand after the death of program, driver or line; it limits their "
+        "speed to one from which they brake in time",
     )
 
     @model_validator(mode="after")

@@ -111,9 +111,7 @@ Message = Status | Ok | Refused | Alarm | Welcome | Setting | Feedback
 
 def parse(line: bytes) -> Message | None:
     """The message in a line without its end; None for anything else, such as noise or half a line."""
-    if len(line) > LONGEST_LINE:
-        return None
-    text = line.decode("ascii", "replace").strip()
+    text = line.decode("ascii", "replace").strip() if len(line) <= LONGEST_LINE else ""
     if text == "ok":
         return Ok()
     if text.startswith("<"):

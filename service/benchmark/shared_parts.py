@@ -13,7 +13,6 @@ from service.benchmark.method import Command, Place
 from service.core.errors import DataError
 from service.core.geometry import Array
 
-
 _Axis = Annotated[int, Field(ge=0, le=2)]
 
 
@@ -53,7 +52,9 @@ def from_unit_box(vertices: Array, data: Path) -> Array:
     try:
         box = _UnitBox.model_validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
-        raise DataError("the extent of the scene cannot be read", where=str(path), remedy="Export it again") from error
+        raise DataError(
+            "the extent of the scene cannot be read", where=str(path), remedy="Export it again"
+        ) from error
     return vertices[:, box.mesh_axes] + np.array(box.centre_m)
 
 

@@ -24,6 +24,7 @@ PROUD = 1.07  # times the radius, so that a drawn sphere covers the scanned one
 BAR_MM = 100.0
 _ROOM_MM = 60.0
 EYE_MM, TOWARDS_MM = (280.0, -1150.0, 850.0), (0.0, 0.0, 210.0)  # the initial view
+_NEAR_EYE_MM, _NEAR_TOWARDS_MM = (150.0, -620.0, 500.0), (0.0, 0.0, 0.0)  # without cameras around the surface
 _ROUND, _FLAT = 10, 6  # meridians and parallels of a sphere
 
 
@@ -162,7 +163,11 @@ def scene_json(scene: Scene) -> str:
         in_view_mm(np.array([T[:3, 3] for T in mine]))
         if station in scene.bases:
             data.append(_base(in_view_mm(scene.bases[station][None, :3, 3]), station, colour))
-    text = json.dumps({"data": data, "layout": _layout(extent)}, allow_nan=False, separators=(",", ":"))
+    text = json.dumps(
+        {"data": data, "layout": _layout(extent, near=not (names or scene.planned))},
+        allow_nan=False,
+        separators=(",", ":"),
+    )
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -310,7 +315,8 @@ def _scale_bar(centre: Array) -> dict[str, object]:
     }
 
 
-def _layout(extent: _Extent) -> dict[str, object]:
+def _layout(extent: _Extent, *, near: bool) -> dict[str, object]:
+    eye, towards = (_NEAR_EYE_MM, _NEAR_TOWARDS_MM) if near else (EYE_MM, TOWARDS_MM)
     ranges = dict(zip("xyz", extent.ranges(), strict=True))
     axes = {f"{a}axis": {"visible": False, "showspikes": False, "range": ends} for a, ends in ranges.items()}
     return {
@@ -318,7 +324,7 @@ def _layout(extent: _Extent) -> dict[str, object]:
             "aspectmode": "manual",
             "aspectratio": {a: metres(high - low) for a, (low, high) in ranges.items()},
             "dragmode": "turntable",
-            "camera": {"eye": _in_box(ranges, EYE_MM), "center": _in_box(ranges, TOWARDS_MM)},
+            "camera": {"eye": _in_box(ranges, eye), "center": _in_box(ranges, towards)},
             **axes,
         },
         "margin": {"l": 0, "r": 0, "t": 0, "b": 70},

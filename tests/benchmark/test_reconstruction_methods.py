@@ -256,6 +256,17 @@ def test_the_table_has_dense_and_sparse_and_what_was_not_run(dataset: DataSet, t
     )
 
 
+@pytest.mark.parametrize(("built", "lacks"), [("with CUDA", ""), ("without CUDA", "colmap is built without CUDA")])
+def test_colmap_is_asked_whether_it_can_match(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, built: str, lacks: str
+) -> None:
+    program = tmp_path / "colmap"
+    program.write_text(f"#!/bin/sh\necho 'COLMAP 3.8 (Commit Unknown on Unknown {built})'\n", encoding="utf-8")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    assert missing(methods()["colmap"]) == lacks
+
+
 def test_gsplat_says_which_packages_or_device_it_lacks() -> None:
     lacks = [name for name in ("torch", "gsplat") if importlib.util.find_spec(name) is None]
     said = missing(methods()["gsplat"])

@@ -15,9 +15,9 @@ from service.run_record import read_log
 from service.run_start import recorded_run
 from service.store.store import Store
 from service.web.scene.data import scene_of
+from tests.support.pages.at_the_table import STANDING
 from tests.support.pages.browser import accessibility_faults, screen, served
 from tests.support.pages.web import password_of, web_site
-from tests.support.runs.at_the_table import STANDING
 from tests.support.runs.attended import attended
 from tests.support.runs.recorded_run import PROTOCOL, record_run
 from tests.web.test_web_region import FUSION

@@ -18,7 +18,7 @@ from service.cli.main import app
 from service.compute.calibration.board.board import Board
 from service.compute.poses.files.pose_files import read_poses_csv
 from service.core.geometry import Array, inverse, transform
-from tests.support.scenes.board_folder import CAMERA, T_FLANGE_CAMERA, BoardFolder, board_folder
+from tests.support.boards.board_folder import CAMERA, T_FLANGE_CAMERA, BoardFolder, board_folder
 
 BOARD = Board(9, 6, 0.02)
 STORE: Any = get_typestore(Stores.ROS2_JAZZY)

@@ -1,4 +1,4 @@
-"""Programs and drivers of a KUKA arm and of axes under GRBL are killed or suspended: they stop, and wait for a person."""
+"""Programs and drivers of a KUKA arm and of axes under GRBL are killed or suspended: these stop, and wait."""
 
 from __future__ import annotations
 

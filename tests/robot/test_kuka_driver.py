@@ -24,7 +24,7 @@ from drivers.errors import (
 from drivers.host.hosted_device import hosted
 from drivers.interfaces import Array, Payload, RobotArm, SafetyState, SettleCriteria
 from drivers.kuka import KukaConfig
-from service.core.arms.models.lbr_med_14 import ARM as LBR_MED_14
+from service.core.arms.kuka.lbr_med_14 import ARM as LBR_MED_14
 from service.core.geometry import inverse, rotation_angle_rad, transform
 from service.core.seven_axes import forward, nearest_posture, postures
 from simulators.kuka_controller.kinematics import MODELS, frames
@@ -43,7 +43,7 @@ def opened(host: str, unattended_s: float = 5.0) -> Generator[RobotArm]:
     arm = hosted(
         RobotArm,
         "drivers.kuka:DRIVER",
-        KukaConfig(host=host, unattended_s=unattended_s),
+        KukaConfig(host=host, unattended_s=unattended_s, stale_after_s=20.0),  # on a busy machine
         call_timeout_s=30,
         name="robot",
     )

@@ -120,7 +120,7 @@ def test_a_session_that_could_command_gets_no_reply() -> None:
 
 @contextlib.contextmanager
 def opened(host: str, port: int = 30200) -> Generator[RobotArm]:
-    config = KukaConfig(host=host, fri_port=port, fri_host=host, connect_timeout_s=20.0)
+    config = KukaConfig(host=host, fri_port=port, fri_host=host, connect_timeout_s=20.0, stale_after_s=20.0)
     arm = hosted(RobotArm, "drivers.kuka:DRIVER", config, call_timeout_s=60, name="robot")
     try:
         arm.open()
@@ -154,7 +154,9 @@ def test_its_samples_are_the_pose_stream(version: str) -> None:
         until(lambda: listened(last_second(arm)), "FRI has gaps", 60)
         sample = last_second(arm)[-1]
         np.testing.assert_allclose(sample.joints_rad, goal, atol=1e-4)
-        np.testing.assert_allclose(sample.T_base_flange, forward(arm_model("LBR Med 14"), sample.joints_rad), atol=1e-12)
+        np.testing.assert_allclose(
+            sample.T_base_flange, forward(arm_model("LBR Med 14"), sample.joints_rad), atol=1e-12
+        )
         assert sample.controller_time_s == pytest.approx(time.time(), abs=5.0)
         report = arm.report()
         assert report.problems == ()
@@ -207,7 +209,8 @@ def test_an_application_without_fri_and_a_port_in_use_are_refused() -> None:
 def test_doctor_says_how_fri_fares(tmp_path: Path) -> None:
     host = address(96)
     rig = tmp_path / "rig.yaml"
-    keys = f"driver: kuka_sunrise, host: {host}, fri_port: 30200, fri_host: {host}, connect_timeout_s: 20"
+    keys = f"driver: kuka_sunrise, host: {host}, fri_port: 30200, fri_host: {host}"
+    keys += ", connect_timeout_s: 20, stale_after_s: 20"
     rig.write_text(f"name: FRI\ndevices:\n  robot: {{{keys}}}\n")
     with simulated_kuka(host, "--fri-version", "2.7"):
         done = orthocapture("doctor", "--rig", str(rig), "--data", str(tmp_path), "--json", timeout_s=120)

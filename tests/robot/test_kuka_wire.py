@@ -1,4 +1,4 @@
-"""Both ends of the KUKA wire against golden transcripts that neither was made from (docs/howto/kuka.md)."""
+"""Both ends of the KUKA wire against golden transcripts that neither was made from (docs/reference)."""
 
 from __future__ import annotations
 

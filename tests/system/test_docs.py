@@ -282,7 +282,7 @@ RUN_ELSEWHERE = {
             "make soak",
             "make clean",
         ),
-        "tests/system/test_docs.py::test_make_targets_do_what_the_documents_say",
+        "tests/system/test_documents.py::test_make_targets_do_what_the_documents_say",
     ),
     "orthocapture import FOLDER --data runs": (
         "tests/poses/test_import.py::test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere"
@@ -330,7 +330,7 @@ RUN_ELSEWHERE = {
             ".venv/bin/pytest tests/protocol/test_gate_words.py -n 0",
             '.venv/bin/pytest -m "not slow" -k gate',
         ),
-        "tests/system/test_docs.py::test_test_files_and_the_marker_are_there",
+        "tests/system/test_documents.py::test_test_files_and_the_marker_are_there",
     ),
     "orthocapture act release": "tests/web/test_web_held.py::test_the_buttons_ask_the_step",
     **dict.fromkeys(
@@ -350,7 +350,7 @@ RUN_ELSEWHERE = {
         "tests/calibration/test_import_ros.py::test_a_recording_calibrates_a_hand_eye_as_its_files_would"
     ),
     'orthocapture simulate rig --scene 7 --dir rig --arm "LBR Med 14"': (
-        "tests/robot/test_kuka_run.py::test_it_comes_to_its_end_with_every_view"
+        "tests/arms/test_kuka_run.py::test_it_comes_to_its_end_with_every_view"
     ),
     "orthocapture simulate kuka": "tests/robot/test_kuka_driver.py::test_a_day_without_trouble",
     "orthocapture simulate rig --scene 7 --dir rig": (

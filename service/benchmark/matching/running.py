@@ -93,13 +93,13 @@ def open_matching_data(folder: Path) -> MatchingData:
         unknown = {pair[end] for pair in data.pairs for end in ("first", "second")} - data.names
         if unknown:
             raise ValueError(f"{min(unknown)} is not among the views")
-        return data
     except DAMAGED as error:
         raise DataError(
             "this is no data set for feature matching",
             where=str(folder),
             remedy="Export one: orthocapture export RUN --format matching --out DIR",
         ) from error
+    return data
 
 
 def results_in(folder: Path) -> list[MethodResult]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
+
 from service.benchmark.method import Command, Method, Place
 from service.benchmark.shared_parts import at, triangulation
 
 DENSE, FUSED, MESH = "dense", "fused.ply", "mesh.ply"
+_HELP_S = 120.0
 
 
 def commands(place: Place) -> tuple[Command, ...]:
@@ -21,6 +24,15 @@ def commands(place: Place) -> tuple[Command, ...]:
     )
 
 
+def lacking() -> str:
+    """COLMAP's help says how it was built; PatchMatch needs CUDA, which Debian's package is built without."""
+    try:
+        told = subprocess.run(("colmap", "-h"), capture_output=True, text=True, timeout=_HELP_S, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"colmap -h does not answer: {error}"
+    return "colmap is built without CUDA" if "without CUDA" in told.stdout + told.stderr else ""
+
+
 KIND = Method(
     "colmap",
     "COLMAP",
@@ -29,4 +41,5 @@ KIND = Method(
     commands,
     at(MESH),
     programs=("colmap",),
+    lacking=lacking,
 )

@@ -21,8 +21,8 @@ def label_surface(inside: NDArray[np.bool_], T_ct_voxel: Transform) -> tuple[Arr
     """Triangles around the segmented voxels.
 
     The surface is where the segmentation, smoothed by a Gaussian of SIGMA_VOXELS, has the value ½. That moves a
-    curved surface inwards by σ² H (H: its mean curvature), for a sphere of 15 mm in voxels of 0.4 mm by 0.005 mm;
-    what is thinner than about two voxels vanishes.
+    curved surface inwards by σ² H (H: its mean curvature): 0.005 mm for a sphere of 15 mm in voxels of 0.4 mm. What
+    is thinner than about two voxels vanishes.
 
     Args:
         inside: (K, J, I) segmented voxels.

@@ -1,8 +1,8 @@
 """A program that moves an arm back and forth and always tries to continue: a process for tests to kill.
 
-Its arguments are a driver, its configuration as JSON, the values of the first joint between which it moves, and whether
-it `lives` or `hangs`. Each line that it reads is the name of a person who permits motion. It reports its observations as
-lines of JSON.
+Its arguments are a driver, its configuration as JSON, the values of the first joint between which it moves, and
+whether it `lives` or `hangs`. Each line that it reads is the name of a person who permits motion. It reports its
+observations as lines of JSON.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import time
 from typing import Any
 
 from drivers.errors import DeviceError, DeviceUnavailableError
-from drivers.host.hosted_device import HostedDevice, hosted
 from drivers.host.__main__ import load_spec
+from drivers.host.hosted_device import HostedDevice, hosted
 from drivers.interfaces import RobotArm
 
 SPEED_RAD_S, ACCELERATION_RAD_S2 = 1.0, 1.5  # the fastest motion of protocols/demo.yaml

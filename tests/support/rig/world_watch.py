@@ -10,7 +10,6 @@ import time
 from collections.abc import Generator
 from dataclasses import dataclass
 
-
 LONGEST_STEP_S = 0.05  # longest gap that counts; in a longer one the simulator or this process was not scheduled
 
 

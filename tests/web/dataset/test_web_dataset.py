@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,6 +25,7 @@ from service.dataset.preview.records import (
     read_preview,
     write_preview,
 )
+from service.dataset.scene_view import decimated
 from service.web.dataset.previews import Previews
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.recorded.reported_run import record_reported_run
@@ -97,6 +100,30 @@ def test_the_picture_of_the_depth_lies_over_the_photograph(web: WebSite, run: st
             depth[np.isclose(depth_m, mm / 1e3, atol=5e-3)][:, 1].mean() for mm in (small.near_mm, small.far_mm)
         )
         assert near > far + 80, "green rises from violet to yellow"
+
+
+def test_every_surface_is_shown_from_the_side_of_the_cameras(web: WebSite, run: str) -> None:
+    """The scan's own axes point anywhere; in the drawing the cameras are above, also where they are not drawn."""
+    folder, preview = next((web.site.data / "cache" / "dataset").iterdir()), preview_of(web, run)
+    assert preview.distances is not None
+    heights_mm = [surface_mm(folder / name)[:, 2] for name in ("coverage.json", preview.distances.figure)]
+    summary = read_run(web.site.data, run).summary()
+    record = summary.registrations()[summary.best() or ""]
+    eyes_m = np.array([np.array(T)[:3, 3] for T in record.T_scan_camera.values()])
+    spheres_m = np.array(summary.scan_spheres_m())
+    up = eyes_m.mean(axis=0) - spheres_m.mean(axis=0)
+    points_m, _ = decimated(*summary.scan_mesh())
+    for found_mm in heights_mm:
+        expected_mm = 1e3 * (points_m - spheres_m.mean(axis=0)) @ up / np.linalg.norm(up)
+        assert found_mm == pytest.approx(expected_mm, abs=0.01)
+
+
+def surface_mm(path: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """(V, 3) vertices of the surface in a figure."""
+    surface = next(t for t in json.loads(path.read_text(encoding="utf-8"))["data"] if t.get("name") == "surface")
+    return np.stack(
+        [np.frombuffer(base64.b64decode(surface[axis]["bdata"]), "<f4").astype(np.float64) for axis in "xyz"], axis=1
+    )
 
 
 def test_crops_on_the_page_are_free_of_markers(web: WebSite, run: str) -> None:

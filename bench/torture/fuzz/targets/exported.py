@@ -1,8 +1,7 @@
-"""Fuzz targets for what was exported or scored before: data sets, image pairs, results of the benchmarks, drawn regions."""
+"""Fuzz targets for what was exported, scored or drawn before: data sets, image pairs, results, regions."""
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import json
@@ -105,7 +104,8 @@ def _pairs(file: str, data: bytes, folder: Path) -> None:
 
 def _matching_results(folder: Path) -> list[bytes]:
     scores = tuple(
-        PairScore(f"a{k}", "b", "easy", 90, 80, tuple(0.5 for _ in PRECISION_PX), PoseError(1.0, 2.0), 70, 0.4, 0.1) for k in range(3)
+        PairScore(f"a{k}", "b", "easy", 90, 80, (0.5,) * len(PRECISION_PX), PoseError(1.0, 2.0), 70, 0.4, 0.1)
+        for k in range(3)
     )
     write_result(folder / "sift.json", MethodResult("sift", "SIFT", "0" * 64, simulated=True, scores=scores))
     return [(folder / "sift.json").read_bytes()]
@@ -124,8 +124,9 @@ def _results(_: Path) -> list[bytes]:
     score = Score(**dict.fromkeys(Score.model_fields, 0.4))
     result = Result(
         method="stereo", scenario="dense", dataset_sha256="0" * 64, simulated=True, views=36, width=960, height=640,
-        commands=(("python", "-m", "x"),), elsewhere=False, effort=Effort(wall_s=1.0, cpu_s=2.0, peak_memory_mb=300.0),
-        mesh_sha256="1" * 64, faces=100, score=score, failure="", finished_utc="2026-11-24T10:00:00Z",
+        commands=(("python", "-m", "x"),), elsewhere=False,
+        effort=Effort(wall_s=1.0, cpu_s=2.0, peak_memory_mb=300.0), mesh_sha256="1" * 64, faces=100, score=score,
+        failure="", finished_utc="2026-11-24T10:00:00Z",
         machine=Machine(processor="x", cores=2, memory_gb=8.0, gpu=""),
     )  # fmt: skip
     other = result.model_copy(update={"effort": None, "score": None, "failure": "no mesh", "scenario": "sparse"})
@@ -206,8 +207,8 @@ _H5 = "service.dataset.posed.of_folder:data_set_of_folder"
 _MATCHING = "service.benchmark.matching.running:open_matching_data"
 TARGETS: tuple[Target, ...] = (
     *(
-        Target(f"data_set_{name}", _H5, functools.partial(_data_set, file), functools.partial(_of, "hdf5", file), kinds,
-               pace=0.3)
+        Target(f"data_set_{name}", _H5, functools.partial(_data_set, file), functools.partial(_of, "hdf5", file),
+               kinds, pace=0.3)
         for name, file, kinds in (
             ("statement", "dataset.json", JSON), ("splits", "splits.json", JSON), ("index", "data.h5", BYTES),
             ("view", "views/*.h5", BYTES),

@@ -8,7 +8,7 @@ import itertools
 import json
 import os
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from simulators.kuka_controller import HOME_RAD
 from simulators.kuka_controller.controller import Controller as KukaController
 from simulators.kuka_controller.kinematics import MODELS
 from simulators.kuka_controller.server import Server as KukaServer
-from simulators.serve import SimulatorError
+from simulators.serve import SimulatorError, Termination
 
 _HOST = f"127.{100 + os.getpid() % 100}.{os.getpid() // 100 % 250}.10"
 _CRITERIA = SettleCriteria(0.05, 0.01, 0.01, 1e-3, 1e-3)
@@ -70,17 +70,18 @@ def _kuka_lines(_: Path) -> list[bytes]:
     """What a controller says in a session, with numbers of requests as the driver counts them."""
     state = {**_kuka_controller().state(1), "locked": False}
     hello = {"is": "hello", "protocol": 1, "model": "LBR Med 14", "serial": "1", "software": "x", "time_s": 1.0}
-    permitted, begun, stopped = ({"is": "ack", "seq": n, **more} for n, more in ((1, {}), (2, {"motion": 1}), (3, {})))
-    done = {"is": "done", "motion": 1}
-    refused = {"is": "err", "seq": 2, "motion": None, "code": "limits", "what": "axis 2"}
-    ended = {"is": "err", "seq": None, "motion": 1, "code": "safety", "what": "a stop"}
+    permitted, stopped = ({"is": "ack", "seq": sequence} for sequence in (1, 3))
+    begun = {"is": "ack", "seq": 2, "motion": 1}
+    done: dict[str, object] = {"is": "done", "motion": 1}
+    refused: dict[str, object] = {"is": "err", "seq": 2, "motion": None, "code": "limits", "what": "axis 2"}
+    ended: dict[str, object] = {"is": "err", "seq": None, "motion": 1, "code": "safety", "what": "a stop"}
     return [
         _lines([hello, state, permitted, state, *rest])
         for rest in ([begun, done, stopped, state], [refused, state], [begun, ended, stopped, state])
     ]
 
 
-def _lines(lines: Sequence[dict[str, object]]) -> bytes:
+def _lines(lines: Sequence[Mapping[str, object]]) -> bytes:
     return b"".join(json.dumps(line).encode() + b"\n" for line in lines)
 
 
@@ -111,8 +112,8 @@ def _kuka_requests(_: Path) -> list[bytes]:
     ]  # fmt: skip
 
 
-class _Turns:
-    """A termination after some turns of the simulator's loop."""
+class _Turns(Termination):
+    """Set after some turns of the simulator's loop."""
 
     def __init__(self, turns: int) -> None:
         self._left = turns
@@ -124,7 +125,7 @@ class _Turns:
 
 
 def _kuka_simulator(data: bytes, _: Path) -> None:
-    server = KukaServer(_kuka_controller(), (_HOST, 30010), 30011, None)
+    server = KukaServer(_kuka_controller(), (_HOST, 30010), 30011, None, fri_version="none")
     try:
         with (
             socket.create_connection((_HOST, 30010), timeout=2.0) as link,
@@ -162,7 +163,8 @@ _PARTS = tuple(_SESSION)
 
 
 def _grbl_seeds(_: Path) -> list[bytes]:
-    doors = b"".join(f"<{state}|MPos:-3.000,0.000,0.000|FS:0,0>\r\n".encode() for state in ("Door:1", "Door:0", "Hold:1"))
+    states = ("Door:1", "Door:0", "Hold:1")
+    doors = b"".join(f"<{state}|MPos:-3.000,0.000,0.000|FS:0,0>\r\n".encode() for state in states)
     return [b"\x1e".join(_SESSION.values()), b"\x1e".join([*_SESSION.values(), doors, b"ALARM:1\r\nerror:9\r\n"])]
 
 
@@ -210,6 +212,7 @@ TARGETS: tuple[Target, ...] = (
         pace=0.5, **_SIMULATOR,
     ),
     Target(
-        "grbl_requests", "simulators.grbl.controller:Controller.hear", _grbl_simulator, _grbl_lines, _ALL, **_SIMULATOR
+        "grbl_requests", "simulators.grbl.controller:Controller.hear", _grbl_simulator, _grbl_lines, _ALL,
+        **_SIMULATOR,
     ),
 )  # fmt: skip

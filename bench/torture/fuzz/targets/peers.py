@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator
 
 _PERIOD_S = 0.01
 
+
 @contextlib.contextmanager
 def threads_watched() -> Generator[list[BaseException]]:
     """Collect the exceptions that end threads within the block."""

@@ -8,7 +8,7 @@ from typing import cast
 from bench.torture.fuzz.targets.target import Target
 
 _MODULES = (  # each has a tuple TARGETS
-    "written", "delivered", "labelled", "viewed", "exported", "records", "wires", "movers", "hostile",
+    "written", "delivered", "labelled", "viewed", "exported", "streams", "records", "wires", "movers", "hostile",
 )  # fmt: skip
 GROUPS = tuple(f"bench.torture.fuzz.targets.{name}" for name in _MODULES)
 

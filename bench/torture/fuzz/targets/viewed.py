@@ -1,4 +1,4 @@
-"""Fuzz targets for structured scans (views of a sensor, E57), other surface files, and recordings of a video camera."""
+"""Fuzz targets for structured scans (a sensor's views, E57), other surface files, and a video camera's recordings."""
 
 from __future__ import annotations
 
@@ -74,7 +74,8 @@ def _read(name: str, data: bytes, folder: Path) -> None:
 @functools.cache
 def _crc_table() -> tuple[int, ...]:
     table: list[int] = []
-    for value in range(256):
+    for byte in range(256):
+        value = byte
         for _ in range(8):
             value = value >> 1 ^ (0x82F63B78 if value & 1 else 0)
         table.append(value)
@@ -82,7 +83,7 @@ def _crc_table() -> tuple[int, ...]:
 
 
 def with_checksums(data: bytes) -> bytes:
-    """An E57 file whose pages have the checksums (CRC-32C, big-endian) that their bytes need: mutations get further."""
+    """An E57 file with the checksums (CRC-32C, big-endian) that its pages need, so that mutations get further."""
     table, pages = _crc_table(), bytearray(data)
     for at in range(0, len(pages) - _PAGE + 1, _PAGE):
         crc = 0xFFFFFFFF
@@ -97,8 +98,8 @@ def _e57s(folder: Path) -> list[bytes]:
 
     points = _seen_mm() / 1000
     row, column = np.mgrid[:ROWS, :COLUMNS]
-    data: dict[str, Any] = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), np.nan_to_num(points).reshape(-1, 3).T,
-                                    strict=True))  # fmt: skip
+    x, y, z = np.nan_to_num(points).reshape(-1, 3).T
+    data: dict[str, Any] = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
     data |= {"rowIndex": row.ravel(), "columnIndex": column.ravel()}
     data["cartesianInvalidState"] = (~np.isfinite(points).all(axis=-1)).ravel().astype(np.int8)
     path = folder / "scan.e57"
@@ -133,7 +134,7 @@ def _surface(kind: str) -> Callable[[bytes, Path], None]:
 
 def _one_gltf() -> bytes:
     """A glTF with its buffers within."""
-    parts = trimesh.creation.icosphere(subdivisions=1, radius=150.0).export(file_type="gltf")
+    parts: Any = trimesh.creation.icosphere(subdivisions=1, radius=150.0).export(file_type="gltf")
     document = json.loads(parts["model.gltf"])
     for buffer in document["buffers"]:
         content = base64.b64encode(parts[buffer["uri"]]).decode()

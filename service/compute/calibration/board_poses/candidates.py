@@ -34,7 +34,14 @@ class Candidates:
 
 
 def board_candidates(
-    known: BoardKnowledge, board: Board, wishes: ViewRange, approach: Array, *, most: int = _MOST, seed: int = 0, draw: int = 0
+    known: BoardKnowledge,
+    board: Board,
+    wishes: ViewRange,
+    approach: Array,
+    *,
+    most: int = _MOST,
+    seed: int = 0,
+    draw: int = 0,
 ) -> Candidates:
     """Poses that keep the whole printed board in the frame for every truth within the tolerances.
 

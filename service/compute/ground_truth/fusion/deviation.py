@@ -32,7 +32,7 @@ class FieldLengths:
         reach_m: over which it decays where the scan shows nothing.
     """
 
-    smoothing_m: float = 0.001
+    smoothing_m: float = 0.0007
     reach_m: float = 0.006
 
 

@@ -2,7 +2,8 @@
 
 The triangulation of the CT carries the result, which is watertight where the CT is. Its vertices move onto the scan
 by a weight that rises smoothly from 0 to 1 over the overlap. Where the CT deviates from the scan beside the seam, its
-part on the other side follows, by less and less with the distance: so there is no step.
+part on the other side follows, by less and less with the distance: so there is no step. What the scan shows beyond
+that smooth deviation is mostly its noise, and comes in later.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from service.compute.ground_truth.fusion.regions import Correction, Region, corr
 from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, place_jacobian
+
+_DETAIL_FROM = 0.3  # of the overlap: from here on the scan's own detail comes in
 
 
 class Source(IntEnum):
@@ -127,11 +130,12 @@ def fuse(
     height = seen.offset_m[usable] if usable.any() else np.zeros(1)
     offset = float(np.median(height))
     spread = 1.4826 * float(np.median(np.abs(height - offset)))
-    weight = _smooth_step(distance_to(carrier.vertices_m, ~usable) / chosen.blend_m)
+    within = distance_to(carrier.vertices_m, ~usable) / chosen.blend_m
+    weight, detail = _smooth_step(within), _smooth_step((within - _DETAIL_FROM) / (1 - _DETAIL_FROM))
     known_m = np.where(usable, -seen.offset_m, 0.0)
     followed = deviation_field(carrier, known_m, usable, chosen.lengths)[:, None] * vertex_normals(carrier)
     onto = seen.nearest_m - carrier.vertices_m
-    moved, folded = moved_unfolded(carrier, (1 - weight)[:, None] * followed + weight[:, None] * onto)
+    moved, folded = moved_unfolded(carrier, followed + detail[:, None] * (onto - followed))
     sigma = _sigma(carrier, weight, np.linalg.norm(onto - followed, axis=1), max(chosen.sigma_ct_m, spread), chosen)
     source = np.where(weight <= 0, Source.CT, np.where(weight >= 1, Source.SCAN, Source.BLEND)).astype(np.uint8)
     fused = Fused(

@@ -11,9 +11,13 @@ from service.core.gates.verdict import describe, standing
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement
 from service.core.records.events import DeviceOpened
 from service.core.records.import_list import imported_sentence
+from service.core.units import mm
 from service.dataset.late_results import late_results
 from service.dataset.posed.about import About, UsedDevice
+from service.dataset.recorded_fusion import recorded_fusion
 from service.dataset.summary import RunSummary
+
+_UNNAMED = "a person who is not named here"
 
 
 def about_run(
@@ -55,6 +59,7 @@ def about_run(
         settings=_settings(summary),
         accuracy=next((row for row in summary.table() if row.poses == own), None),
         budget=summary.budgets().get(own),
+        fusion=_fusion(summary, personal=personal),
         gates=tuple(gates_in_words(summary).items()),
         accepted=tuple(gate.text for gate in accepted_gates(summary.protocol, summary.state)),
         deviations=tuple(d.text for d in summary.state.deviations if not d.is_note),
@@ -80,8 +85,41 @@ def origin_sentence(summary: RunSummary, *, personal: bool = True) -> str:
     """How the photographs came into the run."""
     if summary.root.origin != "imported":
         return "The photographs were captured in this run"
-    by = summary.root.operator if personal else "a person who is not named here"
+    by = summary.root.operator if personal else _UNNAMED
     return imported_sentence(summary.events[0].at_utc, by)
+
+
+def _fusion(summary: RunSummary, *, personal: bool) -> tuple[tuple[str, str], ...]:
+    """How CT and scan agree, and what of the mesh comes from where."""
+    fusion = recorded_fusion(summary)
+    if fusion is None:
+        return ()
+    m, loop = fusion.measures, fusion.measures.get("loop_closure_mm")
+    drawn = [
+        f"{'CT' if region.source == 'ct' else 'scan'} by "
+        + (region.by if personal or region.by.startswith("protocol ") else _UNNAMED)
+        for region in fusion.answer.regions
+    ]
+    return (
+        (
+            "Chamfer distance of CT and scan",
+            f"{m['chamfer_ct_scan_mm']:.3f} mm (CT to scan {m['ct_to_scan_mm']:.3f} mm, scan to CT "
+            f"{m['scan_to_ct_mm']:.3f} mm; medians {m['ct_to_scan_median_mm']:.3f} mm and "
+            f"{m['scan_to_ct_median_mm']:.3f} mm), sampled every {mm(fusion.spacing_m):g} mm; equal surfaces would "
+            f"give {m['chamfer_floor_mm']:.3f} mm",
+        ),
+        (
+            "Distances of the spheres over the transport",
+            f"changed by up to {m['sphere_distance_change_max_mm']:.3f} mm",
+        ),
+        ("Loop from scan to CT by spheres and back by cameras", "no images" if loop is None else f"{loop:.3f} mm"),
+        (
+            "Vertices",
+            f"{100 * m['ct_share']:.1f} % of the CT, {100 * m['scan_share']:.1f} % of the scan, "
+            f"{100 * m['blend_share']:.1f} % blended; median stated sigma {m['sigma_median_mm']:.3f} mm",
+        ),
+        ("Wound", f"proposed, then corrected: {'; '.join(drawn)}" if drawn else "as proposed"),
+    )
 
 
 def _devices(summary: RunSummary, *, personal: bool) -> tuple[UsedDevice, ...]:

@@ -86,7 +86,7 @@ class ArmAtStation:
             centre_m=centre,
             margin_m=c.margin_m,
             start_rad=np.asarray(start_rad, dtype=np.float64),
-            speed_rad_s=self.motion.speed_rad_s,
+            speed_rad_s=min(self.motion.speed_rad_s, float(self.model.speeds_rad_s.min())),
             acceleration_rad_s2=self.motion.acceleration_rad_s2,
             sharp=sharp,
             must_be_sharp_m=apply(T_base_specimen, corners) if sharp_at_m is None else sharp_at_m,

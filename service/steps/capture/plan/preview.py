@@ -11,6 +11,7 @@ from service.compute.calibration.board.board import Board
 from service.compute.calibration.board_poses.design import CalibrationTargets
 from service.compute.planning.motion_plan import best_posture
 from service.core.arms.known import known_arm
+from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply
 from service.core.protocol.models import Protocol, Step
 from service.core.units import metres
@@ -93,6 +94,13 @@ def _arm(protocol: Protocol, rig: Rig, layout: StationLayout) -> ArmAtStation | 
     if model is None:
         return None
     nominal = rig.nominal_T_flange_camera()
+    load = rig.section.payload
+    if load is not None and load.mass_kg > model.payload_kg:
+        raise ConfigurationError(
+            f"the payload of {load.mass_kg:g} kg is more than a {model.name} carries, {model.payload_kg:g} kg",
+            where=str(rig.path),
+            remedy="Correct mass_kg, or choose another arm",
+        )
     return ArmAtStation(layout, model, nominal, collision, rig.section.optics, protocol.motion)
 
 

@@ -1,4 +1,4 @@
-// The protocol of docs/howto/kuka.md without sockets: requests, the stream, the latch, the heartbeat, ends of motions.
+// The protocol of docs/reference/kuka_protocol.md without sockets: requests, the stream, the latch, the heartbeat, ends of motions.
 package orthocapture.sunrise;
 
 import java.util.LinkedHashMap;

@@ -17,6 +17,20 @@ _ALLOWED = frozenset(
 _BASE_DEPTH_M = 0.10  # pedestal top below the base frame
 
 
+def lbr_r820(name: str) -> ArmModel:
+    """An LBR with a reach of 820 mm, which is made for industry (iiwa) and for medical devices (Med).
+
+    Source: KUKA, specifications "LBR iiwa 7 R800, LBR iiwa 14 R820" and "LBR Med": dimensions, axis ranges, speeds.
+    """
+    return lbr(
+        name,
+        offsets_m=(0.360, 0.420, 0.400, 0.126),
+        limits_deg=(170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0),
+        speeds_deg_s=(85.0, 85.0, 100.0, 75.0, 130.0, 135.0, 135.0),
+        payload_kg=14.0,
+    )
+
+
 def lbr(
     name: str,
     *,

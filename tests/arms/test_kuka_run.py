@@ -26,6 +26,8 @@ BOARD_POSES = {
     "station": "station_1", "prefix": "b", "count": 24, "tilts_deg": [8, 20, 32, 38],
     "rolls_deg": [0, 12, -12, 180, 168], "distances_m": [0.62, 0.68, 0.74], "above_scene_m": 0.09, "coverage": 0.9,
 }  # fmt: skip
+# With eight views a station, the poses of an arm that repeats to 0.15 mm are not what the demonstration asks for.
+WIDER = {"predicted_target_error_mm": 1.0, "loop_closure_mm": 1.0, "robot_corrected_rms_px": 2.0}
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,13 @@ class Run:
     doctor: dict[str, Any]
 
 
+def patient(rig: Path) -> None:
+    """A busy machine is no dead link: wait longer for the arm's stream than at a real one."""
+    record = yaml.safe_load(rig.read_text(encoding="utf-8"))
+    record["devices"]["robot"] |= {"stale_after_s": 20.0, "answer_timeout_s": 20.0, "unattended_s": 20.0}
+    rig.write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Generator[Run]:
     folder = tmp_path_factory.mktemp("kuka")
@@ -46,9 +55,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Generator[Run]:
     (calibration,) = (step for step in record["steps"] if step["kind"] == "calibration")
     del calibration["params"]["viewpoints"]
     calibration["params"]["board_poses"] = BOARD_POSES
+    for gate in (gate for step in record["steps"] for gate in step.get("gates", [])):
+        gate["max"] = WIDER.get(gate["measure"], gate.get("max"))
+        if gate["max"] is None:
+            del gate["max"]
     protocol.write_text(yaml.safe_dump(record, sort_keys=False, allow_unicode=True), encoding="utf-8")
     options = ("--scene", "7", "--image-width", "960", "--ct-voxel-mm", "1.0", "--speed-up", "10", "--arm", ARM)
     with simulated_rig(folder, *options, host="127.0.0.44") as rig:
+        patient(Path(rig["rig"]))
         doctor = orthocapture("doctor", "--rig", rig["rig"], "--json")
         answer = orthocapture(
             "run", str(protocol), "--rig", rig["rig"], "--data", str(data), "--operator", "Ada", "--auto-confirm",
@@ -67,8 +81,8 @@ def test_it_comes_to_its_end_with_every_view(run: Run) -> None:
     assert not any(step.skipped_viewpoints for step in state.steps.values())
     captured = [e.payload for e in run.summary.events if isinstance(e.payload, ViewpointCaptured)]
     assert all(len(one.joints_rad) == 7 for one in captured)
-    robots = [device for device in run.doctor["devices"] if device.get("driver") == "kuka_sunrise"]
-    assert len(robots) == 1
+    robot = run.doctor["devices"]["robot"]
+    assert (robot["ok"], robot["identity"]["model"], robot["identity"]["driver"]) == (True, ARM, "kuka_sunrise")
 
 
 def test_its_errors_are_those_of_a_good_data_set(run: Run) -> None:

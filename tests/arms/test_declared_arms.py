@@ -18,6 +18,7 @@ from service.compute.planning.collision import Capsule, link_segments, nearest_c
 from service.compute.planning.motion_plan import PATH_STEP_RAD, Situation, able_postures, best_posture, plan_motion
 from service.core.arms.known import arm_model, known_arms
 from service.core.arms.model import ArmModel
+from service.core.errors import ConfigurationError
 from service.core.geometry import Array, inverse, to_rotation_vector, transform
 from service.core.protocol.models import Motion, load_protocol
 from service.core.seven_axes import elbow_angle_rad
@@ -28,7 +29,8 @@ from service.steps.capture.plan.planning import ArmAtStation, usual_posture
 from service.steps.capture.plan.preview import preview_plans
 from service.steps.capture.plan.viewpoints import ViewpointSet, plan_viewpoints
 from service.steps.context import StationLayout
-from service.steps.kinds import viewpoint_capture
+from service.steps.kinds.captures import viewpoint_capture
+from simulators.scene.world import Scene
 
 PROTOCOL = Path(__file__).parents[2] / "protocols" / "exvivo_spine.yaml"
 MOUNT = transform(np.eye(3), np.array([0.0, -0.055, 0.095]))
@@ -168,6 +170,40 @@ def test_an_obstacle_in_the_rig_file_is_named_in_the_plan(tmp_path: Path) -> Non
     assert texts[0].startswith("8 of 8 viewpoints")
     assert texts[1].startswith("0 of 8 viewpoints")
     assert "would touch the lamp" in texts[1]
+
+
+def test_a_load_that_the_arm_does_not_carry_is_refused(tmp_path: Path) -> None:
+    station = {"robot": "robot", "scene_centre_m": [0.70, 0.0, 0.055], "approach_azimuth_deg": 180.0}
+    record = {
+        "name": "OR 3",
+        "devices": {"robot": {"driver": "kuka_sunrise", "host": "192.0.2.1"}},
+        "stations": {"station_1": station},
+        "T_flange_camera_nominal": MOUNT.tolist(),
+        "payload": {"mass_kg": 15.0, "centre_of_gravity_m": [0.0, 0.0, 0.1]},
+        "collision": {"arm": "LBR Med 14"},
+    }
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(record))
+    rig, protocol = load_rig(tmp_path / "rig.yaml"), load_protocol(PROTOCOL, params_models()).protocol
+    with pytest.raises(ConfigurationError, match="of 15 kg is more than a LBR Med 14 carries, 14 kg"):
+        preview_plans(protocol, protocol.step("control_capture_1"), rig, partial(layout_of, rig))
+
+
+# --- the simulated arms ---------------------------------------------------------------------------------------------
+
+
+def test_a_scene_is_the_same_for_every_arm_and_an_lbr_errs_by_most_of_a_millimetre() -> None:
+    usual, scene = Scene.generate(7), Scene.generate(7, arm="LBR Med 14")
+    np.testing.assert_array_equal(scene.registration_m, usual.registration_m)
+    assert scene.lens == usual.lens
+    errors: list[float] = []
+    for k in range(40):
+        q = LBR.usual_rad + np.random.default_rng(k).uniform(-0.4, 0.4, 7)
+        reported = scene.nominal_flange(q)
+        np.testing.assert_allclose(reported, forward(LBR, q[None])[0], atol=1e-12)
+        true = inverse(scene.T_world_base["station_1"]) @ scene.true_flange(q, "station_1")
+        np.testing.assert_array_equal(scene.true_flange(q, "station_1"), scene.true_flange(q, "station_1"))
+        errors.append(1e3 * float(np.linalg.norm(true[:3, 3] - reported[:3, 3])))
+    assert 0.4 < float(np.sqrt(np.mean(np.square(errors)))) < 1.2
 
 
 def _one() -> ViewpointSet:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.core.arms.universal_robot import universal_robot
+from service.core.arms.universal_robots.family import universal_robot
 
 # Source: Universal Robots, "DH parameters for calculations of kinematics and dynamics" (support article); data sheet.
 ARM = universal_robot(

@@ -1,1 +1,0 @@
-"""One file for each arm; each has an entry point of `orthocapture.arms`."""
