@@ -260,7 +260,9 @@ RUN_ELSEWHERE = {
     "--detector grounded --weights WEIGHTS --out result.json": (
         "tests/registration/test_register_command.py::test_grounded_and_vote_record_the_hashes_of_their_weights"
     ),
-    "python -m bench.markers.detectors": "tests/markers/test_grounded.py::test_all_detectors_are_measured_side_by_side",
+    "python -m bench.markers.detectors": (
+        "tests/markers/test_grounded.py::test_all_detectors_are_measured_side_by_side"
+    ),
     "orthocapture demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     "make demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     'python -m pip install ".[fuzz]"': (  # needs a package index, which tests have not

@@ -67,7 +67,8 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     """
     stamps = stamps_ns(dataset.views)
     folder.written_by(FILE, lambda path: _recording(path, dataset, stamps))
-    folder.text("metadata.yaml", (f"# {dataset.mark}\n" if dataset.mark else "") + _metadata(stamps))
+    mark = f"# {dataset.mark}\n" if dataset.mark else ""
+    folder.text("metadata.yaml", mark + _metadata(stamps))
     folder.file("mesh.ply", lambda: ground_truth_ply(dataset.mesh, dataset.mark))
 
 
