@@ -30,6 +30,9 @@ CHOSEN = (
     "robot/itself/protective_stop",
     "camera/ptpip/file/drop",
     "lightbox/serial/light/corrupt",
+    "table/itself/door_tapped",
+    "kuka/itself/protective_stop",
+    "video/itself/frozen",
     "scanner/export/half_written",
     "store/disk_full/commit_02",
 )
@@ -95,7 +98,7 @@ def test_a_motion_that_nobody_confirmed_shows(tmp_path: Path) -> None:
 
 def test_every_kind_of_message_is_spoilt_in_every_way_that_its_wire_has() -> None:
     names = cases()
-    for device, kinds in (("robot", 10), ("camera", 11), ("lightbox", 5)):
+    for device, kinds in (("robot", 10), ("camera", 11), ("lightbox", 5), ("table", 6), ("kuka", 6)):
         wires = {name.rsplit("/", 1)[0] for name, case in names.items() if case.spoil and name.startswith(device)}
         assert len(wires) == kinds
         for wire in wires:

@@ -1,11 +1,8 @@
-"""Fuzz targets for binary streams and volumes: FRI's datagrams, messages of ROS 2, labels in NIfTI files."""
+"""Fuzz targets for binary messages: FRI's datagrams, and those of ROS 2."""
 
 from __future__ import annotations
 
-import functools
-import gzip
 import json
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +10,6 @@ import numpy as np
 
 from bench.machine import REPOSITORY
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
-from drivers.dicom_folder.nifti import check_nifti, read_nifti, without_texts
 from drivers.kuka.fri.wire import FriError, decode
 from service.compute.camera_model import CameraModel
 from service.compute.poses.ros.cdr import CdrError
@@ -30,7 +26,6 @@ from service.compute.poses.ros.messages import (
     encode_tf,
 )
 
-_MOST_VOXELS = 1 << 20
 _CAMERA = CameraModel(480, 320, 700.0, 700.0, 239.5, 159.5, -0.05, 0.01)
 
 
@@ -82,43 +77,9 @@ def _message(data: bytes, _: Path) -> None:
         raise MisbehavedError("a pose that is not finite is accepted")
 
 
-# --- NIfTI --------------------------------------------------------------------------------------------------------
-
-
-def _label_image() -> bytes:
-    """A label image of 4 × 5 × 6 voxels of one millimetre, as NIfTI-1 says."""
-    head = bytearray(352)
-    struct.pack_into("<i", head, 0, 348)
-    struct.pack_into("<8h", head, 40, 3, 4, 5, 6, 1, 1, 1, 1)
-    struct.pack_into("<2h", head, 70, 2, 8)
-    struct.pack_into("<8f", head, 76, 1, 1, 1, 1, 0, 0, 0, 0)
-    struct.pack_into("<3f", head, 108, 352, 1, 0)
-    head[123] = 2
-    head[148:158] = b"a patient."
-    struct.pack_into("<2h", head, 252, 1, 1)
-    struct.pack_into("<12f", head, 280, 1, 0, 0, -2, 0, 1, 0, -2, 0, 0, 1, -2)
-    head[344:348] = b"n+1\0"
-    return bytes(head) + bytes(k % 3 for k in range(4 * 5 * 6))
-
-
-def _labels(name: str, data: bytes, folder: Path) -> None:
-    path = folder / name
-    path.write_bytes(data)
-    check_nifti(path)
-    block, _ = read_nifti(path, (), _MOST_VOXELS)
-    if not np.isfinite(block.T_ct_block).all():
-        raise MisbehavedError("a place that is not finite is accepted")
-    without_texts(path, folder / f"clean-{name}")
-
-
-_NIFTI = "drivers.dicom_folder.nifti:read_nifti"
 TARGETS: tuple[Target, ...] = (
     Target("fri", "drivers.kuka.fri.wire:decode", _datagram, _datagrams, errors=(FriError,), says_place=False),
     Target(
         "ros_message", "service.compute.poses.ros.messages", _message, _messages, errors=(CdrError,), says_place=False
-    ),
-    Target("nifti", _NIFTI, functools.partial(_labels, "labels.nii"), lambda _: [_label_image()]),
-    Target(
-        "nifti_gz", _NIFTI, functools.partial(_labels, "labels.nii.gz"), lambda _: [gzip.compress(_label_image())]
     ),
 )
