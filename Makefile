@@ -4,6 +4,8 @@ PYTHON ?=
 BIN := .venv/bin
 READY := .venv/.installed
 TOOLS := .venv/.installed-dev
+NETWORKS := .venv/.installed-grounded
+TORCH := torch==2.13.0
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
@@ -18,7 +20,7 @@ test: $(TOOLS)
 	$(BIN)/pytest -m "not slow"
 
 # The same and all that takes long: whole runs, browsers, the package, sweeps for faults.
-test-all: $(TOOLS)
+test-all: $(TOOLS) $(NETWORKS)
 	$(BIN)/pytest
 
 # Installs the locks under every supported Python of this machine and runs the fast tests there.
@@ -80,8 +82,12 @@ COMPILE = uv pip compile --universal --generate-hashes --no-emit-index-url --no-
 lock:
 	$(COMPILE) -o constraints.txt
 	$(COMPILE) --extra dev --constraint constraints.txt -o constraints-dev.txt
+	echo 'transformers sympy networkx filelock fsspec jinja2 typing-extensions' | tr ' ' '\n' | \
+		$(subst --group build pyproject.toml,--constraint constraints-dev.txt -,$(COMPILE)) -o constraints-grounded.txt
 	sed -i '1i # Locked versions and hashes of everything that orthocapture needs; made by `make lock`.' constraints.txt
 	sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' constraints-dev.txt
+	sed -i '1i # Locked versions and hashes of what the detector grounded needs beside PyTorch; made by `make lock`.' \
+		constraints-grounded.txt
 
 # Ready-made packages only: nothing is compiled on the way, and what has none for this Python is named at once.
 $(READY): pyproject.toml constraints.txt
@@ -98,6 +104,13 @@ $(TOOLS): $(READY) constraints-dev.txt
 	$(PIP) --no-compile --only-binary :all: --no-binary jsonpath-rw --no-build-isolation --require-hashes -r constraints-dev.txt
 	$(BIN)/python -m compileall -qq -j 0 -x '/include/' .venv/lib
 	touch $(TOOLS)
+
+# The packages of the detector `grounded`, for its tests: PyTorch without CUDA where the index has that build. Its hash
+# depends on the build, so it is locked by its version alone.
+$(NETWORKS): $(TOOLS) constraints-grounded.txt
+	$(PIP) --no-compile --only-binary :all: --require-hashes -r constraints-grounded.txt
+	$(PIP) --no-compile --no-deps "$(TORCH)+cpu" || $(PIP) --no-compile "$(TORCH)"
+	touch $(NETWORKS)
 
 clean:
 	rm -rf .venv build *.egg-info

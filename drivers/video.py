@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import logging
 import os
+import select
 import threading
 import time
+from collections.abc import Generator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -243,10 +246,22 @@ class VideoCamera:
             raise self._unavailable("There is no such device or file")
         # FFmpeg would look at five seconds of a stream before it delivers its first image.
         os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "analyzeduration;200000|probesize;5000000")
-        source = cv2.VideoCapture(str(path), cv2.CAP_V4L2 if path.is_char_device() else cv2.CAP_FFMPEG)
+        with self._written_to(path) if path.is_fifo() else nullcontext():
+            source = cv2.VideoCapture(str(path), cv2.CAP_V4L2 if path.is_char_device() else cv2.CAP_FFMPEG)
         if not source.isOpened():
             raise self._unavailable("OpenCV cannot open it: it is busy, or of a format that OpenCV does not know")
         return source
+
+    @contextmanager
+    def _written_to(self, pipe: Path) -> Generator[None]:
+        """Wait until somebody writes into a pipe, for which OpenCV would wait for ever; hold it open meanwhile."""
+        descriptor = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+        try:
+            if not select.select([descriptor], [], [], self._config.frame_timeout_s)[0]:
+                raise self._unavailable("Nobody writes into this pipe")
+            yield
+        finally:
+            os.close(descriptor)
 
     def _prepare(self, source: cv2.VideoCapture) -> None:
         """Ask for JPEG files instead of pixels, and for the wanted size."""

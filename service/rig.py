@@ -26,6 +26,14 @@ if TYPE_CHECKING:  # the module imports scipy, which would delay the start of a 
 Vector3 = tuple[float, float, float]
 
 
+class ObstacleSection(Record):
+    """Something that stands beside the scene, such as another arm where it is parked: a rod of some thickness."""
+
+    from_m: Vector3  # one end of the rod's axis, in the station's base frame
+    to_m: Vector3  # the other end
+    radius_m: Annotated[float, Field(gt=0, lt=1)]  # of the rod, with its round ends
+
+
 class StationSection(Record):
     """A place where a robot's base stands, with the scene as a technician measured it, in that base frame."""
 
@@ -33,6 +41,7 @@ class StationSection(Record):
     scene_centre_m: Vector3  # centre of the scene in this station's base frame, to a centimetre
     scene_up: Vector3 = (0.0, 0.0, 1.0)  # no other value: arms mounted on walls or ceilings are not supported
     approach_azimuth_deg: float  # direction from the scene to the base, about the base's z axis
+    obstacles: dict[str, ObstacleSection] = Field(default_factory=dict)  # by name: another arm, a lamp, a post
 
 
 class PayloadSection(Record):

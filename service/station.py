@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import socket
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -184,7 +186,7 @@ class Station:
         """Lock a device that acts for this process; folders may be read by several processes."""
         spec, _ = self._spec(name)
         settings = self._config(name, spec).model_dump()
-        where = next((str(settings[field]) for field in _ADDRESS_FIELDS if settings.get(field)), "")
+        where = next((_one_name(field, str(settings[field])) for field in _ADDRESS_FIELDS if settings.get(field)), "")
         if spec.kind in _ACTING:
             self._locks[name] = DeviceLock.take(f"{self.rig.section.devices[name]['driver']} {where}".strip(), name)
 
@@ -251,6 +253,16 @@ class Station:
             refuse(problems, what="rig file", name=str(self.rig.path), remedy=remedy, error=ConfigurationError)
 
 
+def _one_name(field: str, address: str) -> str:
+    """The same text for a device whatever name it is given: a link to its port, the name of its host."""
+    if field != "host":
+        return address if ":" in address else os.path.realpath(address)
+    try:
+        return socket.gethostbyname(address)
+    except OSError:  # to open it will fail, with an error that says so
+        return address
+
+
 def layout_of(rig: Rig, station: str) -> StationLayout:
     """The layout of a station in a rig file. Raises ConfigurationError if there is no such station."""
     section = rig.section.stations.get(station)
@@ -260,4 +272,6 @@ def layout_of(rig: Rig, station: str) -> StationLayout:
             f"the rig has no station {station!r}", where=str(rig.path), remedy=f"Stations: {known}"
         )
     azimuth = math.radians(section.approach_azimuth_deg)
-    return StationLayout(station, section.robot, section.scene_centre_m, (math.cos(azimuth), math.sin(azimuth), 0.0))
+    approach = (math.cos(azimuth), math.sin(azimuth), 0.0)
+    obstacles = tuple(section.obstacles.items())
+    return StationLayout(station, section.robot, section.scene_centre_m, approach, obstacles)

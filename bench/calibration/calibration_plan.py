@@ -30,13 +30,14 @@ from service.compute.calibration.hand_eye.record import board_corners
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
 from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.camera_model import CameraModel
-from service.compute.planning.motion_plan import able_postures
+from service.compute.planning.motion_plan import best_posture
+from service.core.arms.known import arm_model
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.protocol.models import Motion
 from service.rig import CollisionSection, LensSection
 from service.steps.board.plan import START, PlannedBoard, Planner, Why, nominal_board, nominal_camera
 from service.steps.board.poses import BoardPoses
-from service.steps.capture.plan.planning import ArmAtStation, known_arm, usual_posture
+from service.steps.capture.plan.planning import ArmAtStation, usual_posture
 from service.steps.context import StationLayout
 from simulators.scene.world import SCENE_CENTRE_M, Scene, nominal_hand_eye
 
@@ -71,8 +72,7 @@ class Room:
         self.rng = np.random.default_rng([seed, 0xBE7C])
         self.layout = self._layout()
         self.mount = nominal_hand_eye()
-        arm = known_arm("UR10e")
-        assert arm is not None
+        arm = arm_model("UR10e")
         station = ArmAtStation(self.layout, arm, self.mount, CollisionSection(arm="UR10e"), None, Motion())
         self.situation = station.situation(usual_posture(arm, self.layout, self.mount))
         # The simulator's board has its 23 corners along x; ours has them along y.
@@ -88,11 +88,12 @@ class Room:
 
     def feasible(self, T_base_camera: Transform) -> bool:
         """Whether the arm can reach a pose T_base_camera (4, 4)."""
-        return bool(able_postures(T_base_camera, self.situation))
+        return best_posture(T_base_camera, self.situation) is not None
 
     def photograph(self, sent: Transform, shoot: Shoot) -> None:
         """Take an image from the pose where a camera on the nominal mount would be at `sent`."""
-        q = able_postures(sent, self.situation)[0]
+        q = best_posture(sent, self.situation)
+        assert q is not None
         T_camera_board = inverse(self.scene.true_camera(q, _STATION)) @ self.T_world_board
         pixels = self.camera.project(apply(T_camera_board, _BOARD.points()))
         shoot.poses += 1

@@ -21,7 +21,7 @@ from service.compute.calibration.board.board import Board, find_board
 from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_grey
 from service.core.geometry import apply, transform
-from tests.support.scenes.board_images import Photography, checkerboard, photograph
+from tests.support.boards.board_images import Photography, checkerboard, photograph
 
 BOARD = Board(16, 23, 0.015)
 LENS = CameraModel(1536, 1024, 2148.9, 2149.0, 770.9, 514.0, -0.0458, 0.0256, 4.4e-4, -4.9e-4)

@@ -19,11 +19,14 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.machine import RESULTS, machine
 from bench.scenes import rendered
+from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_image, read_reduced
 from service.compute.markers.detect import detect_spheres
+from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.anchors import ANCHOR_WIDTH_PX
 from service.compute.markers.search.predicted import WIDE, Prediction, Tone, locate_predicted, tone_of
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
@@ -40,6 +43,24 @@ def cpu(work: Callable[[], _T]) -> tuple[float, _T]:
     begin = time.process_time()
     result = work()
     return time.process_time() - begin, result
+
+
+def _whole_image(
+    file: Path, camera: CameraModel
+) -> tuple[dict[str, float], NDArray[np.uint8], tuple[SphereOutline, ...]]:
+    """CPU seconds of reading and searching a whole image; the image, and the outlines in it at a reduced width."""
+    decode_s, image = cpu(partial(read_image, file))
+    imread_s, _ = cpu(partial(cv2.imread, str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION))
+    reduced_s, (small, small_camera) = cpu(partial(read_reduced, file, camera, ANCHOR_WIDTH_PX))
+    anchor_s, outlines = cpu(partial(detect_spheres, small, small_camera))
+    row = {
+        "decode_s": decode_s,
+        "imread_s": imread_s,
+        "anchor_decode_s": reduced_s,
+        "anchor_search_s": anchor_s,
+        "whole_search_s": cpu(partial(detect_spheres, image, camera))[0],
+    }
+    return row, image, outlines
 
 
 def measure(folder: Path, most: int) -> dict[str, object]:
@@ -63,18 +84,8 @@ def measure(folder: Path, most: int) -> dict[str, object]:
     rows: list[dict[str, float]] = []
     tone: Tone | None = None
     for file in files:
-        decode_s, image = cpu(partial(read_image, file))
-        imread_s, _ = cpu(partial(cv2.imread, str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION))
-        reduced_s, (small, small_camera) = cpu(partial(read_reduced, file, camera, ANCHOR_WIDTH_PX))
-        anchor_s, outlines = cpu(partial(detect_spheres, small, small_camera))
+        row, image, outlines = _whole_image(file, camera)
         tone = tone or tone_of(outlines)
-        row = {
-            "decode_s": decode_s,
-            "imread_s": imread_s,
-            "anchor_decode_s": reduced_s,
-            "anchor_search_s": anchor_s,
-            "whole_search_s": cpu(partial(detect_spheres, image, camera))[0],
-        }
         T_world_base = np.array(truth["T_world_base"][station[file.name]])
         for label, T_world_camera, margin in (
             ("exact", exact[file.name], 0.05),

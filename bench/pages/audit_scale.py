@@ -24,7 +24,7 @@ from service.store.verification.verify import verify
 from tests.support.pages.web import Browser, web_site
 from tests.support.record.store import captured
 from tests.support.record.store import start_run as start_small_run
-from tests.support.runs.large_run import Sizes, write_large_run
+from tests.support.recorded.large_run import Sizes, write_large_run
 
 LIMIT_MS = 200.0
 

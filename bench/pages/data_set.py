@@ -17,7 +17,7 @@ from pathlib import Path
 from bench.machine import RESULTS, commit, machine
 from service.dataset.preview.records import Preview, read_preview, write_preview
 from tests.support.pages.web import Browser, web_site
-from tests.support.runs.unpacked_run import unpack_recorded_run
+from tests.support.recorded.unpacked_run import unpack_recorded_run
 
 LIMIT_MS = 200.0
 VIEWS = 108  # of the paper's protocol
@@ -48,14 +48,7 @@ def main(words: Sequence[str] | None = None) -> int:
             write_preview(folder, many(preview))
             browser.get(f"{here}/exports")
             web.app.state.formats.known(wait_s=_MAKING_S)
-            pages = {
-                "data set": f"{here}/dataset",
-                "data set, another view": f"{here}/dataset?split=train&view={preview.views[-1].name}",
-                "coverage, frame": f"{here}/dataset/coverage/frame",
-                "distances, frame": f"{here}/dataset/distances/frame",
-                "picture": f"{here}/dataset/pictures/{preview.views[0].image}",
-                "exports": f"{here}/exports",
-            }
+            pages = _pages(here, preview)
             rows = {name: measured(browser, path, options.repeat) for name, path in pages.items()}
     about = {
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
@@ -74,6 +67,18 @@ def main(words: Sequence[str] | None = None) -> int:
     for name, row in rows.items():
         sys.stdout.write(f"{name:24} median {row['median_ms']:7.1f} ms, p95 {row['p95_ms']:7.1f} ms\n")
     return int(any(row["p95_ms"] > LIMIT_MS for row in rows.values()))
+
+
+def _pages(here: str, preview: Preview) -> dict[str, str]:
+    """Addresses of the pages and frames of a data set, by their names."""
+    return {
+        "data set": f"{here}/dataset",
+        "data set, another view": f"{here}/dataset?split=train&view={preview.views[-1].name}",
+        "coverage, frame": f"{here}/dataset/coverage/frame",
+        "distances, frame": f"{here}/dataset/distances/frame",
+        "picture": f"{here}/dataset/pictures/{preview.views[0].image}",
+        "exports": f"{here}/exports",
+    }
 
 
 def many(preview: Preview) -> Preview:

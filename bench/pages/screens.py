@@ -8,7 +8,7 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -152,22 +152,33 @@ def tell_runs(data: Path, rig: Rig) -> dict[str, str]:
         return runs
 
 
-def photograph(rig_file: Path, data: Path, into: Path, only: re.Pattern[str]) -> list[Path]:
-    """Take every page at both sizes; returns the files."""
-    rig = load_rig(rig_file)
-    add_people(data, PEOPLE)
-    runs = tell_runs(data, rig)
+def _other_addresses(data: Path, run: str) -> dict[str, str]:
+    """Addresses of an invitation and of a photograph of a run."""
     with Store.open(data) as store:
         people = People(store)
         token = people.sign_in("ada", PASSWORD)
         administrator = people.person(token, idle_lock_s=600, deliberate=True)
         assert administrator is not None
         link = people.accounts.invite(administrator, "tom", "Tom Example", "technician")
-        files = [a for a in store.artefacts(runs["RUN_DONE"]) if a.ref.kind == "image"]
-    names = runs | {
-        "SET_UP": f"/set-up/{link}",
-        "ARTEFACT": f"/audit/runs/{runs['RUN_DONE']}/artefacts/{files[3].ref.sha256}",
-    }
+        files = [a for a in store.artefacts(run) if a.ref.kind == "image"]
+    return {"SET_UP": f"/set-up/{link}", "ARTEFACT": f"/audit/runs/{run}/artefacts/{files[3].ref.sha256}"}
+
+
+def _sign_in(shot: Screen, who: str, runs: Iterable[str]) -> None:
+    """Sign in, unless nobody is meant to be; Tina takes control of all runs."""
+    shot.page.set_default_timeout(60_000)
+    if who:
+        shot.sign_in(who)
+    if who == "tina":
+        for run_id in runs:
+            take_control(shot, run_id)
+
+
+def photograph(rig_file: Path, data: Path, into: Path, only: re.Pattern[str]) -> list[Path]:
+    """Take every page at both sizes; returns the files."""
+    add_people(data, PEOPLE)
+    runs = tell_runs(data, load_rig(rig_file))
+    names = runs | _other_addresses(data, runs["RUN_DONE"])
     working = STANDING | {"doing": "working", "robot": "moving", "what": "image", "done": 6, "total": 8}
     asking = STANDING | {"doing": "asking"}
     taken: list[Path] = []
@@ -180,12 +191,7 @@ def photograph(rig_file: Path, data: Path, into: Path, only: re.Pattern[str]) ->
                     continue
                 if who not in before:
                     before[who] = screens.enter_context(screen(browser, server.url, size))
-                    before[who].page.set_default_timeout(60_000)
-                    if who:
-                        before[who].sign_in(who)
-                    if who == "tina":
-                        for run_id in runs.values():
-                            take_control(before[who], run_id)
+                    _sign_in(before[who], who, runs.values())
                 shot = before[who]
                 for placeholder, text in names.items():
                     path = path.replace(placeholder, text)

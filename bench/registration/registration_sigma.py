@@ -80,57 +80,63 @@ def outlines_of(capture: Capture, workers: int, cache: Path | None) -> list[tupl
 def rendered(capture: Capture, outlines: list[tuple[SphereOutline, ...]]) -> dict[str, dict[str, float]]:
     """Registrations of a scene from true poses, from poses with the errors of SfM or bent, and from robot poses."""
     rng = np.random.default_rng([capture.seed, 0x516])
-    spheres, controls = capture.true_registration_m, capture.true_control_m
-    centre = spheres.mean(axis=0)
-    T_scan_camera = inverse(capture.T_world_scan) @ capture.T_world_camera
     sources: dict[str, tuple[Array, list[int]]] = {
         "true": (capture.T_world_camera, [0] * len(outlines)),
         "disturbed": (disturbed(capture.T_world_camera, SFM_NOISE, rng), [0] * len(outlines)),
         "smooth": (disturbed_smoothly(capture.T_world_camera, SFM_NOISE, rng), [0] * len(outlines)),
         "robot": (capture.T_base_camera, capture.stations),
     }
-    out: dict[str, dict[str, float]] = {}
-    for name, (poses, groups) in sources.items():
-        solved = register_images(
-            outlines,
-            PosedImages(poses, capture.camera, groups=groups),
-            ScanSpheres(spheres, capture.radius_m, control_m=controls),
-        )
-        r = solved.registration
-        control = evaluate(
-            outlines,
-            solved.control_assignments,
-            PosedImages(r.T_scan_camera_refined, capture.camera),
-            ScanSpheres(controls, capture.radius_m),
-            registration=r,
-        )
-        spared = leave_one_out(r, refined=True)
-        sigma = r.sigma_at_m(centre)
-        refined = true_error_m(r.T_scan_camera_refined, T_scan_camera, centre)
-        # The robot's base is known no better than its poses, so the cameras are compared there.
-        known = name != "robot"
-        error = (
-            float(np.linalg.norm(apply(r.T_world_scan, centre) - apply(capture.T_world_scan, centre)))
-            if known
-            else true_error_m(r.T_scan_camera, T_scan_camera, centre)
-        )
-        out[name] = {
-            "true_error_mm": 1e3 * error,
-            "true_error_refined_mm": 1e3 * refined,
-            "sigma_mm": 1e3 * sigma,
-            "normalised": error / sigma,
-            **({"error_chi2": chi2(r, capture.T_world_scan)} if known else {}),
-            "residual_chi2": r.chi2_reduced,
-            "pose_sigma_mm": 1e3 * r.pose_sigma[0],
-            "pose_sigma_deg": float(np.degrees(r.pose_sigma[1])),
-            "control_radial_mm": control.mean_radial_error_mm,
-            "control_px": control.mean_reprojection_error_px,
-            "control_normalised": control.normalised_rms or 0.0,
-            "left_out_radial_mm": spared.mean_radial_error_mm,
-            "left_out_normalised": spared.normalised_rms or 0.0,
-            **{f"sigma_{k}_mm": 1e3 * v for k, v in r.sigma_components_m(centre).items()},
-        }
-    return out
+    # The robot's base is known no better than its poses, so the cameras are compared there.
+    return {
+        name: _registered(capture, outlines, poses, groups, base_known=name != "robot")
+        for name, (poses, groups) in sources.items()
+    }
+
+
+def _registered(
+    capture: Capture,
+    outlines: list[tuple[SphereOutline, ...]],
+    poses: Array,
+    groups: list[int],
+    *,
+    base_known: bool,
+) -> dict[str, float]:
+    """Errors and stated errors of one registration; without a known base, the cameras are compared."""
+    spheres, controls = capture.true_registration_m, capture.true_control_m
+    centre = spheres.mean(axis=0)
+    T_scan_camera = inverse(capture.T_world_scan) @ capture.T_world_camera
+    solved = register_images(
+        outlines,
+        PosedImages(poses, capture.camera, groups=groups),
+        ScanSpheres(spheres, capture.radius_m, control_m=controls),
+    )
+    r = solved.registration
+    refined_images = PosedImages(r.T_scan_camera_refined, capture.camera)
+    controlled = ScanSpheres(controls, capture.radius_m)
+    control = evaluate(outlines, solved.control_assignments, refined_images, controlled, registration=r)
+    spared = leave_one_out(r, refined=True)
+    sigma = r.sigma_at_m(centre)
+    error = (
+        float(np.linalg.norm(apply(r.T_world_scan, centre) - apply(capture.T_world_scan, centre)))
+        if base_known
+        else true_error_m(r.T_scan_camera, T_scan_camera, centre)
+    )
+    return {
+        "true_error_mm": 1e3 * error,
+        "true_error_refined_mm": 1e3 * true_error_m(r.T_scan_camera_refined, T_scan_camera, centre),
+        "sigma_mm": 1e3 * sigma,
+        "normalised": error / sigma,
+        **({"error_chi2": chi2(r, capture.T_world_scan)} if base_known else {}),
+        "residual_chi2": r.chi2_reduced,
+        "pose_sigma_mm": 1e3 * r.pose_sigma[0],
+        "pose_sigma_deg": float(np.degrees(r.pose_sigma[1])),
+        "control_radial_mm": control.mean_radial_error_mm,
+        "control_px": control.mean_reprojection_error_px,
+        "control_normalised": control.normalised_rms or 0.0,
+        "left_out_radial_mm": spared.mean_radial_error_mm,
+        "left_out_normalised": spared.normalised_rms or 0.0,
+        **{f"sigma_{k}_mm": 1e3 * v for k, v in r.sigma_components_m(centre).items()},
+    }
 
 
 # Drawn outlines
@@ -164,52 +170,73 @@ CASES = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class _Common:
+    """The drawn errors that all outlines of a capture share: of the light (3,), of the axis (2,), of the size."""
+
+    light_m: Array
+    shift_rad: Array
+    growth_rad: float
+
+    @classmethod
+    def drawn(cls, case: Case, rng: np.random.Generator) -> _Common:
+        light_m = rng.normal(size=3) * case.common.light_px * DISTANCE_M / CAMERA.fx
+        shift_rad = rng.normal(size=2) * case.common.shift_px / CAMERA.fx
+        return cls(light_m, shift_rad, float(rng.normal()) * case.common.growth_px / CAMERA.fx)
+
+
+def _camera_pose(azimuth_rad: float, tilt_deg: float, centre_m: Array, rng: np.random.Generator) -> Transform:
+    """T_scan_camera near a direction from the centre, which it looks at."""
+    tilt = np.radians(tilt_deg + rng.uniform(-4, 4))
+    out = np.array([np.sin(tilt) * np.cos(azimuth_rad), np.sin(tilt) * np.sin(azimuth_rad), np.cos(tilt)])
+    eye = centre_m + rng.uniform(0.62, 0.72) * out
+    return look_at(eye, centre_m + rng.uniform(-0.02, 0.02, 3), np.array([-out[0], -out[1], 0.3]))
+
+
+def _outlines(
+    case: Case, common: _Common, centres_camera_m: Array, rng: np.random.Generator
+) -> tuple[tuple[SphereOutline, ...], list[int]]:
+    """Outlines with drawn errors of the spheres (N, 3) that are well inside the image, and the indices of these."""
+    pixels = CAMERA.project(centres_camera_m)
+    inside = np.nonzero(np.all((pixels > 40) & (pixels < [CAMERA.width - 40, CAMERA.height - 40]), axis=1))[0]
+    covariance = np.eye(3) * (case.outline_px / CAMERA.fx) ** 2
+    evidence = Evidence(1.0, 0.2, 0.2, 300, 0.1, 0.3, (180.0, 180.0, 180.0), 0.9, covariance)
+    found: list[SphereOutline] = []
+    for m in inside:
+        cone = cone_of_sphere(centres_camera_m[m], RADIUS_M)
+        frame, d = cone.frame(), rng.normal(size=3) * case.outline_px / CAMERA.fx
+        axis = cone.axis + frame[:, :2] @ d[:2]
+        axis[:2] += common.shift_rad * cone.axis[2]
+        size = cone.half_angle_rad + float(d[2]) + common.growth_rad * float(cone.axis[2])
+        found.append(outline_from_cone(Cone(axis / np.linalg.norm(axis), size), CAMERA, 8, evidence))
+    return tuple(found), [int(m) for m in inside]
+
+
 def drawn(seed: int, case: Case, views: int = 18) -> tuple[RegistrationResult, Transform]:
     """Simulate a capture of `views` images with drawn errors; returns the result and the true T_world_scan."""
     rng = np.random.default_rng([seed, 0x5E])
     scan_m = _LABORATORIES[seed % len(_LABORATORIES)]
     T_world_scan = transform(Rotation.random(rng=rng), rng.uniform(-0.3, 0.3, 3))
-    centre = scan_m.mean(axis=0)
-    f, light = CAMERA.fx, rng.normal(size=3) * case.common.light_px * DISTANCE_M / CAMERA.fx
-    shift = rng.normal(size=2) * case.common.shift_px / f
-    growth = float(rng.normal()) * case.common.growth_px / f
-    covariance = np.eye(3) * (case.outline_px / f) ** 2
-    evidence = Evidence(1.0, 0.2, 0.2, 300, 0.1, 0.3, (180.0, 180.0, 180.0), 0.9, covariance)
+    common = _Common.drawn(case, rng)
     poses: list[Transform] = []
     outlines: list[tuple[SphereOutline, ...]] = []
     markers: list[dict[int, int]] = []
     for k in range(views):
         azimuth = np.pi * (k // (views // 2)) + rng.uniform(-1.1, 1.1)
-        tilt = np.radians((14, 32)[k % 2] + rng.uniform(-4, 4))
-        out = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
-        eye = centre + rng.uniform(0.62, 0.72) * out
-        T_scan_camera = look_at(eye, centre + rng.uniform(-0.02, 0.02, 3), np.array([-out[0], -out[1], 0.3]))
-        c = apply(inverse(T_scan_camera), scan_m + light)
-        pixels = CAMERA.project(c)
-        inside = np.nonzero(np.all((pixels > 40) & (pixels < [CAMERA.width - 40, CAMERA.height - 40]), axis=1))[0]
-        found: list[SphereOutline] = []
-        for m in inside:
-            cone = cone_of_sphere(c[m], RADIUS_M)
-            frame, d = cone.frame(), rng.normal(size=3) * case.outline_px / f
-            axis = cone.axis + frame[:, :2] @ d[:2]
-            axis[:2] += shift * cone.axis[2]
-            size = cone.half_angle_rad + float(d[2]) + growth * float(cone.axis[2])
-            found.append(outline_from_cone(Cone(axis / np.linalg.norm(axis), size), CAMERA, 8, evidence))
-        outlines.append(tuple(found))
+        T_scan_camera = _camera_pose(azimuth, (14, 32)[k % 2], scan_m.mean(axis=0), rng)
+        found, inside = _outlines(case, common, apply(inverse(T_scan_camera), scan_m + common.light_m), rng)
+        outlines.append(found)
         markers.append({j: int(m) for j, m in enumerate(inside)})
         poses.append(T_world_scan @ T_scan_camera)
     given = disturbed(np.array(poses), case.pose, rng)
     spheres = scan_m + rng.normal(size=scan_m.shape) * case.spheres_m
+    covariance = np.tile(np.eye(3) * case.spheres_m**2, (len(scan_m), 1, 1)) if case.spheres_m else None
     stated = np.diag([case.pose[0] ** 2] * 3 + [case.pose[1] ** 2] * 3)
     result = register(
         outlines,
         [Assignment(m, inverse(T) @ T_world_scan) for m, T in zip(markers, given, strict=True)],
         PosedImages(given, CAMERA),
-        ScanSpheres(
-            spheres,
-            RADIUS_M,
-            covariance_m2=np.tile(np.eye(3) * case.spheres_m**2, (len(scan_m), 1, 1)) if case.spheres_m else None,
-        ),
+        ScanSpheres(spheres, RADIUS_M, covariance_m2=covariance),
         RegistrationSettings(
             pose_covariance=np.tile(stated, (views, 1, 1)) if case.told else "estimate", common_errors=case.common
         ),

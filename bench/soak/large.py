@@ -84,6 +84,30 @@ def commands(record: LargeRecord) -> Times:
     }
 
 
+def _addresses(record: LargeRecord) -> dict[str, str]:
+    """Pages by their names."""
+    run = record.run_id
+    return {
+        "home": "/",
+        "run": f"/runs/{run}",
+        "capture": f"/runs/{run}/capture?step={STEP}",
+        "contact sheet, last page": f"/runs/{run}/capture?step={STEP}&page={max(1, record.taken // _SHEET)}",
+        "audit": f"/audit/runs/{run}",
+        "audit, timeline": f"/audit/runs/{run}/timeline?after={record.taken}",
+        "audit, artefacts": f"/audit/runs/{run}/artefacts?kind=image&page=9",
+        "audit, provenance": f"/audit/runs/{run}/provenance",
+        "metrics": "/metrics",
+    }
+
+
+def _parts(run: str) -> dict[str, str]:
+    """Parts of pages that screens ask for after each event."""
+    return {
+        "run": f"/runs/{run}/parts/banner,control,vitals,step,actions,side",
+        "capture": f"/runs/{run}/capture/parts/image,plan,sheet?step={STEP}",
+    }
+
+
 def pages(record: LargeRecord) -> Times:
     """Times of every page: the first of a new server, requested again, and after one more event."""
     found: Times = {}
@@ -104,30 +128,13 @@ def pages(record: LargeRecord) -> Times:
         while "data-pending" in get(f"/audit/runs/{run}", auditor):
             time.sleep(0.05)
         found["auditor's first page filled in"] = Took.now().since(began)
-        addresses = {
-            "home": ("/", browser),
-            "run": (f"/runs/{run}", browser),
-            "capture": (f"/runs/{run}/capture?step={STEP}", browser),
-            "contact sheet, last page": (
-                f"/runs/{run}/capture?step={STEP}&page={max(1, record.taken // _SHEET)}",
-                browser,
-            ),
-            "audit": (f"/audit/runs/{run}", auditor),
-            "audit, timeline": (f"/audit/runs/{run}/timeline?after={record.taken}", auditor),
-            "audit, artefacts": (f"/audit/runs/{run}/artefacts?kind=image&page=9", auditor),
-            "audit, provenance": (f"/audit/runs/{run}/provenance", auditor),
-            "metrics": ("/metrics", browser),
-        }
-        for name, (address, who) in addresses.items():
+        for name, address in _addresses(record).items():
+            who = auditor if address.startswith("/audit") else browser
             get(address, who)
             while "data-pending" in get(address, who):
                 time.sleep(0.05)
             found[f"page: {name}"] = _shortest(lambda: get(address, who))  # noqa: B023 - called at once
-        parts = {
-            "run": f"/runs/{run}/parts/banner,control,vitals,step,actions,side",
-            "capture": f"/runs/{run}/capture/parts/image,plan,sheet?step={STEP}",
-        }
-        for name, address in parts.items():
+        for name, address in _parts(run).items():
 
             def news(address: str = address) -> None:
                 get(address)

@@ -2,108 +2,29 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-AS_REAL, REFUSED, NOT_SIMULATED = "as the real one", "refused as the real one refuses", "not simulated"
-HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]
-NEAR = [0.1, *HOME[1:]]
-TOOL = [0.0, 0.0, 0.1, 0.0, 0.0, 0.0]
-NOTHING = [0.0] * 6
-
-
-@dataclass(frozen=True)
-class Call:
-    """One method: how it is called, whether its answer is as expected, its verdict, and the reason."""
-
-    run: Callable[[Any], Any]  # called with the clients of a session
-    right: Callable[[Any], bool]
-    worth: str = AS_REAL
-    note: str = ""
-    crashes: bool = False  # the client itself crashes, whatever the controller does
-
-
-def true(value: Any) -> bool:
-    """Whether the call returned True."""
-    return value is True
-
-
-def done(value: Any) -> bool:
-    """Whether the call returned without a value."""
-    return value is None
-
-
-def numbers(count: int) -> Callable[[Any], bool]:
-    """Whether the value is a list of `count` finite numbers."""
-    return lambda value: len(value) == count and all(math.isfinite(v) for v in value)
-
-
-def number(value: Any) -> bool:
-    """Whether the value is one finite number."""
-    return isinstance(value, (int, float)) and math.isfinite(value)
-
-
-def within(what: list[float], tolerance: float = 1e-3) -> Callable[[Any], bool]:
-    """Whether the value equals these numbers within the tolerance."""
-    return lambda value: (
-        len(value) == len(what) and all(abs(a - b) < tolerance for a, b in zip(value, what, strict=True))
-    )
-
-
-def zeros(count: int) -> Callable[[Any], bool]:
-    """Whether the value is a list of `count` zeros."""
-    return lambda value: list(value) == [0.0] * count
-
-
-def error(words: str) -> Callable[[Any], bool]:
-    """Whether the call raised an error containing these words."""
-    return lambda value: isinstance(value, str) and words in value
-
-
-def left(name: str) -> Callable[[Any], Any]:
-    """Disconnect one of the clients; returns whether it reports so."""
-
-    def run(s: Any) -> Any:
-        client = getattr(s, name)
-        client.disconnect()
-        return client.isConnected()
-
-    return run
-
-
-def back(name: str) -> Callable[[Any], Any]:
-    """Disconnect and reconnect one of the clients; returns its answer."""
-
-    def run(s: Any) -> Any:
-        client = getattr(s, name)
-        client.disconnect()
-        return [client.reconnect(), client.isConnected()]
-
-    return run
-
-
-def no(value: Any) -> bool:
-    """Whether the call returned False."""
-    return value is False
-
-
-def _second(ask: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Call twice: the real-time getters return the previous content of the registers, so the second answer counts."""
-
-    def run(s: Any) -> Any:
-        ask(s)
-        time.sleep(0.05)
-        return ask(s)
-
-    return run
-
-
-# --- RTDEControlInterface ------------------------------------------------------------------------------------
+from bench.vendor.call import (
+    HOME,
+    NEAR,
+    NOT_SIMULATED,
+    NOTHING,
+    TOOL,
+    Call,
+    back,
+    done,
+    left,
+    no,
+    numbers,
+    second,
+    true,
+    within,
+    zeros,
+)
 
 
 def _arrives(start: Callable[[Any], Any], goal: list[float] = NEAR) -> Callable[[Any], Any]:
@@ -294,13 +215,13 @@ CONTROL: dict[str, Call] = {
     "setTcp": Call(lambda s: [s.control.setTcp(TOOL), *s.control.getTCPOffset()][:4], lambda v: v[3] == 0.1),
     "getTCPOffset": Call(lambda s: s.control.getTCPOffset(), numbers(6)),
     "getActualToolFlangePose": Call(
-        _second(lambda s: s.control.getActualToolFlangePose()), lambda v: abs(v[0] + 0.691) < 0.01, note=_LAGS
+        second(lambda s: s.control.getActualToolFlangePose()), lambda v: abs(v[0] + 0.691) < 0.01, note=_LAGS
     ),
     "getTargetWaypoint": Call(lambda s: s.control.getTargetWaypoint(), numbers(6)),
     "getActualJointPositionsHistory": Call(
-        _second(lambda s: s.control.getActualJointPositionsHistory(5)), within(HOME), note=_LAGS
+        second(lambda s: s.control.getActualJointPositionsHistory(5)), within(HOME), note=_LAGS
     ),
-    "getStepTime": Call(_second(lambda s: s.control.getStepTime()), lambda v: v == 0.002, note=_LAGS),
+    "getStepTime": Call(second(lambda s: s.control.getStepTime()), lambda v: v == 0.002, note=_LAGS),
     "isPoseWithinSafetyLimits": Call(
         lambda s: [s.control.isPoseWithinSafetyLimits(pose) for pose in (_below(s), [5.0, *NOTHING[1:]])],
         lambda v: v == [True, False],
@@ -390,22 +311,22 @@ CONTROL: dict[str, Call] = {
         lambda s: s.control.setExternalForceTorque(NOTHING), true, NOT_SIMULATED, _NO_FORCE
     ),
     "directTorque": Call(lambda s: s.new_control.directTorque(NOTHING), true, NOT_SIMULATED, f"{_NO_FORCE}; {_NEW}"),
-    "getJointTorques": Call(_second(lambda s: s.control.getJointTorques()), zeros(6), NOT_SIMULATED, "zeros"),
+    "getJointTorques": Call(second(lambda s: s.control.getJointTorques()), zeros(6), NOT_SIMULATED, "zeros"),
     "getMassMatrix": Call(
-        _second(lambda s: s.new_control.getMassMatrix()), zeros(36), NOT_SIMULATED, f"zeros; {_NEW}"
+        second(lambda s: s.new_control.getMassMatrix()), zeros(36), NOT_SIMULATED, f"zeros; {_NEW}"
     ),
     "getCoriolisAndCentrifugalTorques": Call(
-        _second(lambda s: s.new_control.getCoriolisAndCentrifugalTorques()), zeros(6), NOT_SIMULATED, f"zeros; {_NEW}"
+        second(lambda s: s.new_control.getCoriolisAndCentrifugalTorques()), zeros(6), NOT_SIMULATED, f"zeros; {_NEW}"
     ),
     "getTargetJointAccelerations": Call(
-        _second(lambda s: s.new_control.getTargetJointAccelerations()), numbers(6), note=_NEW
+        second(lambda s: s.new_control.getTargetJointAccelerations()), numbers(6), note=_NEW
     ),
     "getJacobian": Call(
-        _second(lambda s: s.new_control.getJacobian()),
+        second(lambda s: s.new_control.getJacobian()),
         lambda v: len(v) == 36 and sum(abs(x) for x in v) > 1,
         note=_NEW,
     ),
     "getJacobianTimeDerivative": Call(
-        _second(lambda s: s.new_control.getJacobianTimeDerivative()), numbers(36), note=_NEW
+        second(lambda s: s.new_control.getJacobianTimeDerivative()), numbers(36), note=_NEW
     ),
 }

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bench.vendor.calls import (
+from bench.vendor.call import (
     AS_REAL,
     HOME,
     NOT_SIMULATED,

@@ -15,7 +15,8 @@ import rtde_io
 import rtde_receive
 import script_client
 
-from bench.vendor.calls import CONTROL, HOME, Call
+from bench.vendor.call import HOME, Call
+from bench.vendor.calls import CONTROL
 from bench.vendor.reads import DASHBOARD, IO, RECEIVE, SCRIPT
 
 INTERFACES: dict[str, tuple[type[Any], dict[str, Call]]] = {

@@ -16,7 +16,7 @@ from typing import Any
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.whole_runs.whole_run import whole_run
-from tests.support.runs.shortened import shortened
+from tests.support.protocols.shortened import shortened
 
 PROTOCOL = REPOSITORY / "protocols" / "exvivo_spine.yaml"
 
@@ -34,11 +34,12 @@ def main(words: Sequence[str] | None = None) -> int:
         "image_width": options.image_width,
         "ct_voxel_mm": options.ct_voxel_mm,
         "speed_up": options.speed_up,
+        "arm": options.arm,
     }
     stem = options.results / f"{options.name}-{options.image_width}-{options.date}"
     options.results.mkdir(parents=True, exist_ok=True)
     rig = ["--image-width", str(options.image_width), "--ct-voxel-mm", str(options.ct_voxel_mm),
-           "--speed-up", str(options.speed_up)]  # fmt: skip
+           "--speed-up", str(options.speed_up), "--arm", options.arm, "--host", options.host]  # fmt: skip
     found: list[dict[str, Any]] = []
     text = ""
     for scene in scenes:
@@ -73,6 +74,8 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--image-width", type=int, default=1920, help="width of the simulated photographs (1920)")
     parser.add_argument("--ct-voxel-mm", type=float, default=0.4, help="edge of the CT's voxels (0.4)")
     parser.add_argument("--speed-up", type=float, default=1.0, help="the arm takes 1/N of its time (1)")
+    parser.add_argument("--arm", default="UR10e", help="model of the simulated arm (UR10e)")
+    parser.add_argument("--host", default="127.0.0.1", help="address of its controller (127.0.0.1)")
     parser.add_argument("--protocol", type=Path, default=PROTOCOL, help="a protocol other than the paper's")
     parser.add_argument("--one-of", type=int, default=1, metavar="N", help="take one in N views (1)")
     parser.add_argument("--timeout-h", type=float, default=3.0, help="timeout of each command (3)")
@@ -93,7 +96,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         "",
         f"Commit {record['commit']}; {computer['processor']}, {computer['cores']} cores, {computer['memory_gb']} GB, "
         f"{computer['system']}, Python {computer['python']}; photographs {record['image_width']} px wide, "
-        f"CT voxels of {record['ct_voxel_mm']} mm, arm {record['speed_up']:g} times as fast as a real one.",
+        f"CT voxels of {record['ct_voxel_mm']} mm, {record['arm']} {record['speed_up']:g} times as fast as real.",
         "",
         "The true error is the registration's displacement at the scene's centre against the simulator's record. "
         "Nobody was asked anything: the simulated technician did what the screen told him.",

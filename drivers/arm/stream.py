@@ -48,6 +48,7 @@ class PoseStream:
         self._vendor_errors = vendor_errors
         self._samples: deque[RobotSample] = deque()
         self._lock = threading.Lock()
+        self._reading = threading.Lock()
         self._stop = threading.Event()
         self._death = ""
         self._looked_s = self._looking_since_s = -float("inf")  # time of the last poll; start of gapless polling
@@ -110,10 +111,7 @@ class PoseStream:
     def between(self, start_s: float, end_s: float) -> tuple[RobotSample, ...]:
         """Return the samples that arrived between two host times (time.monotonic()), oldest first."""
         with self._lock:
-            # Search from the newest backwards: the buffer is long, and callers nearly always want recent samples.
-            recent = takewhile(lambda s: s.monotonic_s >= start_s, reversed(self._samples))
-            found = [s for s in recent if s.monotonic_s <= end_s]
-        return tuple(reversed(found))
+            return within(self._samples, start_s, end_s)
 
     def clear(self) -> None:
         """Discard all samples, because the tool offset behind their flange poses has changed."""
@@ -133,18 +131,41 @@ class PoseStream:
             if now_s - self._looked_s > STALL_S:
                 self._looking_since_s = now_s
             self._looked_s = now_s
+            self._take()
+            if self._death:
+                return
+
+    def catch_up(self) -> None:
+        """Take all samples that have arrived, and not only one at each poll.
+
+        For a source that has its samples at hand: after a pause of this process many are waiting.
+        """
+        while self._take():
+            pass
+
+    def _take(self) -> bool:
+        """Take one sample, in the order in which they come; returns whether there was one."""
+        with self._reading:
             try:
-                sample = self._read()
+                sample = None if self._death else self._read()
             except self._vendor_errors as error:
                 self._death = f" ({error})"
                 _LOG.warning("%s: pose stream: %s", self._where, error)
-                return
+                return False
             if sample is None:
-                continue
+                return False
             with self._lock:
                 self._samples.append(sample)
                 while self._samples[0].monotonic_s < sample.monotonic_s - BUFFER_S:
                     self._samples.popleft()
+            return True
+
+
+def within(samples: deque[RobotSample], start_s: float, end_s: float) -> tuple[RobotSample, ...]:
+    """Return the samples of a buffer between two host times (time.monotonic()), oldest first."""
+    # Search from the newest backwards: the buffer is long, and callers nearly always want recent samples.
+    recent = takewhile(lambda s: s.monotonic_s >= start_s, reversed(samples))
+    return tuple(reversed([s for s in recent if s.monotonic_s <= end_s]))
 
 
 def judge(samples: Sequence[RobotSample], criteria: SettleCriteria) -> SettleReport:

@@ -1,37 +1,43 @@
-"""Driver for a CT suite, through the folder of DICOM series and segmented meshes that it delivers."""
+"""Driver for a CT suite, through the folder of DICOM series, segmentations and meshes that it delivers."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
-from pydicom.dataset import FileDataset
 
-from drivers.dicom_folder.slices import (
-    PARSE_ERRORS,
-    SliceHeader,
-    arrange,
-    dicom_files,
-    problems_of,
-    read_dicom,
-    read_header,
-)
+from drivers.dicom_folder.deidentify import deidentify
+from drivers.dicom_folder.files import dicom_files
+from drivers.dicom_folder.headers import SEGMENTATION, SliceHeader, read_headers
+from drivers.dicom_folder.labels import placed
+from drivers.dicom_folder.nifti import check_nifti, is_nifti, read_nifti
+from drivers.dicom_folder.pixels import hounsfield
+from drivers.dicom_folder.segmentation import read_segmentation
+from drivers.dicom_folder.slices import arrange, problems_of
 from drivers.errors import UnreadableFileError
-from drivers.interfaces import CtSeries, CtVolume, DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
+from drivers.interfaces import (
+    CleanFile,
+    CtLabels,
+    CtSeries,
+    CtVolume,
+    DeviceIdentity,
+    DeviceReport,
+    ScanExport,
+    ScannedMesh,
+)
 from drivers.meshes.export_watch import ExportWatch
 from drivers.meshes.mesh_file import MeshUnit, read_mesh_file
 from drivers.plugin import DriverConfig, DriverSpec
 from drivers.scan_folder import free_bytes, require_folder
 
 _ARRIVING = "still arriving"
-# What pydicom, its plug-ins and Pillow raise for pixels that are truncated, damaged or of a missing codec.
-_DECODE_ERRORS = (*PARSE_ERRORS, RuntimeError, OSError)
+_Headers = tuple[SliceHeader, ...] | str  # of one file; or why it cannot be read
 
 
 class DicomFolderConfig(DriverConfig):
@@ -43,6 +49,10 @@ class DicomFolderConfig(DriverConfig):
     )
     stable_s: float = Field(
         default=10.0, ge=0, description="how long a series or a segmented mesh must stay unchanged; 10 s on a share"
+    )
+    deidentify: bool = Field(
+        default=True,
+        description="keep copies of series and segmentations that name no person, instead of the files themselves",
     )
 
 
@@ -64,13 +74,17 @@ class DicomFolder:
         self._config = config
         self._monotonic = monotonic
         self._watch = ExportWatch(config.folder, config.stable_s, monotonic)
-        self._headers: dict[_FileKey, SliceHeader | str] = {}
+        self._niftis = ExportWatch(
+            config.folder, config.stable_s, monotonic, suffixes=(".nii", ".gz"), check=check_nifti
+        )
+        self._headers: dict[_FileKey, _Headers] = {}
         self._arrivals: dict[str, _Arrival] = {}
 
     def open(self) -> DeviceIdentity:
         """Check that the folder exists and start watching it; raises DeviceUnavailableError if it does not."""
         require_folder(self._config.folder)
         self._watch.poll()
+        self._niftis.poll()
         self.series()
         return self._identity()
 
@@ -98,7 +112,7 @@ class DicomFolder:
                 "arriving": str(len(arriving)),
                 "stable_s": f"{self._config.stable_s:g}",
             },
-            problems=tuple(problems) + self._watch.poll()[1],
+            problems=tuple(problems) + self._watch.poll()[1] + self._niftis.poll()[1],
         )
 
     def series(self) -> tuple[CtSeries, ...]:
@@ -108,23 +122,11 @@ class DicomFolder:
         series in transfer looks like a complete, shorter one. The age of the files is not used, since copying may
         preserve it and the clock of a share may differ.
         """
-        require_folder(self._config.folder)
-        groups: dict[str, list[SliceHeader]] = {}
-        keys: dict[str, set[_FileKey]] = {}
-        unread: set[_FileKey] = set()  # each may be the beginning of another slice, of any series
-        for key, header in self._scan().items():
-            if isinstance(header, SliceHeader):
-                groups.setdefault(header.series_uid, []).append(header)
-                keys.setdefault(header.series_uid, set()).add(key)
-            else:
-                unread.add(key)
-        now = self._monotonic()
-        arrivals: dict[str, _Arrival] = {}
-        for uid, own in keys.items():
-            files, old = frozenset(own | unread), self._arrivals.get(uid)
-            arrivals[uid] = old if old is not None and old.files == files else _Arrival(files, now)
-        self._arrivals = arrivals
-        return tuple(self._series(uid, headers, self._arriving(uid, now)) for uid, headers in sorted(groups.items()))
+        return tuple(
+            self._series(uid, headers, self._arriving(uid))
+            for uid, headers in sorted(self._groups().items())
+            if headers[0].modality != SEGMENTATION
+        )
 
     def read(self, series: CtSeries) -> CtVolume:
         """Read one series into Hounsfield units.
@@ -136,9 +138,9 @@ class DicomFolder:
         Raises:
             UnreadableFileError: the series has problems, or a slice cannot be decoded; names the slice and the file.
         """
-        headers = [self._header(path) for path in series.files]
-        sound = [header for header in headers if isinstance(header, SliceHeader)]
-        problems = [header for header in headers if isinstance(header, str)] + list(problems_of(sound))
+        found = [self._header(path) for path in series.files]
+        sound = [header for headers in found if not isinstance(headers, str) for header in headers]
+        problems = [headers for headers in found if isinstance(headers, str)] + list(problems_of(sound))
         if problems:
             raise UnreadableFileError(
                 f"the series cannot be used: {'; '.join(problems)}",
@@ -148,9 +150,47 @@ class DicomFolder:
         ordered, T_ct_voxel, spacing = arrange(sound)
         first = ordered[0]
         volume = np.empty((len(ordered), first.rows, first.columns), dtype=np.int16)
-        for k, header in enumerate(ordered):
-            volume[k] = _hounsfield(header)
+        for k, pixels in enumerate(hounsfield(ordered)):
+            volume[k] = pixels
         return CtVolume(volume, T_ct_voxel, spacing, self._series(series.uid, ordered, ()))
+
+    def without_personal_data(self, source: Path, target: Path) -> CleanFile | None:
+        """Copy a file of a series or segmentation without what may name people; None if the rig keeps files as is.
+
+        Raises UnreadableFileError as drivers.dicom_folder.deidentify.deidentify does.
+        """
+        return deidentify(source, target) if self._config.deidentify else None
+
+    def segmentations(self) -> tuple[ScanExport, ...]:
+        """Return the complete segmentations in the folder (DICOM SEG, NIfTI), oldest first."""
+        groups = self._groups()
+        found = list(self._niftis.poll()[0])
+        for uid, headers in groups.items():
+            if headers[0].modality == SEGMENTATION and not self._arriving(uid):
+                found += [_segmentation(path) for path in dict.fromkeys(header.path for header in headers)]
+        return tuple(sorted(found, key=lambda export: (export.modified_utc, export.name)))
+
+    def read_labels(self, segmentation: ScanExport, volume: CtVolume, segments: tuple[str, ...]) -> CtLabels:
+        """Read the named segments, or all, of a segmentation of this volume.
+
+        Raises:
+            IncompleteExportError: a NIfTI file is cut short.
+            UnreadableFileError: the file is damaged, a segment is missing, or its voxels are not those of the volume.
+        """
+        path, shape = segmentation.files[0], volume.hounsfield.shape
+        if is_nifti(path):
+            block, names = read_nifti(path, segments, most_voxels=volume.hounsfield.size)
+            blocks = [block]
+        else:
+            blocks, names = read_segmentation(path, segments, volume.series.frame_of_reference)
+        inside = placed(blocks, (shape[0], shape[1], shape[2]), volume.T_ct_voxel, path)
+        if not inside.any():
+            raise UnreadableFileError(
+                f"the segments {', '.join(names)} are empty",
+                where=str(path),
+                remedy="Name other segments in the step, or segment the series again",
+            )
+        return CtLabels(inside, names, segmentation)
 
     def segmented_meshes(self) -> tuple[ScanExport, ...]:
         """Return the complete segmented meshes in the folder (STL, PLY, OBJ), oldest first."""
@@ -161,8 +201,29 @@ class DicomFolder:
         """Read one segmented mesh, in metres; raises as drivers.meshes.mesh_file.read_mesh_file does."""
         return read_mesh_file(export.files[0], self._config.mesh_unit, export=export)
 
-    def _scan(self) -> dict[_FileKey, SliceHeader | str]:
-        fresh: dict[_FileKey, SliceHeader | str] = {}
+    def _groups(self) -> dict[str, list[SliceHeader]]:
+        """The readable slices by the UID of their series, and since when each series has not changed."""
+        require_folder(self._config.folder)
+        groups: dict[str, list[SliceHeader]] = {}
+        keys: dict[str, set[_FileKey]] = {}
+        unread: set[_FileKey] = set()  # each may be the beginning of another slice, of any series
+        for key, headers in self._scan().items():
+            if isinstance(headers, str):
+                unread.add(key)
+                continue
+            for header in headers:
+                groups.setdefault(header.series_uid, []).append(header)
+                keys.setdefault(header.series_uid, set()).add(key)
+        now = self._monotonic()
+        arrivals: dict[str, _Arrival] = {}
+        for uid, own in keys.items():
+            files, old = frozenset(own | unread), self._arrivals.get(uid)
+            arrivals[uid] = old if old is not None and old.files == files else _Arrival(files, now)
+        self._arrivals = arrivals
+        return groups
+
+    def _scan(self) -> dict[_FileKey, _Headers]:
+        fresh: dict[_FileKey, _Headers] = {}
         for path in dicom_files(self._config.folder):
             try:
                 key = _key(path)
@@ -172,19 +233,19 @@ class DicomFolder:
         self._headers = fresh
         return fresh
 
-    def _arriving(self, uid: str, now: float) -> tuple[str, ...]:
-        waited_s = now - self._arrivals[uid].since_s
+    def _arriving(self, uid: str) -> tuple[str, ...]:
+        waited_s = self._monotonic() - self._arrivals[uid].since_s
         if waited_s >= self._config.stable_s:
             return ()
         return (f"{_ARRIVING}: unchanged for {waited_s:.1f} s, waiting for {self._config.stable_s:g} s",)
 
-    def _header(self, path: Path) -> SliceHeader | str:
-        """The header, or why it cannot be read; a file that does not change is read only once."""
+    def _header(self, path: Path) -> _Headers:
+        """The headers, or why they cannot be read; a file that does not change is read only once."""
         try:
             known = self._headers.get(_key(path))
         except OSError as error:
             return f"{path.name}: cannot be opened ({error.strerror})"
-        return read_header(path) if known is None else known
+        return read_headers(path) if known is None else known
 
     def _series(self, uid: str, headers: list[SliceHeader], arriving: tuple[str, ...]) -> CtSeries:
         return CtSeries(
@@ -192,8 +253,9 @@ class DicomFolder:
             description=headers[0].description,
             modality=headers[0].modality,
             slices=len(headers),
-            files=tuple(header.path for header in headers),
+            files=tuple(dict.fromkeys(header.path for header in headers)),
             problems=arriving + problems_of(headers),
+            frame_of_reference=headers[0].frame_of_reference,
         )
 
     def _identity(self) -> DeviceIdentity:
@@ -213,31 +275,9 @@ def _key(path: Path) -> _FileKey:
     return path, stat.st_size, stat.st_mtime_ns
 
 
-def _hounsfield(header: SliceHeader) -> NDArray[np.int16]:
-    """The pixels of one slice in Hounsfield units, (J, I). Raises UnreadableFileError."""
-    try:
-        dataset = read_dicom(header.path)
-        stored = np.asarray(dataset.pixel_array)
-    except _DECODE_ERRORS as error:
-        raise UnreadableFileError(
-            f"the image of slice {header.instance_uid} cannot be decoded ({error})",
-            where=str(header.path),
-            remedy=f"Export it again, uncompressed (it has transfer syntax {header.transfer_syntax})",
-        ) from error
-    if stored.shape != (header.rows, header.columns):
-        raise UnreadableFileError(
-            f"slice {header.instance_uid} holds an image of shape {stored.shape} instead of "
-            f"{(header.rows, header.columns)}",
-            where=str(header.path),
-            remedy="Export the series again as single monochrome slices",
-        )
-    slope, intercept = _rescale(dataset)
-    return np.clip(np.rint(stored * slope + intercept), -32768, 32767).astype(np.int16)
-
-
-def _rescale(dataset: FileDataset) -> tuple[float, float]:
-    values: Mapping[str, object] = {name: dataset.get(name) for name in ("RescaleSlope", "RescaleIntercept")}
-    return float(str(values["RescaleSlope"])), float(str(values["RescaleIntercept"]))
+def _segmentation(path: Path) -> ScanExport:
+    modified = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat().replace("+00:00", "Z")
+    return ScanExport(path.name, (path,), modified)
 
 
 DRIVER = DriverSpec(kind="ct", config=DicomFolderConfig, build=DicomFolder, hosted=False, call_timeout_s=300.0)

@@ -86,6 +86,13 @@ class GrblConfig(DriverConfig):
         default=5.0, gt=0, description="time after which moving axes are stopped whose program does not query them"
     )
 
+    rest_within_s: float = Field(
+        default=0.5,
+        ge=0.4,
+        description="longest time until the axes stand after the death of program, driver or line; it limits their "
+        "speed to one from which they brake in time",
+    )
+
     @model_validator(mode="after")
     def _each_axis_once(self) -> Self:
         if len({axis.letter for axis in self.axes}) != len(self.axes):

@@ -82,7 +82,7 @@ class Axes:
         return best, float(np.linalg.norm(gap[:3, 3])), rotation_angle_rad(gap)
 
     def _unwound(self, values: Array, near: Array) -> Array:
-        """The same pose with each turn as close to `near` as whole revolutions within the range bring it."""
+        """Values of the axes with whole revolutions added to each turn, within its range, to be closest to `near`."""
         low, high = self.limits
         out = values.copy()
         for i, axis in enumerate(self.axes):

@@ -15,12 +15,25 @@ from dataclasses import dataclass, field
 import serial
 
 from drivers.errors import DeviceRefusedError, DeviceTimeoutError, DeviceUnavailableError
-from drivers.grbl.wire import RESET, STATUS, Alarm, Feedback, Message, Ok, Refused, Setting, Status, Welcome, parse
+from drivers.grbl.wire import (
+    LONGEST_LINE,
+    RESET,
+    STATUS,
+    Alarm,
+    Feedback,
+    Message,
+    Ok,
+    Refused,
+    Setting,
+    Status,
+    Welcome,
+    parse,
+)
 
 LINK_ERRORS = (serial.SerialException, OSError, termios.error)
 POLL_S = 0.05  # between requests for a status report
+STOOD_STILL_S = 0.3  # a longer gap between two looks at the line: this process was suspended
 _LOST_S = 0.2  # a request whose report did not come by then is repeated: noise, homing, an alarm
-_LONGEST_LINE = 512
 _CABLE = "Check the cable and the power of the controller, then reconnect"
 
 _LOG = logging.getLogger(__name__)
@@ -58,6 +71,7 @@ class Link:
         self._asked_s = -1.0  # when the open request for a status report was sent; -1: none is open
         self._doubtful = False  # it was sent again: the next report may answer the one before
         self.answered_s = -math.inf  # when the newest answer to a line arrived, monotonic
+        self.went_on_s = -math.inf  # when this process went on after it had been suspended, monotonic
         self._stop = threading.Event()
         self.version = ""
         self.death = ""  # why the connection ended
@@ -78,8 +92,10 @@ class Link:
         deadline_s = time.monotonic() + timeout_s
         with self._news:
             before = self._welcomes
+        resets = 0
         while True:
             self.act(RESET)
+            resets += 1
             # Some boards start anew when their port is opened and are deaf until then: it is repeated.
             wait_s = min(1.0, deadline_s - time.monotonic())
             with self._news:
@@ -88,6 +104,9 @@ class Link:
             if time.monotonic() >= deadline_s:
                 what = f"nothing on this port greets as GRBL within {timeout_s:g} s"
                 raise DeviceUnavailableError(what, where=self._where, remedy=_CABLE)
+        if resets > 1:  # a late welcome would drop the lines that are sent next
+            with self._news:
+                self._news.wait_for(lambda: self._welcomes >= before + resets or bool(self.death), 1.0)
         if self.death:
             raise self._lost()
 
@@ -156,7 +175,7 @@ class Link:
 
     def _run(self) -> None:
         heard = b""
-        next_s = 0.0
+        next_s, looked_s = 0.0, time.monotonic()
         try:
             while not self._stop.is_set():
                 now_s = time.monotonic()
@@ -166,8 +185,11 @@ class Link:
                     self._asked_s = now_s
                     self.act(STATUS)
                 heard += self._port.read(max(1, self._port.in_waiting))
+                before_s, looked_s = looked_s, time.monotonic()
+                if looked_s - before_s > STOOD_STILL_S:
+                    self.went_on_s = looked_s
                 *lines, heard = heard.split(b"\n")
-                heard = heard[-_LONGEST_LINE:]  # noise without line ends must not accumulate
+                heard = heard[-LONGEST_LINE:]  # noise without line ends must not accumulate
                 for line in lines:
                     self._take(parse(line), time.monotonic())
         except (*LINK_ERRORS, DeviceUnavailableError) as error:

@@ -9,8 +9,8 @@ import numpy as np
 from drivers.grbl.wire import jog
 from service.core.geometry import Array
 
-AHEAD_S = 0.4  # of motion in the controller's buffer beyond its braking distance; it moves as long without its host
-_PIECE_S = 0.1
+AHEAD_S = 0.15  # of motion in the controller's buffer beyond its braking distance; it moves as long without its host
+PIECE_S = 0.05  # of motion in a jog
 _BLOCKS = 10  # of the 15 that GRBL's planner holds
 ARRIVED = 0.02  # degrees or millimetres; positions are rounded to 0.001 and to whole steps
 
@@ -44,7 +44,7 @@ class Motion:
         ahead_s = AHEAD_S + self.braking_s
         if self.all_sent or (self.sent - self._done(position)) * self.duration_s >= ahead_s:
             return None
-        piece = max(_PIECE_S, ahead_s / _BLOCKS) / self.duration_s
+        piece = max(PIECE_S, ahead_s / _BLOCKS) / self.duration_s
         self.sent = 1.0 if self.sent + 1.5 * piece >= 1.0 else self.sent + piece
         length = float(np.linalg.norm(self.target - self.start))
         return jog(self.letters, self._at(self.sent).tolist(), 60.0 * length / self.duration_s)

@@ -13,13 +13,15 @@ import numpy as np
 from drivers.arm.latch import Latch
 from drivers.errors import DeviceBusyError, DeviceError, DeviceUnavailableError, LeaveNeededError, SafetyStopError
 from drivers.grbl import LETTERS, GrblConfig
-from drivers.grbl.link import Link, Sent
-from drivers.grbl.motion import Motion
+from drivers.grbl.link import POLL_S, Link, Sent
+from drivers.grbl.motion import AHEAD_S, PIECE_S, Motion
 from drivers.grbl.setup import Setup
 from drivers.grbl.wire import JOG_CANCEL, Alarm, Message, Refused, Status, Welcome
 from drivers.interfaces import Array, SafetyState
 
-HEARTBEAT_S = 0.5  # without a sign of life of the program for so long the axes are stopped
+HEARTBEAT_S = 0.2  # the axes are stopped after so long without a sign of life from the program
+# Until the axes brake after the death of program, driver or line: what was handed over, or a heartbeat and a report.
+REACTION_S = max(AHEAD_S + 1.5 * PIECE_S, HEARTBEAT_S + POLL_S) + 0.05
 _UNANSWERED = 3  # lines that fit into the controller's 128 bytes
 _DRIVEN = ("Run", "Jog", "Home")
 _DOOR = "A person must close the safety door, and then confirm"
@@ -36,8 +38,9 @@ class Mover:
         self._setup: Setup | None = None
         self._motion: Motion | None = None
         self._sent: deque[Sent] = deque()  # pieces of it without an answer yet
-        self._attended_s = self._beat_s = -math.inf
+        self._attended_s = self._beat_s = self._began_s = -math.inf
         self._locked = False  # the controller was in an alarm at its last report
+        self._at_the_door = False  # it was stopped by the door at its last report
         self.newest: tuple[Status | None, float] = (None, -math.inf)  # and when it was asked for, monotonic
         self.position: Array | None = None  # machine coordinates, degrees and millimetres; None: none stated yet
         self._work_offset: tuple[float, ...] | None = None  # WCO as last stated, of all axes of the controller
@@ -57,7 +60,7 @@ class Mover:
         self._link = self._setup = self._motion = None
         self.newest = (None, -math.inf)
         self.position = self._work_offset = None
-        self.homed = self.interrupted = self._locked = False
+        self.homed = self.interrupted = self._locked = self._at_the_door = False
 
     # --- what the reports say ----------------------------------------------------------------------------
 
@@ -127,10 +130,12 @@ class Mover:
         if locked and not self._locked and self.homed:  # an alarm whose line was lost
             self._lose("an alarm that its controller did not name", at_s)
         self._locked = locked
-        if status.state == "Door":
+        opened = status.state == "Door" and not self._at_the_door
+        self._at_the_door = status.state == "Door"
+        if self._at_the_door:
             self.interrupted = self.interrupted or self._motion is not None
             self._motion = None
-        if self._door_is_open:
+        if self._door_is_open or opened:  # it may have closed again since the last report
             self.latch.see(SafetyState.SAFEGUARD_STOP, at_s)
         if self._link is None:
             return
@@ -175,10 +180,11 @@ class Mover:
             raise LeaveNeededError("the position of the axes is not known", where=self._where, remedy=remedy)
         state = self.status.state if self.status is not None else "silent"
         if self.moving or state != "Idle":
-            raise DeviceBusyError(f"the controller is {state}", where=self._where, remedy="Wait until the axes stand")
+            remedy = "Wait until the axes stand still"
+            raise DeviceBusyError(f"the controller is {state}", where=self._where, remedy=remedy)
 
     def begin(self, target: Array, speeds: Array) -> None:
-        """Start a motion to machine coordinates (N,), with a highest speed (N,) of each axis a second."""
+        """Start a motion to machine coordinates (N,), at most at `speeds` (N,), in units of each axis per second."""
         setup, position = self._setup, self.position
         if setup is None or position is None:
             raise DeviceUnavailableError("the axes are not connected", where=self._where, remedy="Open them first")
@@ -191,6 +197,7 @@ class Mover:
         braking_s = float(np.max(way[going] / duration_s / setup.acceleration[going])) / 2
         letters = tuple(axis.letter for axis in self._config.axes)
         self.attend()
+        self._began_s = self._attended_s
         self.beat(self._attended_s)
         self._sent.clear()
         self._motion = Motion(letters, position.copy(), target, duration_s, braking_s)
@@ -201,7 +208,7 @@ class Mover:
 
     def _feed(self, link: Link, motion: Motion, status: Status, position: Array, asked_s: float) -> None:
         now_s = time.monotonic()
-        if lost := self._unsupervised(now_s):
+        if lost := self._unsupervised(link, now_s):
             self._end(link, lost)
             return
         for sent in self._sent:
@@ -223,7 +230,9 @@ class Mover:
         except DeviceError:
             self.interrupted, self._motion = True, None  # the next call reports the dead line
 
-    def _unsupervised(self, now_s: float) -> str:
+    def _unsupervised(self, link: Link, now_s: float) -> str:
+        if link.went_on_s > self._began_s:  # the axes came to rest meanwhile, and must not move on by themselves
+            return "the driver's process stood still, and the axes were stopped"
         if now_s - self._beat_s > HEARTBEAT_S:
             return "the program gave no sign of life, and the axes were stopped"
         if now_s - self._attended_s > self._config.unattended_s:

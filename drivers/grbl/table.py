@@ -22,7 +22,7 @@ from drivers.errors import (
 from drivers.grbl import GrblConfig
 from drivers.grbl.axes import Axes
 from drivers.grbl.link import Link
-from drivers.grbl.mover import Mover
+from drivers.grbl.mover import REACTION_S, Mover
 from drivers.grbl.setup import Setup, setup_of
 from drivers.grbl.wire import FEED_HOLD, JOG_CANCEL, Message, Status
 from drivers.interfaces import (
@@ -222,7 +222,9 @@ class GrblTable:
         speeds = np.array(
             [np.degrees(speed_rad_s) if a.turns else 1e3 * self._config.slide_speed_m_s for a in self._config.axes]
         )
-        self._mover.begin(target, speeds)
+        # From a higher speed they would not stand in time if nobody were left to stop them.
+        fastest = setup.acceleration * (self._config.rest_within_s - REACTION_S)
+        self._mover.begin(target, np.minimum(speeds, fastest))
 
     def stop(self) -> None:
         """Hold, drop what is left of the motion, and return when the axes stand.
@@ -270,14 +272,6 @@ class GrblTable:
             return report
         recent = stream.between(now_s - criteria.window_s - LONGEST_RINGING_S, now_s)
         return dataclasses.replace(report, ringing_s=ringing_s(recent, criteria))
-
-    def set_digital_output(self, index: int, on: bool) -> None:
-        """Refuse: a coolant pin is the only output, and not made for this."""
-        raise DeviceRefusedError(
-            f"there is no digital output {index} to switch {'on' if on else 'off'}",
-            where=self._where,
-            remedy="Release the camera by its own driver",
-        )
 
     # --- parts -------------------------------------------------------------------------------------------
 

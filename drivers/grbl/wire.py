@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+LONGEST_LINE = 512  # bytes
 STATUS, RESET, JOG_CANCEL, FEED_HOLD = b"?", b"\x18", b"\x85", b"!"  # acted on at once, without an answer
 STATES = ("Idle", "Run", "Hold", "Jog", "Alarm", "Door", "Check", "Home", "Sleep")
 ALARMS: Mapping[int, str] = {
@@ -36,8 +37,8 @@ ERRORS: Mapping[int, str] = {
     22: "no feed rate is set",
 }
 _REPORT = re.compile(r"<([A-Z][a-z]+)(?::(\d))?((?:\|[A-Za-z]+:[-\d.,A-Z]*)*)>")
-_SETTING = re.compile(r"\$(\d+)=(-?[\d.]+)")
-_COUNT = re.compile(r"(ALARM|error):(\d+)")
+_SETTING = re.compile(r"\$(\d{1,3})=(-?[\d.]+)")
+_COUNT = re.compile(r"(ALARM|error):(\d{1,3})")
 _FEEDBACK = re.compile(r"\[[ -~]*\]")
 _WELCOME = re.compile(r"Grbl (\S+) \[")
 
@@ -110,7 +111,7 @@ Message = Status | Ok | Refused | Alarm | Welcome | Setting | Feedback
 
 def parse(line: bytes) -> Message | None:
     """The message in a line without its end; None for anything else, such as noise or half a line."""
-    text = line.decode("ascii", "replace").strip()
+    text = line.decode("ascii", "replace").strip() if len(line) <= LONGEST_LINE else ""
     if text == "ok":
         return Ok()
     if text.startswith("<"):
@@ -145,4 +146,4 @@ def _numbers(text: str) -> tuple[float, ...] | None:
 
 
 def _is_number(text: str) -> bool:
-    return re.fullmatch(r"-?\d+(\.\d*)?", text) is not None
+    return re.fullmatch(r"-?[0-9]{1,9}(\.[0-9]*)?", text) is not None

@@ -14,7 +14,17 @@ from drivers.interfaces.robot import (
     SettleCriteria,
     SettleReport,
 )
-from drivers.interfaces.surfaces import CtSeries, CtSource, CtVolume, Mesh, ScanExport, ScannedMesh, Scanner
+from drivers.interfaces.surfaces import (
+    CleanFile,
+    CtLabels,
+    CtSeries,
+    CtSource,
+    CtVolume,
+    Mesh,
+    ScanExport,
+    ScannedMesh,
+    Scanner,
+)
 
 __all__ = [
     "Array",
@@ -22,6 +32,8 @@ __all__ = [
     "CameraSettings",
     "CapturedFile",
     "CapturedImage",
+    "CleanFile",
+    "CtLabels",
     "CtSeries",
     "CtSource",
     "CtVolume",

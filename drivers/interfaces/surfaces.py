@@ -66,6 +66,7 @@ class CtSeries:
     slices: int
     files: tuple[Path, ...]
     problems: tuple[str, ...]  # localiser, gap, mixed orientation, …; a series with problems is not read
+    frame_of_reference: str = ""  # its UID; "" if the series states none
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +79,24 @@ class CtVolume:
     series: CtSeries
 
 
+@dataclass(frozen=True, slots=True)
+class CtLabels:
+    """A segmentation on the voxels of a series."""
+
+    inside: NDArray[np.bool_]  # (K, J, I)
+    segments: tuple[str, ...]  # the names of those that it holds
+    source: ScanExport
+
+
+@dataclass(frozen=True, slots=True)
+class CleanFile:
+    """A copy of a file without what may name people."""
+
+    path: Path
+    original_sha256: str
+    removed: tuple[str, ...]  # keywords of the attributes that were removed, never their values
+
+
 class CtSource(Device, Protocol):
     """A CT suite, accessed through the DICOM folder that it delivers."""
 
@@ -87,6 +106,24 @@ class CtSource(Device, Protocol):
 
     def read(self, series: CtSeries) -> CtVolume:
         """Read one series. Raises UnreadableFileError, which names the gap, the slice and the file."""
+        ...
+
+    def without_personal_data(self, source: Path, target: Path) -> CleanFile | None:
+        """Copy a file of a series or segmentation without what may name people; None if the rig keeps files as is.
+
+        Raises UnreadableFileError if that is not possible.
+        """
+        ...
+
+    def segmentations(self) -> tuple[ScanExport, ...]:
+        """Return the complete segmentations in the folder (DICOM SEG, NIfTI), oldest first."""
+        ...
+
+    def read_labels(self, segmentation: ScanExport, volume: CtVolume, segments: tuple[str, ...]) -> CtLabels:
+        """Read the named segments, or all, of a segmentation of this volume.
+
+        Raises UnreadableFileError if its voxels are not those of the volume, or a segment is missing.
+        """
         ...
 
     def segmented_meshes(self) -> tuple[ScanExport, ...]:

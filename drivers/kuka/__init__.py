@@ -29,6 +29,18 @@ class KukaConfig(DriverConfig):
         gt=0,
         description="time after which a moving arm is stopped whose program is alive but does not query it",
     )
+    fri_port: int | None = Field(
+        default=None,
+        ge=1,
+        le=65535,
+        description="UDP port of this machine at which to listen to the controller's FRI, usually 30200; without "
+        "FRI, poses come from the application alone",
+    )
+    fri_host: str = Field(
+        default="",
+        description="address of this machine in the network of FRI, if that is not the application's (KONI)",
+    )
+    fri_period_ms: int = Field(default=10, ge=1, le=100, description="milliseconds between two messages of FRI")
 
 
 def _build(config: KukaConfig) -> Device:

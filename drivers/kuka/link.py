@@ -44,6 +44,7 @@ class Ended:
 
     code: str
     what: str
+    at_s: float  # host time.monotonic() when that was heard
 
 
 class Link:
@@ -99,8 +100,13 @@ class Link:
                 raise self.error(str(line.get("code")), str(line.get("what")))
             return hello_of(line)
         except WireError as error:
-            remedy = "Install the application of this version of orthocapture (docs/kuka.md)"
+            remedy = "Install the application of this version of orthocapture (docs/howto/kuka.md)"
             raise DeviceFaultError(str(error), where=self._where, remedy=remedy) from error
+
+    @property
+    def local_host(self) -> str:
+        """Address of this machine in the network of the controller."""
+        return str(self._socket.getsockname()[0])
 
     def beat(self) -> None:
         """Send a sign of life; a dead connection is noticed elsewhere."""
@@ -181,7 +187,7 @@ class Link:
                 self._answers[whole(line, "seq")] = line
             elif line.get("motion") is not None:
                 code, what = (str(line.get("code")), str(line.get("what"))) if line["is"] == "err" else ("", "")
-                self._ended[whole(line, "motion")] = Ended(code, what)
+                self._ended[whole(line, "motion")] = Ended(code, what, now_s)
             else:
                 _LOG.warning("%s: %s", self._where, line)
             self._news.notify_all()

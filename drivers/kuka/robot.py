@@ -11,7 +11,7 @@ from typing import NoReturn
 import numpy as np
 
 from drivers.arm.latch import Latch
-from drivers.arm.stream import PoseStream, judge, ringing_s
+from drivers.arm.stream import MINIMUM_COVERAGE, PoseStream, judge, ringing_s
 from drivers.errors import (
     DeviceError,
     DeviceFaultError,
@@ -33,16 +33,21 @@ from drivers.interfaces import (
     Transform,
 )
 from drivers.kuka import KukaConfig
+from drivers.kuka.fri.poses import FriPoses
 from drivers.kuka.link import Link
-from drivers.kuka.wire import JOINTS, State, to_abc
-from service.core.geometry import inverse, to_rotation_vector
-from service.core.seven_axes import SEVEN_AXIS_ARMS, SevenAxisArm, nearest_posture
+from drivers.kuka.speeds import Speeds
+from drivers.kuka.wire import JOINTS, State, agree, to_abc
+from service.core.arms.known import known_arms
+from service.core.arms.model import ArmModel
+from service.core.geometry import to_rotation_vector
+from service.core.seven_axes import forward, nearest_posture
+from service.core.units import mm
 
 DRIVER_VERSION = "1"
-HEARTBEAT_S = 0.3  # without a line for so long the application stops the arm (docs/howto/kuka.md)
-SPEED_WINDOW_S = 0.05  # the wire has no speeds; over one period the encoders' steps would dominate
+HEARTBEAT_S = 0.3  # without a line for so long the application stops the arm (docs/reference/kuka_protocol.md)
 LONGEST_RINGING_S = 10.0
 STOP_S = 5.0
+FRAME_TOLERANCE_M = 0.0005
 _REMEDY_STOP = "A person must find and clear the cause and release the stop on the smartPAD; then try again"
 
 
@@ -55,12 +60,14 @@ class KukaRobot:
         self._latch = Latch(self._where)
         self._link: Link | None = None
         self._stream: PoseStream | None = None
-        self._arm: SevenAxisArm = SEVEN_AXIS_ARMS[0]
+        self._arm: ArmModel | None = None  # as the application states it
         self._arrived: deque[RobotSample] = deque()  # from the link's thread to the stream's
-        self._recent: deque[State] = deque()  # over SPEED_WINDOW_S
+        self._speeds = Speeds()
+        self._fri: FriPoses | None = None
         self._state: State | None = None
         self._T_flange_tcp: Transform = np.eye(4)
         self._motion = 0  # the last one whose end was not observed yet
+        self._last_motion = 0
         self._permitted = False
         self._attended_s = -np.inf
         self._left_alone = False
@@ -70,15 +77,16 @@ class KukaRobot:
     def open(self) -> DeviceIdentity:
         """Connect and return the controller's identity.
 
-        The arm can then be observed; it moves only after `let_move`. Raises DeviceUnavailableError, and
-        DeviceFaultError for an application of another version or an arm of another model.
+        The arm can then be observed; it moves only after `let_move`. Raises DeviceUnavailableError,
+        DeviceFaultError for an application of another version or an arm of another model, and DeviceRefusedError for
+        an application without FRI if the configuration asks for it.
         """
         self.close()
         self._arrived.clear()
-        self._recent.clear()
+        self._speeds = Speeds()
         address = (self._config.host, self._config.port)
         self._link = link = Link(address, self._config.connect_timeout_s, self._receive)
-        known = {arm.name: arm for arm in SEVEN_AXIS_ARMS}
+        known = {arm.name: arm for arm in known_arms() if arm.family == "seven_axes"}
         if link.hello.model not in known:
             self.close()
             remedy = f"Known are {', '.join(known)}"
@@ -92,6 +100,8 @@ class KukaRobot:
         )
         self._stream.await_first(self._config.connect_timeout_s)
         self._stream.latest()
+        if self._config.fri_port is not None:
+            self._listen(link, self._config.fri_port)
         return self._identity()
 
     def heartbeat(self, sent_monotonic_s: float) -> None:
@@ -112,12 +122,14 @@ class KukaRobot:
         if self._link is not None and not self._link.death:
             with contextlib.suppress(DeviceError):
                 self.stop()
+        if self._fri is not None:
+            self._fri.close()
         if self._stream is not None:
             self._stream.close()
         if self._link is not None:
             self._link.close()
-        self._stream = self._link = self._state = None
-        self._motion = 0
+        self._stream = self._link = self._state = self._fri = None
+        self._motion = self._last_motion = 0
 
     def report(self) -> DeviceReport:
         """Return versions, clock offset, and what prevents the arm from moving."""
@@ -133,6 +145,7 @@ class KukaRobot:
             )
         if state.override < 1.0:
             problems.append(f"The override stands at {100 * state.override:.0f} %. Set it to 100 % on the smartPAD")
+        problems += [*self._frame_problems(state), *(self._fri.problems() if self._fri is not None else [])]
         tcp = to_rotation_vector(self._T_flange_tcp)
         return DeviceReport(
             identity=self._identity(),
@@ -144,9 +157,33 @@ class KukaRobot:
                 "override": f"{100 * state.override:.0f} %",
                 "tool centre point (m, rad)": " ".join(f"{v:.4f}" for v in tcp),
                 "joints (rad)": " ".join(f"{v:.4f}" for v in sample.joints_rad),
+                **(self._fri.details() if self._fri is not None else {}),
             },
             problems=tuple(problems),
         )
+
+    def _listen(self, link: Link, port: int) -> None:
+        """Start the process that listens to FRI, and have the application send to it."""
+        if problems := self._frame_problems(self._newest()):
+            what, _, remedy = problems[0].partition(". ")
+            raise DeviceFaultError(f"FRI's poses would be in another frame: {what}", where=self._where, remedy=remedy)
+        host = self._config.fri_host or link.local_host
+        self._fri = FriPoses((host, port), self._pose_of, self._newest)
+        self._request("fri", host=host, port=port, period_ms=self._config.fri_period_ms)
+        self._fri.await_first(self._config.connect_timeout_s)
+
+    def _pose_of(self, joints_rad: Array) -> Transform:
+        return forward(self._arm or self._not_open(), joints_rad)
+
+    def _frame_problems(self, state: State) -> list[str]:
+        """Whether the flange is where the joints have it; not asked of a moving arm, as the two are read in turn."""
+        apart_m = float(np.linalg.norm((self._pose_of(state.joints_rad) - state.T_base_flange)[:3, 3]))
+        if state.motion or apart_m < FRAME_TOLERANCE_M:
+            return []
+        return [
+            f"The controller has the flange {mm(apart_m):.1f} mm from where its joints put it. Set "
+            "the robot's base to the origin of the world in the station setup, and install it again"
+        ]
 
     def _identity(self) -> DeviceIdentity:
         hello = self._linked().hello
@@ -185,7 +222,7 @@ class KukaRobot:
         }
         answer = self._request("tool", **{**wanted, "mass_kg": payload.mass_kg})
         for name, values in wanted.items():
-            if not _agree(answer.get(name), values):
+            if not agree(answer.get(name), values):
                 raise DeviceFaultError(
                     f"{name} reads back as {answer.get(name)!r}, not {values}",
                     where=self._where,
@@ -203,8 +240,12 @@ class KukaRobot:
         )
 
     def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
-        """Return the buffered samples between two host times, oldest first; does not count as supervising the arm."""
-        return self._streaming().between(start_monotonic_s, end_monotonic_s)
+        """Return the buffered samples between two host times, oldest first; does not count as supervising the arm.
+
+        They are those of FRI where it has them without a gap.
+        """
+        listened = self._fri.between(start_monotonic_s, end_monotonic_s) if self._fri is not None else ()
+        return listened or self._streaming().between(start_monotonic_s, end_monotonic_s)
 
     def solve_ik(self, T_base_flange: Transform, near_rad: Array) -> Array:
         """Return joints (7,) for a flange pose, in radians: close to `near_rad`, the elbow clear of the limits.
@@ -212,7 +253,7 @@ class KukaRobot:
         Raises UnreachablePoseError if there are none.
         """
         near = np.array(self._joints(near_rad))
-        joints = nearest_posture(self._arm, np.asarray(T_base_flange, dtype=np.float64), near)
+        joints = nearest_posture(self._arm or self._not_open(), np.asarray(T_base_flange, dtype=np.float64), near)
         if joints is None:
             x, y, z = T_base_flange[:3, 3]
             raise UnreachablePoseError(
@@ -235,7 +276,7 @@ class KukaRobot:
         if not isinstance(motion, int):
             raise DeviceFaultError(f"the motion's number is {motion!r}", where=self._where, remedy=_REMEDY_STOP)
         self._attend()
-        self._motion = motion
+        self._motion = self._last_motion = motion
 
     def stop(self) -> None:
         """Decelerate and return when the arm stands still. Raises DeviceTimeoutError if it does not come to rest."""
@@ -277,33 +318,32 @@ class KukaRobot:
         """Judge the last window of the pose stream against the criteria. Returns at once; meant to be polled."""
         self._attend()
         stream = self._streaming()
-        # Asked before the window is read: a motion that ends in between has left no trace in it. Stillness alone does
-        # not tell, as the brakes may still be on before a motion begins.
-        under_way = bool(self._motion) and self._linked().ended(self._motion) is None
         now_s = stream.latest().monotonic_s
-        report = judge(stream.between(now_s - criteria.window_s, now_s), criteria)
+        # Stillness alone does not tell: the brakes may still be on before a motion begins, and the window may end
+        # before a motion of which the end is known already.
+        ended = self._linked().ended(self._last_motion)
+        under_way = bool(self._last_motion) and (
+            ended is None or now_s - ended.at_s < MINIMUM_COVERAGE * criteria.window_s
+        )
+        report = judge(self.samples(now_s - criteria.window_s, now_s), criteria)
         if under_way:
             report = dataclasses.replace(report, settled=False)
         if not report.settled:
             return report
-        recent = stream.between(now_s - criteria.window_s - LONGEST_RINGING_S, now_s)
+        recent = self.samples(now_s - criteria.window_s - LONGEST_RINGING_S, now_s)
         return dataclasses.replace(report, ringing_s=ringing_s(recent, criteria))
 
     # --- parts -------------------------------------------------------------------------------------------
 
     def _receive(self, state: State, now_s: float) -> None:
         """Take a line of the stream (in the link's thread)."""
-        recent = self._recent
-        recent.append(state)
-        while len(recent) > 2 and recent[1].time_s < state.time_s - SPEED_WINDOW_S:
-            recent.popleft()
         self._latch.see(state.safety, now_s)
         if state.locked and self._permitted:
             self._permitted = False
             if state.safety.may_move and self._latch.stop is None and not self._motion:
                 self._latch.end("the application has locked the arm")
         self._state = state
-        self._arrived.append(_sample(recent, now_s))
+        self._arrived.append(self._speeds.sample(state, now_s))
 
     def _next_sample(self) -> RobotSample | None:
         if self._arrived:
@@ -335,7 +375,9 @@ class KukaRobot:
         return self._link or self._not_open()
 
     def _streaming(self) -> PoseStream:
-        return self._stream or self._not_open()
+        stream = self._stream or self._not_open()
+        stream.catch_up()
+        return stream
 
     def _newest(self) -> State:
         return self._state or self._not_open()
@@ -352,29 +394,3 @@ class KukaRobot:
                 remedy="Choose another viewpoint",
             )
         return [float(v) for v in joints]
-
-
-def _sample(recent: deque[State], now_s: float) -> RobotSample:
-    """The newest state with speeds from the differences over the recent ones."""
-    old, before, new = recent[0], recent[max(len(recent) - 2, 0)], recent[-1]
-    window_s, period_s = max(new.time_s - old.time_s, 1e-6), max(new.time_s - before.time_s, 1e-6)
-    apart = inverse(old.T_base_flange) @ new.T_base_flange
-    return RobotSample(
-        controller_time_s=new.time_s,
-        monotonic_s=now_s,
-        joints_rad=new.joints_rad,
-        joint_velocities_rad_s=(new.joints_rad - old.joints_rad) / window_s,
-        target_velocities_rad_s=(new.commanded_rad - before.commanded_rad) / period_s,
-        T_base_flange=new.T_base_flange,
-        tcp_speed_m_s=float(np.linalg.norm(apart[:3, 3])) / window_s,
-        safety=new.safety,
-    )
-
-
-def _agree(answer: object, values: list[float]) -> bool:
-    """Whether the controller's answer, a number or a list of numbers, equals the values."""
-    try:
-        found = np.atleast_1d(np.asarray(answer, dtype=np.float64))
-    except (ValueError, TypeError):
-        return False
-    return found.shape == (len(values),) and bool(np.max(np.abs(found - np.array(values))) < 1e-6)

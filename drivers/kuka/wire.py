@@ -1,10 +1,11 @@
-"""The lines of the KUKA wire (docs/kuka.md), checked and turned into records."""
+"""The lines of the KUKA wire (docs/reference/kuka_protocol.md), checked and turned into records."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -15,6 +16,7 @@ PROTOCOL = 1
 JOINTS = 7
 LONGEST_LINE = 65536
 Line = Mapping[str, object]
+_LARGEST = 1e12  # beyond any position, time or angle; also refuses what is not a number
 
 _SAFETY = {
     "normal": SafetyState.NORMAL,
@@ -124,6 +126,15 @@ def to_abc(T: Transform) -> tuple[list[float], list[float]]:
     return T[:3, 3].tolist(), [float(np.arctan2(R[1, 0], R[0, 0])), b, float(np.arctan2(R[2, 1], R[2, 2]))]
 
 
+def agree(answer: object, values: list[float]) -> bool:
+    """Whether the controller's answer, a number or a list of numbers, equals the values."""
+    try:
+        found = np.atleast_1d(np.asarray(answer, dtype=np.float64))
+    except (ValueError, TypeError):
+        return False
+    return found.shape == (len(values),) and bool(np.max(np.abs(found - np.array(values))) < 1e-6)
+
+
 def _text(line: Line, name: str) -> str:
     value = line.get(name)
     if not isinstance(value, str):
@@ -141,10 +152,8 @@ def _flag(line: Line, name: str) -> bool:
 def _numbers(line: Line, name: str, count: int) -> Array:
     """`count` finite numbers as an array, or one number if the count is 0."""
     value = line.get(name)
-    try:
-        found = np.asarray([value] if count == 0 else value, dtype=np.float64)
-    except (ValueError, TypeError):
-        found = np.zeros(0)
-    if found.shape != (max(count, 1),) or not np.all(np.isfinite(found)):
-        raise WireError(f"{line['is']}: {name} is {value!r}, not {max(count, 1)} finite numbers")
-    return found
+    values = cast("list[object]", value) if count and isinstance(value, list) else [value]
+    numbers = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < _LARGEST]
+    if len(values) != max(count, 1) or len(numbers) != len(values):
+        raise WireError(f"{line['is']}: {name} is {str(value)[:60]}, not {max(count, 1)} finite numbers")
+    return np.array(numbers, dtype=np.float64)

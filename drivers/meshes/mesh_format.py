@@ -86,6 +86,13 @@ def companions(path: Path) -> tuple[Path, ...]:
     return tuple(dict.fromkeys(found))
 
 
+def companion_names(content: bytes) -> tuple[str, ...]:
+    """The files to which the beginning of an OBJ, or an MTL, refers: relative, with `/`, as written there."""
+    found = [match.group(1).decode("utf-8", "replace") for match in _MTLLIB.finditer(content[:_HEAD_BYTES])]
+    found += [_texture_name(match.group(1).decode("utf-8", "replace")) for match in _TEXTURE.finditer(content)]
+    return tuple(PureWindowsPath(name.strip().strip('"')).as_posix() for name in found)
+
+
 def _texture_name(arguments: str) -> str:
     """The file name in an MTL map statement, after its options (-bm 1.0 -s 1 1 1 …)."""
     words = arguments.split()

@@ -58,6 +58,8 @@ def read_surface_file(path: Path, unit: MeshUnit = "auto") -> SurfaceFile:
         else:
             _check_format(path)
             check_complete(path)
+            if path.suffix.lower() == ".glb":
+                _check_chunks(path)
             (vertices, faces, _), normals = parse_mesh(path), None
             check_mesh(path, vertices, faces)
     except OSError as error:
@@ -79,4 +81,22 @@ def _check_format(path: Path) -> None:
             where=str(path),
             remedy="Export it as OBJ, PLY, STL, OFF, GLB or glTF, or points as PLY or text "
             f"({', '.join(TEXT_SUFFIXES)})",
+        )
+
+
+def _check_chunks(path: Path) -> None:
+    """Check that the chunks of a GLB file are as long as they say; what reads them sets that memory aside at once.
+
+    Raises UnreadableFileError.
+    """
+    size, at = path.stat().st_size, 12
+    with path.open("rb") as stream:
+        while at + 8 <= size:
+            stream.seek(at)
+            at += 8 + int.from_bytes(stream.read(4), "little")
+    if at != size:
+        raise UnreadableFileError(
+            "a part of the file is longer or shorter than it says",
+            where=str(path),
+            remedy="Export it again; it was cut short or damaged",
         )

@@ -19,7 +19,6 @@ from drivers.errors import (
     DeviceFaultError,
     DeviceRefusedError,
     DeviceTimeoutError,
-    DeviceUnavailableError,
     SafetyStopError,
     UnreachablePoseError,
 )
@@ -37,41 +36,16 @@ from drivers.interfaces import (
 from drivers.ur import UrConfig
 from drivers.ur import vendor as library
 from drivers.ur.link import VENDOR_ERRORS, ControllerFacts, connect_dashboard, probe, read_facts, vendor
-from drivers.ur.safety import safety_state
+from drivers.ur.samples import PLAYING, RESTART, VARIABLES, SampleReader, joint_values, joints_for, opened, robot_mode
 from drivers.ur.script import ControlScript, wait
 from drivers.ur.watchdog import Watchdog
 from service.core.geometry import from_rotation_vector, inverse, to_rotation_vector
 
 DRIVER_VERSION = "1"
-ROBOT_MODES = {
-    -1: "NO_CONTROLLER",
-    0: "DISCONNECTED",
-    1: "CONFIRM_SAFETY",
-    2: "BOOTING",
-    3: "POWER_OFF",
-    4: "POWER_ON",
-    5: "IDLE",
-    6: "BACKDRIVE",
-    7: "RUNNING",
-}
-PLAYING = 2  # runtime_state
-VARIABLES = (
-    "timestamp",
-    "actual_q",
-    "actual_qd",
-    "target_qd",
-    "actual_TCP_pose",
-    "actual_TCP_speed",
-    "safety_status_bits",
-    "robot_mode",
-    "runtime_state",
-    "target_speed_fraction",
-)
 READ_BACK_S = 1.0
 TOOL_CHANGE_S = 0.05  # by the controller's clock, until a new tool shows in the stream
 LONGEST_RINGING_S = 10.0  # how far back the end of the last motion is searched for
 MOTION_START_S = 0.06  # until the target velocity of a new motion shows in the stream
-_RESTART = "Restart the controller; see the log of the pendant if it happens again"
 _SET_ELSEWHERE = "Check on the pendant whether another program sets it, end that program, then try again"
 
 _LOG = logging.getLogger(__name__)
@@ -86,12 +60,10 @@ class UrRobot:
         self._where = config.host
         self._facts: ControllerFacts | None = None
         self._dashboard: library.Dashboard | None = None
-        self._receive: library.Receive | None = None
         self._stream: PoseStream | None = None
-        self._T_flange_tcp: Transform = np.eye(4)
-        self._controller_time_s = -1.0
         self._motion_started_s = -np.inf
         self._latch = Latch(config.host)
+        self._samples = SampleReader(self._latch)
         self._watchdog = Watchdog(
             self._latch,
             watchdog_s=config.watchdog_s,
@@ -118,10 +90,9 @@ class UrRobot:
             dashboard.stop()
         variables = [*VARIABLES, *(["payload"] if facts.version >= (5, 6) else [])]
         with vendor(self._where, "connecting the receive interface"):
-            self._receive = library.receive(self._config.host, STREAM_HZ, variables)
-        self._controller_time_s = -1.0
+            self._samples.read_from(library.receive(self._config.host, STREAM_HZ, variables))
         self._stream = PoseStream(
-            self._read_sample,
+            self._samples.read,
             stale_after_s=self._config.stale_after_s,
             where=self._where,
             vendor_errors=VENDOR_ERRORS,
@@ -151,11 +122,11 @@ class UrRobot:
                 self._script.end()
         else:
             self._script.abandon()
-        for client in (self._receive, self._dashboard):
+        for client in (self._samples.receive, self._dashboard):
             with contextlib.suppress(*VENDOR_ERRORS):
                 if client is not None and client.isConnected():
                     client.disconnect()
-        self._receive = self._dashboard = None
+        self._samples.receive = self._dashboard = None
 
     def report(self) -> DeviceReport:
         """Return versions, clock offset, and what prevents the arm from moving."""
@@ -170,7 +141,7 @@ class UrRobot:
                 f"The speed slider stands at {100 * state.speed_fraction:.0f} %: motions take longer. "
                 "Set it to 100 % on the pendant"
             )
-        tcp = to_rotation_vector(self._T_flange_tcp)
+        tcp = to_rotation_vector(self._samples.T_flange_tcp)
         return DeviceReport(
             identity=self._identity(),
             clock_offset_s=self._streaming().clock_offset_s(),
@@ -186,7 +157,7 @@ class UrRobot:
         )
 
     def _identity(self) -> DeviceIdentity:
-        facts = _opened(self._facts, self._where)
+        facts = opened(self._facts, self._where)
         library = f"ur_rtde {importlib.metadata.version('ur-rtde')}"
         version = f"{DRIVER_VERSION} ({library})"
         return DeviceIdentity("robot", facts.model, facts.serial, facts.software, "ur", version, self._where)
@@ -224,15 +195,15 @@ class UrRobot:
         while self._streaming().next().controller_time_s < settled_s:
             pass
         self._streaming().clear()
-        difference = inverse(self._T_flange_tcp) @ T_flange_tcp - np.eye(4)
+        difference = inverse(self._samples.T_flange_tcp) @ T_flange_tcp - np.eye(4)
         if float(np.max(np.abs(difference))) > 1e-6:
             raise DeviceFaultError(
                 "the tool centre point reads back differently from what was set",
                 where=self._where,
                 remedy=_SET_ELSEWHERE,
             )
-        if _opened(self._facts, self._where).version >= (5, 6):
-            receive = _opened(self._receive, self._where)
+        if opened(self._facts, self._where).version >= (5, 6):
+            receive = opened(self._samples.receive, self._where)
             self._read_back(
                 lambda: abs(receive.getPayload() - payload.mass_kg) < 1e-6, f"payload of {payload.mass_kg:g} kg"
             )
@@ -241,12 +212,11 @@ class UrRobot:
         """Return the newest sample with the controller's modes. Raises DeviceUnavailableError if it is stale."""
         self._watchdog.attend()
         sample = self._streaming().latest()
-        receive = _opened(self._receive, self._where)
+        receive = opened(self._samples.receive, self._where)
         with vendor(self._where, "reading the state"):
-            mode = receive.getRobotMode()
             return RobotState(
                 sample=sample,
-                robot_mode=ROBOT_MODES.get(mode, str(mode)),
+                robot_mode=robot_mode(receive),
                 program_running=receive.getRuntimeState() == PLAYING,
                 speed_fraction=receive.getTargetSpeedFraction(),
             )
@@ -261,39 +231,23 @@ class UrRobot:
         Checks first that a solution exists, because an unreachable pose would end the control script. Raises
         UnreachablePoseError if there is none, or if it lies beyond the safety limits.
         """
-        near = _joints(near_rad, self._where)
+        near = joint_values(near_rad, self._where)
 
-        def ask(control: library.Control) -> list[float]:
-            pose = to_rotation_vector(T_base_flange @ self._T_flange_tcp).tolist()
-            if not control.getInverseKinematicsHasSolution(pose, near):
-                self._raise_unless_running(control)
-                x, y, z = T_base_flange[:3, 3]
-                raise UnreachablePoseError(
-                    f"the arm cannot reach the flange pose at ({x:.3f}, {y:.3f}, {z:.3f}) m in its base frame",
-                    where=self._where,
-                    remedy="Choose another viewpoint or move the station",
-                )
-            joints = control.getInverseKinematics(pose, near)
-            if len(joints) != 6:
-                self._raise_unless_running(control)
-                raise DeviceFaultError("inverse kinematics returned no joints", where=self._where, remedy=_RESTART)
-            if not control.isJointsWithinSafetyLimits(joints):
-                self._raise_unless_running(control)
-                raise UnreachablePoseError(
-                    "the pose lies beyond the controller's safety limits",
-                    where=self._where,
-                    remedy="Choose another viewpoint, or widen the limits on the pendant if that is safe",
-                )
-            return joints
+        def ask(control: library.Control) -> Array:
+            try:
+                return joints_for(control, T_base_flange, self._samples.T_flange_tcp, near, self._where)
+            except (UnreachablePoseError, DeviceFaultError):
+                self._raise_unless_running(control)  # a script that ended is why
+                raise
 
-        return np.asarray(self._perform("inverse kinematics", ask), dtype=np.float64)
+        return self._perform("inverse kinematics", ask)
 
     def move_joints(self, target_rad: Array, *, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Start a joint motion to `target_rad` (6,) and return at once.
 
         Raises SafetyStopError, LeaveNeededError, or DeviceRefusedError if the controller does not start it.
         """
-        target = _joints(target_rad, self._where)
+        target = joint_values(target_rad, self._where)
         self._begin("joint motion", lambda control: control.moveJ(target, speed_rad_s, acceleration_rad_s2, True))
 
     def stop(self) -> None:
@@ -304,7 +258,7 @@ class UrRobot:
         with vendor(self._where, "stopping the motion"):
             self._watchdog.look()
             if not self._script.stop_motion(self._driven_next):
-                _opened(self._dashboard, self._where).stop()
+                opened(self._dashboard, self._where).stop()
 
     def is_moving(self) -> bool:
         """Return whether the last motion is still under way.
@@ -352,39 +306,11 @@ class UrRobot:
     # --- parts -------------------------------------------------------------------------------------------
 
     def _streaming(self) -> PoseStream:
-        return _opened(self._stream, self._where)
+        return opened(self._stream, self._where)
 
     def _newest(self) -> RobotSample | None:
         stream = self._stream  # another thread may set it to None
         return stream.newest() if stream is not None else None
-
-    def _read_sample(self) -> RobotSample | None:
-        receive = self._receive
-        if receive is None:
-            return None
-        # Each getter locks separately: read the set again if a new package arrived in between.
-        for _ in range(3):
-            before_s = receive.getTimestamp()
-            if before_s == self._controller_time_s:
-                return None
-            sample = self._take(receive, before_s)
-            if receive.getTimestamp() == before_s:
-                self._controller_time_s = before_s
-                self._latch.see(sample.safety, sample.monotonic_s)
-                return sample
-        return None
-
-    def _take(self, receive: library.Receive, controller_time_s: float) -> RobotSample:
-        return RobotSample(
-            controller_time_s=controller_time_s,
-            monotonic_s=time.monotonic(),
-            joints_rad=np.array(receive.getActualQ()),
-            joint_velocities_rad_s=np.array(receive.getActualQd()),
-            target_velocities_rad_s=np.array(receive.getTargetQd()),
-            T_base_flange=from_rotation_vector(np.array(receive.getActualTCPPose())) @ inverse(self._T_flange_tcp),
-            tcp_speed_m_s=float(np.linalg.norm(receive.getActualTCPSpeed()[:3])),
-            safety=safety_state(receive.getSafetyStatusBits()),
-        )
 
     def _obstacle(self) -> DeviceError | None:
         """What prevents the arm from moving until a person resolves it; None if nothing does."""
@@ -402,7 +328,7 @@ class UrRobot:
     def _taken_remote(self, facts: ControllerFacts) -> bool:
         """Whether somebody has switched the pendant to Remote since the last query."""
         with vendor(self._where, "asking for remote control"):
-            remote = _opened(self._dashboard, self._where).isInRemoteControl()
+            remote = opened(self._dashboard, self._where).isInRemoteControl()
         self._facts = dataclasses.replace(facts, remote_control=remote)
         return remote
 
@@ -435,8 +361,8 @@ class UrRobot:
             pose = control.getTCPOffset()
         if len(pose) != 6:
             self._raise_unless_running(control)
-            raise DeviceFaultError("the tool centre point cannot be read back", where=self._where, remedy=_RESTART)
-        self._T_flange_tcp = from_rotation_vector(np.array(pose))
+            raise DeviceFaultError("the tool centre point cannot be read back", where=self._where, remedy=RESTART)
+        self._samples.T_flange_tcp = from_rotation_vector(np.array(pose))
         self._tool_read = self._script.sent
 
     def _begin(self, what: str, start: Callable[[library.Control], bool]) -> None:
@@ -471,18 +397,3 @@ class UrRobot:
                     where=self._where,
                     remedy=_SET_ELSEWHERE,
                 ) from None
-
-
-def _opened(part: T | None, where: str) -> T:
-    if part is None:
-        raise DeviceUnavailableError("the robot is not connected", where=where, remedy="Open it first")
-    return part
-
-
-def _joints(values: Array, where: str) -> list[float]:
-    joints = np.asarray(values, dtype=np.float64)
-    if joints.shape != (6,) or not np.all(np.isfinite(joints)):
-        raise DeviceRefusedError(
-            f"joints must be six finite numbers, not {values}", where=where, remedy="Choose another viewpoint"
-        )
-    return [float(v) for v in joints]

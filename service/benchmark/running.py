@@ -9,8 +9,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from drivers.meshes.surface_file import read_surface_file
+from service.benchmark.commands import run_commands, this_machine
 from service.benchmark.method import Command, Method, Place, missing, place_of
-from service.benchmark.programs import run_commands, this_machine
 from service.benchmark.records import RESULT, Effort, Result, Scenario, Score
 from service.benchmark.scoring import score_mesh, write_scored
 from service.compute.ground_truth.distances.chamfer import ChamferSettings
@@ -78,15 +78,7 @@ def run_trial(trial: Trial, whole: DataSet, progress: Progress = lambda _what, _
     progress("writing what the method reads", 0, 0)
     _export(trial, dataset, place.data)
     commands = trial.method.commands(place)
-    effort: Effort | None = None
-    mesh, failure = trial.mesh, ""
-    if mesh is None:
-        _require_installed(trial, commands)
-        progress(f"running {trial.method.words}", 0, 0)
-        try:
-            effort, mesh = _run(trial, place, commands)
-        except (ComputeError, DataError) as error:
-            failure = str(error)
+    mesh, effort, failure = _mesh(trial, place, commands, progress)
     truth = truth_file(trial.out, whole.identity)
     if not truth.is_file():
         write_ply(truth, Surface(whole.mesh.vertices_m, whole.mesh.faces), 1.0, {}, ["world frame, metres"])
@@ -141,6 +133,21 @@ def _require_installed(trial: Trial, commands: tuple[Command, ...]) -> None:
             remedy=f"It expects {trial.method.expects}. Install that, or run these commands elsewhere and give the "
             f"mesh with --mesh:\n{lines}",
         )
+
+
+def _mesh(
+    trial: Trial, place: Place, commands: tuple[Command, ...], progress: Progress
+) -> tuple[Path | None, Effort | None, str]:
+    """The mesh given or made, what it took to make it, and why there is none."""
+    if trial.mesh is not None:
+        return trial.mesh, None, ""
+    _require_installed(trial, commands)
+    progress(f"running {trial.method.words}", 0, 0)
+    try:
+        effort, mesh = _run(trial, place, commands)
+    except (ComputeError, DataError) as error:
+        return None, None, str(error)
+    return mesh, effort, ""
 
 
 def _run(trial: Trial, place: Place, commands: tuple[Command, ...]) -> tuple[Effort, Path]:

@@ -78,28 +78,39 @@ def _details(results: Sequence[Result], known: Mapping[str, Method]) -> list[str
         "method", "scenario", "views", "px", "Chamfer mm", "accuracy mm", "completeness mm", "F 0.5 mm", "F 1 mm",
         "normals", "wall s", "CPU s", "memory MB",
     )  # fmt: skip
-    rows: list[str] = []
-    for result in results:
-        score, effort = result.score, result.effort
-        scores = [_NONE] * 6
-        if score is not None:
-            scores = [
-                *(f"{x:.3f}" for x in (score.chamfer_mm, score.accuracy_mm, score.completeness_mm)),
-                *(f"{x:.3f}" for x in (score.f_score_05, score.f_score_10, score.normal_consistency)),
-            ]
-        took = [_NONE] * 3
-        if effort is not None:
-            took = [f"{effort.wall_s:.0f}", f"{effort.cpu_s:.0f}", f"{effort.peak_memory_mb:.0f}"]
-        size = f"{result.width} × {result.height}"
-        cells = [_words(result.method, known), result.scenario, str(result.views), size, *scores, *took]
-        rows.append(f"| {' | '.join(cells)} |")
+    return [
+        f"| {' | '.join(head)} |",
+        "|---|---|" + "---:|" * (len(head) - 2),
+        *(f"| {' | '.join(_detail_cells(result, known))} |" for result in results),
+        "",
+        *_remarks(results, known),
+        "",
+    ]
+
+
+def _detail_cells(result: Result, known: Mapping[str, Method]) -> list[str]:
+    score, effort = result.score, result.effort
+    scores, took = [_NONE] * 6, [_NONE] * 3
+    if score is not None:
+        scores = [
+            *(f"{x:.3f}" for x in (score.chamfer_mm, score.accuracy_mm, score.completeness_mm)),
+            *(f"{x:.3f}" for x in (score.f_score_05, score.f_score_10, score.normal_consistency)),
+        ]
+    if effort is not None:
+        took = [f"{effort.wall_s:.0f}", f"{effort.cpu_s:.0f}", f"{effort.peak_memory_mb:.0f}"]
+    size = f"{result.width} × {result.height}"
+    return [_words(result.method, known), result.scenario, str(result.views), size, *scores, *took]
+
+
+def _remarks(results: Sequence[Result], known: Mapping[str, Method]) -> list[str]:
     floors = [result.score.floor_mm for result in results if result.score is not None]
     machines = dict.fromkeys(
         f"{m.processor}, {m.cores} cores, {m.memory_gb:g} GB, {m.gpu or 'no GPU'}"
         for m in (result.machine for result in results)
     )
-    told = [
-        f"Equal surfaces would give {min(floors):.3f} mm, by the sampling alone." if floors else "",
+    floor = [f"Equal surfaces would give {min(floors):.3f} mm, by the sampling alone."] if floors else []
+    return [
+        *floor,
         *(f"Machine: {machine}." for machine in machines),
         *(
             f"{_words(r.method, known)}, {r.scenario}: made elsewhere, mesh {r.mesh_sha256[:12]}."
@@ -111,14 +122,6 @@ def _details(results: Sequence[Result], known: Mapping[str, Method]) -> list[str
             for r in results
             if r.failure
         ),
-    ]
-    return [
-        f"| {' | '.join(head)} |",
-        "|---|---|" + "---:|" * (len(head) - 2),
-        *rows,
-        "",
-        *(line for line in told if line),
-        "",
     ]
 
 

@@ -72,8 +72,16 @@ _COMMANDS = {
         "service.cli.site.doctor:doctor_command",
         "Open every device of a rig; report versions, clock offsets, free space and problems.",
     ),
+    "dicom-listen": _Command(
+        "service.cli.site.dicom_listen:dicom_listen_command",
+        "Receive CT series and segmentations that a CT suite sends (DICOM C-STORE), until it is terminated.",
+    ),
     "calibrate": _Command(
-        "service.cli.compute.calibrate:calibrate_app", "Calibrate a camera and its mounting from images of a board."
+        "service.cli.calibrate.group:calibrate_app", "Calibrate a camera and its mounting from images of a board."
+    ),
+    "import-ros": _Command(
+        "service.cli.compute.import_ros:import_ros_command",
+        "Take images, robot poses, camera and mount from a recording of ROS 2; the files fit the other commands.",
     ),
     "sfm": _Command(
         "service.cli.compute.sfm:sfm_command",

@@ -2,49 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
+from service.core.arms.model import ArmModel
 from service.core.geometry import Array, Transform
 
-TWISTS_RAD = np.radians([-90.0, 90.0, 90.0, -90.0, -90.0, 90.0, 0.0])
 _ELBOWS = 48  # elbow angles that are tried, 7.5° apart
 _REACH = 1e-9
 _STRAIGHT = 1e-9
 _NEAR_LIMIT_RAD = np.radians(10.0)
 _LIMIT_WEIGHT = 10.0  # 10° inside the limit count nothing, at the limit as much as three radians of travel
+_NEAR_SINGULAR_RAD = np.radians(12.0)
+_SINGULAR_WEIGHT = 2.0
+_BENDS = (1, 3, 5)  # shoulder, elbow and wrist: where one is straight, the arm loses a direction
 
 
-@dataclass(frozen=True, slots=True)
-class SevenAxisArm:
-    """A spherical–revolute–spherical arm: joints 1 to 3 meet in the shoulder, 4 is the elbow, 5 to 7 the wrist.
-
-    Attributes:
-        name: the manufacturer's.
-        offsets_m: base to shoulder, shoulder to elbow, elbow to wrist, wrist to flange.
-        limits_rad: (7,) largest absolute angle of each joint.
-    """
-
-    name: str
-    offsets_m: tuple[float, float, float, float]
-    limits_rad: tuple[float, ...]
-
-
-# Source: KUKA, "LBR iiwa 7 R800, LBR iiwa 14 R820" and "LBR Med", specifications: dimensions and axis ranges.
-_LIMITS_RAD = tuple(float(v) for v in np.radians([170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0]))
-SEVEN_AXIS_ARMS = tuple(
-    SevenAxisArm(name, (0.360, 0.420, 0.400, 0.126), _LIMITS_RAD) for name in ("LBR Med 14", "LBR iiwa 14")
-)
-
-
-def forward(arm: SevenAxisArm, joints_rad: Array) -> Transform:
+def forward(arm: ArmModel, joints_rad: Array) -> Transform:
     """T_base_flange (4, 4) at joints (7,)."""
-    base, upper, fore, hand = arm.offsets_m
-    offsets = (base, 0.0, upper, 0.0, fore, 0.0, hand)
     T_base_link = np.eye(4)
-    for q, d, alpha in zip(joints_rad, offsets, TWISTS_RAD, strict=True):
+    for q, d, alpha in zip(joints_rad, arm.d_m, arm.alpha_rad, strict=True):
         c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
         T_base_link = T_base_link @ np.array(
             [[c, -s * ca, s * sa, 0.0], [s, c * ca, -c * sa, 0.0], [0.0, sa, ca, d], [0, 0, 0, 1]]
@@ -52,7 +30,7 @@ def forward(arm: SevenAxisArm, joints_rad: Array) -> Transform:
     return T_base_link
 
 
-def postures(arm: SevenAxisArm, T_base_flange: Transform, elbow_angles_rad: Array | None = None) -> Array:
+def postures(arm: ArmModel, T_base_flange: Transform, elbow_angles_rad: Array | None = None) -> Array:
     """Joints (K, 7) within the limits that reach a pose, for elbow angles all round; empty if out of reach.
 
     The elbow angle turns the elbow about the line from the shoulder to the wrist; it is 0 where joint 3 is. For each
@@ -62,7 +40,7 @@ def postures(arm: SevenAxisArm, T_base_flange: Transform, elbow_angles_rad: Arra
     Manipulators With Joint Limits", IEEE Transactions on Robotics 24 (2008).
     """
     angles = np.linspace(-np.pi, np.pi, _ELBOWS, endpoint=False) if elbow_angles_rad is None else elbow_angles_rad
-    base, upper, fore, hand = arm.offsets_m
+    base, upper, fore, hand = arm.d_m[::2]
     wrist = T_base_flange[:3, 3] - hand * T_base_flange[:3, 2] - np.array([0.0, 0.0, base])
     length = float(np.linalg.norm(wrist))
     cosine4 = (length**2 - upper**2 - fore**2) / (2 * upper * fore)
@@ -79,34 +57,47 @@ def postures(arm: SevenAxisArm, T_base_flange: Transform, elbow_angles_rad: Arra
             q[:, 0:3], q[:, 3], q[:, 4:7] = _zyz(R_0_3, shoulder), q4, _zyz(R_4_7, wrist_side)
             found.append(q)
     every = np.concatenate(found)
-    return every[np.all(np.abs(every) <= np.array(arm.limits_rad) + _REACH, axis=1)]
+    return every[np.all(np.abs(every) <= arm.limits_rad + _REACH, axis=1)]
 
 
-def nearest_posture(arm: SevenAxisArm, T_base_flange: Transform, near_rad: Array) -> Array | None:
-    """Joints (7,) that reach a pose and are near `near_rad`, and clear of the limits; None if out of reach.
+def nearest_posture(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array | None:
+    """Joints (7,) that reach a pose and are near `near_rad`, clear of limits and singularities; None if out of reach.
 
-    The elbow angle is the one at `near_rad` unless another brings less motion, or more room to the limits.
+    The elbow angle is the one at `near_rad` unless another brings less motion, or more room.
     """
+    found = postures_by_cost(arm, T_base_flange, near_rad)
+    return found[0] if len(found) else None
+
+
+def postures_by_cost(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array:
+    """Joints (K, 7) that reach a pose with the elbow at `near_rad`'s angle and all round, the best ones first."""
     angles = np.concatenate([[elbow_angle_rad(arm, near_rad)], np.linspace(-np.pi, np.pi, _ELBOWS, endpoint=False)])
     found = postures(arm, T_base_flange, angles)
-    if not len(found):
-        return None
-    return np.asarray(found[int(np.argmin(posture_costs(arm, found, near_rad)))], dtype=np.float64)
+    return found[np.argsort(posture_costs(arm, found, near_rad), kind="stable")]
 
 
-def posture_costs(arm: SevenAxisArm, joints_rad: Array, near_rad: Array) -> Array:
-    """(K,) squared travel (rad²) from `near_rad` to joints (K, 7), plus what closeness to the limits costs."""
-    room = np.array(arm.limits_rad) - np.abs(joints_rad)
+def posture_costs(arm: ArmModel, joints_rad: Array, near_rad: Array) -> Array:
+    """(K,) squared travel (rad²) from `near_rad` to joints (K, 7), plus what limits and singularities cost.
+
+    A joint close to its limit costs, and so does a shoulder, elbow or wrist that is nearly straight.
+    """
+    room = arm.limits_rad - np.abs(joints_rad)
     short = np.clip(1.0 - room / _NEAR_LIMIT_RAD, 0.0, None)
     # A joint of the start counts no more than it must: the start itself may lie near a limit.
-    here = np.clip(1.0 - (np.array(arm.limits_rad) - np.abs(near_rad)) / _NEAR_LIMIT_RAD, 0.0, None)
-    costly = _LIMIT_WEIGHT * np.sum(np.clip(short - here, 0.0, None) ** 2, axis=1)
-    return np.sum((joints_rad - near_rad) ** 2, axis=1) + costly
+    here = np.clip(1.0 - (arm.limits_rad - np.abs(near_rad)) / _NEAR_LIMIT_RAD, 0.0, None)
+    limits = _LIMIT_WEIGHT * np.sum(np.clip(short - here, 0.0, None) ** 2, axis=1)
+    return np.sum((joints_rad - near_rad) ** 2, axis=1) + limits + _singular_costs(joints_rad, near_rad)
 
 
-def elbow_angle_rad(arm: SevenAxisArm, joints_rad: Array) -> float:
+def _singular_costs(joints_rad: Array, near_rad: Array) -> Array:
+    straight = np.clip(1.0 - np.abs(joints_rad[:, _BENDS]) / _NEAR_SINGULAR_RAD, 0.0, None)
+    here = np.clip(1.0 - np.abs(near_rad[list(_BENDS)]) / _NEAR_SINGULAR_RAD, 0.0, None)
+    return np.asarray(_SINGULAR_WEIGHT * np.sum(np.clip(straight - here, 0.0, None) ** 2, axis=1), dtype=np.float64)
+
+
+def elbow_angle_rad(arm: ArmModel, joints_rad: Array) -> float:
     """The elbow angle at joints (7,), -π … π."""
-    base, _, _, hand = arm.offsets_m
+    base, _, _, hand = arm.d_m[::2]
     T = forward(arm, joints_rad)
     wrist = T[:3, 3] - hand * T[:3, 2] - np.array([0.0, 0.0, base])
     length = float(np.linalg.norm(wrist))
@@ -118,9 +109,9 @@ def elbow_angle_rad(arm: SevenAxisArm, joints_rad: Array) -> float:
     return float(np.arctan2(w @ (wrist / length), np.trace(turned) - 1.0))
 
 
-def _reference(arm: SevenAxisArm, wrist: Array, q4: float) -> Array:
+def _reference(arm: ArmModel, wrist: Array, q4: float) -> Array:
     """(3, 3) turn of the upper arm with joint 3 at 0 that brings the wrist there, from the shoulder."""
-    _, upper, fore, _ = arm.offsets_m
+    _, upper, fore, _ = arm.d_m[::2]
     leaning = np.arctan2(np.hypot(wrist[0], wrist[1]), wrist[2])
     q2 = leaning + np.arctan2(fore * np.sin(q4), upper + fore * np.cos(q4))
     return _rz(np.array([np.arctan2(wrist[1], wrist[0])]))[0] @ _ry(np.array([q2]))[0]

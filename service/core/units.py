@@ -58,9 +58,24 @@ def ms(duration_s: float) -> float:
     return 1e3 * duration_s
 
 
+def seconds_of_ms(duration_ms: float) -> float:
+    """Seconds of a duration in milliseconds."""
+    return duration_ms / 1e3
+
+
 def seconds_of_us(duration_us: float) -> float:
     """Seconds of a duration in microseconds."""
     return duration_us / 1e6
+
+
+def nanoseconds(duration_s: float) -> int:
+    """Whole nanoseconds of a duration in seconds."""
+    return round(duration_s * 1e9)
+
+
+def nanoseconds_of_us(duration_us: int) -> int:
+    """Nanoseconds of whole microseconds, exactly."""
+    return duration_us * 1000
 
 
 def seconds_of_ns(duration_ns: float) -> float:
@@ -76,6 +91,11 @@ def megabytes(size_bytes: float) -> float:
 def gigabytes(size_bytes: float) -> float:
     """Gigabytes (10^9 bytes) of a number of bytes."""
     return size_bytes / 1e9
+
+
+def bytes_of_gigabytes(size_gb: float) -> int:
+    """Bytes of a number of gigabytes (10^9 bytes)."""
+    return round(size_gb * 1e9)
 
 
 def megapixels(width_px: int, height_px: int) -> float:

@@ -24,6 +24,7 @@ PROUD = 1.07  # times the radius, so that a drawn sphere covers the scanned one
 BAR_MM = 100.0
 _ROOM_MM = 60.0
 EYE_MM, TOWARDS_MM = (280.0, -1150.0, 850.0), (0.0, 0.0, 210.0)  # the initial view
+_NEAR_EYE_MM, _NEAR_TOWARDS_MM = (150.0, -620.0, 500.0), (0.0, 0.0, 0.0)  # without cameras around the surface
 _ROUND, _FLAT = 10, 6  # meridians and parallels of a sphere
 
 
@@ -87,6 +88,7 @@ class Scene:
         stations: station of each viewpoint.
         bases: T_frame_base by station, where known.
         up: unit vector (3,).
+        outlines: (K, 3) corners of closed polygons on the surface, by what they surround.
     """
 
     cameras: Mapping[str, Transform]
@@ -97,6 +99,7 @@ class Scene:
     planned: Mapping[str, Transform] = field(default_factory=dict[str, Transform])
     bases: Mapping[str, Transform] = field(default_factory=dict[str, Transform])
     up: tuple[float, float, float] | None = None
+    outlines: Mapping[str, Array] = field(default_factory=dict[str, Array])
 
 
 def decimated(vertices_m: Array, faces: Any, most: int = FACES_SHOWN) -> tuple[Array, NDArray[np.int64]]:
@@ -148,6 +151,7 @@ def scene_json(scene: Scene) -> str:
         mine = [s for s in scene.spheres if s.kind == kind]
         if mine:
             data += _spheres(in_view_mm(np.array([s.centre_m for s in mine])), mine, mm(scene.radius_m))
+    data += [_outline(in_view_mm(corners), what) for what, corners in scene.outlines.items()]
     data.append(_scale_bar(in_view_mm(_centre(scene))))
     names = sorted({*scene.stations.values(), *scene.bases})
     for i, station in enumerate(names):
@@ -159,7 +163,11 @@ def scene_json(scene: Scene) -> str:
         in_view_mm(np.array([T[:3, 3] for T in mine]))
         if station in scene.bases:
             data.append(_base(in_view_mm(scene.bases[station][None, :3, 3]), station, colour))
-    text = json.dumps({"data": data, "layout": _layout(extent)}, allow_nan=False, separators=(",", ":"))
+    text = json.dumps(
+        {"data": data, "layout": _layout(extent, near=not (names or scene.planned))},
+        allow_nan=False,
+        separators=(",", ":"),
+    )
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -287,6 +295,11 @@ def _base(at: Array, station: str, colour: str) -> dict[str, object]:
     }
 
 
+def _outline(corners: Array, what: str) -> dict[str, object]:
+    line = {"mode": "lines", "line": {"color": "#c2352b", "width": 7}, "hoverinfo": "skip"}
+    return {"type": "scatter3d", "name": what, **line, **_xyz(np.vstack([corners, corners[:1]]))}
+
+
 def _scale_bar(centre: Array) -> dict[str, object]:
     x, y, z = (float(v) for v in centre[0])
     ends = [[x - 0.5 * BAR_MM, y - 300, z - 60], [x + 0.5 * BAR_MM, y - 300, z - 60]]
@@ -302,7 +315,8 @@ def _scale_bar(centre: Array) -> dict[str, object]:
     }
 
 
-def _layout(extent: _Extent) -> dict[str, object]:
+def _layout(extent: _Extent, *, near: bool) -> dict[str, object]:
+    eye, towards = (_NEAR_EYE_MM, _NEAR_TOWARDS_MM) if near else (EYE_MM, TOWARDS_MM)
     ranges = dict(zip("xyz", extent.ranges(), strict=True))
     axes = {f"{a}axis": {"visible": False, "showspikes": False, "range": ends} for a, ends in ranges.items()}
     return {
@@ -310,7 +324,7 @@ def _layout(extent: _Extent) -> dict[str, object]:
             "aspectmode": "manual",
             "aspectratio": {a: metres(high - low) for a, (low, high) in ranges.items()},
             "dragmode": "turntable",
-            "camera": {"eye": _in_box(ranges, EYE_MM), "center": _in_box(ranges, TOWARDS_MM)},
+            "camera": {"eye": _in_box(ranges, eye), "center": _in_box(ranges, towards)},
             **axes,
         },
         "margin": {"l": 0, "r": 0, "t": 0, "b": 70},

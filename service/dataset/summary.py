@@ -44,12 +44,22 @@ class ArtefactReader(Interface):
 
 @dataclass(frozen=True, slots=True)
 class GroundTruth:
-    """The mesh of the data set: what it is in words, its file, vertices (V, 3) in metres, faces (F, 3)."""
+    """The mesh of the data set.
+
+    Attributes:
+        words: what it is.
+        sha256: of its file.
+        vertices_m: (V, 3).
+        faces: (F, 3).
+        source, sigma_m: (V,) of each vertex, as the fusion stated them; None for a scan.
+    """
 
     words: str
     sha256: str
     vertices_m: Array = field(repr=False)
     faces: NDArray[np.int64] = field(repr=False)
+    source: NDArray[np.uint8] | None = field(default=None, repr=False)
+    sigma_m: Array | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +138,8 @@ class RunSummary:
             return GroundTruth("scan", sha256, np.asarray(vertices_m, dtype=np.float64), faces.astype(np.int64))
         columns, faces = read_ply(self.store.artefact_path(fused[-1].sha256))
         vertices_mm = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
-        return GroundTruth("CT and scan, fused", fused[-1].sha256, metres(vertices_mm), faces)
+        source, sigma_m = columns["source"].astype(np.uint8), metres(columns["sigma_mm"].astype(np.float64))
+        return GroundTruth("CT and scan, fused", fused[-1].sha256, metres(vertices_mm), faces, source, sigma_m)
 
 
 def summarise(store: Store, run_id: str, protocol: Protocol) -> RunSummary:

@@ -18,7 +18,8 @@ from service.monitor.worker_sign import living_workers
 from service.store.database.tables import event_index, events, jobs, runs
 from service.store.events import parse_canonical
 from service.store.records import SITE
-from service.store.store import Store, read_open_runs
+from service.store.run_rows import read_open_runs
+from service.store.store import Store
 
 CAPTURED = ("viewpoint_captured", "view_held", "view_imported")
 _LAST_CAPTURES = 21  # used for the median time per viewpoint

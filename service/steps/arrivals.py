@@ -11,9 +11,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from drivers.errors import DeviceTimeoutError
-from drivers.interfaces import ScannedMesh
+from drivers.interfaces import CtSource, ScannedMesh
 from service.core.records.events import ArtefactRef, FilesKept
 from service.steps.context import StepContext
+from service.steps.notes import DEIDENTIFIED
 from service.store.records import NewArtefact
 
 T = TypeVar("T")
@@ -47,6 +48,51 @@ def keep(context: StepContext, path: Path, *, device: str, kind: str, media_type
         note = f"imported {path.name}, written {listing.check(str(path), ref.sha256).modified_utc}"
     _record(context, ref, device, note)
     return ref
+
+
+def keep_clean(
+    context: StepContext, ct: CtSource, paths: Sequence[Path], *, device: str, kind: str
+) -> tuple[ArtefactRef, ...]:
+    """Copy files of a CT suite into the evidence, without what may name people, and note what was removed.
+
+    The copies have new names, since the old ones may name people too. The note on each copy has the SHA-256 of its
+    original. If the rig keeps files as they are, they are kept unchanged.
+
+    Raises DataError as `keep` does, and UnreadableFileError if a file cannot be copied so.
+    """
+    kept: list[ArtefactRef] = []
+    removed: set[str] = set()
+    copies = 0
+    for number, path in enumerate(paths, start=1):
+        context.checkpoint()
+        with tempfile.TemporaryDirectory(prefix="orthocapture-") as folder:
+            target = Path(folder) / f"{kind}_{number:05d}{_suffix(path)}"
+            clean = ct.without_personal_data(path, target)
+            if clean is None:
+                kept.append(keep(context, path, device=device, kind=kind, media_type=_media_type(path)))
+                continue
+            listing = context.devices.imported()
+            if listing is not None:
+                listing.check(str(path), clean.original_sha256)
+            ref = context.evidence.put_file(
+                target, kind=kind, media_type=_media_type(path), original_name=target.name
+            )
+        removed.update(clean.removed)
+        copies += 1
+        note = f"kept {target.name} without personal data; the original file has the SHA-256 {clean.original_sha256}"
+        _record(context, ref, device, note)
+        kept.append(ref)
+    if copies:
+        context.note(DEIDENTIFIED, device=device, files=copies, removed=sorted(removed))
+    return tuple(kept)
+
+
+def _suffix(path: Path) -> str:
+    return next((end for end in (".nii.gz", ".nii") if path.name.lower().endswith(end)), ".dcm")
+
+
+def _media_type(path: Path) -> str:
+    return "application/dicom" if _suffix(path) == ".dcm" else "application/octet-stream"
 
 
 def keep_array(context: StepContext, array: Any, *, device: str, kind: str, name: str) -> ArtefactRef:

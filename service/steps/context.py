@@ -19,7 +19,7 @@ from service.core.records.import_list import ImportList
 from service.core.run.decide import RunState, StepState
 from service.core.run.state import JobState
 from service.jobs.kind import JobKind, JobRecord
-from service.rig import CollisionSection, LensSection, OpticsSection
+from service.rig import CollisionSection, LensSection, ObstacleSection, OpticsSection
 from service.steps.measures import MeasureRecord
 from service.store.records import NewArtefact
 
@@ -40,6 +40,7 @@ class StationLayout:
     robot: str  # device name in rig.yaml
     scene_centre_m: tuple[float, float, float]
     approach: tuple[float, float, float]  # horizontal unit vector from the scene towards the base
+    obstacles: tuple[tuple[str, ObstacleSection], ...] = ()  # what else stands there, by name
 
 
 @dataclass(frozen=True, slots=True)

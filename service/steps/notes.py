@@ -1,15 +1,17 @@
-"""Notes of steps that other steps and pages read, as typed records: planned poses, suggestions, images to repeat."""
+"""Notes of steps that other steps and pages read, as typed records: planned poses, suggestions, what was removed."""
 
 from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.core.run.state import StepState
+from service.core.text.counts import counted
 from service.jobs.capture.live_summary import Suggestion
 from service.jobs.records import Matrix
 
 BOARD_POSES, SUGGESTION = "board_poses", "suggested_viewpoints"
 SPOILT = "spoilt images"  # images that a retry of the step repeats
+DEIDENTIFIED = "personal data removed"
 DEPARTING = "images depart from the calibration"
 
 
@@ -82,6 +84,35 @@ class ImagesToRepeat(_NoteRecord):
     viewpoints: tuple[str, ...] = ()
     attempt: int | None = None
     advice: str | None = None
+
+
+class Deidentified(_NoteRecord):
+    """Attributes that were removed from files before these were kept.
+
+    Attributes:
+        device: from which the files came.
+        files: their number.
+        removed: the names of the attributes, over all files; never their values.
+    """
+
+    device: str
+    files: int
+    removed: tuple[str, ...]
+
+    @property
+    def words(self) -> str:
+        """The sentence for reports and pages."""
+        names = ", ".join(self.removed) or "none was present"
+        return (
+            f"Personal data: {counted(self.files, 'file')} of the device {self.device} were kept as copies without "
+            f"these attributes: {names}. UIDs were replaced; the pixels are those of the original files, which are "
+            "not in the record"
+        )
+
+
+def deidentified(state: StepState) -> tuple[Deidentified, ...]:
+    """What was removed from files in a step, oldest first."""
+    return tuple(Deidentified.model_validate(note.data) for note in state.notes if note.note == DEIDENTIFIED)
 
 
 def board_plans(state: StepState) -> tuple[BoardPlan, ...]:

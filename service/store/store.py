@@ -9,24 +9,24 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from sqlalchemy import Connection, case, func, insert, select
+from sqlalchemy import Connection, select
 
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.jobs.priorities import Lane
 from service.core.records.events import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
 from service.store.database.engine import LOOK, RESTORE, Database, database_path, open_database
-from service.store.database.tables import artefacts, event_index, events, heads, runs
+from service.store.database.tables import artefacts, events, heads, runs
 from service.store.durable_effects import Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock
 from service.store.errors import UnknownRunError
-from service.store.events import ROOT, append, read_events, to_event
-from service.store.files.artefacts import ArtefactFiles, chunks_of, insert_artefacts, read_artefacts
+from service.store.events import append, read_events, to_event
+from service.store.files.artefacts import ArtefactFiles, chunks_of, insert_artefacts, open_folder, read_artefacts
 from service.store.logged_events import tell
 from service.store.queue import jobs as queue
 from service.store.queue.leases import RunLease, acquire, check_lease, held_runs, is_held
 from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, NewJob, RunRow, Timestamp
+from service.store.run_rows import begin_chain, read_open_runs, read_runs, resolve_run
 from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
 
-_ENDS = ("run_completed", "run_aborted")
 _OWN_KINDS = frozenset({"run_started", "site_opened", "job_enqueued", "job_finished", "job_failed"})
 
 
@@ -69,19 +69,7 @@ class Store:
                 where=str(database_path(data_dir)),
                 remedy="Name the data folder with --data DIR, or with the environment variable ORTHOCAPTURE_DATA",
             )
-        folder = ArtefactFiles(data_dir / "artefacts", files, ids)
-        try:
-            for directory in (*reversed(data_dir.absolute().parents), data_dir.absolute()):
-                if not directory.exists():
-                    files.make_directory(directory)
-                    files.sync_directory(directory.parent)
-            folder.prepare()
-        except OSError as error:
-            raise StoreError(
-                f"the data folder cannot be made: {error.strerror or error}",
-                where=str(error.filename or data_dir),
-                remedy="Check the path and its permissions, or choose another folder with --data DIR",
-            ) from error
+        folder = open_folder(data_dir, files, ids)
         database = open_database(data_dir, files)
         return cls(database, folder, files, clock or SystemClock(), ids, database_path(data_dir))
 
@@ -161,7 +149,7 @@ class Store:
         """Begin a run with its first event and its artefacts, protocol and rig among them. Returns the run's name."""
         run_id = self._ids.new_run(self._clock.utc_now())
         with self._database.writing() as connection:
-            self._begin_chain(connection, run_id, payload, actor, artefacts)
+            begin_chain(connection, self._clock, self._folder, run_id, payload, actor, artefacts)
         return run_id
 
     def record_site(
@@ -181,36 +169,14 @@ class Store:
     ) -> list[Event]:
         """`record_site` within a transaction of `database.writing()`, so that an action and its record are atomic."""
         if connection.execute(select(runs.c.run_id).where(runs.c.run_id == SITE)).first() is None:
-            self._begin_chain(connection, SITE, SiteOpened(software=dict(software or {})), actor, ())
+            opened = SiteOpened(software=dict(software or {}))
+            begin_chain(connection, self._clock, self._folder, SITE, opened, actor, ())
         return append(connection, self._clock, SITE, payloads, actor)
 
     def append(self, connection: Connection, run_id: str, payloads: Sequence[Payload], *, actor: str) -> list[Event]:
         """Append to a run's chain within a transaction of `database.writing()`. Raises UnknownRunError."""
         self._require_run(connection, run_id)
         return append(connection, self._clock, run_id, payloads, actor)
-
-    def _begin_chain(
-        self,
-        connection: Connection,
-        run_id: str,
-        payload: RunStarted | SiteOpened,
-        actor: str,
-        artefacts: Sequence[NewArtefact],
-    ) -> None:
-        # The run's row holds the hash of the root event, which refers to the row; keys are checked at commit.
-        connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
-        connection.execute(insert(heads).values(run_id=run_id, seq=0, sha256=ROOT))
-        (root,) = append(connection, self._clock, run_id, [payload], actor)
-        simulated = isinstance(payload, RunStarted) and payload.simulated
-        connection.execute(
-            insert(runs).values(
-                run_id=run_id,
-                created_utc=root.at_utc,
-                simulated=int(simulated),
-                root_sha256=root.sha256,
-            )
-        )
-        insert_artefacts(connection, self._folder, [root], artefacts)
 
     def runs(self) -> list[RunRow]:
         """All runs, oldest first."""
@@ -427,58 +393,3 @@ class Store:
         """Queue the jobs of these local processes again without counting a try: they were told to stop and have."""
         with self._database.writing() as connection:
             queue.release(connection, pids)
-
-
-def read_runs(connection: Connection) -> list[RunRow]:
-    """All runs, oldest first, without the site's chain."""
-    statement = (
-        select(runs, heads.c.seq, heads.c.sha256)
-        .outerjoin(heads, heads.c.run_id == runs.c.run_id)
-        .where(runs.c.run_id != SITE)
-        .order_by(runs.c.created_utc, runs.c.run_id)
-    )
-    return [
-        RunRow(row.run_id, row.created_utc, bool(row.simulated), row.root_sha256, row.seq or 0, row.sha256 or ROOT)
-        for row in connection.execute(statement)
-    ]
-
-
-def read_open_runs(connection: Connection) -> set[str]:
-    """Runs that have neither an end recorded by the runner nor an operator's abort, which it confirms later."""
-    ended = (
-        select(event_index.c.seq)
-        .where(event_index.c.run_id == heads.c.run_id, event_index.c.kind.in_(_ENDS))
-        .exists()
-    )
-    aborted = (
-        select(events.c.seq)
-        .where(
-            events.c.run_id == heads.c.run_id,
-            events.c.seq == event_index.c.seq,
-            event_index.c.run_id == heads.c.run_id,
-            event_index.c.kind == "operator_action",
-            # A damaged payload must not raise here; the verification finds it.
-            case((func.json_valid(events.c.payload) == 1, func.json_extract(events.c.payload, "$.action")))
-            == "abort",
-        )
-        .correlate(heads)
-        .exists()
-    )
-    found = select(heads.c.run_id).where(heads.c.run_id != SITE, ~ended, ~aborted)
-    return set(connection.execute(found).scalars())
-
-
-def resolve_run(known: Sequence[RunRow], name: str) -> str:
-    """The run for a full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
-    if not known:
-        raise UnknownRunError("there is no run in this data folder yet", remedy="Start one with `orthocapture run`")
-    if name == "latest":
-        return known[-1].run_id
-    matches = [run.run_id for run in known if run.run_id == name] or [
-        run.run_id for run in known if name and run.run_id.startswith(name)
-    ]
-    if len(matches) != 1:
-        newest = ", ".join(run.run_id for run in known[-3:])
-        what = f"no run is called {name!r}" if not matches else f"{name!r} is the beginning of {len(matches)} runs"
-        raise UnknownRunError(what, remedy=f"The newest are: {newest}; or say `latest`")
-    return matches[0]

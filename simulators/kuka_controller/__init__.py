@@ -8,6 +8,7 @@ import os
 import numpy as np
 
 from simulators.kuka_controller.controller import MODES, Controller
+from simulators.kuka_controller.fri import VERSIONS
 from simulators.kuka_controller.kinematics import MODELS, Array
 from simulators.kuka_controller.server import Server
 from simulators.serve import SimulatorError, Termination, announce
@@ -28,6 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--initial-joints", default="", metavar="Q1,…,Q7", help="joints at start-up in radians")
     parser.add_argument(
         "--true-load-kg", type=float, metavar="M", help="mass on the flange: another one in the tool stops the arm"
+    )
+    parser.add_argument(
+        "--fri-version", default="1", choices=(*VERSIONS, "none"), help="FRI, which sends every 10 ms at most"
     )
     parser.add_argument("--world", default="", metavar="HOST:PORT", help="world socket that receives the joints")
     parser.add_argument("--arm", default="robot", help="name of the arm in the world and in fault plans")
@@ -50,7 +54,7 @@ def serve(args: argparse.Namespace) -> None:
     if args.world:
         host, _, port = args.world.rpartition(":")
         world = WorldLink((host, int(port)), args.arm)
-    server = Server(controller, (args.host, args.port), args.pendant_port, world)
+    server = Server(controller, (args.host, args.port), args.pendant_port, world, args.fri_version)
     announce(
         host=args.host,
         application=f"{args.host}:{args.port}",

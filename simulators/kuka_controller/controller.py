@@ -110,6 +110,11 @@ class Controller:
         """Note that a line of the client arrived."""
         self._heard_s = self.time_s
 
+    @property
+    def silent_s(self) -> float:
+        """How long no line of the client has come."""
+        return self.time_s - self._heard_s
+
     def permit(self) -> None:
         """Unlock the arm. Raises RefusedError during a stop."""
         self._refuse_in_stop()
@@ -183,7 +188,7 @@ class Controller:
         if self.motion is None:
             self._still_s += dt_s
             return None
-        if self.time_s - self._heard_s > HEARTBEAT_S and self.motion.stopping is None:
+        if self.silent_s > HEARTBEAT_S and self.motion.stopping is None:
             self.locked = True
             self.stop("heartbeat", f"the arm was stopped: no line of its client for {HEARTBEAT_S:g} s")
         return self._move(self.motion, dt_s)

@@ -49,6 +49,11 @@ def frames(model: Model, q: Array) -> list[Array]:
     return chain
 
 
+def forward(model: Model, q: Array) -> Array:
+    """Return T_base_flange (4, 4) at joints q (7,) in radians."""
+    return frames(model, q)[-1]
+
+
 def jacobian(chain: list[Array]) -> Array:
     """Return the geometric Jacobian (6, 7) of the flange: linear rows, then angular rows."""
     point = chain[-1][:3, 3]

@@ -15,6 +15,7 @@ from typing import cast
 import numpy as np
 
 from simulators.kuka_controller.controller import MODES, SAFETY, Controller, End, RefusedError
+from simulators.kuka_controller.fri import Session
 from simulators.serve import SimulatorError, Termination
 from simulators.world_link import WorldLink
 
@@ -22,6 +23,7 @@ _LOG = logging.getLogger(__name__)
 
 PERIOD_S = 0.01
 LONGEST_LINE = 1 << 16
+GIVES_WAY_S = 5.0  # a client that is silent for so long gives way to a new one
 MAX_BACKLOG_BYTES = 1 << 18
 
 
@@ -52,9 +54,16 @@ class Server:
     """Listens on both ports and advances the controller in real time."""
 
     def __init__(
-        self, controller: Controller, address: tuple[str, int], pendant_port: int, world: WorldLink | None
+        self,
+        controller: Controller,
+        address: tuple[str, int],
+        pendant_port: int,
+        world: WorldLink | None,
+        fri_version: str,
     ) -> None:
         self.controller, self._world = controller, world
+        self._host, self._fri_version = address[0], fri_version
+        self._fri: Session | None = None
         self._selector = selectors.SelectSelector()
         self._clients: list[_Client] = []
         self._number = 0
@@ -89,6 +98,8 @@ class Server:
             end = self.controller.advance(now_s - last_s)
             last_s = now_s
             self._stream(now_s, end)
+            if self._fri is not None:
+                self._fri.send(PERIOD_S)
             if self._world is not None:
                 self._world.push([float(v) for v in self.controller.q], self.controller.time_s, now_s)
 
@@ -129,6 +140,7 @@ class Server:
             self._clients.remove(client)
             if not client.pendant:
                 self.controller.lose_client()
+                self._end_fri()
 
     def _accept(self, listener: socket.socket, *, pendant: bool) -> None:
         connection, _ = listener.accept()
@@ -137,6 +149,10 @@ class Server:
         client = _Client(connection, pendant)
         if not pendant and self._client is not None:
             self._read(self._client)  # it may have hung up just before
+        present = self._client
+        if not pendant and present is not None and self.controller.silent_s > GIVES_WAY_S:
+            present.dead = True
+            self.controller.lose_client()
         if not pendant and self._client is not None:
             client.send(_error(None, "taken", "another client is connected"))
             connection.close()
@@ -214,6 +230,7 @@ class Server:
                 )
             },
             "stop": self._stop,
+            "fri": lambda: self._start_fri(line),
         }  # fmt: skip
         action = actions.get(str(line.get("do")))
         if action is None:
@@ -239,6 +256,25 @@ class Server:
         self.controller.stop()
         return {}
 
+    def _start_fri(self, line: dict[str, object]) -> dict[str, object]:
+        host, port, period_ms = line.get("host"), _numbers(line, "port", 0)[0], _numbers(line, "period_ms", 0)[0]
+        if not isinstance(host, str) or not host:
+            raise RefusedError("bad_value", "host is not a text")
+        if not (1 <= port <= 65535 and 0 <= period_ms <= 100):
+            raise RefusedError("bad_value", "port is not from 1 to 65535, or period_ms not from 0 to 100")
+        if self._fri_version == "none":
+            raise RefusedError("not_ready", "this controller has no FRI")
+        self._end_fri()
+        if period_ms:
+            cycles = max(1, round(period_ms / 1000 / PERIOD_S))
+            self._fri = Session(self.controller, self._host, (host, int(port)), self._fri_version, cycles)
+        return {}
+
+    def _end_fri(self) -> None:
+        if self._fri is not None:
+            self._fri.close()
+        self._fri = None
+
     def _pendant(self, words: list[str]) -> str:
         """Carry out what a person does at the smartPAD or the stop buttons."""
         match words:
@@ -256,6 +292,7 @@ class Server:
 
     def close(self) -> None:
         """Close every socket."""
+        self._end_fri()
         for key in list(self._selector.get_map().values()):
             if isinstance(key.fileobj, socket.socket):
                 key.fileobj.close()

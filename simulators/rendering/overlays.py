@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from simulators.geometry import Array, Array32
 from simulators.rendering.surfaces import LAMP_COLOUR, ROOM_COLOUR
@@ -116,13 +117,30 @@ def draw_calibration_board(frame: Frame, T_world_board: Array, lamp_m: Array) ->
     # In units of squares, from the outer corner of the pattern.
     x, y = place @ R[:, 0] / BOARD_SQUARE_M + 1.0, place @ R[:, 1] / BOARD_SQUARE_M + 1.0
     margin = MARGIN_M / BOARD_SQUARE_M
-    outer = np.maximum(
-        np.abs(x - BOARD_SQUARES[0] / 2) - BOARD_SQUARES[0] / 2,
-        np.abs(y - BOARD_SQUARES[1] / 2) - BOARD_SQUARES[1] / 2,
-    )
+    outer = _outside(x, y)
+    cover, white = _sampled(x, y, outer, margin, t > 0)
+    normal = -T_world_board[:3, 2]
+    to_lamp = lamp_m - T_world_board[:3, 3]
+    distance = float(np.linalg.norm(to_lamp))
+    lamp = max(0.0, float(normal @ to_lamp)) / distance * (float(np.linalg.norm(lamp_m)) / distance) ** 2
+    light = lamp * LAMP_COLOUR + ROOM_COLOUR
+    colour = ((INK + (PAPER - INK) * white)[..., None] * light).astype(np.float32)
+    frame.colour[:] += cover[..., None].astype(np.float32) * (colour - frame.colour)
+
+
+def _sampled(x: Array, y: Array, outer: Array, margin: float, ahead: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Share (H, W) of each pixel that shows the board, and of that the share which is white.
+
+    Args:
+        x: (H, W) of the pixels' centres, in squares.
+        y: likewise.
+        outer: (H, W) distance outside the pattern, in squares.
+        margin: width of the board outside the pattern, in squares.
+        ahead: (H, W) whether the board's plane is in front of the camera.
+    """
     dx, dy = np.gradient(x), np.gradient(y)
     step_x, step_y = np.abs(dx[0]) + np.abs(dx[1]), np.abs(dy[0]) + np.abs(dy[1])
-    touched = (t > 0) & (outer < margin + np.maximum(step_x, step_y))
+    touched = ahead & (outer < margin + np.maximum(step_x, step_y))
     cover, white = (touched & (outer < margin)).astype(np.float64), _pattern(x, y)
     near = (np.abs(x - np.round(x)) < step_x) | (np.abs(y - np.round(y)) < step_y)
     near |= np.abs(outer - margin) < np.maximum(step_x, step_y)
@@ -134,21 +152,20 @@ def draw_calibration_board(frame: Frame, T_world_board: Array, lamp_m: Array) ->
     xe, ye = x.ravel()[edge], y.ravel()[edge]
     gx, gy = [g.ravel()[edge] for g in dx], [g.ravel()[edge] for g in dy]
     inside_sum, white_sum = np.zeros(len(edge)), np.zeros(len(edge))
-    half = np.array(BOARD_SQUARES) / 2
     for row, column in sub:
         xs, ys = xe + row * gx[0] + column * gx[1], ye + row * gy[0] + column * gy[1]
-        inside = np.maximum(np.abs(xs - half[0]) - half[0], np.abs(ys - half[1]) - half[1]) < margin
+        inside = _outside(xs, ys) < margin
         inside_sum += inside
         white_sum += inside * _pattern(xs, ys)
     cover.ravel()[edge] = inside_sum / _SUBSAMPLES
     white.ravel()[edge] = white_sum / np.maximum(inside_sum, 1.0)
-    normal = -T_world_board[:3, 2]
-    to_lamp = lamp_m - T_world_board[:3, 3]
-    distance = float(np.linalg.norm(to_lamp))
-    lamp = max(0.0, float(normal @ to_lamp)) / distance * (float(np.linalg.norm(lamp_m)) / distance) ** 2
-    light = lamp * LAMP_COLOUR + ROOM_COLOUR
-    colour = ((INK + (PAPER - INK) * white)[..., None] * light).astype(np.float32)
-    frame.colour[:] += cover[..., None].astype(np.float32) * (colour - frame.colour)
+    return cover, white
+
+
+def _outside(x: Array, y: Array) -> Array:
+    """Distance outside the pattern along its axes, in squares; negative inside."""
+    half = np.array(BOARD_SQUARES) / 2
+    return np.maximum(np.abs(x - half[0]) - half[0], np.abs(y - half[1]) - half[1])
 
 
 def _pattern(x: Array, y: Array) -> Array:

@@ -36,6 +36,33 @@ def drape_coordinate(metres: Array) -> Array:
     return 0.5 + np.sign(metres) * t
 
 
+@dataclass(frozen=True, slots=True)
+class _Grain:
+    """Noise (H, W) that several tissues share, from coarse to fine, and its source."""
+
+    noise: Noise
+    wobble: Array32
+    fine: Array32
+    pores: Array32
+    speckle: Array32
+
+    @classmethod
+    def of(cls, noise: Noise) -> _Grain:
+        return cls(
+            noise,
+            wobble=noise.octaves(1, 0.012, 5),
+            fine=noise.octaves(2, 0.0016, 4, 0.75),
+            pores=noise.field(7, 0.0011),
+            speckle=noise.field(3, 0.0005),
+        )
+
+    def coloured(self, colour: tuple[float, float, float]) -> Array32:
+        """(H, W, 3) of one colour."""
+        out = np.empty((*self.noise.shape, 3), dtype=np.float32)
+        out[:] = colour
+        return out
+
+
 def specimen_texture(scene: Scene, size: int) -> Texture:
     """Skin, fat, muscle, bone and blood, placed by the anatomy's coordinates."""
     anatomy = scene.specimen.anatomy
@@ -44,33 +71,13 @@ def specimen_texture(scene: Scene, size: int) -> Texture:
     grid = cv2.resize(scene.specimen.grid_m, (size, size), interpolation=cv2.INTER_LINEAR)
     place = np.asarray(grid, dtype=np.float64)
     x, y = place[..., 0], place[..., 1]
-    wobble = noise.octaves(1, 0.012, 5)
-    fine = noise.octaves(2, 0.0016, 4, 0.75)
-    speckle = noise.field(3, 0.0005)
-    pores = noise.field(7, 0.0011)
-    t = np.asarray(anatomy.incision(x, y), dtype=np.float32) + np.float32(0.02) * wobble
-
-    skin = _skin(scene, noise, fine, speckle, pores)
-    fat = np.empty_like(skin)
-    fat[:] = (0.74, 0.58, 0.38)
-    fat *= (1.0 + 0.16 * noise.octaves(10, 0.005, 4) + 0.08 * speckle)[..., None]
-    fat = mixed(fat, (0.55, 0.12, 0.09), 0.7 * ramp(0.5, 1.4, noise.octaves(11, 0.006, 4)))
-
-    muscle = np.empty_like(skin)
-    muscle[:] = (0.34, 0.065, 0.05)
+    grain = _Grain.of(noise)
+    t = np.asarray(anatomy.incision(x, y), dtype=np.float32) + np.float32(0.02) * grain.wobble
     fibres = noise.octaves(12, 0.0016, 4, 0.8, stretch=14.0)
-    muscle *= (1.0 + 0.34 * fibres + 0.18 * fine + 0.08 * speckle)[..., None]
-    muscle = mixed(muscle, (0.66, 0.50, 0.42), 0.65 * ramp(1.4, 2.2, noise.octaves(13, 0.0030, 3, 0.7, stretch=9.0)))
-    muscle = mixed(muscle, (0.70, 0.56, 0.36), 0.8 * ramp(1.3, 1.8, noise.octaves(14, 0.008, 5, 0.7, stretch=2.0)))
-
-    bone = np.empty_like(skin)
-    bone[:] = (0.66, 0.50, 0.36)
-    bone *= (1.0 + 0.10 * fine + 0.07 * speckle + 0.08 * wobble)[..., None]
-    bone = mixed(bone, (0.45, 0.10, 0.08), 0.75 * ramp(0.3, 1.3, noise.octaves(15, 0.007, 5)))
-    bone = mixed(bone, (0.20, 0.03, 0.03), 0.8 * ramp(1.4, 2.0, noise.field(16, 0.0016)))
+    skin, fat, muscle, bone = _skin(scene, grain), _fat(grain), _muscle(grain, fibres), _bone(grain)
 
     height = np.asarray(anatomy.vertebrae(x, y), dtype=np.float32)
-    is_bone = ramp(0.0032, 0.0058, height + np.float32(0.0016) * wobble)
+    is_bone = ramp(0.0032, 0.0058, height + np.float32(0.0016) * grain.wobble)
     colour = muscle + (skin - muscle) * ramp(1.00, 1.06, t)[..., None]
     band = ramp(0.86, 0.94, t) * (1 - ramp(1.03, 1.08, t))
     colour += (fat - colour) * band[..., None]
@@ -80,28 +87,50 @@ def specimen_texture(scene: Scene, size: int) -> Texture:
     # The cut ends (columns of texels next to u = 0 and 1) show muscle, fat and skin as the incision does.
     end = np.minimum(np.arange(size), np.arange(size)[::-1])[:, None] < 0.0015 * size
     colour = np.where(end[..., None], muscle, colour)
-    relief = (
-        0.00016 * fine + 0.00035 * wobble + 0.00012 * np.where(t < 1.0, 1.8 * fibres * (1 - 0.8 * is_bone), pores)
-    )
+    uneven = np.where(t < 1.0, 1.8 * fibres * (1 - 0.8 * is_bone), grain.pores)
+    relief = 0.00016 * grain.fine + 0.00035 * grain.wobble + 0.00012 * uneven
     colour *= _relief_shading(relief.astype(np.float32), length / size, arc / size)[..., None]
     gloss = np.where(t > 1.05, 0.10, np.where(t > 0.9, 0.5, 0.75)) + 0.5 * pool
     gloss = gloss * (0.45 + 0.55 * ramp(-0.6, 1.2, noise.octaves(18, 0.003, 4)))
     return Texture(_packed(colour, gloss.astype(np.float32)), length / size)
 
 
-def _skin(scene: Scene, noise: Noise, fine: Array32, speckle: Array32, pores: Array32) -> Array32:
+def _skin(scene: Scene, grain: _Grain) -> Array32:
     """Mottled skin with pores, hair, inspection stamps and smears of blood (H, W, 3)."""
-    size = noise.shape[0]
-    skin = np.empty((size, size, 3), dtype=np.float32)
-    skin[:] = (0.66, 0.43, 0.34)
+    noise, size = grain.noise, grain.noise.shape[0]
+    skin = grain.coloured((0.66, 0.43, 0.34))
     blotch = noise.octaves(4, 0.03, 5)
-    skin *= (1.0 + 0.10 * blotch + 0.09 * fine + 0.09 * speckle)[..., None]
+    skin *= (1.0 + 0.10 * blotch + 0.09 * grain.fine + 0.09 * grain.speckle)[..., None]
     skin = mixed(skin, (0.55, 0.22, 0.18), 0.5 * ramp(0.5, 1.8, noise.octaves(5, 0.018, 5)))
     skin = mixed(skin, (0.42, 0.27, 0.20), 0.55 * ramp(0.9, 1.5, noise.octaves(6, 0.004, 3)))
-    skin = mixed(skin, (0.30, 0.15, 0.10), 0.55 * ramp(1.3, 2.2, pores))
+    skin = mixed(skin, (0.30, 0.15, 0.10), 0.55 * ramp(1.3, 2.2, grain.pores))
     skin = mixed(skin, (0.20, 0.13, 0.09), _strokes(noise, 8, 5200, 0.004, 0.010, size))
-    skin = mixed(skin, (0.10, 0.10, 0.32), 0.7 * _stamp(size, scene.seed) * ramp(-1.0, 0.6, fine))
+    skin = mixed(skin, (0.10, 0.10, 0.32), 0.7 * _stamp(size, scene.seed) * ramp(-1.0, 0.6, grain.fine))
     return mixed(skin, (0.28, 0.02, 0.02), 0.8 * ramp(1.2, 1.7, noise.octaves(9, 0.022, 6)))
+
+
+def _fat(grain: _Grain) -> Array32:
+    """Yellow fat with blood in it (H, W, 3)."""
+    fat = grain.coloured((0.74, 0.58, 0.38))
+    fat *= (1.0 + 0.16 * grain.noise.octaves(10, 0.005, 4) + 0.08 * grain.speckle)[..., None]
+    return mixed(fat, (0.55, 0.12, 0.09), 0.7 * ramp(0.5, 1.4, grain.noise.octaves(11, 0.006, 4)))
+
+
+def _muscle(grain: _Grain, fibres: Array32) -> Array32:
+    """Red muscle along its fibres (H, W), with tendons and fat (H, W, 3)."""
+    noise = grain.noise
+    muscle = grain.coloured((0.34, 0.065, 0.05))
+    muscle *= (1.0 + 0.34 * fibres + 0.18 * grain.fine + 0.08 * grain.speckle)[..., None]
+    muscle = mixed(muscle, (0.66, 0.50, 0.42), 0.65 * ramp(1.4, 2.2, noise.octaves(13, 0.0030, 3, 0.7, stretch=9.0)))
+    return mixed(muscle, (0.70, 0.56, 0.36), 0.8 * ramp(1.3, 1.8, noise.octaves(14, 0.008, 5, 0.7, stretch=2.0)))
+
+
+def _bone(grain: _Grain) -> Array32:
+    """Bone with blood on it and pores (H, W, 3)."""
+    bone = grain.coloured((0.66, 0.50, 0.36))
+    bone *= (1.0 + 0.10 * grain.fine + 0.07 * grain.speckle + 0.08 * grain.wobble)[..., None]
+    bone = mixed(bone, (0.45, 0.10, 0.08), 0.75 * ramp(0.3, 1.3, grain.noise.octaves(15, 0.007, 5)))
+    return mixed(bone, (0.20, 0.03, 0.03), 0.8 * ramp(1.4, 2.0, grain.noise.field(16, 0.0016)))
 
 
 def board_texture(scene: Scene, size: int) -> Texture:
@@ -225,6 +254,18 @@ def _stamp(size: int, seed: int) -> Array32:
     return _as_seen(canvas)
 
 
+_LABELS = (
+    ("SPINE LAB", 0.05, 0.10),
+    ("SPECIMEN {seed:04d}", 0.42, 0.07),
+    ("CRANIAL >", 0.74, 0.12),
+    ("< CAUDAL", 0.04, 0.90),
+    ("DO NOT MOVE", 0.36, 0.925),
+    ("OR-2  L/R", 0.68, 0.90),
+    ("THIS SIDE UP", 0.015, 0.40),
+    ("SN 30-15", 0.90, 0.66),
+)  # text, and column and row of its beginning as fractions of the board
+
+
 def _labels(size: int, extent_m: tuple[float, float], seed: int) -> tuple[Array32, Array32]:
     """Ink and paper (H, W), 0…1, of rulers along the board's rim and of labels."""
     ink, paper = np.zeros((size, size), dtype=np.uint8), np.zeros((size, size), dtype=np.uint8)
@@ -235,27 +276,8 @@ def _labels(size: int, extent_m: tuple[float, float], seed: int) -> tuple[Array3
         if mm % 10 == 0:
             _text(ink, str(mm // 10), (at / size - 0.006, 0.955), 0.010)
     rng = np.random.default_rng([seed, 5])
-    words = [
-        "SPINE LAB",
-        f"SPECIMEN {seed:04d}",
-        "CRANIAL >",
-        "< CAUDAL",
-        "DO NOT MOVE",
-        "OR-2  L/R",
-        "THIS SIDE UP",
-        "SN 30-15",
-    ]
-    places = [
-        (0.05, 0.10),
-        (0.42, 0.07),
-        (0.74, 0.12),
-        (0.04, 0.90),
-        (0.36, 0.925),
-        (0.68, 0.90),
-        (0.015, 0.40),
-        (0.90, 0.66),
-    ]
-    for word, (column, row) in zip(words, places, strict=True):
+    for text, column, row in _LABELS:
+        word = text.format(seed=seed)
         wide = 0.016 * len(word) + 0.02
         a = (round((column - 0.01) * size), round((row - 0.035) * size))
         b = (round((column - 0.01 + wide) * size), round((row + 0.018) * size))

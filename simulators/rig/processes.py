@@ -20,12 +20,10 @@ from simulators.faults import FaultPlan
 from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand.technician import MISHAP_EVERY, Hand
 from simulators.rig.world_server import World, WorldServer
-from simulators.scene.arm import ARM_MODEL
-from simulators.scene.world import SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
+from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
 from simulators.serve import SimulatorError, Termination, announce
-from simulators.ur_controller.kinematics import inverse as solve_joints
 
-_ELBOW_UP = np.array([1.4, -1.6, 1.9, -1.9, -1.57, 0.0])
+_LOAD_KG = 1.6  # camera, lens and mount
 _TAPE_SIGMA_M = 0.003  # accuracy with which a technician measures the scene's centre with a tape
 
 
@@ -36,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--image-width", type=int, default=1536, metavar="W", help="image width of the photographs")
     parser.add_argument("--speed-up", type=float, default=1.0, metavar="N", help="the arm takes 1/N of its time")
     parser.add_argument("--ct-voxel-mm", type=float, default=0.4, help="edge of the CT's voxels")
+    parser.add_argument("--arm", choices=ARMS, default=ARMS[0], help="model of the arm; each has its own stations")
     parser.add_argument("--version", default="5.12", help="of Polyscope")
     parser.add_argument(
         "--arms", type=int, choices=(1, 2), default=1, help="one arm that is moved, or one per station"
@@ -76,7 +75,7 @@ class _Rig:
         self.termination = termination
         self.folder: Path = args.dir.resolve()
         self.faults: FaultPlan = args.faults
-        scene = Scene.generate(args.scene)
+        scene = Scene.generate(args.scene, arm=args.arm)
         self.arms = () if args.hand else ("robot",) if args.arms == 1 else ("robot_1", "robot_2")
         self.children: dict[str, subprocess.Popen[str]] = {}
         self._words: dict[str, tuple[str, ...]] = {}  # command line with which each was started
@@ -110,8 +109,8 @@ class _Rig:
         hosts = self._hosts()
         for arm, host in zip(self.arms, hosts, strict=True):
             self._child(
-                arm, "ur", "--host", host, "--version", self.args.version, "--speed-up", str(self.args.speed_up),
-                f"--initial-joints={joints}", "--world", world, "--arm", arm,
+                arm, self.scene.arm.simulator, "--host", host, "--speed-up", str(self.args.speed_up),
+                f"--initial-joints={joints}", "--world", world, "--arm", arm, *self._model(),
             )  # fmt: skip
         camera = self._child(
             "camera", "camera", "--port", "0", "--world", world, "--image-width", str(self.args.image_width),
@@ -188,6 +187,12 @@ class _Rig:
         self._ready[name] = ready = _ready_line(process, name, self.folder)
         return ready
 
+    def _model(self) -> tuple[str, ...]:
+        """Options that only this kind of controller has."""
+        if self.scene.arm.simulator == "kuka":
+            return ("--model", self.scene.arm.name, "--true-load-kg", str(_LOAD_KG))
+        return ("--model", self.scene.arm.name, "--version", self.args.version)
+
     # --- what the service reads ---
 
     def _hosts(self) -> list[str]:
@@ -196,7 +201,8 @@ class _Rig:
         return [first, f"{stem}.{int(last) + 1}"][: len(self.arms)]
 
     def _rig_file(self, gphoto_port: str, hosts: list[str]) -> dict[str, Any]:
-        robots = {arm: {"driver": "ur", "host": host} for arm, host in zip(self.arms, hosts, strict=True)}
+        driver = {"ur": "ur", "kuka": "kuka_sunrise"}[self.scene.arm.simulator]
+        robots = {arm: {"driver": driver, "host": host} for arm, host in zip(self.arms, hosts, strict=True)}
         rig: dict[str, Any] = {
             "name": f"simulated rig, scene {self.scene.seed}",
             "simulated": True,
@@ -215,8 +221,8 @@ class _Rig:
             **rig,
             "stations": {name: self._station(i, name) for i, name in enumerate(STATIONS)},
             "T_flange_camera_nominal": nominal_hand_eye().tolist(),
-            "payload": {"mass_kg": 1.6, "centre_of_gravity_m": [0.0, 0.0, 0.08]},
-            "collision": {"arm": ARM_MODEL.name},
+            "payload": {"mass_kg": _LOAD_KG, "centre_of_gravity_m": [0.0, 0.0, 0.08]},
+            "collision": {"arm": self.scene.arm.name},
             "lens": self._lens(),
         }
 
@@ -253,7 +259,7 @@ class _Rig:
                 "scene": self.scene.seed,
                 "T_flange_camera": self.scene.T_flange_camera.tolist(),
                 "T_world_base": {name: T.tolist() for name, T in self.scene.T_world_base.items()},
-                "arm_dh_deltas": self.scene.arm.dh_deltas.tolist(),
+                "arm": {"model": self.scene.arm.name, **self.scene.arm.truth()},
                 "control_m": self.scene.control_m.tolist(),
                 "radius_m": self.scene.radius_m,
                 "intrinsics": self.scene.camera_intrinsics(self.args.image_width).to_json(),
@@ -311,7 +317,7 @@ def _start_joints(scene: Scene) -> Array:
     eye = SCENE_CENTRE_M + np.array([0.0, -0.1, 0.62])
     T_world_camera = look_at(eye, SCENE_CENTRE_M, np.array([0.0, 1.0, 0.0]))
     T_base_flange = inverse(scene.T_world_base[STATIONS[0]]) @ T_world_camera @ inverse(nominal_hand_eye())
-    q = solve_joints(ARM_MODEL, T_base_flange, _ELBOW_UP)
+    q = scene.arm.joints_for(T_base_flange)
     if q is None:
         raise SimulatorError("the arm does not reach the scene")
     return q

@@ -10,22 +10,22 @@ from functools import cached_property
 import numpy as np
 
 from simulators.geometry import Array, Ints, from_euler
-from simulators.scene.arm import ARM_MODEL, ArmErrors, perturbed_forward
+from simulators.scene.arm import ARM_MODEL, ArmErrors, SimulatedArm, UniversalRobot
 from simulators.scene.intrinsics import FULL_HEIGHT, FULL_WIDTH, Intrinsics
+from simulators.scene.lbr_arm import LBR_MODELS, Lbr, LbrErrors
 from simulators.scene.parts import Part, box, cylinder, joined, sphere_mesh
 from simulators.scene.specimen import Specimen
-from simulators.ur_controller.kinematics import forward
 
 RADIUS_M = 0.015
 BOARD_HALF_M = (0.235, 0.170)
 BOARD_THICKNESS_M = 0.018
 POST_RADIUS_M = 0.005
-REPEATABILITY_M = 0.02e-3
 BOARD_SQUARES = (24, 17)  # along the board's x and y
 BOARD_SQUARE_M = 0.015
 SCENE_CENTRE_M = np.array([0.0, 0.0, 0.05])
 STATIONS = ("station_1", "station_2")
 NOMINAL_LUX = 45_000.0
+ARMS = (ARM_MODEL.name, *sorted(LBR_MODELS))  # that a rig can hold
 
 Moved = tuple[tuple[int, float, float, float], ...]  # moved registration spheres: index and centre (m, world)
 
@@ -50,7 +50,7 @@ class Scene:
     control_m: Array  # (3, 3)
     foot_m: Array  # (10, 3) feet of the registration spheres' posts
     T_flange_camera: Array
-    arm: ArmErrors
+    arm: SimulatedArm
     T_world_base: dict[str, Array]
     lens: Intrinsics  # at full resolution
     lamp_m: Array
@@ -64,9 +64,16 @@ class Scene:
         return RADIUS_M
 
     @classmethod
-    def generate(cls, seed: int, moved: Moved = ()) -> Scene:
-        """Generate this seed's scene, identical on every machine and in every process, with some spheres moved."""
+    def generate(cls, seed: int, moved: Moved = (), arm: str = ARM_MODEL.name) -> Scene:
+        """Generate this seed's scene, identical on every machine and in every process, with some spheres moved.
+
+        Another arm stands at other stations; everything else of the scene is the same.
+        """
         scene = cls._as_set_up(seed)
+        if arm != ARM_MODEL.name:
+            rng = np.random.default_rng([seed, 0x1B2])
+            errors = LbrErrors.draw(rng)
+            scene = replace(scene, arm=Lbr(errors, LBR_MODELS[arm]), T_world_base=_lbr_bases(rng))
         for index, *centre in moved:
             scene = scene.with_sphere_at(int(index), np.array(centre))
         return scene
@@ -96,7 +103,7 @@ class Scene:
             control_m=control,
             foot_m=feet,
             T_flange_camera=T_flange_camera,
-            arm=_arm_errors(rng),
+            arm=UniversalRobot(ArmErrors.draw(rng)),
             T_world_base=_bases(rng),
             lens=_lens(rng),
             lamp_m=np.array([0.16, -0.24, 1.05]) + rng.uniform(-0.05, 0.05, 3),
@@ -141,19 +148,19 @@ class Scene:
         return self.lens.scaled(width)
 
     def nominal_flange(self, q: Array) -> Array:
-        """T_base_flange as the controller computes it from its encoders (6,), in radians."""
-        return forward(ARM_MODEL, q)
+        """T_base_flange as the controller computes it from its encoders (N,), in radians."""
+        return self.arm.reported(q)
 
     def true_flange(self, q: Array, station: str) -> Array:
-        """The true T_world_flange: perturbed kinematics plus 0.02 mm of repeatability."""
+        """The true T_world_flange: kinematics as built, and where the arm came to rest this time."""
         digest = hashlib.sha256(np.round(q, 5).tobytes() + str(self.seed).encode()).digest()
         noise = np.random.default_rng(int.from_bytes(digest[:8], "big")).standard_normal(3)
-        T_base_flange = perturbed_forward(q, self.arm)
-        T_base_flange[:3, 3] += REPEATABILITY_M / np.sqrt(3.0) * noise
+        T_base_flange = self.arm.true(q)
+        T_base_flange[:3, 3] += self.arm.repeatability_m / np.sqrt(3.0) * noise
         return self.T_world_base[station] @ T_base_flange
 
     def true_camera(self, q: Array, station: str) -> Array:
-        """The true T_world_camera at joints q (6,)."""
+        """The true T_world_camera at joints q (N,)."""
         return self.true_flange(q, station) @ self.T_flange_camera
 
     def board_placement(self, nth: int) -> Array:
@@ -228,32 +235,6 @@ def _control_spheres(rng: np.random.Generator, specimen: Specimen) -> Array:
     return np.stack(centres)
 
 
-def _arm_errors(rng: np.random.Generator) -> ArmErrors:
-    """As-built geometry (0.5 mm rms at the flange over the work space) plus gear errors (another 0.5 mm rms).
-
-    Hand-eye and base calibration absorb most of the former. The latter changes from viewpoint to viewpoint, so poses
-    of such an arm are good to about half a millimetre after any hand-eye calibration.
-    """
-    sigma = np.array([0.10e-3, 0.10e-3, np.radians(0.006), np.radians(0.022)])
-    drawn = ArmErrors(
-        dh_deltas=rng.standard_normal((6, 4)) * sigma,
-        wave_rad=np.radians(0.02) * rng.uniform(0.6, 1.0, 6),
-        wave_number=rng.integers(3, 9, 6).astype(np.float64),
-        wave_phase_rad=rng.uniform(0.0, 2 * np.pi, 6),
-    )
-    # Normalised, because a random draw could be a perfect or a broken arm.
-    geometry, gears = drawn.scaled(1.0, 0.0), drawn.scaled(0.0, 1.0)
-    return drawn.scaled(0.5e-3 / _rms_error_m(geometry), 0.5e-3 / _rms_error_m(gears))
-
-
-def _rms_error_m(errors: ArmErrors) -> float:
-    """RMS displacement of the flange over the work space of a capture, in metres."""
-    q = np.random.default_rng(1).uniform(-1.0, 1.0, (60, 6)) * [0.5, 0.35, 0.35, 0.4, 0.4, 1.0]
-    q += [1.57, -1.5, 1.9, -2.0, -1.57, 0.0]
-    shift = [perturbed_forward(row, errors)[:3, 3] - forward(ARM_MODEL, row)[:3, 3] for row in q]
-    return float(np.sqrt(np.mean(np.sum(np.square(shift), axis=1))))
-
-
 def _bases(rng: np.random.Generator) -> dict[str, Array]:
     """T_world_base of the two stations, on opposite sides of the table."""
     bases: dict[str, Array] = {}
@@ -261,6 +242,21 @@ def _bases(rng: np.random.Generator) -> dict[str, Array]:
         yaw = (0.0 if side < 0 else np.pi) + rng.uniform(-0.15, 0.15)
         angles = np.array([*rng.uniform(-0.004, 0.004, 2), yaw])
         position = [rng.uniform(-0.04, 0.04), side * rng.uniform(0.74, 0.80), rng.uniform(-0.10, -0.06)]
+        bases[name] = from_euler(angles, np.array(position))
+    return bases
+
+
+def _lbr_bases(rng: np.random.Generator) -> dict[str, Array]:
+    """T_world_base of the two stations of an LBR.
+
+    Its reach of 820 mm takes all of the paper's viewpoints only within a centimetre or two of this place: nearer, the
+    elbow cannot bend far enough, and farther, the arm is too short.
+    """
+    bases: dict[str, Array] = {}
+    for name, side in zip(STATIONS, (-1.0, 1.0), strict=True):
+        yaw = (np.pi / 2 if side < 0 else -np.pi / 2) + rng.uniform(-0.1, 0.1)
+        angles = np.array([*rng.uniform(-0.004, 0.004, 2), yaw])
+        position = [rng.uniform(-0.03, 0.03), side * rng.uniform(0.695, 0.703), rng.uniform(-0.009, -0.003)]
         bases[name] = from_euler(angles, np.array(position))
     return bases
 

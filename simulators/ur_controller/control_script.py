@@ -43,7 +43,7 @@ class ControlProgram:
         self._writes = self._operations = 0
         self._watchdog_s = 0.0  # longest time between two writes of the command register; 0: no watchdog
         self._told: set[int] = set()  # commands that were logged as having no effect
-        self._handlers = self._table()
+        self._handlers = {**self._moves(), **self._questions(), **self._settings()}
         self._progress(-1)
 
     # --- registers ---------------------------------------------------------------------------------------
@@ -126,7 +126,8 @@ class ControlProgram:
         except MotionError as error:
             raise StopProgram(str(error)) from error
 
-    def _table(self) -> dict[int, Callable[[], None]]:
+    def _moves(self) -> dict[int, Callable[[], None]]:
+        """Commands that move or stop the arm."""
         return {
             1: lambda: self._move_joints(self._vector(0)),
             2: lambda: self._move_joints(self._solve(self._vector(0), self._c.target_q)),
@@ -134,25 +135,28 @@ class ControlProgram:
             4: lambda: self._move_straight(self._forward(self._vector(0), self._c.tcp_pose_m)),
             9: lambda: self._speed(tool=False),
             10: lambda: self._speed(tool=True),
-            8: _nothing,  # the force is always zero
             11: lambda: self._servo(self._vector(0)),
             12: self._servo_along,
             15: self._stop_now,
             16: self._stop_now,
-            17: self._payload,
-            18: _nothing,  # nobody pushes the arm: it stays in place
-            19: _nothing,
             24: lambda: self._servo(self._solve(self._vector(0), self._c.target_q)),
+            31: self._stop_protectively,
+            33: self._stop_now,
+            34: self._stop_now,
+            41: self._jog,
+            42: lambda: self._decelerate(JOG_STOP_M_S2 / LEVER_M),
+            45: self._follow_path,
+            51: self._move_until_contact,
+        }
+
+    def _questions(self) -> dict[int, Callable[[], None]]:
+        """Commands whose answer is in the output registers."""
+        return {
             25: lambda: self._answer(False),  # there is never any contact
             26: lambda: self._out([self._c.step_s]),
             27: lambda: self._out(self._c.joints_ago(self._in_int(1))),
             28: lambda: self._out(self._c.target_tcp_pose),
-            29: lambda: self._c.set_tcp(self._vector(0)),
             30: lambda: self._out(self._solve(self._vector(0), self._vector(6))),
-            31: self._stop_protectively,
-            33: self._stop_now,
-            34: self._stop_now,
-            35: self._watch,
             36: lambda: self._answer(self._c.inverse(self._vector(0), self._c.target_q) is not None),
             37: lambda: self._answer(self._c.within_limits(self._vector(0))),
             38: lambda: self._no_numbers(6),
@@ -160,29 +164,36 @@ class ControlProgram:
                 kinematics.to_pose(kinematics.from_pose(self._vector(0)) @ kinematics.from_pose(self._vector(6)))
             ),
             40: lambda: self._out(self._c.tcp_pose_m),
-            41: self._jog,
-            42: lambda: self._decelerate(JOG_STOP_M_S2 / LEVER_M),
             43: lambda: self._out(self._c.tcp_pose),
             44: lambda: self._out(kinematics.to_pose(self._forward(self._vector(0), self._vector(6)))),
-            45: self._follow_path,
             46: lambda: self._out(self._solve(self._vector(0), self._c.target_q)),
             47: lambda: self._answer(self._c.steady),
-            51: self._move_until_contact,
-            52: _nothing,
-            53: _nothing,
             54: lambda: self._answer(False),
             58: lambda: self._out(kinematics.to_pose(self._c.T_base_flange)),
             60: lambda: self._answer(self._c.inverse(self._vector(0), self._c.target_q) is not None),
             61: lambda: self._answer(self._c.inverse(self._vector(0), self._vector(6)) is not None),
-            62: _nothing,
             63: lambda: self._answer(False),
             64: lambda: self._answer(False),
-            65: self._target_payload,
             67: lambda: self._no_numbers(36),
             68: lambda: self._no_numbers(6),
             69: lambda: self._out(self._c.target_qdd),
             70: lambda: self._matrix(self._c.jacobian(self._c.actual_q)),
             71: lambda: self._matrix(self._c.jacobian_rate()),
+        }
+
+    def _settings(self) -> dict[int, Callable[[], None]]:
+        """Commands that set something, or do nothing here, and the end of the script."""
+        return {
+            8: _nothing,  # the force is always zero
+            17: self._payload,
+            18: _nothing,  # nobody pushes the arm: it stays in place
+            19: _nothing,
+            29: lambda: self._c.set_tcp(self._vector(0)),
+            35: self._watch,
+            52: _nothing,
+            53: _nothing,
+            62: _nothing,
+            65: self._target_payload,
             255: self._end,
         }
 

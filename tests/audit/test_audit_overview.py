@@ -16,7 +16,7 @@ from service.core.records.events import FilesKept, StepStarted
 from service.store.records import NewArtefact
 from service.web.page.rendering import local_time
 from tests.support.pages.web import WebSite, web_site
-from tests.support.runs.reported_run import record_reported_run
+from tests.support.recorded.reported_run import record_reported_run
 
 
 @pytest.fixture

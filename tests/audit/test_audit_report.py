@@ -29,7 +29,7 @@ from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of
-from tests.support.runs.reported_run import record_reported_run
+from tests.support.recorded.reported_run import record_reported_run
 
 AT = datetime(2026, 11, 21, 11, 30, tzinfo=UTC)
 

@@ -99,7 +99,7 @@ def test_what_differs_is_named_and_measured(folder: Path, monkeypatch: pytest.Mo
 
 @pytest.fixture(scope="module")
 def referring(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same run, whose jobs refer to earlier answers."""
+    """The recorded run, with jobs that refer to earlier answers instead of copying them."""
     made = tmp_path_factory.mktemp("referring")
     record_run(made, version=2)
     return made

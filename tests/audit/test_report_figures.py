@@ -17,7 +17,7 @@ from service.audit.report.content import report_content
 from service.audit.report.output.html import render_html
 from service.cli.main import app
 from service.store.verification.verify import verify
-from tests.support.runs.reported_run import record_reported_run
+from tests.support.recorded.reported_run import record_reported_run
 
 _SVG = "{http://www.w3.org/2000/svg}"
 _LARGEST_BYTES = 3_000_000  # limit for a report sent by mail

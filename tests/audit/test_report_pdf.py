@@ -16,7 +16,7 @@ from service.audit.report.content import report_content
 from service.audit.report.output.pdf import render_pdf
 from service.store.verification.verify import verify
 from tests.support.pages.pdf_text import fonts_of, pages_of, reader_of, root_of, tags_of
-from tests.support.runs.reported_run import record_reported_run
+from tests.support.recorded.reported_run import record_reported_run
 
 AT = datetime(2026, 11, 21, 11, 30, 7, tzinfo=UTC)
 
@@ -40,7 +40,7 @@ def pdf(report: Report) -> bytes:
 
 @pytest.fixture
 def no_dejavu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a machine where DejaVu is not installed."""
+    """Hide DejaVu, as on a machine where it is not installed."""
     monkeypatch.setattr("service.audit.report.output.pdf._FONT_FOLDERS", ())
 
 

@@ -21,7 +21,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.home.time_charts import TimePoint, time_chart
 from tests.support.pages.web import WebSite, web_site
-from tests.support.runs.reported_run import record_reported_run
+from tests.support.recorded.reported_run import record_reported_run
 
 
 @dataclass(frozen=True)

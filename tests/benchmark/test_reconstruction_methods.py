@@ -29,7 +29,7 @@ from tests.support.scenes.posed import posed_data_set, scene
 
 COARSE = ChamferSettings(spacing_m=1e-3)
 PLACE = Place(Path("/d"), Path("/w"), Path("/c"), "python")
-TRIANGULATED = "python -m service.benchmark.triangulated /d /w/dense"
+TRIANGULATED = "python -m service.benchmark.programs.triangulated /d /w/dense"
 COMMANDS = {
     "colmap": [
         TRIANGULATED,
@@ -57,8 +57,8 @@ COMMANDS = {
         "python /c/gaussian_splatting/train.py -s /d -m /w/gaussians --iterations 7000",
         "python /c/train.py -s /d -c /w/gaussians -i 7000 -r density -o /w/sugar --eval False",
     ],
-    "stereo": ["python -m service.benchmark.stereo_program /d /w/mesh.ply"],
-    "gsplat": ["python -m service.benchmark.gaussians_program /d /w/mesh.ply"],
+    "stereo": ["python -m service.benchmark.programs.stereo /d /w/mesh.ply"],
+    "gsplat": ["python -m service.benchmark.programs.gaussians /d /w/mesh.ply"],
 }
 STAND_INS = ("colmap", "openmvs", "instant-ngp", "neus2", "sugar")
 PROGRAMS = ("colmap", "InterfaceCOLMAP", "DensifyPointCloud", "ReconstructMesh", "RefineMesh")

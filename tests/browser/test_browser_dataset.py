@@ -19,7 +19,7 @@ from tests.support.pages.browser import (
     screen,
     served,
 )
-from tests.support.runs.unpacked_run import unpack_recorded_run
+from tests.support.recorded.unpacked_run import unpack_recorded_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

@@ -20,13 +20,13 @@ from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
 from service.store.store import Store
+from tests.support.pages.at_the_table import STANDING, at_the_table, left_at, record
 from tests.support.pages.browser import TABLET, Screen, Served, screen, served
 from tests.support.pages.shown_site import skip
 from tests.support.pages.web import password_of, web_site
-from tests.support.runs.at_the_table import STANDING, at_the_table, left_at, record
+from tests.support.recorded.calibrated_run import RIG
 from tests.support.runs.attended import attended
 from tests.support.runs.bench_run import PROTOCOL
-from tests.support.runs.calibrated_run import RIG
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 BADGE = "0004711815"

@@ -13,7 +13,7 @@ from service.audit.report.content import report_content
 from service.audit.report.output.html import write_html
 from service.store.verification.verify import verify
 from tests.support.pages.browser import chromium
-from tests.support.runs.reported_run import record_reported_run
+from tests.support.recorded.reported_run import record_reported_run
 
 
 @pytest.fixture(scope="module")

@@ -28,8 +28,8 @@ from tests.support.pages.browser import (
     served,
 )
 from tests.support.processes.waiting import until
+from tests.support.protocols.short_protocol import short_protocol
 from tests.support.rig.rig import press_pedal, simulated_rig
-from tests.support.runs.short_protocol import short_protocol
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 

@@ -10,10 +10,10 @@ import pytest
 from playwright.sync_api import Browser, FloatRect, Page, expect
 
 from service.core.records.events import OperatorAction, StepFailed, StepStarted
+from tests.support.pages.at_the_table import at_the_table, record
 from tests.support.pages.browser import Served, screen, served
 from tests.support.pages.shown_site import skip
 from tests.support.pages.web import password_of, web_site
-from tests.support.runs.at_the_table import at_the_table, record
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

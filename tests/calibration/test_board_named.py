@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 from service.cli.main import app
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.board.images import find_boards
-from tests.support.scenes.board_folder import BoardFolder, board_folder
+from tests.support.boards.board_folder import BoardFolder, board_folder
 
 BOARD = Board(9, 6, 0.02)
 CHARUCO = Board(8, 5, 0.022, "charuco", 0.016, "DICT_4X4_100", legacy=True)

@@ -14,8 +14,8 @@ from service.compute.calibration.board.parts import find_part, with_parts
 from service.compute.calibration.board_poses.knowledge import BoardKnowledge
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
-from tests.support.scenes.board_bench import BOARD, LENS, Picture
-from tests.support.scenes.board_images import checkerboard, photograph
+from tests.support.boards.board_bench import BOARD, LENS, Picture
+from tests.support.boards.board_images import checkerboard, photograph
 
 KNOWN = BoardKnowledge(LENS, np.eye(4), np.eye(4), 1e-3 * np.eye(12), 0.005, 0.003, 8)
 SHADE = checkerboard(BOARD.columns, BOARD.rows, BOARD.square_m)

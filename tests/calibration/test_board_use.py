@@ -20,7 +20,7 @@ from service.web.record.board_images import board_uses
 from tests.support.pages.web import WebSite, web_site
 from tests.support.record.core import EYE
 from tests.support.record.store import enqueue
-from tests.support.runs.calibrated_run import PROTOCOL, RIG, begin_calibrated_run, capture
+from tests.support.recorded.calibrated_run import PROTOCOL, RIG, begin_calibrated_run, capture
 
 REASON = "no board of 16 × 23 inner corners in the image (searched at widths [1200, 1920])"
 

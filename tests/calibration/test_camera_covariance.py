@@ -19,7 +19,7 @@ from service.compute.poses.hybrid.rows import linearise
 from service.compute.poses.sfm.tracks import Tracks
 from service.core.errors import DataError
 from service.core.geometry import Array, align_points
-from tests.support.scenes.board_sessions import BOARD, CAMERA, T_FLANGE_CAMERA, locate, noisy_session
+from tests.support.boards.board_sessions import BOARD, CAMERA, T_FLANGE_CAMERA, locate, noisy_session
 from tests.support.scenes.tracked_scene import tracked_scene
 
 NAMES = ("fx", "fy", "cx", "cy")

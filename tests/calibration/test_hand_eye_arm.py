@@ -12,11 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from service.cli.compute.calibrate import calibrate_app
+from service.cli.calibrate.group import calibrate_app
 from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm.joint_file import read_joints_csv
 from service.compute.arm.kinematics import (
-    arm_model,
     chain,
     dh_jacobian,
     forward,
@@ -31,13 +30,15 @@ from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrat
 from service.compute.calibration.hand_eye.record import hand_eye_record, read_arm_correction
 from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.poses.files.pose_files import write_poses_csv
+from service.core.arms.known import arm_model
+from service.core.arms.model import ArmModel
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, inverse
 from simulators.scene.world import Scene
 from simulators.ur_controller.kinematics import MODELS
 from simulators.ur_controller.kinematics import forward as simulated_forward
-from tests.support.scenes.board_images import checkerboard, photograph
-from tests.support.scenes.board_sessions import (
+from tests.support.boards.board_images import checkerboard, photograph
+from tests.support.boards.board_sessions import (
     BOARD,
     T_FLANGE_CAMERA,
     OddScene,
@@ -62,14 +63,14 @@ def _solve(session: Session, *, bootstrap: int = 40) -> HandEyeResult:
     )
 
 
-def _with_joints(session: Session) -> HandEyeResult:
+def _with_joints(session: Session, arm: ArmModel = UR10E) -> HandEyeResult:
     return calibrate_hand_eye(
         HandEyeViews(
             session.T_base_flange,
             session.T_camera_board,
             corners=session.corners,
             joints_rad=session.joints_rad,
-            arm=UR10E,
+            arm=arm,
         ),
         bootstrap=20,
     )
@@ -166,6 +167,36 @@ def test_an_arm_that_errs_otherwise_still_gains() -> None:
     assert scene_error_mm(scene, views, poses @ result.corrected.T_flange_camera) < 0.7 * best
 
 
+def test_an_arm_of_seven_axes_with_errors_of_another_kind_gains_as_well() -> None:
+    """Its links are displaced in all directions, its gears have no whole waves, and its joints yield to gravity."""
+    scene = Scene.generate(7, arm="LBR Med 14")
+    shots = plan(scene, "exvivo_spine", "hand_eye")
+    session = board_session(scene, shots)
+    arm = matching_arm(session.joints_rad, session.T_base_flange)
+    assert arm is not None
+    assert arm.axes == 7
+    result = _with_joints(session, arm)
+    assert result.corrected is not None
+    record = json.loads(json.dumps(hand_eye_record(result, [f"{i}.jpg" for i in range(len(shots))])))
+    corrected = read_arm_correction(record["arm_correction"])
+    assert corrected.correction.dh_deltas.shape == (7, 4)
+    assert corrected.correction.observed.shape == (7,)
+    views = plan(scene, "exvivo_spine", "viewpoint_capture_1", "viewpoint_capture_2")[::2]
+    reported = np.array([scene.nominal_flange(shot.q) for shot in views])
+    poses = corrected.T_base_camera(np.array([shot.q for shot in views]), reported)
+    plain = min(scene_error_mm(scene, views, reported @ T) for T in result.methods.values())
+    assert scene_error_mm(scene, views, poses) < 0.3 * plain
+    repeatability_mm = 1e3 * scene.arm.repeatability_m / np.sqrt(3)
+    assert result.corrected.robot_noise_mm == pytest.approx(repeatability_mm, rel=0.4)
+
+
+def test_a_correction_of_seven_joints_does_not_fit_an_arm_of_six() -> None:
+    nothing = ArmCorrection("UR10e", np.zeros((7, 4)), np.zeros((7, 10)), np.zeros((7, 10)), np.zeros(7))
+    q = np.array([0.1, -1.5, 1.2, -1.0, -1.5, 0.3])
+    with pytest.raises(DataError, match="a correction of 7 joints for a UR10e"):
+        corrected_T_base_flange(q, forward(UR10E, q[None])[0], nothing)
+
+
 def test_no_correction_where_the_arm_has_only_noise() -> None:
     scene = Scene.generate(3)
     shots = plan(scene, "exvivo_spine", "hand_eye")
@@ -246,9 +277,11 @@ def test_an_empty_correction_changes_nothing(q: Array) -> None:
     [
         ("name,q1,q2,q3,q4,q5,q6\n", "first line"),
         ("image,q1,q2,q3,q4,q5,q6\na.jpg,90,0,0,0,0,0\n", "not a joint angle"),
-        ("image,q1,q2,q3,q4,q5,q6\na.jpg,0,0,0,0,0\n", "six finite"),
+        ("image,q1,q2,q3,q4,q5,q6\na.jpg,0,0,0,0,0\n", "not 6 finite"),
         ("image,q1,q2,q3,q4,q5,q6\na.jpg,0,0,0,0,0,x\n", "not a number"),
         ("image,q1,q2,q3,q4,q5,q6\nb.jpg,0,0,0,0,0,0\n", "no joints: a.jpg"),
+        ("image,q1,q3\na.jpg,0,0\n", "first line"),
+        ("image\na.jpg\n", "first line"),
     ],
 )
 def test_joint_files_that_are_wrong_are_refused(tmp_path: Path, text: str, what: str) -> None:

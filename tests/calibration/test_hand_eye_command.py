@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 from service.cli.main import app
 from service.compute.calibration.board.board import Board
 from service.core.geometry import Array, inverse
-from tests.support.scenes.board_folder import T_BASE_BOARD, T_FLANGE_CAMERA, BoardFolder, board_folder
+from tests.support.boards.board_folder import T_BASE_BOARD, T_FLANGE_CAMERA, BoardFolder, board_folder
 
 BOARD = Board(9, 6, 0.02)
 

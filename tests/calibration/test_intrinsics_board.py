@@ -12,7 +12,7 @@ from service.compute.calibration.board.board import Board, find_board
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, transform
-from tests.support.scenes.board_images import Photography, Shade, checkerboard, photograph, printed
+from tests.support.boards.board_images import Photography, Shade, checkerboard, photograph, printed
 
 CAMERA = CameraModel(1200, 800, 1680, 1682, 602.3, 401.7, -0.045, 0.03, 4e-4, -5e-4)
 CHECKERBOARD = Board(11, 8, 0.015)

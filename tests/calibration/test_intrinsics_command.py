@@ -24,7 +24,7 @@ from service.core.records.events import ViewpointCaptured
 from service.steps import params_models
 from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.context import StepContext
-from tests.support.scenes.board_images import checkerboard, photograph
+from tests.support.boards.board_images import checkerboard, photograph
 
 CAMERA = CameraModel(900, 600, 1260, 1261, 452.0, 301.0, -0.045, 0.03, 4e-4, -5e-4)
 BOARD = Board(9, 6, 0.02)
@@ -77,8 +77,8 @@ def test_a_folder_of_photographs_becomes_a_camera_that_every_command_reads(folde
     assert set(reasons) == {"empty.jpg", "larger.png"}
     assert "no board" in reasons["empty.jpg"]
     assert "1200 × 800" in reasons["larger.png"]
-    camera = read_camera_json(out, (900, 600))
-    assert camera.fx == record["fx"]
+    camera = read_camera_json(out)
+    assert (camera.width, camera.height, camera.fx) == (900, 600, record["fx"])
     for name in ("coverage.png", "residuals.png", "uncertainty.png"):
         with Image.open(report / name) as plot:
             assert plot.width > 800

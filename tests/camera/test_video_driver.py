@@ -145,6 +145,11 @@ def test_a_camera_that_dies_and_one_that_comes_back(pipe: Path, tmp_path: Path) 
     assert again.jpeg.sha256 in (tmp_path / "log2").read_text()
 
 
+def test_a_pipe_into_which_nobody_writes_is_unavailable(pipe: Path) -> None:
+    with pytest.raises(DeviceUnavailableError, match="Nobody writes"), opened(pipe, frame_timeout_s=0.5):
+        pass
+
+
 def test_damaged_images_are_not_used(tmp_path: Path) -> None:
     files = [jpeg(0), jpeg(1)[:-400], jpeg(2), jpeg(3, (80, 60))]
     with opened(recording(tmp_path / "a.mjpeg", *files)) as camera:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import pytest
 
 from service.core.errors import IntegrityError
@@ -19,6 +21,7 @@ from service.core.records.events import (
     StepRetried,
     StepStarted,
     ViewpointFailed,
+    site,
 )
 from service.core.run.decide import (
     Accept,
@@ -31,6 +34,7 @@ from service.core.run.decide import (
     fold,
     initial_state,
 )
+from service.core.run.fold import RUN_EVENTS, kind_of
 from tests.support.record.core import GOOD, TOY, Log, captured, toy_protocol
 from tests.support.record.core_log import at_capture, at_scan, failure, refused
 from tests.support.record.counting import calls_of
@@ -221,3 +225,10 @@ def test_questions_are_values() -> None:
     log = Log()
     assert isinstance(log.decision, AskOperator)
     assert log.decision == decide(log.protocol, fold(log.protocol, log.events))
+
+
+def test_every_kind_of_event_is_folded_unless_it_belongs_to_the_sites_chain() -> None:
+    """So neither the state of a run nor the auditor's digest of it misses a kind that is added later."""
+    recorded = get_args(get_args(Payload)[0]) or get_args(Payload)
+    left = {payload.__module__ for payload in recorded if kind_of(payload) not in RUN_EVENTS}
+    assert left == {site.__name__}

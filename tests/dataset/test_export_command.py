@@ -20,15 +20,15 @@ from service.compute.pixels.masks import Ball, marker_mask
 from service.core.geometry import apply, increment, inverse
 from service.core.records.events import EvidenceExported, RunCompleted, RunReleased
 from service.core.units import metres
-from service.dataset.posed.of_run import control_spheres, data_set_of, specimen_pixels, upwards
+from service.dataset.posed.of_run.data_set import control_spheres, data_set_of, specimen_pixels, upwards
+from service.dataset.posed.of_run.view_covariances import pose_covariance
 from service.dataset.posed.records import Mesh
-from service.dataset.posed.view_covariances import pose_covariance
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.store import tamper
+from tests.support.recorded.reported_run import record_reported_run
+from tests.support.recorded.unpacked_run import unpack_recorded_run
 from tests.support.runs.bench_run import record_runs
-from tests.support.runs.reported_run import record_reported_run
-from tests.support.runs.unpacked_run import unpack_recorded_run
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -191,6 +191,7 @@ def test_what_the_options_state_stands_in_the_metadata(recorded: Path, tmp_path:
         (("--format", "nonsense"), "there is no format 'nonsense'"),
         (("--format", "gltf", "--crop", "wide"), "'wide' is not a size"),
         (("--format", "gltf", "--crop", "99999x10"), "does not fit"),
+        (("--format", "gltf", "--crops", "2"), "1920 × 1080 px does not fit"),
     ],
 )
 def test_what_cannot_be_is_refused(recorded: Path, tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:

@@ -15,16 +15,16 @@ from service.audit.report.output.html import render_html
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array
 from service.core.run.state import RunState
-from service.dataset.posed.of_run import data_set_of
+from service.dataset.posed.of_run.data_set import data_set_of
+from service.dataset.posed.of_run.view_covariances import pose_covariance
 from service.dataset.posed.records import DataSet
-from service.dataset.posed.view_covariances import pose_covariance
 from service.dataset.registrations import own_registration, registrations, signed_rows
 from service.run_record import RunRecord
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.record.known_spheres import best_registration, scan_spheres
 from service.web.scene.data import scene_of
-from tests.support.runs.unpacked_run import unpack_recorded_run
+from tests.support.recorded.unpacked_run import unpack_recorded_run
 
 pytestmark = pytest.mark.timeout(300)
 

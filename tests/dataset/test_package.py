@@ -46,6 +46,7 @@ ABOUT = About(
     budget=ErrorBudget(
         contributions=(Contribution(name="scan", sigma_mm=0.05, how="stated", counted=True),), total_mm=0.0513
     ),
+    fusion=(("Wound", "proposed, then corrected: CT by Grace"),),
     deviations=("the scan was repeated",),
 )
 
@@ -151,7 +152,12 @@ def test_the_card_tells_what_people_ask(exported: Path) -> None:
         *("# A lumbar spine", "SIMULATED", "1.2.0", "A. Name, A hospital"),
         *(STATED.licence, STATED.ethics, STATED.cite),
         *("ILCE-7RM5", "4711", "f/22", "L1 to L5", "0.012 mm", "| scan | 0.0500 | stated |", "| sum | 0.0513 |"),
-        *("the scan was repeated", "T_world_camera", "Lengths are metres"),
+        *(
+            "**Wound**: proposed, then corrected: CT by Grace",
+            "the scan was repeated",
+            "T_world_camera",
+            "Lengths are metres",
+        ),
     ):
         assert words in text, words
     for name in listed(exported):

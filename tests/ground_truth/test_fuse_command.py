@@ -82,6 +82,18 @@ def test_a_sphere_that_moved_in_transport_fails_the_gate_by_name_of_its_distance
     assert (tmp_path / "truth.ply").is_file()
 
 
+def test_a_sphere_that_the_scan_lacks_is_cut_out_of_the_ct(tmp_path: Path) -> None:
+    taken_m = np.array([0.018, 0.012, 0.0360])  # on the specimen, as a control sphere
+    done = run(tmp_path, np.vstack([CENTRES_M, taken_m]), "--json")
+    assert done.exit_code == 0, done.output
+    record = json.loads(done.stdout)
+    assert (record["spheres"], record["taken_away"]) == (5, 1)
+    p = np.asarray(trimesh.load_mesh(tmp_path / "truth.ply", process=False).vertices, dtype=np.float64)
+    above = p[np.linalg.norm(p - taken_m, axis=1) < RADIUS_M + 0.0008]
+    assert len(above) > 20  # the scan's surface, which the sphere nearly touched
+    assert above[:, 2] == pytest.approx(height(above[:, 0], above[:, 1]), abs=1e-4)
+
+
 def test_a_wrong_radius_is_told(tmp_path: Path) -> None:
     done = run(tmp_path, CENTRES_M, "--radius-mm", "9", "--json")
     assert done.exit_code == 1

@@ -22,8 +22,9 @@ from service.core.geometry import inverse, transform
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import RegionDrawn
 from service.core.run.state import RunState
-from service.dataset.preview.fusion import recorded_fusion
+from service.dataset.posed.of_run.about_run import about_run
 from service.dataset.preview.surfaces import Simplified, fused_mesh, shown_distances
+from service.dataset.recorded_fusion import recorded_fusion
 from service.dataset.summary import summarise
 from service.steps import params_models
 from service.store.store import Store
@@ -31,9 +32,9 @@ from service.worker.job import JobContext
 from service.worker.loop import HANDLERS, work
 from tests.ground_truth.test_fuse_command import CENTRES_M, RADIUS_M, T_WORLD_CT, with_spheres
 from tests.ground_truth.test_fusion import ct_mesh, height, scan_mesh
+from tests.support.recorded.registration_record import registration_record
 from tests.support.rig.bench_rig import BenchRig, ScriptedOperator, answer
 from tests.support.runs.bench_run import Bench, begin_run
-from tests.support.runs.registration_record import registration_record
 
 TAKEN_M = np.array([0.018, 0.012, 0.0360])  # a control sphere on the specimen, which the scan does not show
 PROTOCOL = """\
@@ -159,6 +160,10 @@ def test_the_screen_shows_sources_and_sigmas_and_the_recorded_distances(bench: B
     summary = summarise(bench.store, bench.run_id, loaded.protocol)
     fusion = recorded_fusion(summary)
     assert fusion is not None
+    exported = summary.ground_truth()
+    assert exported.source is not None
+    assert np.array_equal(exported.source, columns["source"])
+    assert exported.sigma_m == pytest.approx(1e-3 * columns["sigma_mm"], rel=1e-6)
     mesh = Simplified(points, read_ply(bench.store.artefact_path(fusion.files["ground_truth_mesh"].sha256))[1])
     truth, measures = fused_mesh(tmp_path, summary, fusion, mesh), state.steps["ground_truth"].measures
     assert (truth.ct_share, truth.sigma_median_mm) == (measures["ct_share"], measures["sigma_median_mm"])
@@ -173,6 +178,10 @@ def test_the_screen_shows_sources_and_sigmas_and_the_recorded_distances(bench: B
     assert unpacked(sigmas["intensity"]) == pytest.approx(
         np.minimum(columns["sigma_mm"], truth.sigma_high_mm), rel=1e-6
     )
+    card = dict(about_run(summary, "spheres").fusion)
+    assert f"{measures['chamfer_ct_scan_mm']:.3f} mm" in card["Chamfer distance of CT and scan"]
+    assert "0.5 mm" in card["Chamfer distance of CT and scan"]
+    assert card["Wound"] == "proposed, then corrected: CT by protocol truth 1"
     distances = shown_distances(tmp_path, summary, fusion)
     recorded = ("chamfer_ct_scan_mm", "ct_to_scan_mm", "scan_to_ct_median_mm", "spheres_rms_mm")
     told = (distances.chamfer_mm, distances.ct_to_scan_mm, distances.scan_to_ct_median_mm, distances.spheres_rms_mm)
@@ -201,6 +210,10 @@ def test_a_region_that_a_person_drew_is_used_with_the_name(bench: Bench) -> None
     state, columns, points = fused(bench)
     regions = state.steps["ground_truth"].result["details"]["regions"]
     assert [(r["by"], r["frame"]) for r in regions] == [("protocol truth 1", "scan"), ("grace", "scan")]
+    loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="truth.yaml")
+    summary = summarise(bench.store, bench.run_id, loaded.protocol)
+    told = [dict(about_run(summary, "", personal=personal).fusion)["Wound"] for personal in (True, False)]
+    assert [("by grace" in words, "who is not named" in words) for words in told] == [(True, False), (False, True)]
     within = np.all(np.abs(points[:, :2] - [-0.019, 0.015]) < 0.0028, axis=1) & (points[:, 2] > 0.02)
     assert within.any()
     assert np.all(columns["source"][within] == 0)

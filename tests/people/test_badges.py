@@ -18,9 +18,9 @@ from service.rig import load_rig
 from service.store.database.engine import database_path
 from service.store.records import SITE
 from service.store.verification.verify import verify
+from tests.support.pages.at_the_table import left_at
 from tests.support.pages.web import PIN, Browser, WebSite, password_of, web_site
 from tests.support.processes.waiting import until
-from tests.support.runs.at_the_table import left_at
 from tests.support.runs.bench_run import PROTOCOL, Bench
 
 BADGE = "0004711815"

@@ -16,7 +16,7 @@ from service.cli.main import app
 from service.compute.calibration.board.board import Board
 from service.compute.images.folder import image_folder
 from service.core.errors import DataError
-from tests.support.scenes.board_folder import CAMERA, BoardFolder, board_folder
+from tests.support.boards.board_folder import CAMERA, BoardFolder, board_folder
 
 BOARD = Board(9, 6, 0.02)
 

@@ -24,12 +24,12 @@ from service.core.protocol.models import load_protocol
 from service.core.records.events import OperatorAction, RunStarted, ViewImported, ViewpointCaptured
 from service.core.records.import_list import FileRole, PhotographRole
 from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_run import data_set_of
+from service.dataset.posed.of_run.data_set import data_set_of
 from service.dataset.summary import summarise
 from service.import_folder import find_places, import_rig, list_import
 from service.run_start import recorded_rig, recorded_run, start_run
 from service.steps import params_models
-from service.steps.kinds.image_import import StatedSettings, settings_agree
+from service.steps.kinds.imports.image_import import StatedSettings, settings_agree
 from service.store.database.engine import database_path
 from service.store.store import Store
 from service.store.verification.verify import verify

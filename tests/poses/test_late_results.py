@@ -56,9 +56,9 @@ from service.store.verification.verify import verify
 from tests.support.pages.web import web_site
 from tests.support.processes.waiting import until
 from tests.support.record.store import enqueue, rows
+from tests.support.recorded.registration_record import registration_record
+from tests.support.recorded.reported_run import evaluation
 from tests.support.rig.rig import REPOSITORY, command, orthocapture
-from tests.support.runs.registration_record import registration_record
-from tests.support.runs.reported_run import evaluation
 
 PROTOCOL = """\
 id: later
@@ -186,10 +186,10 @@ def test_the_first_page_shows_what_came_and_what_is_still_to_come(run: Run, tmp_
             return browser.get(f"/audit/runs/{run.run_id}").text
 
         until(lambda: "colmap: arrived 12 min after the release" in page(), "nothing is said of what came")
-        assert "COLMAP from nothing: waits for a worker, then about" in page()
+        assert "COLMAP from scratch: waits for a worker, then about" in page()
         job = run.store.claim_job("worker", 60.0)
         assert job is not None
-        assert "COLMAP from nothing: still computing, about" in page()
+        assert "COLMAP from scratch: still computing, about" in page()
 
 
 def test_an_aborted_run_waits_for_nothing(run: Run) -> None:
@@ -215,14 +215,14 @@ def test_the_report_the_data_set_and_the_bundle_tell_the_same(run: Run, tmp_path
         readme, report = bundle.read("README.txt").decode(), bundle.read("report.html").decode()
         crate = json.loads(bundle.read("ro-crate-metadata.json"))
     assert "NOT IN YET" in readme
-    assert "  - COLMAP from nothing: was still being computed\n" in readme
+    assert "  - COLMAP from scratch: was still being computed\n" in readme
     dataset = next(item for item in crate["@graph"] if item["@id"] == "./")
     assert "Not in when this was made: " in dataset["description"]
     for told in (
         "Results that arrived later",
         "colmap: arrived 12 min after the release",
         "What was judged and signed is robot",
-        "COLMAP from nothing: was still being computed",
+        "COLMAP from scratch: was still being computed",
         "triangulated and colmap come from the same features and matches",
     ):
         assert told in report

@@ -32,8 +32,8 @@ from service.store.verification.verify import verify
 from service.web.record.known_spheres import best_registration as shown_registration
 from service.worker.loop import work
 from tests.support.record.store import enqueue
+from tests.support.recorded.registration_record import registration_record
 from tests.support.runs.recorded_run import record_run
-from tests.support.runs.registration_record import registration_record
 
 DEMO = Path(__file__).parents[2] / "protocols" / "demo.yaml"
 CAMERA = {

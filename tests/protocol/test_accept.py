@@ -8,20 +8,13 @@ import os
 import pty
 import re
 import select
-import subprocess
-import sys
 import termios
-from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 from typer.testing import CliRunner, Result
 
-from service.audit.bundle.export import export_bundle
-from service.audit.record.run import read_run
-from service.audit.report.content import report_content
-from service.audit.report.output.html import render_html
 from service.cli.main import app
 from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.operators import Display, TerminalOperator
@@ -29,25 +22,22 @@ from service.core.errors import ProtocolError
 from service.core.gates.dependence import dependent_steps, depends_on
 from service.core.protocol.models import load_protocol
 from service.core.protocol.rules import NEVER_ACCEPTED
-from service.core.records.events import ActionRefused, OperatorAction, RunCompleted
+from service.core.records.events import ActionRefused, OperatorAction
 from service.core.run.actions import allowed_actions, unmet_requirements
 from service.core.run.decide import AskOperator
 from service.core.run.fold import fold
 from service.core.run.state import RunState
-from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_run import data_set_of
 from service.monitor.devices import OpenDevices
 from service.monitor.reporter import Reporter
 from service.people.sessions import People
 from service.runner.operator import AnswerBy
 from service.steps import params_models
 from service.store.store import Store
-from service.store.verification.verify import verify
-from tests.support.pages.web import WebSite, password_of, web_site
+from tests.support.pages.web import WebSite, password_of
 from tests.support.record.core import TOY, Log, load, toy_protocol
+from tests.support.recorded.reported_run import record_reported_run
 from tests.support.rig.bench_rig import BenchRig
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
-from tests.support.runs.reported_run import record_reported_run
 
 ROOT = Path(__file__).parents[2]
 TOY_ACCEPTING = TOY.replace("min: 3, unit: views}", "min: 3, unit: views, accept_by: supervisor}").replace(
@@ -207,12 +197,6 @@ def test_later_steps_that_use_it_depend_on_it() -> None:
 # --- on the screen ---------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def web(tmp_path: Path) -> Generator[WebSite]:
-    with web_site(tmp_path) as site:
-        yield site
-
-
 def failed_capture(web: WebSite) -> Bench:
     """A run whose capture waits for a decision on its screen; it has 4 of 5 views."""
     bench = web.begin_run(ACCEPTING)
@@ -349,50 +333,6 @@ def test_without_accounts_a_name_is_a_claim_and_the_record_says_so(tmp_path: Pat
 
 def bench_text(folder: Path, run: str) -> str:
     return str(json.loads(invoke("status", run, "--data", folder / "data", "--json").stdout)["deviations"])
-
-
-# --- every reader is told -------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def accepted_run(tmp_path: Path) -> tuple[Path, str]:
-    """A completed, registered run whose evaluation was accepted at 0.9 mm."""
-    return tmp_path, record_reported_run(tmp_path, error_mm=0.9, registered=True, accepted_by="Emmy")
-
-
-def test_report_data_set_and_bundle_say_it(accepted_run: tuple[Path, str]) -> None:
-    folder, run_id = accepted_run
-    data = folder / "data"
-    run = read_run(data, run_id)
-    assert any(isinstance(event.payload, RunCompleted) for event in run.events)
-    text = "0.9 mm, allowed ≤ 0.35; accepted by Emmy (supervisor): the pilot does not need it"
-    shown = render_html(report_content(run, verify(data, run_id), with_scene=False, with_pictures=False))
-    plain = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", shown))
-    assert plain.index("gate accepted") < plain.index("redo")  # listed first among the deviations
-    assert plain.count("Depends on an accepted gate: Evaluate: best_mean_radial_error_mm " + text) >= 2
-    write_data_set(data_set_of(run.summary()), exporter("plain"), folder / "dataset")
-    described = json.loads((folder / "dataset" / "dataset.json").read_text())
-    assert described["accepted_gates"] == [f"Evaluate: best_mean_radial_error_mm {text}"]
-    with Store.open(data) as store:
-        bundle = export_bundle(store, run_id, folder / "bundle.zip", actor="Emmy", hashes_only=True).path
-    verifier = ROOT / "service" / "audit" / "verify" / "bundle_verifier.py"
-    done = subprocess.run([sys.executable, verifier, bundle], capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "evaluation counts as passed with figures outside their limits, as Emmy (supervisor)" in done.stdout
-
-
-def test_the_auditor_reads_it_first(web: WebSite) -> None:
-    run_id = record_reported_run(web.folder, error_mm=0.9, accepted_by="emmy", person="grace")
-    auditor = web.browser("auditor")
-    assert auditor.get(f"/audit/runs/{run_id}").status_code == 200
-    page = ""
-    while "Gate accepted" not in page:  # the digest is computed in the background
-        page = auditor.get(f"/audit/runs/{run_id}").text
-    first = re.search(r'<table class="table deviations">.*?<tbody>\s*<tr>(.*?)</tr>', page, re.DOTALL)
-    assert first is not None
-    assert "Gate accepted outside its limits" in first[1]
-    signed = auditor.get(f"/audit/runs/{run_id}/signatures").text
-    assert "accepted outside its limits: the pilot does not need it" in signed
 
 
 class Typed:

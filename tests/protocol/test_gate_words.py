@@ -20,13 +20,13 @@ from service.cli.main import app
 from service.core.gates.verdict import describe, describe_judged, figure, quantity, standing
 from service.core.records.events import GateVerdict, Uncertainty
 from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.of_run import data_set_of
+from service.dataset.posed.of_run.data_set import data_set_of
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import WebSite, web_site
 from tests.support.processes.waiting import until
-from tests.support.runs.calibrated_run import begin_calibrated_run
-from tests.support.runs.reported_run import record_reported_run
+from tests.support.recorded.calibrated_run import begin_calibrated_run
+from tests.support.recorded.reported_run import record_reported_run
 
 BOUNDED = "0.340 mm, 0.300 to 0.380"
 

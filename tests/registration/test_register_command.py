@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import shutil
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from service.core.geometry import apply, inverse
 from simulators.scan_station.formats import encode
 from simulators.scan_station.station import scan_scene
 from simulators.scene.world import RADIUS_M, Scene
+from tests.support.grounded_weights import tiny_weights
 from tests.support.scenes.colmap_model import write_colmap_text
 from tests.support.scenes.scene_photographs import photograph, pose_above
 
@@ -319,3 +322,21 @@ def test_the_papers_detector_takes_the_boxes_of_another(capture: Capture, few: P
     assert "other.jpg" in register(capture, tmp_path / "out.json", images=few, detector="paper", boxes=boxes).output
     assert "paper" in register(capture, tmp_path / "out.json", images=few, boxes=boxes).output
     assert "mauve" in register(capture, tmp_path / "out.json", images=few, sphere_colour="mauve").output
+
+
+def test_grounded_and_vote_record_the_hashes_of_their_weights(
+    capture: Capture, few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("ORTHOCAPTURE_GROUNDED", raising=False)
+    without = register(capture, tmp_path / "out.json", images=few, detector="grounded")
+    assert without.exit_code != 0
+    assert "grounding-dino" in without.output
+    importlib.import_module("torch").set_num_threads(1)
+    weights = tiny_weights(tmp_path / "weights")
+    # Random networks find no sphere for certain, so that the classical detector's clear outlines are what is left.
+    out = tmp_path / "out.json"
+    found = registered(register(capture, out, images=few, detector="vote", weights=weights), out)
+    assert found["detector"]["name"] == "vote"
+    model = weights / "sam2" / "model.safetensors"
+    assert found["detector"]["weights_sha256"]["sam2/model.safetensors"] == sha256(model.read_bytes()).hexdigest()
+    assert found["search"]["images_searched"] == 3

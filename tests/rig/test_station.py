@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import DeviceError, DeviceUnavailableError
+from drivers.host.device_lock import DeviceLock
 from drivers.interfaces import DeviceReport
 from service.core.errors import ConfigurationError
 from service.rig import load_rig
@@ -145,3 +146,28 @@ def test_an_arm_is_driven_by_one_process_whatever_rig_file_names_it(tmp_path: Pa
             with pytest.raises(DeviceError) as refused:
                 station.robot("station_1")
             assert "another process" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("device", "known"),
+    [
+        ("{driver: lightbox, port: /dev/../LINE-BY-ID}", "lightbox LINE"),
+        ("{driver: lightbox, port: link/line}", "lightbox LINE"),
+        ("{driver: ur, host: localhost}", "ur 127.0.0.1"),
+    ],
+)
+def test_another_name_of_a_device_is_the_same_device(tmp_path: Path, device: str, known: str) -> None:
+    line = tmp_path / "line"
+    line.touch()
+    (tmp_path / "by-id").symlink_to(line)
+    (tmp_path / "link").symlink_to(tmp_path)
+    text = RIG.replace("{driver: ur, host: 127.0.0.9}", device.replace("LINE-BY-ID", f"..{tmp_path}/by-id"))
+    lock = DeviceLock.take(known.replace("LINE", str(line.resolve())), "elsewhere")
+    try:
+        with (
+            station_of(tmp_path, text) as (station, _),
+            pytest.raises(DeviceUnavailableError, match="another process drives this device"),
+        ):
+            station.device("arm")
+    finally:
+        lock.release()

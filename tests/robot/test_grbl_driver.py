@@ -129,18 +129,19 @@ def test_an_alarm_latches_and_only_a_persons_confirmation_leads_to_homing(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("kind", "error", "words"),
+    ("kind", "value", "error", "words"),
     [
-        ("reset_button", SafetyStopError, "was in"),
-        ("door", SafetyStopError, "safeguard"),
+        ("reset_button", 0, SafetyStopError, "was in"),
+        ("door", 0.3, SafetyStopError, "safeguard"),
+        ("door", 1e-6, SafetyStopError, "safeguard"),  # closed again before the next report
         # What the driver sees first: the axes stand, or a piece of the motion that came too late is refused.
-        ("hold_button", LeaveNeededError, "stopped the axes|refused a part"),
+        ("hold_button", 0, LeaveNeededError, "stopped the axes|refused a part"),
     ],
 )
 def test_whatever_interrupts_a_motion_waits_for_a_person(
-    tmp_path: Path, kind: str, error: type[Exception], words: str
+    tmp_path: Path, kind: str, value: float, error: type[Exception], words: str
 ) -> None:
-    with table(tmp_path, *fault(on="jog", kind=kind, nth=8, value=0.3)) as port, opened(port) as arm:
+    with table(tmp_path, *fault(on="jog", kind=kind, nth=8, value=value)) as port, opened(port) as arm:
         let_move(arm)
         with pytest.raises(error, match=words):
             travel(arm, -500)

@@ -80,6 +80,11 @@ def test_the_driver_reads_every_line_of_the_transcript_and_writes_its_jog() -> N
         (b"error:20", Refused(20)),
         (b"<Idle|MPos:1.0", None),
         (b"\xff\x00garbage", None),
+        (b"error:" + b"9" * 5000, None),
+        (b"ALARM:" + b"1" * 5000, None),
+        (b"$" + b"1" * 5000 + b"=1", None),
+        (b"$110=" + b"9" * 400, None),
+        (b"<Idle|MPos:" + b"9" * 400 + b",0,0|FS:0,0>", Status("Idle", 0, None, None, None, None)),
     ],
 )
 def test_lines_and_what_they_say(line: bytes, message: object) -> None:

@@ -1,4 +1,4 @@
-"""Both ends of the KUKA wire against golden transcripts that neither was made from (docs/kuka.md)."""
+"""Both ends of the KUKA wire against golden transcripts that neither was made from (docs/reference)."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from drivers.kuka import DRIVER, KukaConfig
 from drivers.kuka.wire import WireError, from_abc, hello_of, parse, state_of, to_abc
 from service.core.geometry import transform
 from tests.support.processes.waiting import until
-from tests.support.rig.kuka_simulator import agrees, simulated_kuka, transcript
+from tests.support.rig.kuka_simulator import Controller, agrees, simulated_kuka, transcript
+from tests.support.rig.sunrise import sunrise_engine
 from tests.support.rig.ur_simulator import address
 
 
 @pytest.mark.parametrize("name", ["session.jsonl", "refusals.jsonl"])
-def test_the_simulator_answers_as_the_transcript(name: str) -> None:
+@pytest.mark.parametrize("controller", [simulated_kuka, sunrise_engine])
+def test_simulator_and_application_answer_as_the_transcript(controller: Controller, name: str) -> None:
     host = address(70)
     with (
-        simulated_kuka(host),
+        controller(host),
         socket.create_connection((host, 30010), timeout=30) as connection,
         connection.makefile("rb") as lines,
     ):
@@ -37,6 +39,21 @@ def test_the_simulator_answers_as_the_transcript(name: str) -> None:
             while line["is"] == "state" != row["line"]["is"]:
                 line = json.loads(lines.readline())
             assert agrees(line, row["line"]), (line, row["line"])
+
+
+@pytest.mark.parametrize("controller", [simulated_kuka, sunrise_engine])
+def test_a_client_that_stays_silent_gives_way_to_a_new_one(controller: Controller) -> None:
+    host = address(70)
+    said: list[str] = []
+
+    def second_is_greeted() -> bool:
+        with socket.create_connection((host, 30010), timeout=30) as second, second.makefile("rb") as lines:
+            said.append(json.loads(lines.readline()).get("code", "hello"))
+        return said[-1] == "hello"
+
+    with controller(host), socket.create_connection((host, 30010), timeout=30):
+        until(second_is_greeted, "the first client stays", 60)
+    assert said[0] == "taken"
 
 
 class _Golden(threading.Thread):
@@ -106,6 +123,10 @@ def test_a_line_that_the_protocol_does_not_know_is_refused() -> None:
     whole = {**state, "n": 1, "time_s": 1.0, "flange_xyz_m": [0, 0, 1], "flange_abc_rad": [0, 0, 0]}
     assert state_of(whole).safety.may_move
     assert not state_of({**whole, "safety": "something new"}).safety.may_move
+    large, text, flags = [10**400] * 7, ["1"] * 7, [True] * 7
+    for name, value in (("q", large), ("q", text), ("q", flags), ("time_s", 10**400), ("override", "0x1")):
+        with pytest.raises(WireError, match=name):
+            state_of({**whole, name: value})
     for name, value in (("q", [0.0] * 6), ("locked", 0), ("time_s", float("nan")), ("motion", True), ("mode", None)):
         with pytest.raises(WireError, match=name):
             state_of({**whole, name: value})

@@ -22,8 +22,8 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.launch import Launcher
 from tests.support.processes.waiting import until
+from tests.support.protocols.short_protocol import short_protocol
 from tests.support.rig.rig import press_pedal, simulated_rig
-from tests.support.runs.short_protocol import short_protocol
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

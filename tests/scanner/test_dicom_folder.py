@@ -5,19 +5,17 @@ from __future__ import annotations
 import base64
 import resource
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pydicom.data
 import pytest
 import trimesh
-from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
+from pydicom.dataset import Dataset
 from pydicom.encaps import encapsulate
 from pydicom.pixels.decoders.base import get_decoder
 from pydicom.uid import (
     UID,
-    CTImageStorage,
     ExplicitVRLittleEndian,
     ImplicitVRLittleEndian,
     JPEGLosslessSV1,
@@ -29,67 +27,14 @@ from scipy.spatial.transform import Rotation
 from drivers.dicom_folder import DRIVER, DicomFolder, DicomFolderConfig
 from drivers.errors import DeviceUnavailableError, UnreadableFileError
 from drivers.interfaces import Array, CtSeries
+from tests.support.scenes.ct_series import SHAPE, SPACING_MM, Change, pixels, write_series
 
 # Only files in the package itself; get_testdata_file would look for others on the network.
 SHIPPED = Path(pydicom.data.__file__).parent / "test_files"
-Change = Callable[[Dataset, int], None]
-SHAPE = (5, 6, 8)  # K, J, I
-SPACING_MM = (0.4, 0.5, 0.6)  # i, j, k
 
 
 def source(folder: Path) -> DicomFolder:
     return DicomFolder(DicomFolderConfig(folder=folder, stable_s=0.0))
-
-
-def pixels() -> Array:
-    return np.arange(np.prod(SHAPE)).reshape(SHAPE).astype(np.float64)
-
-
-def write_series(
-    folder: Path,
-    *,
-    rotation: Array | None = None,
-    change: Change | None = None,
-    skip: tuple[int, ...] = (),
-    syntax: UID = ExplicitVRLittleEndian,
-    uid: str | None = None,
-    reverse: bool = False,
-) -> Array:
-    """Write a series of SHAPE; returns T_ct_voxel in metres."""
-    folder.mkdir(parents=True, exist_ok=True)
-    R = np.eye(3) if rotation is None else rotation
-    origin = np.array([12.5, -40.25, 7.0])
-    uid = uid or generate_uid()
-    for k in range(SHAPE[0]):
-        if k in skip:
-            continue
-        meta = FileMetaDataset()
-        meta.TransferSyntaxUID = ExplicitVRLittleEndian if syntax == RLELossless else syntax
-        meta.MediaStorageSOPClassUID = CTImageStorage
-        meta.MediaStorageSOPInstanceUID = generate_uid()
-        ds = FileDataset("", {}, file_meta=meta, preamble=b"\0" * 128)
-        ds.SOPClassUID, ds.SOPInstanceUID, ds.SeriesInstanceUID = CTImageStorage, meta.MediaStorageSOPInstanceUID, uid
-        ds.Modality, ds.SeriesDescription, ds.InstanceNumber = "CT", "test", k + 1
-        ds.ImageType = ["ORIGINAL", "PRIMARY", "AXIAL"]
-        ds.Rows, ds.Columns, ds.SamplesPerPixel = SHAPE[1], SHAPE[2], 1
-        ds.PhotometricInterpretation = "MONOCHROME2"
-        ds.BitsAllocated, ds.BitsStored, ds.HighBit, ds.PixelRepresentation = 16, 16, 15, 0
-        ds.PixelSpacing = [SPACING_MM[1], SPACING_MM[0]]
-        ds.ImageOrientationPatient = [f"{x:.10f}"[:16] for x in [*R[:, 0], *R[:, 1]]]
-        ds.ImagePositionPatient = [f"{x:.8f}"[:16] for x in origin + k * SPACING_MM[2] * R[:, 2]]
-        ds.RescaleSlope, ds.RescaleIntercept = 2, -1000
-        ds.PixelData = pixels()[k].astype("<u2").tobytes()
-        ds["PixelData"].VR = "OW"
-        if change is not None:
-            change(ds, k)
-        if syntax == RLELossless:
-            ds.compress(RLELossless)
-        order = SHAPE[0] - k if reverse else k
-        ds.save_as(folder / f"I{order:04d}", enforce_file_format=True)
-    T = np.eye(4)
-    T[:3, :3] = R @ np.diag(SPACING_MM) * 1e-3
-    T[:3, 3] = origin * 1e-3
-    return T
 
 
 def only(folder: Path) -> CtSeries:

@@ -12,9 +12,9 @@ import pytest
 
 from service.core.records.events import GatesEvaluated, StepMeasured, StepNote, StepRetried
 from service.store.store import Store
+from tests.support.boards.board_bench import MOUNT, PROTOCOL, Picture, board_room
 from tests.support.rig.bench_rig import answer
 from tests.support.runs.bench_run import Bench, begin_run
-from tests.support.scenes.board_bench import MOUNT, PROTOCOL, Picture, board_room
 
 
 @pytest.fixture

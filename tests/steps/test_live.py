@@ -16,13 +16,13 @@ import pytest
 from drivers.interfaces import CameraSettings
 from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm.inverse_kinematics import postures
-from service.compute.arm.kinematics import arm_model
 from service.compute.capture.live import LiveView, clipped_fraction, register_station, sharpness
 from service.compute.markers.search.predicted import NEAR, ImageOutlines, Prediction, find_spheres, tone_of
 from service.compute.planning.coverage import (
     CoverageLimits,
 )
 from service.compute.registration.identification.pairing import paired
+from service.core.arms.known import arm_model
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import GatesEvaluated, StepNote
 from service.jobs.capture import live_view

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.compute.arm.inverse_kinematics import nearest_posture, postures
-from service.compute.arm.kinematics import arm_model, forward
+from service.compute.arm.kinematics import forward
 from service.compute.planning.capsules import segment_box_distance_m, segment_distance_m
 from service.compute.planning.collision import Capsule, nearest_contacts
 from service.compute.planning.motion_plan import (
@@ -30,6 +30,7 @@ from service.compute.planning.motion_plan import (
     travel_times_s,
 )
 from service.compute.planning.optics import depth_of_field
+from service.core.arms.known import arm_model
 from service.core.geometry import Array, Transform, inverse, look_at, transform
 from service.core.protocol.models import Motion, load_protocol
 from service.rig import CollisionSection, load_rig
@@ -39,7 +40,7 @@ from service.steps.capture.plan.planning import ArmAtStation, usual_posture
 from service.steps.capture.plan.preview import preview_board_poses, preview_plans
 from service.steps.capture.plan.viewpoints import Arc, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.context import StationLayout
-from service.steps.kinds import viewpoint_capture
+from service.steps.kinds.captures import viewpoint_capture
 
 PROTOCOL = Path(__file__).parents[2] / "protocols" / "exvivo_spine.yaml"
 ARM = arm_model("UR10e")

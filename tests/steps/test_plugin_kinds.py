@@ -106,7 +106,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     (about / "entry_points.txt").write_text(ENTRY_POINTS)
     path = os.pathsep.join([str(folder), str(REPOSITORY)])
     answer = subprocess.run(
-        [sys.executable, "-m", "tests.support.runs.plugin_run", str(folder)],
+        [sys.executable, "-m", "tests.support.processes.plugin_run", str(folder)],
         cwd=REPOSITORY,
         env={**os.environ, "PYTHONPATH": path},
         capture_output=True,

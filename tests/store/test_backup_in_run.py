@@ -11,8 +11,8 @@ import pytest
 
 from service.core.records.events import ViewpointCaptured
 from service.store.store import Store
+from tests.support.protocols.short_protocol import short_protocol
 from tests.support.rig.rig import REPOSITORY, command, orthocapture, simulated_rig
-from tests.support.runs.short_protocol import short_protocol
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 VIEWS = 16

@@ -21,12 +21,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from docs.generate.pages import REFERENCE, pages
-from docs.generate.steps import measures_of_kind
 from service.compute.poses.files.camera_files import write_camera_json
 from service.compute.poses.files.pose_files import write_poses_csv
 from service.core.records.events import JobFailed
-from service.steps import step_kinds
 from service.store.records import NewJob
 from service.store.store import Store
 from tests.support.record.store import enqueue
@@ -39,7 +36,6 @@ HELP_TEXTS = "commands.md"  # the help of the commands, put together
 SCRIPTS = Path(sys.executable).parent
 SHELLS = ("sh", "bash", "shell", "console")
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-_PATH = re.compile(r"`((?:service|drivers|simulators|protocols|bench|tests)/[\w/]*(?:\w|\.(?:py|yaml)|/))`")
 _SPAN = re.compile(r"`((?:orthocapture|make|python3?|pip|\.venv/bin/\S+) [^`]+)`")
 
 
@@ -244,7 +240,7 @@ RUN_ELSEWHERE = {
         ),
         "tests/benchmark/test_benchmark_command.py::test_methods_are_run_scored_and_put_into_the_table",
     ),
-    "orthocapture layout --spheres spheres.json": "tests/steps/test_layout.py::test_command",
+    "orthocapture layout --spheres spheres.json": "tests/layout/test_layout.py::test_command",
     "orthocapture export latest --format colmap --out dataset --data runs": (
         "tests/dataset/test_export_command.py::test_a_run_is_exported_recorded_and_still_verifies"
     ),
@@ -286,7 +282,7 @@ RUN_ELSEWHERE = {
             "make soak",
             "make clean",
         ),
-        "tests/system/test_docs.py::test_make_targets_do_what_the_documents_say",
+        "tests/system/test_documents.py::test_make_targets_do_what_the_documents_say",
     ),
     "orthocapture import FOLDER --data runs": (
         "tests/poses/test_import.py::test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere"
@@ -334,7 +330,7 @@ RUN_ELSEWHERE = {
             ".venv/bin/pytest tests/protocol/test_gate_words.py -n 0",
             '.venv/bin/pytest -m "not slow" -k gate',
         ),
-        "tests/system/test_docs.py::test_test_files_and_the_marker_are_there",
+        "tests/system/test_documents.py::test_test_files_and_the_marker_are_there",
     ),
     "orthocapture act release": "tests/web/test_web_held.py::test_the_buttons_ask_the_step",
     **dict.fromkeys(
@@ -343,6 +339,18 @@ RUN_ELSEWHERE = {
             "orthocapture simulate grbl --link rig/table --world HOST:PORT",
         ),
         "tests/robot/test_grbl_run.py::test_a_run_with_the_turntable_instead_of_the_arm",
+    ),
+    "orthocapture dicom-listen --folder ct --from CTSUITE": (
+        "tests/scanner/test_dicom_listen.py::test_dcmtk_sends_a_series_and_the_importer_reads_it"
+    ),
+    "orthocapture export latest --format mcap --out bag --data runs": (
+        "tests/dataset/test_mcap.py::test_rosbags_opens_the_folder_as_a_recording_of_ros"
+    ),
+    "orthocapture import-ros bag --out files --base base_link --flange tool0 --camera-frame camera_optical": (
+        "tests/calibration/test_import_ros.py::test_a_recording_calibrates_a_hand_eye_as_its_files_would"
+    ),
+    'orthocapture simulate rig --scene 7 --dir rig --arm "LBR Med 14"': (
+        "tests/arms/test_kuka_run.py::test_it_comes_to_its_end_with_every_view"
     ),
     "orthocapture simulate kuka": "tests/robot/test_kuka_driver.py::test_a_day_without_trouble",
     "orthocapture simulate rig --scene 7 --dir rig": (
@@ -372,32 +380,6 @@ def test_the_test_that_runs_it_exists(command: str, test: str) -> None:
     assert name in {node.name for node in module.body if isinstance(node, ast.FunctionDef)}, command
 
 
-def test_make_targets_do_what_the_documents_say() -> None:
-    """The last line of each target; tests/system/test_demo.py runs the command of `make demo`."""
-    for target, last in (
-        ("test", '.venv/bin/pytest -m "not slow"'),
-        ("test-all", ".venv/bin/pytest"),
-        ("demo", ".venv/bin/orthocapture demo"),
-        ("lint", ".venv/bin/lint-imports"),
-        ("lock", "sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' constraints-dev.txt"),
-        ("docs", ".venv/bin/sphinx-build --quiet --fail-on-warning --keep-going docs build/docs"),
-        ("reference", ".venv/bin/python -m docs.generate"),
-        ("test-versions", ".ci/versions"),
-        ("torture-audit", ".venv/bin/python -m bench.torture.audit"),
-        ("torture-crash", ".venv/bin/python -m bench.torture.crash"),
-        ("torture-faults", ".venv/bin/python -m bench.torture.faults"),
-        ("torture-fuzz", ".venv/bin/python -m bench.torture.fuzz --seconds-per-target 60 --record"),
-        ("soak", ".venv/bin/python -m bench.soak"),
-        ("clean", "rm -rf .venv build *.egg-info"),
-    ):
-        done = subprocess.run(
-            ["make", "--dry-run", "--no-print-directory", target],
-            cwd=ROOT, capture_output=True, text=True, timeout=30, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        assert done.stdout.splitlines()[-1] == last
-
-
 def test_commands_are_found_in_blocks_tables_and_text() -> None:
     text = (
         "Say `make it so`, not `orthocapture.drivers`.\n```sh\n# a note\n$ ls -l  # all\nfind . \\\n  -name x\n```\n"
@@ -411,12 +393,6 @@ def test_the_extras_that_documents_install_are_declared() -> None:
     named = {name for text in RUN_ELSEWHERE for name in re.findall(r'pip install "\.\[(\w+)\]"', text)}
     assert named
     assert named <= set(project["optional-dependencies"])
-
-
-def test_test_files_and_the_marker_are_there() -> None:
-    """What the commands for a part of the tests name; they cannot be run within the tests themselves."""
-    assert (ROOT / "tests" / "protocol" / "test_gate_words.py").is_file()
-    assert '"slow: ' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 
 
 # Their snippets run in an exported data set: tests/dataset/test_formats.py, tests/matching/test_matching_export.py.
@@ -437,56 +413,3 @@ def test_snippets_of_python_run(site: Site) -> None:
         )
         assert done.returncode == 0, done.stderr
     assert "viewpoint,sha256" in (site.folder / "captures.csv").read_text()
-
-
-def test_files_that_the_documents_name_exist() -> None:
-    for document in DOCUMENTS:
-        for path in _PATH.findall(document.read_text(encoding="utf-8")):
-            assert (ROOT / path).exists(), f"{document.name}: {path}"
-
-
-def test_every_page_is_reached_from_the_first() -> None:
-    """Sphinx says so too, but only where it is installed."""
-    listed = set(re.findall(r"^(\w+/\w+)$", (ROOT / "docs" / "index.md").read_text(encoding="utf-8"), re.MULTILINE))
-    pages_there = {
-        path.relative_to(ROOT / "docs").with_suffix("").as_posix()
-        for part in ("tutorial", "howto", "reference", "explanation")
-        for path in (ROOT / "docs" / part).glob("*.md")
-    }
-    assert pages_there == {page for page in listed if not page.startswith("decisions/")}
-
-
-# --- what is generated ------------------------------------------------------------------------------------------
-
-
-def test_the_generated_documents_are_up_to_date() -> None:
-    """`make reference` regenerates them."""
-    for name, text in pages().items():
-        assert (REFERENCE / name).read_text(encoding="utf-8") == text, f"{name}: run `make reference`"
-
-
-def test_every_key_of_a_file_and_every_measure_is_explained() -> None:
-    for name in ("protocol.md", "rig.md"):
-        keys = [
-            line for line in (REFERENCE / name).read_text(encoding="utf-8").splitlines() if line.startswith("| `")
-        ]
-        assert keys
-        assert not [line for line in keys if line.endswith("|  |")], name
-    for kind in step_kinds().values():
-        assert all(measure.meaning for measure in measures_of_kind(kind).values()), kind.name
-
-
-def test_links_of_the_documents_lead_somewhere() -> None:
-    for document in DOCUMENTS:
-        for target in re.findall(r"\]\(([^)#]+)\)", document.read_text(encoding="utf-8")):
-            assert "://" in target or (document.parent / target).exists(), f"{document.name}: {target}"
-
-
-def test_what_the_readme_says_of_a_corrected_arm_is_what_was_measured() -> None:
-    """For errors of the simulated arm's own model, and for an arm with other errors (bench/calibration/hand_eye)."""
-    measured = json.loads((ROOT / "bench" / "results" / "hand_eye-2026-11-21.json").read_text())
-    text = " ".join((ROOT / "README.md").read_text().split())
-    for kind, words in (("systematic", "poses good to {} … {} mm once"), ("odd", "{} … {} mm are left")):
-        rows = [row for row in measured[kind] if row["session"].startswith("hand-eye step")]
-        left = [row["error_mm"]["arm corrected"] for row in rows]
-        assert words.format(f"{min(left):.2f}", f"{max(left):.2f}") in text

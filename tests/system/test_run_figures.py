@@ -13,9 +13,9 @@ from service.dataset.summary import summarise
 from service.run_start import recorded_run
 from service.steps import params_models
 from service.store.store import Store
+from tests.support.protocols.shortened import shortened
 from tests.support.rig.rig import REPOSITORY
 from tests.support.runs.bench_run import record_runs
-from tests.support.runs.shortened import shortened
 
 
 def test_seconds_of_a_run_come_from_its_record(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from service.core.records.events import OperatorAction
 from service.dataset.summary import RunSummary, summarise
 from service.run_start import recorded_run
 from service.store.store import Store
+from tests.support.protocols.shortened import shortened
 from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig
-from tests.support.runs.shortened import shortened
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 WIDTH, SLICE_MM = "960", 1.0

@@ -13,6 +13,8 @@ import pytest
 from bench.torture.fuzz.targets.table import GROUPS, targets_of
 from bench.torture.fuzz.targets.target import fault_of
 from bench.torture.fuzz.watch import Sweep
+from drivers.errors import UnreadableFileError
+from drivers.meshes.surface_file import read_surface_file
 from service.compute.images.files import read_image
 from service.core.errors import DataError
 
@@ -69,6 +71,13 @@ def test_an_image_that_claims_a_gigapixel_is_refused_before_memory_is_set_aside(
     assert done
     with pytest.raises(DataError, match=r"claims to have 30000 × 30000 pixels"):
         read_image(path)
+
+
+def test_a_part_of_a_glb_that_claims_four_gigabytes_is_refused_before_memory_is_set_aside(tmp_path: Path) -> None:
+    path = tmp_path / "mesh.glb"
+    path.write_bytes(b"glTF" + struct.pack("<II", 2, 24) + struct.pack("<I", 0xFFFFFFF0) + b"JSON{}  ")
+    with pytest.raises(UnreadableFileError, match="longer or shorter than it says"):
+        read_surface_file(path)
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from service.web.page.charts import LEVELS, dots, heat_map, vector_field
 from service.web.record.planned_poses import Station
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.record.core import EYE
-from tests.support.runs.calibrated_run import VIEWS, begin_calibrated_run, capture
+from tests.support.recorded.calibrated_run import VIEWS, begin_calibrated_run, capture
 from tests.support.runs.recorded_run import record_run
 
 

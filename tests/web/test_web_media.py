@@ -21,7 +21,7 @@ from service.store.records import NewArtefact
 from service.web.record.pictures import DrawnOutline, cached, draw_marks, nearest_width, reduced_jpeg, safe_name
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.record.core import EYE
-from tests.support.runs.calibrated_run import begin_calibrated_run, capture
+from tests.support.recorded.calibrated_run import begin_calibrated_run, capture
 
 HOSTILE = '../../etc/pass"wd\r\nSet-Cookie: a=b; .jpg'
 

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from service.core.geometry import apply
 from service.core.records.events import RegionDrawn
 from service.core.run.fold import fold
+from service.core.run.state import JobState
+from service.dataset.scene_view import scene_json, viewing_frame
+from service.jobs.surfaces import fuse
+from service.run_record import RunRecord, read_log
 from service.run_start import recorded_run
+from service.web.scene.data import scene_of
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.runs.recorded_run import PROTOCOL, record_run
 
@@ -64,6 +72,28 @@ def test_a_region_is_recorded_with_the_name_of_who_drew_it(shown: tuple[WebSite,
     assert "grace: 3 corners, from the CT; not used yet" in after
 
 
+def test_the_wound_that_the_last_fusion_used_is_outlined(shown: tuple[WebSite, Browser, str]) -> None:
+    site, _, run = shown
+    protocol, _ = recorded_run(site.store, run)
+    before = read_log(site.store, run, protocol)
+    assert scene_of(before).scene.outlines == {}
+    eye = tuple(tuple(float(row == column) for column in range(6)) for row in range(6))
+    corners = ((0.01, 0.0, 0.02), (0.03, 0.0, 0.02), (0.02, 0.02, 0.02))
+    answer = fuse.Answer(T_scan_ct=tuple(row[:4] for row in eye[:4]), covariance=eye, wound_m=corners)
+    jobs = {
+        name: JobState(name, "fuse", 1, seq, name, {}, status="finished", result=found.model_dump(mode="json"))
+        for name, seq, found in (("second", 9, answer), ("first", 7, answer.model_copy(update={"wound_m": ()})))
+    }
+    steps = {**before.state.steps, "ground_truth": replace(before.state.steps["ground_truth"], jobs=jobs)}
+    log = RunRecord(site.store, run, protocol, tuple(before.events), replace(before.state, steps=steps))
+    scene = scene_of(log).scene
+    (line,) = (
+        trace for trace in json.loads(scene_json(scene))["data"] if trace.get("name") == "wound of the last fusion"
+    )
+    drawn_mm = np.stack([np.frombuffer(base64.b64decode(line[axis]["bdata"]), dtype="<f4") for axis in "xyz"], axis=1)
+    assert drawn_mm == pytest.approx(1e3 * apply(viewing_frame(scene), np.array([*corners, corners[0]])), abs=1e-3)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -72,6 +102,8 @@ def test_a_region_is_recorded_with_the_name_of_who_drew_it(shown: tuple[WebSite,
         {"corners": "[[0, 0, 1e9], [0, 1, 0], [1, 0, 0]]"},
         {"corners": "{"},
         {"corners": '"x"'},
+        {"corners": "[" * 39_000},
+        {"corners": f"[[{'9' * 5_000}, 0, 0], [0, 1, 0], [1, 0, 0]]"},
         {"along": "[0, 0, 0]"},
         {"along": "[0, NaN, 0]"},
         {"source": "air"},

@@ -19,6 +19,7 @@ import trimesh
 
 from bench.torture.faults.place.disk import FaultyDisk, JumpingClock
 from bench.torture.faults.place.material import SCAN, ct_folder, mirrored_ct, other_ct, scan_folder, spoilt_ct
+from bench.torture.faults.place.newer_rigs import Film, pendant
 from service.store.database.engine import database_path
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
@@ -239,6 +240,32 @@ def _data_back(trial: Trial) -> None:
         aside.rename(trial.data)
 
 
+# --- turntable, KUKA arm, video camera --------------------------------------------------------------------------
+
+
+def _film(trial: Trial) -> Film:
+    assert trial.film is not None
+    return trial.film
+
+
+def _pulled(trial: Trial, seconds: float | None) -> None:
+    """End the video, and let it begin anew after `seconds` if not None."""
+    _film(trial).end()
+
+    def back() -> None:
+        assert seconds is not None
+        time.sleep(seconds)
+        _film(trial).run()
+
+    if seconds is not None:
+        _background(trial, back)
+
+
+def _kuka_stop(trial: Trial) -> None:
+    pendant(trial, "stop external_stop")
+    trial.stopped()
+
+
 ACTS: Mapping[str, Callable[[Trial], None]] = {
     "nothing": lambda _trial: None,
     "slider": lambda trial: _slider(trial, float(trial.case.value["fraction"])),
@@ -258,12 +285,20 @@ ACTS: Mapping[str, Callable[[Trial], None]] = {
     "data_away": _data_away,
     "unplug": lambda trial: trial.simulators.stop(("lightbox",)),
     "camera_off": lambda trial: trial.simulators.stop(("camera",)),
+    "film": lambda trial: _film(trial).run(str(trial.case.value["how"])),
+    "film_pauses": lambda trial: _film(trial).pause(),
+    "film_ends": lambda trial: _pulled(trial, trial.case.value.get("seconds")),
+    "table_off": lambda trial: trial.simulators.stop(("grbl",)),
+    "kuka_off": lambda trial: trial.simulators.stop(("kuka",)),
+    "kuka_stop": _kuka_stop,
     "arm_off": lambda trial: trial.simulators.stop(("ur",)),
 }
 MENDS: Mapping[str, Callable[[Trial], None]] = {
     "unlock": _unlock,
     "power_up": _power_up,
     "slider_up": lambda trial: _slider(trial, 1.0),
+    "film": lambda trial: _film(trial).run(),
+    "kuka_release": lambda trial: pendant(trial, "release"),
     "scan": _whole_scan,
     "ct": _whole_ct,
     "share_back": _share_back,

@@ -49,6 +49,22 @@ _CAMERA: dict[str, tuple[str, int, int, int]] = {
     "ptpip/file": ("a packet of a file", 1, 2, 1),
     "ptpip/request": ("a request to the camera", 1, 6, 1),
 }
+_TABLE: dict[str, tuple[str, int, int, int]] = {
+    "grbl/welcome": ("the controller's welcome", -1, 1, 1),
+    "grbl/setting": ("a setting", -1, 20, 1),
+    "grbl/status": ("a report", 1, 20, 1),
+    "grbl/answer": ("the answer to a piece of a motion", 1, 3, 1),
+    "grbl/query": ("a request for a report", 1, 20, 1),
+    "grbl/jog": ("a piece of a motion", 1, 3, 1),
+}
+_KUKA: dict[str, tuple[str, int, int, int]] = {
+    "lines/hello": ("the application's greeting", -1, 1, 1),
+    "lines/state": ("a line of the stream", 1, 40, 1),
+    "lines/ack": ("the answer to a request", 1, 1, 1),
+    "lines/done": ("the end of a motion", 1, 1, 1),
+    "lines/request": ("a request to the application", 1, 1, 1),
+    "lines/beat": ("a sign of life", 1, 20, 1),
+}
 _LIGHTBOX: dict[str, tuple[str, int, int, int]] = {
     "serial/identity": ("the box's identity", -1, 1, 1),
     "serial/light": ("a reading of the light", 1, 1, 1),
@@ -58,7 +74,8 @@ _LIGHTBOX: dict[str, tuple[str, int, int, int]] = {
 }
 # Messages that the protocol cannot refuse, or that cannot be reordered because the sender waits for the answer.
 _NO_REFUSAL = {"rtde/controller", "rtde/stream", "rtde/command", "dashboard/welcome", "script/script"} | {
-    "ptpip/event", "ptpip/request", "serial/request",
+    "ptpip/event", "ptpip/request", "serial/request", "grbl/welcome", "grbl/status", "grbl/query", "grbl/jog",
+    "lines/state", "lines/done", "lines/request", "lines/beat",
 }  # fmt: skip
 
 
@@ -139,6 +156,45 @@ def _more_of_the_robot() -> Iterator[Case]:
     yield Case(f"{own}/local_control", "arm", "remote control is off", options=local, act="nothing", mend="remote")
     yield Case(f"{own}/local_control_on", "arm", "remote control is off and stays so", options=local, act="nothing")
     yield Case(f"{own}/switched_off", "arm", "the controller loses its power", after=1, act="arm_off")
+
+
+def _table_itself() -> Iterator[Case]:
+    for name, what, kind, value in (
+        ("limit_switch", "a limit switch is hit", "hard_limit", 0.0),
+        ("door", "the safety door is opened for 1 s", "door", 1.0),
+        ("door_tapped", "the safety door is opened for a moment", "door", 1e-6),
+        ("reset", "somebody resets the controller", "reset_button", 0.0),
+        ("held", "somebody holds the axes", "hold_button", 0.0),
+        ("unplugged_1s", "the cable is pulled for 1 s", "unplug", 1.0),
+    ):
+        plan = ({"device": "grbl", "on": "jog", "kind": kind, "nth": 12, "value": value},)
+        yield Case(f"table/itself/{name}", "table", f"{what}, in a motion", faults=plan)
+    yield Case("table/itself/switched_off", "table", "the controller loses its power", after=1, act="table_off")
+
+
+def _kuka_itself() -> Iterator[Case]:
+    own = "kuka/itself"
+    for name, what in (("protective_stop", "a protective stop"), ("emergency_stop", "the emergency stop")):
+        plan = ({"device": "robot", "on": "move", "kind": name, "nth": 2},)
+        yield Case(f"{own}/{name}", "kuka", f"{what} in a motion", faults=plan, mend="kuka_release")
+    plan = ({"device": "robot", "on": "move", "kind": "reject", "nth": 2},)
+    yield Case(f"{own}/motion_refused", "kuka", "the controller does not start a motion", faults=plan)
+    words = "somebody opens the cell between two motions"
+    yield Case(f"{own}/cell_opened", "kuka", words, after=1, act="kuka_stop", mend="kuka_release")
+    yield Case(f"{own}/switched_off", "kuka", "the controller loses its power", after=1, act="kuka_off")
+
+
+def _video_itself() -> Iterator[Case]:
+    def case(name: str, what: str, act: str, mend: str = "film", **value: object) -> Case:
+        return Case(f"video/itself/{name}", "video", what, after=1, act=act, mend=mend, value=value)
+
+    yield case("frozen", "the camera gives the same image again and again", "film", how="frozen")
+    yield case("damaged", "its images are damaged", "film", how="damaged")
+    yield case("other_size", "its images have another size", "film", how="other_size")
+    yield case("noise", "it sends random bytes", "film", how="noise")
+    yield case("silent", "it stands still", "film_pauses")
+    yield case("away_1s", "it is gone for 1 s", "film_ends", mend="", seconds=1.0)
+    yield case("away_never", "it is gone for good", "film_ends", mend="")
 
 
 def _files() -> Iterator[Case]:
@@ -225,6 +281,11 @@ def cases() -> dict[str, Case]:
         *_camera_itself(),
         *_wires("lightbox", "lightbox", _LIGHTBOX),
         Case("lightbox/itself/unplugged", "lightbox", "the serial cable is unplugged", after=1, act="unplug"),
+        *_wires("table", "table", _TABLE),
+        *_table_itself(),
+        *_wires("kuka", "kuka", _KUKA),
+        *_kuka_itself(),
+        *_video_itself(),
         *_files(),
         *_store(),
     ]

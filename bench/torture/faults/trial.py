@@ -23,6 +23,7 @@ from bench.torture.faults.place.laboratory import (
     CT,
     PROTOCOL,
     SCAN,
+    TABLE,
     VIEWS,
     Laboratory,
     Simulators,
@@ -30,7 +31,8 @@ from bench.torture.faults.place.laboratory import (
     write_rig,
 )
 from bench.torture.faults.place.material import FIVE, ct_folder, make_material, scan_folder
-from bench.torture.faults.place.person import ArmEye, LeftError, Motions, Person
+from bench.torture.faults.place.newer_rigs import KUKA_STATION, TABLE_STATION, Film, kuka_rig, table_rig, video_rig
+from bench.torture.faults.place.person import ArmEye, LeftError, Motions, Person, PlaceEye
 from bench.torture.faults.wire.proxy import RunningProxy, Wire, start_proxy
 from service.core.errors import OrthocaptureError
 from service.core.protocol.models import parse_protocol
@@ -44,6 +46,10 @@ from service.store.store import Store
 from service.worker import loop
 from tests.support.rig.bench_rig import BenchArm, BenchCamera
 
+STATIONS: dict[str, dict[str, Any]] = {
+    "table": {"station": TABLE_STATION, "camera_m": 0.0},
+    "kuka": {"station": KUKA_STATION},
+}
 _UNSIGNED = "the record could not be signed"
 _SESSIONS = 3  # programs that drive the run in turn, if an error ends them
 
@@ -79,70 +85,95 @@ class Trial:
         self.clock: JumpingClock | None = None
         self.words: list[str] = []
         self.verdict = Verdict(case.name)
+        self.film: Film | None = None
         self._eye: Motions = Motions()
 
     # --- the rig ------------------------------------------------------------------------------------------
 
-    def _wired(self, *wires: Wire) -> None:
+    def wired(self, *wires: Wire) -> None:
+        """Put the proxy between the driver and these wires, if the case spoils messages."""
         if self.case.spoil is not None:
             self.proxy = start_proxy(list(wires), self.case.spoil, self.folder / "wire.jsonl", self.seed)
+
+    def watch(self, eye: PlaceEye) -> None:
+        """Observe the motions of the device through the world."""
+        eye.begin()
+        self.ends.append(eye.close)
+        self._eye = eye
+
+    def stopped(self) -> None:
+        """Note that a person stopped the arm now."""
+        self._eye.stopped_s.append(time.monotonic())
 
     def _plan(self) -> list[str]:
         return ["--faults", json.dumps(list(self.case.faults))] if self.case.faults else []
 
     def _laboratory(self) -> Laboratory:
+        devices = {
+            "arm": self._arm_devices,
+            "camera": self._camera_devices,
+            "lightbox": self._lightbox_devices,
+            "scan": self._scan_devices,
+            "ct": self._ct_devices,
+            "table": lambda: {"robot": table_rig(self, self._plan())},
+            "kuka": lambda: {"robot": kuka_rig(self, self._plan())},
+            "video": lambda: {"camera": video_rig(self)},
+        }
         scene = self.case.scene
-        devices: dict[str, Any] = {}
-        near = self.arm_host[:-1] + "2"
-        if scene == "arm":
-            self.simulators.start("ur", "--host", self.arm_host, "--speed-up", "3", *self._plan(), *self.case.options)
-            self._wired(
-                Wire("robot", "rtde", (near, 30004), (self.arm_host, 30004)),
-                Wire("robot", "dashboard", (near, 29999), (self.arm_host, 29999)),
-                Wire("robot", "script", (near, 30003), (self.arm_host, 30003)),
-            )
-            devices["robot"] = {
-                "driver": "ur",
-                "host": near if self.proxy else self.arm_host,
-                "connect_timeout_s": 2.0,
-                "watchdog_s": 1.0,
-                "stale_after_s": 2.0,
-            }
-        if scene == "camera":
-            words = ("camera", "--port", "0", "--fast", "--image-width", "96", *self._plan(), *self.case.options)
-            ready = self.simulators.start(*words)
-            port, near_port = int(ready["port"]), 15740
-            self._wired(Wire("camera", "ptpip", (near, near_port), ("127.0.0.1", port)))
-            address = f"ptpip:{near}:{near_port}" if self.proxy else str(ready["gphoto_port"])
-            devices["camera"] = {"driver": "gphoto", "port": address, "capture_timeout_s": 5.0}
-        if scene == "lightbox":
-            far, line = self.folder / "far", self.folder / "line"
-            self.simulators.start("lightbox", "--link", str(far), *self._plan(), *self.case.options)
-            self._wired(Wire("lightbox", "serial", str(line), str(far)))
-            devices["lightbox"] = {
-                "driver": "lightbox",
-                "port": str(line if self.proxy else far),
-                "timeout_s": 0.3,
-            }
-        if scene == "scan":
-            scan_folder(self.scene_folder, self.material)
-            devices["scanner"] = {"driver": "scan_folder", "folder": str(self.scene_folder), "stable_s": 0.5}
-        if scene == "ct":
-            ct_folder(self.scene_folder, self.material)
-            scans = self.folder / "scans"
-            scans.mkdir()
-            devices["scanner"] = {"driver": "scan_folder", "folder": str(scans), "stable_s": 0.5}
-            devices["ct"] = {"driver": "dicom_folder", "folder": str(self.scene_folder), "stable_s": 0.5}
-        rig = write_rig(self.folder, devices)
-        self.arm = arm = None if scene == "arm" else BenchArm()
-        self.shutter = shutter = None if scene == "camera" else BenchCamera(picture=exposed)
+        rig = write_rig(self.folder, devices[scene]() if scene in devices else {}, **STATIONS.get(scene, {}))
+        self.arm = arm = None if scene in ("arm", "table", "kuka") else BenchArm()
+        self.shutter = shutter = None if scene in ("camera", "video") else BenchCamera(picture=exposed)
         if arm is not None:
             arm.on_move = self._eye.began
-        else:
+        elif scene == "arm":
             eye = ArmEye(self.arm_host)
             self.ends.append(eye.close)
             self._eye = eye
         return Laboratory(rig, arm, shutter)
+
+    @property
+    def _near_host(self) -> str:
+        """Address of the driver's end of a wire."""
+        return self.arm_host[:-1] + "2"
+
+    def _arm_devices(self) -> dict[str, Any]:
+        near = self._near_host
+        self.simulators.start("ur", "--host", self.arm_host, "--speed-up", "3", *self._plan(), *self.case.options)
+        self.wired(
+            Wire("robot", "rtde", (near, 30004), (self.arm_host, 30004)),
+            Wire("robot", "dashboard", (near, 29999), (self.arm_host, 29999)),
+            Wire("robot", "script", (near, 30003), (self.arm_host, 30003)),
+        )
+        host = near if self.proxy else self.arm_host
+        limits = {"connect_timeout_s": 2.0, "watchdog_s": 1.0, "stale_after_s": 2.0}
+        return {"robot": {"driver": "ur", "host": host, **limits}}
+
+    def _camera_devices(self) -> dict[str, Any]:
+        words = ("camera", "--port", "0", "--fast", "--image-width", "96", *self._plan(), *self.case.options)
+        ready = self.simulators.start(*words)
+        port, near_port = int(ready["port"]), 15740
+        self.wired(Wire("camera", "ptpip", (self._near_host, near_port), ("127.0.0.1", port)))
+        address = f"ptpip:{self._near_host}:{near_port}" if self.proxy else str(ready["gphoto_port"])
+        return {"camera": {"driver": "gphoto", "port": address, "capture_timeout_s": 5.0}}
+
+    def _lightbox_devices(self) -> dict[str, Any]:
+        far, line = self.folder / "far", self.folder / "line"
+        self.simulators.start("lightbox", "--link", str(far), *self._plan(), *self.case.options)
+        self.wired(Wire("lightbox", "serial", str(line), str(far)))
+        return {"lightbox": {"driver": "lightbox", "port": str(line if self.proxy else far), "timeout_s": 0.3}}
+
+    def _scan_devices(self) -> dict[str, Any]:
+        scan_folder(self.scene_folder, self.material)
+        return {"scanner": {"driver": "scan_folder", "folder": str(self.scene_folder), "stable_s": 0.5}}
+
+    def _ct_devices(self) -> dict[str, Any]:
+        ct_folder(self.scene_folder, self.material)
+        scans = self.folder / "scans"
+        scans.mkdir()
+        return {
+            "scanner": {"driver": "scan_folder", "folder": str(scans), "stable_s": 0.5},
+            "ct": {"driver": "dicom_folder", "folder": str(self.scene_folder), "stable_s": 0.5},
+        }
 
     # --- the run ------------------------------------------------------------------------------------------
 
@@ -170,7 +201,7 @@ class Trial:
             logging.getLogger(chatty).setLevel(logging.WARNING)
 
     def _begin(self, store: Store, station: Laboratory) -> str:
-        text = {"scan": SCAN, "ct": CT}.get(self.case.scene, PROTOCOL)
+        text = {"scan": SCAN, "ct": CT, "table": TABLE}.get(self.case.scene, PROTOCOL)
         distance_m = self.case.value.get("distance_m", 0.5 if self.case.scene == "arm" else 0.6)
         source = text.replace("DISTANCE", str(distance_m)).encode()
         loaded = parse_protocol(source, params_models(), name="faults.yaml")

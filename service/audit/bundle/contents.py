@@ -103,9 +103,9 @@ def write_records(bundle: BundleZip, store: Store, connection: Connection, run: 
     bundle.add("artefacts.jsonl", _lines(_rows(connection, artefact_table, run_id, order)))
     bundle.add("jobs.jsonl", _lines(map(_job, _rows(connection, job_table, run_id, (job_table.c.position,)))))
     signed = [*read_checkpoints(connection, SITE), *read_checkpoints(connection, run_id)]
-    bundle.add("checkpoints.jsonl", _lines(map(asdict, signed)))
+    bundle.add("checkpoints.jsonl", _lines(asdict(checkpoint) for checkpoint in signed))
     stamped = [*read_timestamps(connection, SITE), *read_timestamps(connection, run_id)]
-    bundle.add("timestamps.jsonl", _lines(map(asdict, stamped)))
+    bundle.add("timestamps.jsonl", _lines(asdict(stamp) for stamp in stamped))
     bundle.add("keys.jsonl", _lines(map(_key, run.keys)))
     for name, ref in (("protocol.yaml", root.protocol), ("rig.yaml", root.rig)):
         bundle.add(name, chunks_of(store.artefact_path(ref.sha256)))

@@ -76,7 +76,7 @@ class Exports:
         self.folder.mkdir(exist_ok=True)
         options = (
             _UNSAFE.sub("_", wanted.form)[:40],
-            f"{wanted.crop}x{wanted.crops}" if wanted.crop else "",
+            f"{wanted.crop_px}x{wanted.crops}" if wanted.crop_px else "",
             "anonymous" if wanted.anonymous else "",
         )
         name = "-".join((self._name(run_id), *filter(None, options)))

@@ -15,7 +15,7 @@ from service.core.errors import ConfigurationError
 from service.core.gates.release import refuse_data_set
 from service.core.records.data_set import VERSION
 from service.dataset.posed.exporter import Exporter, exporter, write_data_set
-from service.dataset.posed.of_run import data_set_of, specimen_pixels
+from service.dataset.posed.of_run.data_set import data_set_of, specimen_pixels
 from service.dataset.posed.pixels import cropped_data_set, undistorted_data_set
 from service.dataset.posed.records import DataSet
 from service.dataset.summary import RunSummary
@@ -45,7 +45,7 @@ def export_data_set(
         SpaceShortError: it would use the space that is reserved for the evidence. Nothing was written.
         DataError: the folder exists, or the run does not have what the format needs.
     """
-    how, size = exporter(wanted.form), crop_size(wanted.crop)
+    how, size = exporter(wanted.form), crop_size(wanted.crop_px)
     require_version(wanted.version)
     require_export_space(store, run_id, target)
     require_exportable(store, run_id, progress)

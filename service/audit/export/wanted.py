@@ -13,6 +13,7 @@ from service.core.errors import DataError
 from service.core.records.data_set import FIRST_VERSION, VERSION, DataSetStatement
 from service.dataset.posed.folder import being_written, discard, interrupted
 
+_USUAL_CROP = "1920x1080"  # as in the paper
 _WANTED = ".wanted"  # ends the name of the file beside an unfinished export
 
 
@@ -22,7 +23,7 @@ class WantedExport:
 
     Attributes:
         form: name of the format.
-        crop: `WIDTHxHEIGHT` in pixels; "" for whole images.
+        crop: `WIDTHxHEIGHT` in pixels; "" for whole images or, where several crops are wanted, for 1920x1080.
         crops: of each image, at most.
         anonymous: GPS, owner and serial numbers are left out of the pictures, and people and serial numbers out of
             the metadata.
@@ -38,10 +39,15 @@ class WantedExport:
     version: Annotated[str, Field(pattern=VERSION)] = FIRST_VERSION
 
     @property
+    def crop_px(self) -> str:
+        """`WIDTHxHEIGHT` of the crops; "" for whole images."""
+        return self.crop or (_USUAL_CROP if self.crops > 1 else "")
+
+    @property
     def words(self) -> str:
         """The format and its options."""
         crops = f", up to {self.crops} of each image" if self.crops > 1 else ""
-        cut = f", crops of {self.crop.replace('x', ' × ')} px{crops}" if self.crop else ""
+        cut = f", crops of {self.crop_px.replace('x', ' × ')} px{crops}" if self.crop_px else ""
         return f"{self.form}{cut}{', anonymous' if self.anonymous else ''}"
 
 

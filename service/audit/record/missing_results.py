@@ -11,7 +11,7 @@ from service.steps.poses.time_left import missing_results
 
 
 def not_in_yet(protocol: Protocol, state: RunState, events: Sequence[Event]) -> list[str]:
-    """Lines such as `COLMAP from nothing: was still being computed`; empty if every result has arrived.
+    """Lines such as `COLMAP from scratch: was still being computed`; empty if every result has arrived.
 
     The same events give the same lines, so the time that is left is not among them.
     """

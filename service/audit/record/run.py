@@ -19,7 +19,7 @@ from service.store.durable_effects import DurableFiles, RandomIds
 from service.store.events import read_events
 from service.store.files.artefacts import ArtefactFiles, read_artefacts
 from service.store.records import Artefact
-from service.store.store import read_runs, resolve_run
+from service.store.run_rows import read_runs, resolve_run
 
 
 class RecordedFiles:

@@ -20,7 +20,8 @@ from service.store.durable_effects import Clock
 from service.store.events import to_event
 from service.store.queue.leases import ProcessIdentity
 from service.store.records import SITE
-from service.store.store import Store, read_open_runs
+from service.store.run_rows import read_open_runs
+from service.store.store import Store
 
 
 def record_start(store: Store, rig: Rig, protocols: Sequence[Path], address: str) -> ServiceStarted:

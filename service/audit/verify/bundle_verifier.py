@@ -636,7 +636,7 @@ class Check:
             if path in (MANIFEST, SIGNATURE) or path.startswith("#"):
                 continue
             if path not in self.files or (sha256 and self.files[path][0] != sha256):
-                self.fault(name, f"it describes {path} otherwise than the manifest")
+                self.fault(name, f"its description of {path} differs from the manifest")
 
     def _check_stamps(
         self,

@@ -7,10 +7,10 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
 
 from service.compute.matching.methods.method import Matcher
 from service.compute.matching.pairs.difficulty import CLASSES
@@ -21,6 +21,7 @@ from service.compute.matching.scores.pose import THRESHOLDS_DEG, PoseError, auc
 from service.core.errors import DataError
 
 ALL = "all"
+_Count = Annotated[int, Field(ge=0, le=10**9)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,14 +103,21 @@ class _PairRecord(_Record):
     first: str
     second: str
     difficulty: str
-    matches: int
-    scored: int
-    precision: dict[str, float]
-    rotation_deg: float | None
-    translation_deg: float | None
-    inliers: int
-    epipolar_px: float | None
-    seconds: float
+    matches: _Count
+    scored: _Count
+    precision: dict[str, FiniteFloat]
+    rotation_deg: FiniteFloat | None
+    translation_deg: FiniteFloat | None
+    inliers: _Count
+    epipolar_px: FiniteFloat | None
+    seconds: FiniteFloat
+
+    @field_validator("precision")
+    @classmethod
+    def _at_each_threshold(cls, found: dict[str, float]) -> dict[str, float]:
+        if list(found) != [f"{threshold:g}" for threshold in PRECISION_PX]:
+            raise ValueError("the precision is not stated at the thresholds of the table")
+        return found
 
 
 class _ResultRecord(_Record):

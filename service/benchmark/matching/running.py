@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import FiniteFloat, TypeAdapter
+
 from service.benchmark.matching.plots import curves_png, matches_picture, png
 from service.benchmark.matching.result import MethodResult, read_result, result_of, write_result
 from service.benchmark.matching.table import markdown
@@ -15,6 +17,19 @@ from service.compute.matching.pairs.loader import MatchingData, Pair
 from service.compute.matching.scores.evaluate import DAMAGED, Progress, Views, chosen_pairs, evaluate
 from service.compute.matching.scores.matches import match_errors_px
 from service.core.errors import DataError
+
+_Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """What has to be right about a pair of the list."""
+
+    first: str
+    second: str
+    difficulty: str
+    angle_deg: FiniteFloat
+    T_second_first: tuple[_Row, _Row, _Row, _Row]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +49,9 @@ class WantedRun:
     weights: Path | None
     per_class: int
     out: Path
+
+
+_PAIRS = TypeAdapter(tuple[_Pair, ...])
 
 
 def run_matching(wanted: WantedRun, progress: Progress) -> list[MethodResult]:
@@ -70,13 +88,18 @@ def open_matching_data(folder: Path) -> MatchingData:
         DataError: the folder holds none.
     """
     try:
-        return MatchingData(folder)
+        data = MatchingData(folder)
+        _PAIRS.validate_python(data.pairs)
+        unknown = {pair[end] for pair in data.pairs for end in ("first", "second")} - data.names
+        if unknown:
+            raise ValueError(f"{min(unknown)} is not among the views")
     except DAMAGED as error:
         raise DataError(
             "this is no data set for feature matching",
             where=str(folder),
             remedy="Export one: orthocapture export RUN --format matching --out DIR",
         ) from error
+    return data
 
 
 def results_in(folder: Path) -> list[MethodResult]:

@@ -13,7 +13,7 @@ MESH = "mesh.ply"
 
 def commands(place: Place) -> tuple[Command, ...]:
     """A process of its own, which alone loads torch."""
-    return ((place.python, "-m", "service.benchmark.gaussians_program", str(place.data), str(place.work / MESH)),)
+    return ((place.python, "-m", "service.benchmark.programs.gaussians", str(place.data), str(place.work / MESH)),)
 
 
 def lacking() -> str:

@@ -10,7 +10,7 @@ MESH = "mesh.ply"
 
 def commands(place: Place) -> tuple[Command, ...]:
     """A process of its own, so that its time and memory are measured as those of the others."""
-    return ((place.python, "-m", "service.benchmark.stereo_program", str(place.data), str(place.work / MESH)),)
+    return ((place.python, "-m", "service.benchmark.programs.stereo", str(place.data), str(place.work / MESH)),)
 
 
 KIND = Method("stereo", "Stereo (CPU)", "nothing else", "colmap-pinhole", commands, at(MESH))

@@ -16,6 +16,7 @@ from service.compute.ground_truth.distances.chamfer import ChamferScore, Chamfer
 from service.compute.ground_truth.distances.heat_map import HeatScale
 from service.compute.ground_truth.distances.heat_mesh import write_heat_mesh
 from service.compute.ground_truth.distances.neighbours import PointIndex
+from service.compute.ground_truth.fusion.common import CommonPart, common_part
 from service.compute.ground_truth.fusion.cut_out import Markers, without_markers
 from service.compute.ground_truth.fusion.fuse import Fused, FusionSettings, Source, fuse
 from service.compute.ground_truth.fusion.picture import fusion_picture
@@ -50,7 +51,8 @@ def fuse_command(
 ) -> None:
     """Fuse a CT mesh and a scan: the CT in the wound, the scan outside, blended between.
 
-    The CT comes into the scan's frame by the spheres. Each vertex written has its source (0: CT, 1: scan, 2: blend)
+    The CT comes into the scan's frame by the spheres. Spheres that the scan lacks were taken away before it, and are
+    cut out of the CT. Each vertex written has its source (0: CT, 1: scan, 2: blend)
     and its standard deviation in millimetres. Exit status 1: distances between spheres changed by more than 0.3 mm.
     """
     with reporting_errors(json):
@@ -67,9 +69,10 @@ def fuse_command(
             aligned = align(tomogram, scanned, metres(radius_mm))
             tomogram = tomogram.moved(aligned.T_scan_ct)
             report("distances", 1, 3)
-            score = chamfer(tomogram, scanned, ChamferSettings(metres(spacing_mm)))
+            common = common_part(tomogram, aligned, metres(radius_mm))
+            score = chamfer(common.ct, scanned, ChamferSettings(metres(spacing_mm)))
             report("fusion", 2, 3)
-            fused = _fused(tomogram, scanned, aligned, metres(blend_mm))
+            fused = _fused(common, scanned, aligned, metres(blend_mm))
         if post_radius_mm is not None:
             up = scanned.area_vectors_m2.sum(axis=0)
             fused = without_markers(
@@ -78,10 +81,10 @@ def fuse_command(
         unit_m = METRES_PER_UNIT[of_scan.unit]
         write_ply(out, fused.surface, unit_m, {"source": fused.source, "sigma_mm": mm(fused.sigma_m)}, _COMMENTS)
         if heat_map is not None:
-            distance_m = PointIndex(score.gt.samples.points_m).nearest(tomogram.vertices_m)[0]
-            write_heat_mesh(heat_map, tomogram, distance_m, HeatScale.of(score, 0.02), unit_m)
+            distance_m = PointIndex(score.gt.samples.points_m).nearest(common.ct.vertices_m)[0]
+            write_heat_mesh(heat_map, common.ct, distance_m, HeatScale.of(score, 0.02), unit_m)
         if picture is not None:
-            picture.write_bytes(fusion_picture(tomogram, scanned, score, HeatScale.of(score, 0.02), fused))
+            picture.write_bytes(fusion_picture(common.ct, scanned, score, HeatScale.of(score, 0.02), fused))
         record = fusion_record(aligned, score, fused)
         if json:
             print_json(record)
@@ -99,15 +102,16 @@ def _surface(file: ScannedMesh) -> Surface:
     return Surface(file.mesh.vertices_m, file.mesh.faces.astype(np.int64))
 
 
-def _fused(ct: Surface, scan: Surface, aligned: Aligned, blend_m: float) -> Fused:
+def _fused(common: CommonPart, scan: Surface, aligned: Aligned, blend_m: float) -> Fused:
     # A scan sees its scene from above only: its faces together point up.
     settings = FusionSettings(
         blend_m=blend_m,
         sigma_ct_m=aligned.sigma_ct_m,
         sigma_scan_m=aligned.sigma_scan_m,
         alignment_covariance=aligned.covariance,
+        least_part_m2=0.0,  # small parts are left out already
     )
-    return fuse(ct, scan, scan.area_vectors_m2.sum(axis=0), settings)
+    return fuse(common.ct, scan, scan.area_vectors_m2.sum(axis=0), settings, removed=common.taken)
 
 
 def fusion_record(aligned: Aligned, score: ChamferScore, fused: Fused) -> dict[str, Any]:
@@ -115,6 +119,7 @@ def fusion_record(aligned: Aligned, score: ChamferScore, fused: Fused) -> dict[s
     return {
         "spheres": len(aligned.loop.spheres),
         "spheres_moved": len(aligned.loop.moved),
+        "taken_away": len(aligned.only_ct),
         "spheres_rms_mm": mm(aligned.loop.rms_m),
         "T_scan_ct": aligned.T_scan_ct.tolist(),
         "distance_change_mm": mm(aligned.distances.worst_m),
@@ -138,7 +143,7 @@ def fusion_record(aligned: Aligned, score: ChamferScore, fused: Fused) -> dict[s
 def _show(record: dict[str, Any]) -> None:
     console.print(
         f"{record['spheres']} spheres in both, rms {record['spheres_rms_mm']:.3f} mm, "
-        f"{record['spheres_moved']} moved; "
+        f"{record['spheres_moved']} moved, {record['taken_away']} only in the CT, which are cut out; "
         f"largest change of a distance {record['distance_change_mm']:.3f} mm "
         f"(limit {record['distance_change_limit_mm']:g} mm)"
     )

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json as json_module
 import os
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -25,6 +26,8 @@ from service.cli.common import (
 from service.cli.compute.spheres import SeedsOption, spheres_of
 from service.compute.images.folder import image_folder
 from service.compute.markers.detectors import options_for
+from service.compute.markers.grounded.detector import GroundedDetector
+from service.compute.markers.grounded.weights import VARIABLE, weights_in
 from service.compute.markers.search.image_files import (
     DetectFile,
     LocatedOutlines,
@@ -33,7 +36,7 @@ from service.compute.markers.search.image_files import (
     searched_whole,
 )
 from service.compute.markers.search.paper_files import detect_file_by_masks, read_boxes
-from service.compute.pipeline import register_images
+from service.compute.pipeline import PipelineResult, register_images
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
 from service.compute.poses.files.pose_files import posed_images
 from service.compute.scene import PosedImages, ScanSpheres
@@ -41,7 +44,7 @@ from service.core.errors import ConfigurationError
 from service.core.geometry import Array
 from service.core.units import metres, mm
 
-DetectorName = Literal["classical", "paper"]
+DetectorName = Literal["classical", "paper", "grounded", "vote"]
 
 
 def register_command(
@@ -86,13 +89,25 @@ def register_command(
     ] = None,
     detector: Annotated[
         DetectorName,
-        typer.Option("--detector", help="paper: the published method, for comparison; it searches whole images."),
+        typer.Option(
+            "--detector",
+            help="paper: the published method without its networks; grounded: with Grounding DINO and SAM 2; vote: "
+            "grounded and classical. These search whole images.",
+        ),
     ] = "classical",
     boxes: Annotated[
         Path | None,
         typer.Option(
             "--boxes",
             help="For --detector paper: JSON with boxes (left, top, right, bottom) of another detector by image.",
+        ),
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(
+            "--weights",
+            envvar=VARIABLE,
+            help="For --detector grounded and vote: folder with grounding-dino/ and sam2/, the networks' weights.",
         ),
     ] = None,
     strict: StrictOption = False,
@@ -107,64 +122,64 @@ def register_command(
         files = list(folder.files)
         tell_left_out(folder.left_out)
         options = options_for(sphere_colour, largest_sphere)
-        detect = _file_detector(detector, boxes, [file.name for file in files])
         registration_m, control_m, radius_m = _spheres(mesh, spheres, radius_mm, mesh_unit, control, seeds)
+        names = [file.name for file in files]
+        spheres_seen = len(registration_m) + len(control_m)
+        detect, found_by = _file_detector(detector, boxes, names, weights, spheres_seen)
         T_world_camera = np.array([known[file.name] for file in files])
         processes = min(len(files), workers or os.cpu_count() or 1)
+        posed = PosedImages(T_world_camera, model, metric=not estimate_scale, names=names)
+        scanned = ScanSpheres(registration_m, radius_m, control_m=control_m)
         with progress_bar(quiet=json) as progress:
 
             def show(done: int, total: int) -> None:
                 progress("spheres in images", done, total)
 
-            if full_search or detector == "paper":
-                detected = detect_all(files, model, options, processes, show, detect=detect)
-                located = searched_whole(detected)
+            if full_search or detector != "classical":
+                # One process has the networks, which use all cores by themselves.
+                searchers = 1 if detector in ("grounded", "vote") else processes
+                located = searched_whole(detect_all(files, model, options, searchers, show, detect=detect))
             else:
-                located = locate_outlines(
-                    files,
-                    PosedImages(T_world_camera, model, metric=not estimate_scale),
-                    ScanSpheres(registration_m, radius_m, control_m=control_m),
-                    options=options,
-                    workers=processes,
-                    progress=show,
-                )
-        result = register_images(
-            located.outlines,
-            PosedImages(T_world_camera, model, metric=not estimate_scale, names=[file.name for file in files]),
-            ScanSpheres(registration_m, radius_m, control_m=control_m),
-            assignments=located.assignments,
-        )
+                located = locate_outlines(files, posed, scanned, options=options, workers=processes, progress=show)
+        result = register_images(located.outlines, posed, scanned, assignments=located.assignments)
         record = result.as_json(model)
-        record["spheres_mm"] = {
-            "registration": mm(registration_m).tolist(),
-            "control": mm(control_m).tolist(),
-        }
+        record["spheres_mm"] = {"registration": mm(registration_m).tolist(), "control": mm(control_m).tolist()}
         record["left_out"] = folder.left_out
-        record["search"] = _search(located, [file.name for file in files])
+        record["search"] = _search(located, names)
+        record["detector"] = {"name": detector, "weights_sha256": found_by}
         out.write_text(json_module.dumps(record, indent=1), encoding="utf-8")
         if json:
             print_json(record)
             return
-        console.print(
-            f"{record['n_images']} images, {len(result.markers)} spheres, {result.registration.rms_px:.3f} px rms, "
-            f"predicted error at their centre {record['predicted_error_mm']:.3f} mm"
-        )
-        if result.evaluation is not None:
-            evaluation = result.evaluation
-            console.print(
-                f"control spheres: {evaluation.mean_radial_error_mm:.3f} mm mean radial error, "
-                f"{evaluation.mean_reprojection_error_px:.2f} px mean reprojection error"
-            )
+        _tell(result, record)
         console.print(f"written: {out}")
 
 
-def _file_detector(detector: DetectorName, boxes: Path | None, names: list[str]) -> DetectFile | None:
-    """The detector for one file; None for the default."""
+def _tell(result: PipelineResult, record: dict[str, Any]) -> None:
+    console.print(
+        f"{record['n_images']} images, {len(result.markers)} spheres, {result.registration.rms_px:.3f} px rms, "
+        f"predicted error at their centre {record['predicted_error_mm']:.3f} mm"
+    )
+    if result.evaluation is not None:
+        evaluation = result.evaluation
+        console.print(
+            f"control spheres: {evaluation.mean_radial_error_mm:.3f} mm mean radial error, "
+            f"{evaluation.mean_reprojection_error_px:.2f} px mean reprojection error"
+        )
+
+
+def _file_detector(
+    detector: DetectorName, boxes: Path | None, names: list[str], folder: Path | None, least: int
+) -> tuple[DetectFile | None, Mapping[str, str]]:
+    """The detector for one file, None for the default, and the hashes of its weights, if it has any."""
+    if boxes is not None and detector != "paper":
+        raise typer.BadParameter("--boxes needs --detector paper")
+    if detector == "paper":
+        return partial(detect_file_by_masks, boxes=None if boxes is None else read_boxes(boxes, names)), {}
     if detector == "classical":
-        if boxes is not None:
-            raise typer.BadParameter("--boxes needs --detector paper")
-        return None
-    return partial(detect_file_by_masks, boxes=None if boxes is None else read_boxes(boxes, names))
+        return None, {}
+    weights = weights_in(folder)
+    return GroundedDetector.of(weights, least, vote=detector == "vote"), weights.sha256()
 
 
 def _search(located: LocatedOutlines, names: list[str]) -> dict[str, object]:

@@ -25,7 +25,8 @@ from service.cli.common import (
 )
 from service.core.errors import ConfigurationError
 from service.store.database.engine import database_path
-from service.store.store import Store, resolve_run
+from service.store.run_rows import resolve_run
+from service.store.store import Store
 from service.store.verification import verify as audit
 
 

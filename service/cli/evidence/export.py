@@ -41,7 +41,12 @@ def export_command(
     crop: Annotated[
         str, typer.Option(metavar="WIDTHxHEIGHT", help="Crops of this size without spheres, such as 1920x1080.")
     ] = "",
-    crops: Annotated[int, typer.Option(min=1, max=16, help="At most so many crops of each image.")] = 1,
+    crops: Annotated[
+        int,
+        typer.Option(
+            min=1, max=16, help="At most so many crops of each image; more than 1 without --crop: of 1920x1080."
+        ),
+    ] = 1,
     anonymous: Annotated[
         bool,
         typer.Option(

@@ -122,12 +122,31 @@ def _print(report: ReplayReport) -> None:
         f"Evidence verified first: {report.files_verified} files, "
         f"{megabytes(report.bytes_verified):.1f} MB read again."
     )
+    _print_versions(report)
+    _print_table(report)
+    for job in report.jobs:
+        if job.error or job.differences:
+            _print_job(job)
+    _print_gates(report)
+    for drift in report.drifts:
+        world = "" if drift.in_world_mm is None else f"{drift.in_world_mm:.6f} mm in the world, "
+        console.print(
+            f"Drift of {drift.registration} at the scene's centre: {world}"
+            f"{drift.against_cameras_mm:.6f} mm against the cameras"
+        )
+    console.print(f"[bold]The run is[/] {_WORDS[report.verdict]}")
+
+
+def _print_versions(report: ReplayReport) -> None:
     if report.versions:
         console.print(f"{len(report.versions)} installed distributions have other versions than recorded:")
         for change in report.versions:
             console.print(f"  {escape(change.name)} {change.recorded or 'none'} → {change.now or 'none'}")
     else:
         console.print("Every installed distribution has the version that was recorded.")
+
+
+def _print_table(report: ReplayReport) -> None:
     table = Table(box=None, pad_edge=False)
     for heading in ("step", "computed again", "result", "equal files", "took"):
         table.add_column(heading, justify="right" if heading == "took" else "left", overflow="fold")
@@ -141,9 +160,9 @@ def _print(report: ReplayReport) -> None:
             f"{job.duration_s:.1f} s",
         )
     print_table(table)
-    for job in report.jobs:
-        if job.error or job.differences:
-            _print_job(job)
+
+
+def _print_gates(report: ReplayReport) -> None:
     changed = [(gate.step, old, new) for gate in report.gates for old, new in gate.changed]
     console.print(
         f"Gates: {report.gates_judged} verdicts follow from the recorded measures; with the recomputed measures "
@@ -151,13 +170,6 @@ def _print(report: ReplayReport) -> None:
     )
     for step, old, new in changed:
         console.print(f"  {step}: {escape(describe(old))} → {escape(describe(new))}")
-    for drift in report.drifts:
-        world = "" if drift.in_world_mm is None else f"{drift.in_world_mm:.6f} mm in the world, "
-        console.print(
-            f"Drift of {drift.registration} at the scene's centre: {world}"
-            f"{drift.against_cameras_mm:.6f} mm against the cameras"
-        )
-    console.print(f"[bold]The run is[/] {_WORDS[report.verdict]}")
 
 
 def _print_job(job: JobReplay) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -56,21 +57,13 @@ def act_command(
         password = partial(typed_password, name, from_stdin=password_stdin)
         if verb in _OF_A_CAPTURE:
             name = who_acts(People(store), name, password).name
-            asked = step or state.current
-            _ask_capture(
-                store,
-                run_id,
-                protocol,
-                state,
-                CaptureAsked.model_validate({"step": asked, "attempt": state.step.attempt, "what": verb}),
-                name,
+            asked = CaptureAsked.model_validate(
+                {"step": step or state.current, "attempt": state.step.attempt, "what": verb}
             )
-            _report_recorded(run_id, verb, asked, name, json=json)
+            _ask_capture(store, run_id, protocol, state, asked, name)
+            _report_recorded(run_id, verb, asked.step, name, json=json)
             return
-        identity = identity_for(People(store), protocol, state, verb, name, password)
-        if identity is None and verb == "pause":  # pausing is always safe, so anybody may do it
-            identity = Identity(name, "", "claimed")
-        identity = identity or who_acts(People(store), name, password)
+        identity = _identity(store, protocol, state, verb, name, password)
         name = identity.name
         action = OperatorAction(
             action=verb,
@@ -89,6 +82,16 @@ def act_command(
             raise refusal
         store.record(run_id, [action], actor=name)
         _report_recorded(run_id, verb, action.step, name, json=json)
+
+
+def _identity(
+    store: Store, protocol: Protocol, state: RunState, verb: str, name: str, password: Callable[[], str]
+) -> Identity:
+    """Who acts. Pausing is always safe, so anybody may pause without a password."""
+    identity = identity_for(People(store), protocol, state, verb, name, password)
+    if identity is None and verb == "pause":
+        return Identity(name, "", "claimed")
+    return identity or who_acts(People(store), name, password)
 
 
 def _ask_capture(

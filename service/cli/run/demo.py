@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -40,7 +40,7 @@ from service.cli.shipped_protocols import shipped_protocols
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import inverse
-from service.core.protocol.models import load_protocol
+from service.core.protocol.models import LoadedProtocol, load_protocol
 from service.core.units import mm
 from service.dataset.posed.folder import check_folder
 from service.dataset.registrations import shared_adjustment_note
@@ -73,51 +73,70 @@ def demo_command(
     with reporting_errors(json), sigterm_like_ctrl_c():
         folder = out.resolve() / time.strftime("%Y%m%d-%H%M%S")
         with _simulated_rig(folder / "rig", scene, image_width, host or free_address()) as ready:
-            rig = load_rig(ready.rig)
-            loaded = load_protocol(shipped_protocols() / "demo.yaml", params_models())
-            data = folder / "data"
-            with Store.open(data) as store:
-                run_id = start_run(store, loaded, rig, operator="demo", auto_confirm=True)
-                state = drive(store, run_id, rig, data=data, auto_confirm=True, worker=True)
-                if state.status != "completed":
-                    raise OrthocaptureError(f"the demo is {state.status}: {state.stop_reason}", where=state.current)
-        with Store.open(data) as store, progress_bar(quiet=json) as progress:
-            summary = summarise(store, run_id, loaded.protocol)
-            dataset = folder / "dataset"
-            export_data_set(store, run_id, _EXPORTED, dataset, "demo", progress)
-            files = check_folder(dataset)
-            audit = verify(data, run_id, progress)  # with the record of the export
-            truth = true_errors_mm(summary, ready.truth)
-            report = folder / "report.html"
-            write_html(report_content(read_run(data, run_id), audit, true_error_mm=truth), report)
-            compared = summary.state.steps["ground_truth"].measures
-            rows = summary.table()
-            database = str(store.database_path)
-    result = _Result(
-        run=run_id,
-        data_dir=str(data),
-        database=database,
-        artefacts=str(data / "artefacts"),
-        dataset=str(dataset),
-        report=str(report),
-        audit_ok=audit.ok,
-        dataset_files=files,
-        chamfer_mm=round(compared["chamfer_ct_scan_mm"], 4),
-        ct_to_scan_mm=round(compared["ct_to_scan_mm"], 4),
-        scan_to_ct_mm=round(compared["scan_to_ct_mm"], 4),
-        ct_to_scan_median_mm=round(compared["ct_to_scan_median_mm"], 4),
-        scan_to_ct_median_mm=round(compared["scan_to_ct_median_mm"], 4),
-        chamfer_floor_mm=round(compared["chamfer_floor_mm"], 4),
-        duration_s=round(time.monotonic() - started_s, 1),
-        table_note=shared_adjustment_note(summary.protocol, summary.state),
-    )
+            run_id = _run_to_its_end(folder / "data", ready.rig)
+        with progress_bar(quiet=json) as progress:
+            summary, truth, result = _evaluated(folder, run_id, ready.truth, started_s, progress)
+    rows = summary.table()
     if json:
         table = [{**row.plain(), "true_error_mm": truth[row.poses]} for row in rows]
         print_json({**asdict(result), "table": table})
     else:
         _print(result, rows, truth)
-    if not audit.ok:
+    if not result.audit_ok:
         raise typer.Exit(1)
+
+
+def _run_to_its_end(data: Path, rig_file: Path) -> str:
+    """Drive a run of the demo's protocol and return its name. Raises OrthocaptureError if it does not complete."""
+    rig = load_rig(rig_file)
+    with Store.open(data) as store:
+        run_id = start_run(store, _protocol(), rig, operator="demo", auto_confirm=True)
+        state = drive(store, run_id, rig, data=data, auto_confirm=True, worker=True)
+    if state.status != "completed":
+        raise OrthocaptureError(f"the demo is {state.status}: {state.stop_reason}", where=state.current)
+    return run_id
+
+
+def _protocol() -> LoadedProtocol:
+    return load_protocol(shipped_protocols() / "demo.yaml", params_models())
+
+
+def _evaluated(
+    folder: Path, run_id: str, truth_file: Path, started_s: float, progress: Callable[[str, int, int], None]
+) -> tuple[RunSummary, dict[str, float], _Result]:
+    """Export the data set, verify the record and write the report: summary, true errors in mm, and the result."""
+    data, dataset, report = folder / "data", folder / "dataset", folder / "report.html"
+    with Store.open(data) as store:
+        summary = summarise(store, run_id, _protocol().protocol)
+        export_data_set(store, run_id, _EXPORTED, dataset, "demo", progress)
+        database = str(store.database_path)
+    files = check_folder(dataset)
+    audit = verify(data, run_id, progress)  # with the record of the export
+    truth = true_errors_mm(summary, truth_file)
+    write_html(report_content(read_run(data, run_id), audit, true_error_mm=truth), report)
+    compared = {name: round(value, 4) for name, value in summary.state.steps["ground_truth"].measures.items()}
+    return (
+        summary,
+        truth,
+        _Result(
+            run=run_id,
+            data_dir=str(data),
+            database=database,
+            artefacts=str(data / "artefacts"),
+            dataset=str(dataset),
+            report=str(report),
+            audit_ok=audit.ok,
+            dataset_files=files,
+            chamfer_mm=compared["chamfer_ct_scan_mm"],
+            ct_to_scan_mm=compared["ct_to_scan_mm"],
+            scan_to_ct_mm=compared["scan_to_ct_mm"],
+            ct_to_scan_median_mm=compared["ct_to_scan_median_mm"],
+            scan_to_ct_median_mm=compared["scan_to_ct_median_mm"],
+            chamfer_floor_mm=compared["chamfer_floor_mm"],
+            duration_s=round(time.monotonic() - started_s, 1),
+            table_note=shared_adjustment_note(summary.protocol, summary.state),
+        ),
+    )
 
 
 def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:

@@ -103,12 +103,7 @@ def import_command(
         about = about_run(specimen=specimen, purpose=purpose, site=site, text=remarks)
         loaded = load_protocol(protocol, params_models())
         with progress_bar(quiet=json) as progress:
-            parts: set[PhotographRole | FileRole] = set()
-            for step in loaded.protocol.step_ids:
-                part = part_of(loaded.protocol, step)
-                if part is not None:
-                    parts.add(part)
-            listing = list_import(find_places(folder, given, parts), progress)
+            listing = list_import(find_places(folder, given, _parts_of(loaded.protocol)), progress)
         _require_wanted(loaded.protocol, listing)
         if not json:
             _show(listing)
@@ -124,19 +119,23 @@ def import_command(
             summary = summarise(store, run_id, loaded.protocol)
             table, note = summary.table(), shared_adjustment_note(loaded.protocol, summary.state)
         if json:
-            print_json(
-                {
-                    "run": run_id,
-                    "status": state.status,
-                    "table": [row.plain() for row in table],
-                    "table_note": note,
-                    **listing_record(listing),
-                }
-            )
+            rows = [row.plain() for row in table]
+            answer = {"run": run_id, "status": state.status, "table": rows, "table_note": note}
+            print_json({**answer, **listing_record(listing)})
         else:
             _show_result(run_id, state.status, state.deviation_count, table, note)
         if state.status != "completed":
             raise typer.Exit(1)
+
+
+def _parts_of(protocol: Protocol) -> set[PhotographRole | FileRole]:
+    """What the steps of a protocol import."""
+    parts: set[PhotographRole | FileRole] = set()
+    for step in protocol.step_ids:
+        part = part_of(protocol, step)
+        if part is not None:
+            parts.add(part)
+    return parts
 
 
 def _require_wanted(protocol: Protocol, listing: ImportList) -> None:

@@ -56,21 +56,11 @@ def doctor_command(
     json: JsonOption = False,
 ) -> None:
     """Open every device of a rig; report versions, clock offsets, free space and problems."""
-    found: dict[str, DeviceReport | OrthocaptureError] = {}
     with reporting_errors(json):
         rig_file = load_rig(rig)
         loaded = None if protocol is None else load_protocol(protocol, params_models()).protocol
         station = Station(rig_file)
-        try:
-            with progress_bar(quiet=json) as progress:
-                for i, name in enumerate(station.names()):
-                    progress(f"opening {name}", i, len(station.names()))
-                    try:
-                        found[name] = station.device(name).report()
-                    except (DeviceError, ConfigurationError) as error:
-                        found[name] = error
-        finally:
-            station.close()
+        found = _reports(station, quiet=json)
         existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
         free_bytes = shutil.disk_usage(existing).free
         space = None if loaded is None else _foresee(data, loaded, free_bytes, simulated=rig_file.section.simulated)
@@ -90,14 +80,34 @@ def doctor_command(
             console.print(f"[bold yellow]![/] not installed: {escape(what)} (see docs/howto/installation.md)")
         for name, report in found.items():
             _print(name, report)
-        note = "" if free_bytes > _LOW_DISK_BYTES else "  [yellow]little for a full capture[/]"
-        console.print(f"[bold]data folder[/] {escape(str(data))}: {gigabytes(free_bytes):.1f} GB free{note}")
-        console.print(f"[bold]this machine's clock[/] {escape(_clock_words(clock))}")
-        if space is not None:
-            colour = {"enough": "green", "short": "yellow", "stop": "red"}[space.verdict]
-            console.print(f"    [{colour}]{escape(space.words)}[/]")
+        _print_machine(data, free_bytes, space, clock)
     if not healthy:
         raise typer.Exit(1)
+
+
+def _reports(station: Station, *, quiet: bool) -> dict[str, DeviceReport | OrthocaptureError]:
+    """Open every device of a rig: its report, or the error that opening it raised. Closes them all."""
+    found: dict[str, DeviceReport | OrthocaptureError] = {}
+    try:
+        with progress_bar(quiet=quiet) as progress:
+            for i, name in enumerate(station.names()):
+                progress(f"opening {name}", i, len(station.names()))
+                try:
+                    found[name] = station.device(name).report()
+                except (DeviceError, ConfigurationError) as error:
+                    found[name] = error
+    finally:
+        station.close()
+    return found
+
+
+def _print_machine(data: Path, free_bytes: int, space: Forecast | None, clock: HostClock) -> None:
+    note = "" if free_bytes > _LOW_DISK_BYTES else "  [yellow]little for a full capture[/]"
+    console.print(f"[bold]data folder[/] {escape(str(data))}: {gigabytes(free_bytes):.1f} GB free{note}")
+    console.print(f"[bold]this machine's clock[/] {escape(_clock_words(clock))}")
+    if space is not None:
+        colour = {"enough": "green", "short": "yellow", "stop": "red"}[space.verdict]
+        console.print(f"    [{colour}]{escape(space.words)}[/]")
 
 
 def _clock_words(clock: HostClock) -> str:

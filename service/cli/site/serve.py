@@ -25,7 +25,7 @@ from service.cli.shipped_protocols import shipped_protocols
 from service.core.errors import ConfigurationError
 from service.logs.file_log import file_log
 from service.people.sessions import People
-from service.rig import load_rig
+from service.rig import Rig, load_rig
 from service.run_start import signature_copy
 from service.steps import params_models
 from service.store.records import SITE
@@ -94,11 +94,7 @@ def serve_command(
         tls = _tls(tls_certificate, tls_key)
         lan = _leaves_this_machine(host)
         if lan and tls is None and not insecure_lan:
-            raise ConfigurationError(
-                f"{host} is reachable from other machines, and there is no TLS",
-                where="--host",
-                remedy="Give --tls-certificate and --tls-key, or --insecure-lan in a network you trust",
-            )
+            raise _unprotected(host)
         rig_file = load_rig(rig)
         proxies = known_proxies(trusted_proxy or [])
         limits = ConnectionLimits(affordable_connections(connections), address_connections, client_wait_s)
@@ -123,16 +119,28 @@ def serve_command(
             )
             record_start(store, rig_file, site.protocol_files(), address)
             link = people.first_link()
-            checkpoint(store, SITE)
-            keep_elsewhere(data, signature_copy(rig_file), error_console.print)
+            _seal(store, data, rig_file)
             http = server(create_app(site), listener, proxies, tls, log)
             with http.capture_signals():
                 _announce(address, f"{address}/set-up/{link}" if link else "", json=json)
                 # The numerics behind steps and protocols take seconds to load, so load them in the background.
                 threading.Thread(target=params_models, daemon=True).start()
                 http.run(sockets=[listener])
-            checkpoint(store, SITE)
-            keep_elsewhere(data, signature_copy(rig_file), error_console.print)
+            _seal(store, data, rig_file)
+
+
+def _unprotected(host: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"{host} is reachable from other machines, and there is no TLS",
+        where="--host",
+        remedy="Give --tls-certificate and --tls-key, or --insecure-lan in a network you trust",
+    )
+
+
+def _seal(store: Store, data: Path, rig: Rig) -> None:
+    """Sign the end of the site's chain, and keep a copy of the signature where the rig says."""
+    checkpoint(store, SITE)
+    keep_elsewhere(data, signature_copy(rig), error_console.print)
 
 
 def _announce(address: str, set_up: str, *, json: bool) -> None:

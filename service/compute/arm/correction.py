@@ -8,17 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.arm.kinematics import ArmModel, arm_model, chain, dh_jacobian, pose_gap
+from service.compute.arm.kinematics import chain, dh_jacobian, pose_gap
+from service.core.arms.known import arm_model
+from service.core.arms.model import ArmModel
 from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.units import mm
 
-HARMONICS = np.arange(1, 11)  # periods per revolution; tens of poses cannot tell faster ones from noise
-# Usual manufacturing tolerances of a joint's a, d, α, θ; only the ratios matter, the scale is estimated.
-DH_TOLERANCE = np.array([0.2e-3, 0.2e-3, np.radians(0.015), np.radians(0.04)])
-GEAR_TOLERANCE_RAD = np.radians(0.01)  # per harmonic
-N_DH = 24
-N_GEAR = 6 * 2 * len(HARMONICS)
 _MODEL_GAP_M, _MODEL_GAP_RAD = 0.02, np.radians(3.0)
 
 
@@ -32,10 +28,10 @@ class ArmCorrection:
 
     Attributes:
         arm: name of the arm model to whose nominal parameters these are added.
-        dh_deltas: (6, 4) added to a, d (metres), α, θ (radians) of each joint.
-        gear_cos_rad: (6, H) amplitudes of cos(k q), k = 1 … H, added to each joint's angle.
-        gear_sin_rad: (6, H) amplitudes of sin(k q).
-        observed: (6,) share of each joint's error that the images determine, 0 … 1: 1 - posterior / prior variance,
+        dh_deltas: (N, 4) added to a, d (metres), α, θ (radians) of each joint.
+        gear_cos_rad: (N, H) amplitudes of cos(k q), k = 1 … H, added to each joint's angle.
+        gear_sin_rad: (N, H) amplitudes of sin(k q).
+        observed: (N,) share of each joint's error that the images determine, 0 … 1: 1 - posterior / prior variance,
             over the terms in use.
     """
 
@@ -73,10 +69,12 @@ class ArmCorrection:
             )
         except (KeyError, ValueError, TypeError, OverflowError) as error:
             raise DataError(f"not an arm correction: {error!r}", where=_PLACE, remedy=_REMEDY) from error
+        axes = len(found.observed) if found.observed.ndim == 1 else 0
         if (
-            found.dh_deltas.shape != (6, 4)
+            axes == 0
+            or found.dh_deltas.shape != (axes, 4)
             or found.gear_cos_rad.ndim != 2
-            or found.gear_cos_rad.shape[0] != 6
+            or len(found.gear_cos_rad) != axes
             or found.gear_cos_rad.shape != found.gear_sin_rad.shape
         ):
             raise DataError("not an arm correction: the shapes are inconsistent", where=_PLACE, remedy=_REMEDY)
@@ -87,7 +85,7 @@ def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction:
     """The arm's true poses: reported poses times the difference between corrected and nominal kinematics.
 
     Args:
-        joints_rad: (6,) or (N, 6) as reported by the controller.
+        joints_rad: (J,) or (N, J) as reported by the controller.
         T_base_flange: (4, 4) or (N, 4, 4) as reported by the controller.
         correction: from a hand-eye calibration of the same arm.
 
@@ -102,13 +100,17 @@ def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction:
         return corrected_T_base_flange(joints[None], poses[None], correction)[0]
     arm = arm_model(correction.arm)
     check_arm(arm, joints, poses)
+    if len(correction.dh_deltas) != arm.axes:
+        raise DataError(
+            f"a correction of {len(correction.dh_deltas)} joints for a {arm.name}", where=_PLACE, remedy=_REMEDY
+        )
     nominal = arm.joint_values(joints)
     k = np.arange(1, correction.gear_cos_rad.shape[1] + 1)
     phase = joints[:, :, None] * k
     gears = np.sum(correction.gear_cos_rad * np.cos(phase) + correction.gear_sin_rad * np.sin(phase), axis=2)
     real = nominal + correction.dh_deltas
     real[:, :, 3] += gears
-    before, after = chain(nominal)[:, 6], chain(real)[:, 6]
+    before, after = chain(nominal)[:, -1], chain(real)[:, -1]
     R_t = np.swapaxes(before[:, :3, :3], 1, 2)
     gap = np.broadcast_to(np.eye(4), before.shape).copy()
     gap[:, :3, :3] = R_t @ after[:, :3, :3]
@@ -131,22 +133,32 @@ def check_arm(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
         )
 
 
-def correction_design(arm: ArmModel, joints_rad: Array) -> Array:
-    """(N, 6, 24 + 120) derivative of the flange's pose by all parameters, each in units of its tolerance.
+def dh_count(arm: ArmModel) -> int:
+    """How many parameters the geometry of an arm has in `correction_design`."""
+    return 4 * arm.axes
 
-    Columns: DH deltas joint by joint (a, d, α, θ), then for each joint cos(k q), sin(k q), k = 1 … 10.
+
+def gear_count(arm: ArmModel) -> int:
+    """How many parameters the gears of an arm have in `correction_design`."""
+    return arm.axes * 2 * arm.tolerances.harmonics
+
+
+def correction_design(arm: ArmModel, joints_rad: Array) -> Array:
+    """(N, 6, `dh_count` + `gear_count`) derivative of the flange's pose by all parameters, in units of tolerances.
+
+    Columns: DH deltas joint by joint (a, d, α, θ), then for each joint cos(k q), then sin(k q), k = 1 … `harmonics`.
     """
     J = dh_jacobian(chain(arm.joint_values(joints_rad)))
-    phase = joints_rad[:, :, None] * HARMONICS
-    waves = np.stack([np.cos(phase), np.sin(phase)], axis=2)  # (N, 6, 2, H)
-    gears = J[:, :, 3::4, None, None] * waves[:, None]  # (N, 6 rows, 6 joints, 2, H)
-    dh = J * np.tile(DH_TOLERANCE, 6)
-    return np.concatenate([dh, gears.reshape(len(J), 6, -1) * GEAR_TOLERANCE_RAD], axis=2)
+    phase = joints_rad[:, :, None] * np.arange(1, arm.tolerances.harmonics + 1)
+    waves = np.stack([np.cos(phase), np.sin(phase)], axis=2)  # (N, joints, 2, H)
+    gears = J[:, :, 3::4, None, None] * waves[:, None]  # (N, 6 rows, joints, 2, H)
+    dh = J * np.tile(arm.tolerances.dh, arm.axes)
+    return np.concatenate([dh, gears.reshape(len(J), 6, -1) * arm.tolerances.gear_rad], axis=2)
 
 
 def correction_of(arm: ArmModel, scaled: Array, observed: Array) -> ArmCorrection:
-    """The correction from scaled parameters (24 + 120,) in the order of `correction_design`."""
-    gears = scaled[N_DH:].reshape(6, 2, len(HARMONICS)) * GEAR_TOLERANCE_RAD
-    return ArmCorrection(
-        arm.name, scaled[:N_DH].reshape(6, 4) * DH_TOLERANCE, gears[:, 0].copy(), gears[:, 1].copy(), observed
-    )
+    """The correction from scaled parameters (`dh_count` + `gear_count`,) in the order of `correction_design`."""
+    count, of = dh_count(arm), arm.tolerances
+    gears = scaled[count:].reshape(arm.axes, 2, of.harmonics) * of.gear_rad
+    deltas = scaled[:count].reshape(arm.axes, 4) * np.array(of.dh)
+    return ArmCorrection(arm.name, deltas, gears[:, 0].copy(), gears[:, 1].copy(), observed)

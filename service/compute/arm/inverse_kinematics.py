@@ -1,4 +1,4 @@
-"""Closed-form inverse kinematics of the Universal Robots arms: all postures that reach a pose."""
+"""Closed-form inverse kinematics: the postures that reach a pose, and the one that is nearest to another."""
 
 from __future__ import annotations
 
@@ -6,13 +6,45 @@ from itertools import product
 
 import numpy as np
 
-from service.compute.arm.kinematics import JOINT_LIMIT_RAD, ArmModel
+from service.core import seven_axes
+from service.core.arms.model import ArmModel
 from service.core.geometry import Array, Transform, inverse
 
 _REACH_TOLERANCE = 1e-9
 
 
 def postures(arm: ArmModel, T_base_flange: Transform) -> Array:
+    """Joints (K, N) within ±180° and the limits that reach a pose; an empty array if there are none.
+
+    Up to eight for six axes; for seven, those of elbow angles all round.
+    """
+    if arm.family == "seven_axes":
+        return seven_axes.postures(arm, T_base_flange)
+    found = _universal_robot(arm, T_base_flange)
+    return found[np.all(np.abs(found) <= arm.limits_rad, axis=1)]
+
+
+def postures_near(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array:
+    """Joints (K, N) within the limits that reach a pose, those nearest to `near_rad` (N,) first.
+
+    With seven axes nearness is weighed against room to limits and singularities.
+    """
+    if arm.family == "seven_axes":
+        return seven_axes.postures_by_cost(arm, T_base_flange, near_rad)
+    found = _universal_robot(arm, T_base_flange)
+    found = found + 2 * np.pi * np.round((near_rad - found) / (2 * np.pi))
+    found = np.where(np.abs(found) > arm.limits_rad, found - 2 * np.pi * np.sign(found), found)
+    found = found[np.all(np.abs(found) <= arm.limits_rad, axis=1)]
+    return found[np.argsort(np.sum((found - near_rad) ** 2, axis=1), kind="stable")]
+
+
+def nearest_posture(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array | None:
+    """The first of `postures_near`; None if the pose is out of reach."""
+    found = postures_near(arm, T_base_flange, near_rad)
+    return found[0] if len(found) else None
+
+
+def _universal_robot(arm: ArmModel, T_base_flange: Transform) -> Array:
     """Joints (K, 6), K ≤ 8, within ±180°, that reach a pose; an empty array if there are none.
 
     The eight are shoulder left or right, wrist up or down, elbow up or down. Where the last axis is parallel to the
@@ -50,16 +82,6 @@ def postures(arm: ArmModel, T_base_flange: Transform) -> Array:
             T_3_4 = inverse(_link(arm, 1, q2) @ _link(arm, 2, q3)) @ T_1_4
             found.append(np.array([q1, q2, q3, np.arctan2(T_3_4[1, 0], T_3_4[0, 0]), q5, q6]))
     return np.mod(np.array(found).reshape(-1, 6) + np.pi, 2 * np.pi) - np.pi
-
-
-def nearest_posture(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array | None:
-    """The joints (6,) that reach a pose and are nearest to `near_rad` (6,), within ±360°; None if out of reach."""
-    found = postures(arm, T_base_flange)
-    if not len(found):
-        return None
-    found = found + 2 * np.pi * np.round((near_rad - found) / (2 * np.pi))
-    found = np.where(np.abs(found) > JOINT_LIMIT_RAD, found - 2 * np.pi * np.sign(found), found)
-    return np.asarray(found[int(np.argmin(np.sum((found - near_rad) ** 2, axis=1)))], dtype=np.float64)
 
 
 def _link(arm: ArmModel, i: int, angle: float) -> Transform:

@@ -1,4 +1,4 @@
-"""Reads joint angles recorded with images: CSV image,q1,…,q6 in radians."""
+"""Reads joint angles recorded with images: CSV image,q1,…,qN in radians, one column an axis."""
 
 from __future__ import annotations
 
@@ -11,21 +11,24 @@ from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.text.file_text import csv_rows
 
-_HEADER = ("image", "q1", "q2", "q3", "q4", "q5", "q6")
+_AXES = range(1, 17)  # no arm has more
 _LARGEST_RAD = 4 * np.pi  # beyond any arm's range: the file is in degrees
 
 
 def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
-    """Joints (6,) in radians by image name.
+    """Joints (N,) in radians by image name; N is the number of columns q1, q2, …
 
     Raises:
         DataError: the file is missing or malformed (with file:line), in degrees, or lacks an image.
     """
     rows = csv_rows(path)
     header = tuple(cell.strip() for cell in next(rows, (1, []))[1])
-    if header != _HEADER:
+    axes = len(header) - 1
+    if axes not in _AXES or header != ("image", *(f"q{k}" for k in range(1, axes + 1))):
         raise DataError(
-            f"the first line is {','.join(header)!r}", where=f"{path}:1", remedy=f"it must be {','.join(_HEADER)}"
+            f"the first line is {','.join(header)!r}",
+            where=f"{path}:1",
+            remedy="it must be image,q1,q2,… with a column for each of the arm's axes",
         )
     joints: dict[str, Array] = {}
     for line, row in rows:
@@ -36,8 +39,8 @@ def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
             values = np.array([float(cell) for cell in row[1:]])
         except ValueError:
             raise DataError("a field is not a number", where=where, remedy="correct the line") from None
-        if values.shape != (6,) or not np.isfinite(values).all():
-            raise DataError("not six finite numbers after the name", where=where, remedy="correct the line")
+        if values.shape != (axes,) or not np.isfinite(values).all():
+            raise DataError(f"not {axes} finite numbers after the name", where=where, remedy="correct the line")
         if np.abs(values).max() > _LARGEST_RAD:
             raise DataError(
                 f"{np.abs(values).max():.0f} rad is not a joint angle", where=where, remedy="write radians"

@@ -36,16 +36,12 @@ class Closure:
         rms_m: root mean square of the distances (3D), after the alignment if there is one.
         predicted_m: rms predicted from the covariances.
         normalised_chi2: squared Mahalanobis distance per degree of freedom; near 1 if the covariances are right.
-        residuals_m: (n, 3) position in b minus position in a, in the frame of a.
-        significance: (n,) Mahalanobis distance of each sphere's residual, in standard deviations.
     """
 
     n: int
     rms_m: float
     predicted_m: float
     normalised_chi2: float
-    residuals_m: Array = field(repr=False)
-    significance: Array = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,8 +96,8 @@ def _intersect(
 ) -> SeenSphere:
     """Intersect the viewing cones of one sphere by Gauss–Newton.
 
-    Inliers and the variance factor are chosen anew before each step, so there is no fixed cost to minimise and
-    `descent` does not apply. The covariance uses those of the last step.
+    Inliers and the variance factor are chosen anew before each step, so there is no fixed cost that
+    `service.compute.descent` could minimise, and the covariance is that of the last step's equations.
     """
     T = T_scan_camera[[i for i, _ in seen]]
     cones = ObservedCones.of(o.cone for _, o in seen)
@@ -136,8 +132,6 @@ def compare_in_frame(a: Array, covariance_a: Array, b: Array, covariance_b: Arra
         float(np.sqrt(np.mean(np.sum(r**2, axis=1)))),
         float(np.sqrt(np.mean(np.trace(C, axis1=1, axis2=2)))),
         float(square.sum()) / (3 * len(a)),
-        r,
-        np.sqrt(square),
     )
 
 
@@ -175,13 +169,10 @@ def compare_shapes(a: Array, covariance_a: Array, b: Array, covariance_b: Array)
         0, 2, 1
     )  # of a residual, the alignment being fitted
     square = np.einsum("ni,nij,nj->n", r, np.linalg.inv(covariance), r)
-    single = np.einsum("ni,nij,nj->n", r, np.linalg.pinv(left), r)
     closure = Closure(
         len(a),
         float(np.sqrt(np.mean(np.sum(r**2, axis=1)))),
         float(np.sqrt(np.mean(np.trace(left, axis1=1, axis2=2)))),
         float(square.sum()) / (3 * len(a) - 6),
-        r,
-        np.sqrt(single),
     )
     return closure, Alignment(T_a_b, np.linalg.inv(information).astype(np.float64))

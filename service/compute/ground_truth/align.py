@@ -12,7 +12,7 @@ from service.compute.ground_truth.surface import Surface
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.loop_closure import LoopClosure, close_loop
 from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
-from service.core.geometry import Array, Transform
+from service.core.geometry import Array, Transform, apply
 
 TRANSPORT_GATE_M = 3e-4  # largest change of a distance between spheres over the transport
 
@@ -36,6 +36,7 @@ class Aligned:
         loop: the spheres one by one.
         distances: their distances before (CT) and after (scan) the transport.
         only_ct: spheres, by their numbers in the CT, that the scan lacks.
+        taken_away_m: (K, 3) centres of these, in the frame of the scan.
         scan_spheres_m: (M, 3) centres in the scan.
         sigma_ct_m, sigma_scan_m: median rms of the surface of the spheres in each: its noise.
     """
@@ -45,6 +46,7 @@ class Aligned:
     loop: LoopClosure
     distances: DistanceChange
     only_ct: tuple[int, ...]
+    taken_away_m: Array = field(repr=False)
     scan_spheres_m: Array = field(repr=False)
     sigma_ct_m: float
     sigma_scan_m: float
@@ -76,6 +78,7 @@ def align_spheres(ct: Spheres, scan: Spheres) -> Aligned:
         loop=loop,
         distances=distance_changes(ct.centres_m, scan.centres_m, [(k, n) for n, k in match.pairs]),
         only_ct=match.missing_b,
+        taken_away_m=apply(loop.T_a_b, ct.centres_m[list(match.missing_b)].reshape(-1, 3)),
         scan_spheres_m=scan.centres_m,
         sigma_ct_m=float(np.median(ct.rms_m)),
         sigma_scan_m=float(np.median(scan.rms_m)),

@@ -48,15 +48,11 @@ class DistanceChange:
     """Distances between spheres before and after the transport.
 
     Attributes:
-        pairs: (P, 2) indices of the spheres of each distance.
-        change_m: (P,) after minus before.
         worst: the two spheres whose distance changed most.
         worst_m: that change, without its sign: what the gate judges.
         rms_m: of all changes.
     """
 
-    pairs: tuple[tuple[int, int], ...] = field(repr=False)
-    change_m: Array = field(repr=False)
     worst: tuple[int, int]
     worst_m: float
     rms_m: float
@@ -80,4 +76,4 @@ def distance_changes(before_m: Array, after_m: Array, pairs: Sequence[tuple[int,
     first, second = np.array(both).T
     change = np.linalg.norm(b[first] - b[second], axis=1) - np.linalg.norm(a[first] - a[second], axis=1)
     worst = int(np.abs(change).argmax())
-    return DistanceChange(both, change, both[worst], float(np.abs(change[worst])), float(np.sqrt(np.mean(change**2))))
+    return DistanceChange(both[worst], float(np.abs(change[worst])), float(np.sqrt(np.mean(change**2))))

@@ -87,5 +87,7 @@ def read_ply(path: Path) -> tuple[dict[str, NDArray[np.generic]], IntArray]:
         vertex = np.frombuffer(body, dtype=kinds, count=counts["vertex"])
         face = np.frombuffer(body, dtype=_FACE, count=counts["face"], offset=vertex.nbytes)
     except (ValueError, KeyError, IndexError, UnicodeDecodeError) as error:
-        raise DataError("no PLY file of this program, or cut short", where=str(path)) from error
+        raise DataError(
+            "no PLY file of this program, or cut short", where=str(path), remedy="Write it again"
+        ) from error
     return {name: vertex[name] for name, _ in kinds}, face["vertices"].astype(np.int64)

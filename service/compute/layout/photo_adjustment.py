@@ -219,26 +219,9 @@ class _Problem:
 
     def step(self, x: _State) -> tuple[Array, Array, float]:
         """A Gauss–Newton step, the covariance of all unknowns, and chi² per degree of freedom."""
-        n_centres, n_geometry = 3 * self.n_spheres, self.geometry.stop
-        n = n_geometry + _LENS + self.n_photos
-        seen = np.einsum("mij,mj->mi", x.rotations[self.photo], x.centres[self.sphere]) + x.shifts[self.photo]
-        focal = x.focal[self.photo]
-        m = self._measure(seen, x.lens, focal)
-        by_place = self._derivative(lambda d: self._measure(seen + d, x.lens, focal), m, np.full(3, 1e-6))
-        by_lens = self._derivative(lambda d: self._measure(seen, x.lens + d, focal), m, np.full(_LENS, 1e-6))
-        J = np.zeros((len(m), 3, n))
-        rows = np.arange(len(m))
-        turned = np.einsum("mij,mjk->mik", by_place, x.rotations[self.photo])
-        for axis in range(3):
-            J[rows, :, 3 * self.sphere + axis] = turned[:, :, axis]
-        later = self.photo > 0
-        offset = n_centres + 6 * (self.photo[later] - 1)
-        by_turn = np.cross(seen[later, None] - x.shifts[self.photo[later], None], by_place[later])
-        for axis in range(3):
-            J[rows[later], :, offset + axis] = by_turn[:, :, axis]
-            J[rows[later], :, offset + 3 + axis] = by_place[later][:, :, axis]
-        J[:, :, n_geometry : n_geometry + _LENS] = by_lens
-        J[rows, :, n_geometry + _LENS + self.photo] = by_lens[:, :, 0]
+        n_geometry = self.geometry.stop
+        m, J = self._rows(x)
+        n = J.shape[2]
         white_m = np.einsum("mij,mj->mi", self.whiten, m)
         size = np.sqrt(np.mean(white_m**2, axis=1))
         weight = np.sqrt(np.minimum(1.0, _DOUBTFUL / np.maximum(size, 1e-9)))
@@ -260,6 +243,29 @@ class _Problem:
         freedom = max(white_m.size - n_geometry, 1)
         chi2 = float(white_m @ white_m + at @ (priors * at)) / freedom
         return step, covariance, chi2
+
+    def _rows(self, x: _State) -> tuple[Array, Array]:
+        """Differences (M, 3) of the outlines, and their derivative (M, 3, n) by all unknowns."""
+        n_centres, n_geometry = 3 * self.n_spheres, self.geometry.stop
+        seen = np.einsum("mij,mj->mi", x.rotations[self.photo], x.centres[self.sphere]) + x.shifts[self.photo]
+        focal = x.focal[self.photo]
+        m = self._measure(seen, x.lens, focal)
+        by_place = self._derivative(lambda d: self._measure(seen + d, x.lens, focal), m, np.full(3, 1e-6))
+        by_lens = self._derivative(lambda d: self._measure(seen, x.lens + d, focal), m, np.full(_LENS, 1e-6))
+        J = np.zeros((len(m), 3, n_geometry + _LENS + self.n_photos))
+        rows = np.arange(len(m))
+        turned = np.einsum("mij,mjk->mik", by_place, x.rotations[self.photo])
+        for axis in range(3):
+            J[rows, :, 3 * self.sphere + axis] = turned[:, :, axis]
+        later = self.photo > 0
+        offset = n_centres + 6 * (self.photo[later] - 1)
+        by_turn = np.cross(seen[later, None] - x.shifts[self.photo[later], None], by_place[later])
+        for axis in range(3):
+            J[rows[later], :, offset + axis] = by_turn[:, :, axis]
+            J[rows[later], :, offset + 3 + axis] = by_place[later][:, :, axis]
+        J[:, :, n_geometry : n_geometry + _LENS] = by_lens
+        J[rows, :, n_geometry + _LENS + self.photo] = by_lens[:, :, 0]
+        return m, J
 
     def moved(self, x: _State, step: Array) -> _State:
         """The state after a step."""

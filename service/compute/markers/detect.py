@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +57,21 @@ def detect_spheres(
             f"the camera model is for {camera.width}×{camera.height}",
             remedy="Use the calibration made at this image size, and images that no program has rotated or resized",
         )
-    todo = find_rough(image_bgr, camera, options)
+    return confirmed_outlines(image_bgr, camera, find_rough(image_bgr, camera, options), options)
+
+
+def confirmed_outlines(
+    image_bgr: NDArray[np.uint8], camera: CameraModel, roughs: Sequence[RoughSphere], options: DetectionOptions
+) -> tuple[SphereOutline, ...]:
+    """The outlines near rough ones that the edges at full resolution confirm, the most certain first.
+
+    Args:
+        image_bgr: (H, W, 3), of the camera's size.
+        camera: intrinsics.
+        roughs: the best first; of those in one place, the first that is confirmed counts.
+        options: of the detector.
+    """
+    todo = list(roughs)
     found: list[SphereOutline] = []
     while todo:
         # One rough outline of each place at a time, the best first; all places in parallel.

@@ -18,9 +18,9 @@ from service.core.geometry import Array
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom, pixels
 
-_MARGIN = 0.35  # of a circle's radius, added around its box
-_MASK_SIDE = 96  # pixels to which a box is reduced for its mask and the ellipse
-_MAX_LOSS = 0.3  # false pixels of the best ellipse over the mask's area
+MARGIN = 0.35  # of a circle's radius, added around its box
+MASK_SIDE = 96  # pixels to which a box is reduced for its mask and the ellipse
+MOST_LOSS = 0.3  # false pixels of the best ellipse over the mask's area
 _LEAST_STEP = 10.0  # grey levels between sphere and surroundings for a channel to be used
 _ENVELOPE = 0.08  # of the semi-axis, on both sides of the ellipse
 _SLOTS = 96  # azimuth bins for the outline's coverage
@@ -69,7 +69,7 @@ def detect_by_masks(
         if mask is None:
             continue
         estimate = fit_ellipse(mask, box)
-        if estimate.loss > _MAX_LOSS:
+        if estimate.loss > MOST_LOSS:
             continue
         outline = _outline(image_bgr, camera, estimate, options)
         if outline is not None and all(_apart(outline, other) for other in found):
@@ -90,7 +90,7 @@ def find_boxes(image_bgr: NDArray[np.uint8], options: DetectionOptions = DEFAULT
     )
     out: list[Box] = []
     for circle in circles:
-        x, y, half = circle.x / scale, circle.y / scale, (1 + _MARGIN) * circle.radius / scale
+        x, y, half = circle.x / scale, circle.y / scale, (1 + MARGIN) * circle.radius / scale
         out.append((x - half, y - half, x + half, y + half))
     return out
 
@@ -101,16 +101,16 @@ def sphere_mask(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.bool_] | N
     The masks of the channels are joined, opened and closed, and the component that contains the middle is kept. The
     middle is assumed to be sphere and the box's corners background; GrabCut decides the rest.
     """
-    patch = cv2.resize(_cut(image_bgr, box), (_MASK_SIDE, _MASK_SIDE), interpolation=cv2.INTER_AREA)
-    rows, columns = np.mgrid[0:_MASK_SIDE, 0:_MASK_SIDE] - (_MASK_SIDE - 1) / 2
-    distance = np.hypot(rows, columns) / (_MASK_SIDE / 2 / (1 + _MARGIN))  # in radii of the circle in the box
-    joined = np.zeros((_MASK_SIDE, _MASK_SIDE), dtype=np.uint8)
+    patch = cv2.resize(cut(image_bgr, box), (MASK_SIDE, MASK_SIDE), interpolation=cv2.INTER_AREA)
+    rows, columns = np.mgrid[0:MASK_SIDE, 0:MASK_SIDE] - (MASK_SIDE - 1) / 2
+    distance = np.hypot(rows, columns) / (MASK_SIDE / 2 / (1 + MARGIN))  # in radii of the circle in the box
+    joined = np.zeros((MASK_SIDE, MASK_SIDE), dtype=np.uint8)
     for channel in range(3):
         values = patch[:, :, channel]
         step = float(np.median(values[distance < 0.8])) - float(np.median(values[distance > 1.15]))
         if abs(step) < _LEAST_STEP:
             continue  # this channel does not separate sphere and surroundings
-        labels = np.full((_MASK_SIDE, _MASK_SIDE), cv2.GC_PR_BGD, dtype=np.uint8)
+        labels = np.full((MASK_SIDE, MASK_SIDE), cv2.GC_PR_BGD, dtype=np.uint8)
         labels[distance < 1.0] = cv2.GC_PR_FGD
         labels[distance < 0.5] = cv2.GC_FGD
         labels[distance > 1.25] = cv2.GC_BGD
@@ -119,14 +119,19 @@ def sphere_mask(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.bool_] | N
         cv2.setRNGSeed(0)
         cv2.grabCut(colours, labels, (0, 0, 0, 0), background, foreground, 3, cv2.GC_INIT_WITH_MASK)
         joined |= ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.uint8)
+    return in_the_middle(joined)
+
+
+def in_the_middle(joined: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
+    """The component at the middle of a (side, side) mask, which is opened and closed first; None if there is none."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
-    joined = np.asarray(cv2.morphologyEx(cv2.morphologyEx(joined, cv2.MORPH_OPEN, kernel), cv2.MORPH_CLOSE, kernel))
-    _, parts = cv2.connectedComponents(joined.astype(np.uint8))
-    part = int(parts[_MASK_SIDE // 2, _MASK_SIDE // 2])
+    smooth = np.asarray(cv2.morphologyEx(cv2.morphologyEx(joined, cv2.MORPH_OPEN, kernel), cv2.MORPH_CLOSE, kernel))
+    _, parts = cv2.connectedComponents(smooth.astype(np.uint8))
+    part = int(parts[len(joined) // 2, len(joined) // 2])
     return np.asarray(parts == part, dtype=np.bool_) if part else None
 
 
-def _cut(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.uint8]:
+def cut(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.uint8]:
     """The box cropped from the image; beyond the image, its border is repeated."""
     height, width = image_bgr.shape[:2]
     rows = np.clip(np.arange(round(box[1]), round(box[3])), 0, height - 1)
@@ -151,7 +156,7 @@ def fit_ellipse(mask: NDArray[np.bool_], box: Box) -> EllipseEstimate:
 
     y, x = (float(v) for v in np.argwhere(mask).mean(axis=0))
     radius = float(np.sqrt(inside.sum() / np.pi))
-    half = side / 2 / (1 + _MARGIN)
+    half = side / 2 / (1 + MARGIN)
     starts = [
         (x, y, radius, radius, 0.1),
         (side / 2, side / 2, half, half, 0.1),

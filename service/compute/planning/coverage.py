@@ -18,6 +18,8 @@ from scipy.spatial import ConvexHull
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from service.compute.camera_model import CameraModel
+from service.compute.ground_truth.distances.sampling import random_places
+from service.compute.ground_truth.surface import Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 
@@ -93,11 +95,7 @@ def coverage_surface(
     up = _up(spheres_m, triangles.mean(axis=1), area)
     rng = np.random.default_rng(seed)
     picked = rng.choice(len(triangles), size=40 * n_points, p=area / area.sum())
-    u, v = rng.random(len(picked)), rng.random(len(picked))
-    fold = u + v > 1
-    u[fold], v[fold] = 1 - u[fold], 1 - v[fold]
-    t = triangles[picked]
-    points = t[:, 0] + u[:, None] * (t[:, 1] - t[:, 0]) + v[:, None] * (t[:, 2] - t[:, 0])
+    points = random_places(Surface(vertices_m, mesh_faces), picked, rng)
     normals = cross[picked] / area[picked][:, None]
     keep = _between(points, spheres_m, radius_m, up) & ~_on_board(points, normals, up, centre) & (normals @ up > -0.5)
     points, normals = points[keep][: 2 * n_points], normals[keep][: 2 * n_points]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Literal
 
 import numpy as np
 
-from service.compute.arm.inverse_kinematics import postures
-from service.compute.arm.kinematics import JOINT_LIMIT_RAD
+from service.compute.arm.inverse_kinematics import postures_near
 from service.compute.planning.collision import ArmBody, Obstacles, nearest_contacts, straight_path
 from service.compute.planning.optics import DepthOfField, depths_m
 from service.core.geometry import Array, Transform, inverse, transform
@@ -17,7 +17,12 @@ from service.core.geometry import Array, Transform, inverse, transform
 Order = Literal["as_listed", "shortest"]
 
 _NUDGES_DEG = tuple(sign * step for step in (2.5, 5.0, 7.5, 10.0, 12.5, 15.0) for sign in (1, -1))
-_PATH_STEP_RAD = np.radians(3.0)
+#: Spacing of the configurations that are checked on the way from one viewpoint to the next.
+PATH_STEP_RAD = np.radians(3.0)
+_AT_ONCE = 24  # postures that are checked together: seven axes have hundreds for one pose
+_MOST_WAYS = 36  # postures to which a way is looked for if the straight one to the best posture is blocked
+_ROOM_M = 0.05  # clearance beyond which more is not better
+_ROOM_WEIGHT = 1.0  # rad²: what no clearance at all costs against turning the joints
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +33,7 @@ class Situation:
     obstacles: Obstacles
     centre_m: Array  # (3,) of the scene
     margin_m: float  # required clearance
-    start_rad: Array  # (6,) current joints of the arm
+    start_rad: Array  # (N,) current joints of the arm
     speed_rad_s: float
     acceleration_rad_s2: float
     sharp: DepthOfField | None = None
@@ -45,7 +50,7 @@ class PlannedView:
     outcome: Literal["feasible", "nudged", "refused"]
     reason: str = ""  # of a nudge or a refusal
     nudge_deg: float = 0.0  # about the vertical through the scene's centre
-    joints_rad: Array = field(default_factory=lambda: np.full(6, np.nan), repr=False)
+    joints_rad: Array = field(default_factory=lambda: np.full(0, np.nan), repr=False)  # (N,); empty if refused
     travel_s: float = 0.0  # from the previous view
 
 
@@ -88,8 +93,7 @@ def plan_motion(views: Sequence[tuple[str, Transform]], situation: Situation, or
     total = 0.0
     for i in sequence:
         blocked = _blocked(here, able[i].joints_rad, situation)
-        others = able_postures(able[i].T_base_camera, situation)[1:] if blocked else []
-        free = next((q for q in others if not _blocked(here, q, situation)), None)
+        free = _other_way(here, able[i], situation) if blocked else None
         if free is not None:
             able[i], blocked = replace(able[i], joints_rad=free), ""
         if blocked:
@@ -123,7 +127,7 @@ def _blurred(T_base_camera: Transform, situation: Situation) -> str:
 
 
 def travel_times_s(joints_rad: Array, situation: Situation) -> Array:
-    """(K, K) time between joint positions (K, 6), by the joint that turns farthest: ramp up, constant, ramp down."""
+    """(K, K) time between joint positions (K, N), by the joint that turns farthest: ramp up, constant, ramp down."""
     distance = np.zeros((len(joints_rad), len(joints_rad)))
     for turns in joints_rad.T:
         np.maximum(distance, np.abs(turns[:, None] - turns[None]), out=distance)
@@ -131,7 +135,7 @@ def travel_times_s(joints_rad: Array, situation: Situation) -> Array:
 
 
 def _legs_s(joints_rad: Array, situation: Situation) -> Array:
-    """(K - 1,) time from each of the joint positions (K, 6) to the next."""
+    """(K - 1,) time from each of the joint positions (K, N) to the next."""
     turns = np.abs(np.diff(joints_rad, axis=0)).max(axis=1)
     return turn_times_s(turns, situation.speed_rad_s, situation.acceleration_rad_s2)
 
@@ -187,16 +191,16 @@ def _length(path: Sequence[int], times_s: Array) -> float:
 
 
 def _place(name: str, T_base_camera: Transform, situation: Situation) -> PlannedView:
-    able = able_postures(T_base_camera, situation)
-    if able:
-        return PlannedView(name, T_base_camera, "feasible", joints_rad=able[0])
+    best = best_posture(T_base_camera, situation)
+    if best is not None:
+        return PlannedView(name, T_base_camera, "feasible", joints_rad=best)
     nearest = next(iter(_postures(T_base_camera, situation)), None)
     reason = infeasible_reason(T_base_camera, nearest, situation)
     for nudge in _NUDGES_DEG:
         turned = turned_about_scene(T_base_camera, situation.centre_m, float(np.radians(nudge)))
-        able = able_postures(turned, situation)
-        if able:
-            return PlannedView(name, turned, "nudged", reason, nudge, able[0])
+        best = best_posture(turned, situation)
+        if best is not None:
+            return PlannedView(name, turned, "nudged", reason, nudge, best)
     return PlannedView(name, T_base_camera, "refused", reason)
 
 
@@ -207,27 +211,48 @@ def turned_about_scene(T_base_camera: Transform, centre_m: Array, angle_rad: flo
     return transform(R, centre_m - R @ centre_m) @ T_base_camera
 
 
-def _postures(T_base_camera: Transform, situation: Situation) -> list[Array]:
-    """Joints (6,) that reach a pose, those nearest to the arm's current ones first."""
-    start = situation.start_rad
-    found = postures(situation.body.model, T_base_camera @ inverse(situation.body.T_flange_camera))
-    found = found + 2 * np.pi * np.round((start - found) / (2 * np.pi))
-    found = np.where(np.abs(found) > JOINT_LIMIT_RAD, found - 2 * np.pi * np.sign(found), found)
-    return [found[i] for i in np.argsort(np.sum((found - start) ** 2, axis=1), kind="stable")]
+def _postures(T_base_camera: Transform, situation: Situation) -> Array:
+    """Joints (K, N) that reach a pose, those nearest to the arm's current ones first."""
+    T_base_flange = T_base_camera @ inverse(situation.body.T_flange_camera)
+    return postures_near(situation.body.model, T_base_flange, situation.start_rad)
 
 
-def able_postures(T_base_camera: Transform, situation: Situation) -> list[Array]:
-    """Joints (6,) that reach a pose free of collisions and in focus, nearest to the arm's current ones first."""
+def able_postures(T_base_camera: Transform, situation: Situation) -> Iterator[Array]:
+    """Joints (N,) that reach a pose free of collisions and in focus, the best ones first.
+
+    With six axes these are nearest to the arm's current ones. With seven, whose elbow is free, more clearance also
+    counts, among postures about equally near.
+    """
+    if _blurred(T_base_camera, situation):
+        return
     found = _postures(T_base_camera, situation)
-    if not found or _blurred(T_base_camera, situation):
-        return []
-    contacts = nearest_contacts(situation.body, situation.obstacles, np.array(found))
-    return [q for q, contact in zip(found, contacts, strict=True) if contact.clearance_m >= situation.margin_m]
+    elbow_is_free = situation.body.model.axes > 6
+    for k in range(0, len(found), _AT_ONCE):
+        some = found[k : k + _AT_ONCE]
+        contacts = nearest_contacts(situation.body, situation.obstacles, some)
+        clearance_m = np.array([contact.clearance_m for contact in contacts])
+        order = range(len(some))
+        if elbow_is_free:
+            tight = np.clip(1 - (clearance_m - situation.margin_m) / _ROOM_M, 0, None)
+            away = np.sum((some - situation.start_rad) ** 2, axis=1)
+            order = [int(i) for i in np.argsort(away + _ROOM_WEIGHT * tight**2, kind="stable")]
+        yield from (some[i] for i in order if clearance_m[i] >= situation.margin_m)
+
+
+def best_posture(T_base_camera: Transform, situation: Situation) -> Array | None:
+    """The best of `able_postures`; None if there is none."""
+    return next(able_postures(T_base_camera, situation), None)
+
+
+def _other_way(here: Array, view: PlannedView, situation: Situation) -> Array | None:
+    """Joints (N,) of another posture for a view that can be reached straight from `here`; None if there is none."""
+    others = islice(able_postures(view.T_base_camera, situation), 1, _MOST_WAYS)
+    return next((q for q in others if not _blocked(here, q, situation)), None)
 
 
 def _blocked(here: Array, there: Array, situation: Situation) -> str:
     # Both ends are free, or the arm is there already.
-    way = straight_path(here, there, float(_PATH_STEP_RAD))[1:-1]
+    way = straight_path(here, there, float(PATH_STEP_RAD))[1:-1]
     if not len(way):
         return ""
     contacts = nearest_contacts(situation.body, situation.obstacles, way)

@@ -264,53 +264,58 @@ def rms_px(problem: Problem, whitened: Array) -> Array:
     return stretch * np.sqrt(np.sum(r[:, :2] ** 2, axis=1) / 2 + r[:, 2] ** 2)
 
 
-def _result(s: Solution, groups: NDArray[np.int64], cost: Cost) -> RegistrationResult:
+def _result(s: Solution, stations: NDArray[np.int64], cost: Cost) -> RegistrationResult:
     problem, state = s.problem, s.state
-    given = rms_px(problem, s.linearised.r)
-    own = s.linearised.r + np.einsum("okj,oj->ok", s.linearised.A, state.poses[problem.image])
-    refined = rms_px(problem, own)
     keep = s.weights > 0
-    typical = float(np.median(refined[keep]))
-    records = tuple(
-        OutlineResidual(
-            i, j, m, float(given[o]), not bool(keep[o]),
-            "" if keep[o] else f"{refined[o]:.1f} px from its predicted outline, the others {typical:.2f} px",
-        )
-        for o, (i, j, m) in enumerate(problem.members)
-    )  # fmt: skip
+    given_px = rms_px(problem, s.linearised.r)
+    residuals = _residuals(s, given_px)
     pick = [*range(6), problem.scale_column] if problem.with_scale else list(range(6))
-    n_groups = len(problem.groups)
-    position = {g: k for k, g in enumerate(problem.groups)}
-    cameras: list[Array] = []
-    for refine in (False, True):
-        T = state.cameras(problem, refined=refine)
-        cameras.append(
-            np.array(
-                [
-                    inverse(state.bases[position[int(g)]]) @ T[i] if int(g) in position else np.full((4, 4), np.nan)
-                    for i, g in enumerate(groups)
-                ]
-            )
-        )
     plain = marginalise(s.blocks, s.pose_root, 1.0)
-    free = max(1.0, 3.0 * float(np.sum(np.minimum(s.weights, 1.0))) - 6 * n_groups - int(problem.with_scale))
+    free = 3.0 * float(np.sum(np.minimum(s.weights, 1.0))) - 6 * len(problem.groups) - int(problem.with_scale)
     variances = np.diagonal(s.pose_root @ s.pose_root.transpose(0, 2, 1), axis1=1, axis2=2)
     return RegistrationResult(
         T_world_scan=state.bases[0],
         scale=state.scale,
         T_world_group={g: state.bases[0] @ inverse(state.bases[k]) for k, g in enumerate(problem.groups)},
         covariance=s.covariance[np.ix_(pick, pick)],
-        rms_px=float(np.sqrt(np.mean(given[keep] ** 2))),
-        residuals=records,
-        T_scan_camera=cameras[0],
-        chi2_reduced=plain.quadratic / free,
-        n_images=len({r.image for r in records if not r.excluded}),
+        rms_px=float(np.sqrt(np.mean(given_px[keep] ** 2))),
+        residuals=residuals,
+        T_scan_camera=_cameras_in_scan(s, stations, refined=False),
+        chi2_reduced=plain.quadratic / max(1.0, free),
+        n_images=len({r.image for r in residuals if not r.excluded}),
         cost=cost,
         components={name: part[np.ix_(pick, pick)] for name, part in _components(s).items()},
-        T_scan_camera_refined=cameras[1],
+        T_scan_camera_refined=_cameras_in_scan(s, stations, refined=True),
         pose_sigma=(float(np.sqrt(variances[:, :3].mean())), float(np.sqrt(variances[:, 3:].mean()))),
         outline_factor=s.outline_factor,
         solution=s,
+    )
+
+
+def _residuals(s: Solution, given_px: Array) -> tuple[OutlineResidual, ...]:
+    """The outlines' residuals; excluded ones with their reason. `given_px` (O,) is with the camera poses as given."""
+    problem = s.problem
+    own = s.linearised.r + np.einsum("okj,oj->ok", s.linearised.A, s.state.poses[problem.image])
+    refined_px, keep = rms_px(problem, own), s.weights > 0
+    typical_px = float(np.median(refined_px[keep]))
+    return tuple(
+        OutlineResidual(
+            i, j, m, float(given_px[o]), not bool(keep[o]),
+            "" if keep[o] else f"{refined_px[o]:.1f} px from its predicted outline, the others {typical_px:.2f} px",
+        )
+        for o, (i, j, m) in enumerate(problem.members)
+    )  # fmt: skip
+
+
+def _cameras_in_scan(s: Solution, stations: NDArray[np.int64], *, refined: bool) -> Array:
+    """T_scan_camera (N, 4, 4), each through the base of its station; NaN for stations without outlines."""
+    T = s.state.cameras(s.problem, refined=refined)
+    position = {g: k for k, g in enumerate(s.problem.groups)}
+    return np.array(
+        [
+            inverse(s.state.bases[position[int(g)]]) @ T[i] if int(g) in position else np.full((4, 4), np.nan)
+            for i, g in enumerate(stations)
+        ]
     )
 
 

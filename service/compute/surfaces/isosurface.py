@@ -47,10 +47,24 @@ def surface(
             f"no surface at {threshold_hu:g} HU: the volume holds {low} to {high} HU",
             remedy="Choose a threshold between air and the wanted material",
         )
-    depth = max(2, slab_voxels // (volume_hu.shape[1] * volume_hu.shape[2]))
-    vertices: list[Array] = []
-    faces: list[NDArray[np.int64]] = []
-    seams: list[NDArray[np.bool_]] = []
+    points, triangles = _sewn(*_slabs(volume_hu, level, max(2, slab_voxels // volume_hu[0].size)))
+    if not len(points):
+        # Only possible if neighbouring slices are on opposite sides of the level and none crosses it within.
+        raise ComputeError(f"no surface at {threshold_hu:g} HU", remedy="Choose another threshold")
+    # scikit-image's faces for (k, j, i) are clockwise as seen from outside; the change to (i, j, k) mirrors them, and
+    # a left-handed T_ct_voxel mirrors them back.
+    if np.linalg.det(T_ct_voxel[:3, :3]) < 0:
+        triangles = triangles[:, ::-1]
+    return apply(T_ct_voxel, points), np.ascontiguousarray(triangles, dtype=np.int32)
+
+
+def _slabs(
+    volume_hu: NDArray[np.int16], level: float, depth: int
+) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
+    """Vertices (i, j, k) and faces slab by slab of `depth` slices, and which vertices lie where two slabs meet."""
+    vertices: list[Array] = [np.zeros((0, 3))]
+    faces: list[NDArray[np.int64]] = [np.zeros((0, 3), dtype=np.int64)]
+    seams: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
     count = 0
     last = volume_hu.shape[0] - 1
     for first in range(0, last, depth):
@@ -67,15 +81,7 @@ def surface(
         seams.append(on_seam)
         faces.append(triangles.astype(np.int64) + count)
         count += len(ijk)
-    if not vertices:
-        # Only possible if neighbouring slices are on opposite sides of the level and none crosses it within.
-        raise ComputeError(f"no surface at {threshold_hu:g} HU", remedy="Choose another threshold")
-    points, triangles = _sewn(np.concatenate(vertices), np.concatenate(faces), np.concatenate(seams))
-    # scikit-image's faces for (k, j, i) are clockwise as seen from outside; the change to (i, j, k) mirrors them, and
-    # a left-handed T_ct_voxel mirrors them back.
-    if np.linalg.det(T_ct_voxel[:3, :3]) < 0:
-        triangles = triangles[:, ::-1]
-    return apply(T_ct_voxel, points), np.ascontiguousarray(triangles, dtype=np.int32)
+    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(seams)
 
 
 def _sewn(points: Array, faces: NDArray[np.int64], on_seam: NDArray[np.bool_]) -> tuple[Array, NDArray[np.int64]]:

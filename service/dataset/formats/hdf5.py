@@ -21,6 +21,8 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     A view has image (H, W, 3) RGB, depth_m (H, W) z in metres, normal (H, W, 3) in the camera frame, valid and
     markers (H, W), K (3, 3) for pixel centres at integers, distortion (8,) k1 k2 p1 p2 k3 k4 k5 k6, T_world_camera
     (4, 4) and covariance (6, 6). Each view is a file of its own, so that an interrupted export goes on.
+    The mesh has vertices_m and faces; if CT and scan were fused, source (0: CT, 1: scan, 2: blend) and sigma_m along
+    the normal of each vertex.
     """
     for view in dataset.views:
         folder.written_by(
@@ -62,6 +64,9 @@ def _index(path: Path, dataset: DataSet) -> None:
             file[f"splits/{name}"] = np.array([view.encode() for view in split], dtype="S")
         file["mesh/vertices_m"] = dataset.mesh.vertices_m
         file["mesh/faces"] = dataset.mesh.faces
+        for name in ("source", "sigma_m"):
+            if (values := getattr(dataset.mesh, name)) is not None:
+                file[f"mesh/{name}"] = values
 
 
 def _about(file: h5py.File, dataset: DataSet) -> None:

@@ -5,18 +5,20 @@ from __future__ import annotations
 from service.compute.poses.files.camera_files import write_camera_json
 from service.compute.poses.files.pose_files import write_poses_csv, write_transforms_json
 from service.dataset.formats.colmap.model import write_images
-from service.dataset.formats.meshes import ply
+from service.dataset.formats.meshes import ground_truth_ply
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder
 from service.dataset.posed.records import DataSet, only_camera
 
 
 def write(dataset: DataSet, folder: ExportFolder) -> None:
-    """`images/`, `camera.json`, `poses.csv`, `transforms.json` and `mesh.ply`.
+    """`images/`, `camera.json`, `poses.csv`, `transforms.json`, `mesh.ply`, and the scanner's own export in `scan/`.
 
     `poses.csv` is T_world_camera in metres, x right, y down, z forward, with the quaternion's scalar last.
     `transforms.json` has the same poses with OpenGL's axes. In `camera.json` the centre of the first pixel is (0, 0),
-    in `transforms.json` it is (0.5, 0.5). `mesh.ply` is in metres.
+    in `transforms.json` it is (0.5, 0.5). `mesh.ply` is in metres; if CT and scan were fused, each vertex has its
+    `source` (0: CT, 1: scan, 2: blend) and `sigma_m` along its normal. The files in `scan/`, with materials and
+    textures, are as the scanner wrote them: in the same frame, in the scanner's unit (mostly millimetres).
 
     Raises:
         DataError: the views have several cameras.
@@ -30,8 +32,12 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     folder.written_by(
         "transforms.json", lambda path: write_transforms_json(path, camera, in_images, simulated=simulated)
     )
-    folder.file("mesh.ply", lambda: ply(dataset.mesh.vertices_m, dataset.mesh.faces, dataset.mark))
+    folder.file("mesh.ply", lambda: ground_truth_ply(dataset.mesh, dataset.mark))
+    for file in dataset.scan_files:
+        folder.file(f"scan/{file.name}", file.path.read_bytes)
     write_images(dataset, folder, "images")
 
 
-KIND = Exporter("plain", "plain files: images, camera.json, poses.csv, transforms.json, mesh.ply", write)
+KIND = Exporter(
+    "plain", "plain files: images, camera.json, poses.csv, transforms.json, mesh.ply, the scanner's files", write
+)

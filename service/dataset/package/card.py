@@ -35,6 +35,7 @@ def card(dataset: DataSet, words: str, description: str) -> str:
         "Files": [_paragraphs(description), "", *_pairs(BESIDE.items(), code=True)],
         "How it was made": _made(about),
         "How accurate it is": _accuracy(about),
+        **({"Ground truth": _pairs(about.fusion)} if about.fusion else {}),
         "Gates and deviations": _gates(about),
     }
     lines = [f"# {about.title}", ""]

@@ -46,6 +46,7 @@ class About:
         covariance: what the covariances of the poses hold, a sentence.
         mesh: what the ground-truth mesh is, a sentence.
         masks: what the masks hold.
+        fusion: how CT and scan agree and were fused, (name, value) in words; empty if the mesh is the scan.
         gates: verdicts in words, by step.
         accepted: gates accepted outside their limits, in words.
         deviations: from the protocol, in words.
@@ -74,6 +75,7 @@ class About:
     covariance: str = ""
     mesh: str = ""
     masks: str = ""
+    fusion: tuple[tuple[str, str], ...] = ()
     gates: tuple[tuple[str, tuple[str, ...]], ...] = ()
     accepted: tuple[str, ...] = ()
     deviations: tuple[str, ...] = ()

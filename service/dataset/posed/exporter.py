@@ -75,7 +75,7 @@ def write_data_set(
         ConfigurationError: another process is writing the same export.
     """
     ready = undistorted_data_set(dataset, personal=personal) if how.pinhole else dataset
-    identity = f"{how.name} 1 {ready.identity} {'with' if personal else 'without'} personal data"
+    identity = f"{how.name} 2 {ready.identity} {'with' if personal else 'without'} personal data"
     with export_folder(target, identity, leaving, _told(ready, how, progress)) as folder:
         _write(ready, how, folder)
 

@@ -31,7 +31,10 @@ def check_folder(folder: Path) -> int:
     try:
         lines = (folder / SUMS).read_text(encoding="utf-8").splitlines()
     except OSError as error:
-        raise DataError(f"the list of checksums cannot be read: {error.strerror}", where=str(folder)) from error
+        what = f"the list of checksums cannot be read: {error.strerror}"
+        raise DataError(what, where=str(folder), remedy=remedy) from error
+    except UnicodeDecodeError as error:
+        raise DataError("the list of checksums is not text", where=str(folder), remedy=remedy) from error
     stated = {name: sha256 for sha256, _, name in (line.partition("  ") for line in lines)}
     present = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()} - {SUMS}
     if present != set(stated):

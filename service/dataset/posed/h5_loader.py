@@ -22,7 +22,11 @@ class Views:
         with h5py.File(self._path, "r") as file:
             self.simulated = bool(file.attrs["simulated"])
             self.names = [name.decode() for name in np.asarray(file[f"splits/{split}"])]
-            self.mesh = (np.asarray(file["mesh/vertices_m"]), np.asarray(file["mesh/faces"]))
+            mesh: Any = file["mesh"]
+            self.mesh = (np.asarray(mesh["vertices_m"]), np.asarray(mesh["faces"]))
+            # Of each vertex, if CT and scan were fused: 0: CT, 1: scan, 2: blend; sigma along its normal.
+            self.mesh_source = np.asarray(mesh["source"]) if "source" in mesh else None
+            self.mesh_sigma_m = np.asarray(mesh["sigma_m"]) if "sigma_m" in mesh else None
 
     def __len__(self) -> int:
         return len(self.names)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +11,19 @@ import cv2
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.metadata import described
 from service.compute.pixels.splits import Splits
 from service.core.errors import DataError
+from service.core.text.json_text import parse_json
 from service.dataset.formats.meshes import png
 from service.dataset.posed.folder import SUMS, check_folder
 from service.dataset.posed.records import DataSet, Mesh, View
 
 INDEX = "data.h5"
 _REMEDY = "Export it again with --format hdf5"
+_SPLITS = TypeAdapter(Splits)
 
 
 def data_set_of_folder(folder: Path) -> DataSet:
@@ -36,7 +37,9 @@ def data_set_of_folder(folder: Path) -> DataSet:
     check_folder(folder)
     try:
         return _read(folder)
-    except (OSError, KeyError, ValueError) as error:
+    except ValidationError as error:
+        raise DataError("splits.json does not name the views", where=str(folder), remedy=_REMEDY) from error
+    except (OSError, KeyError, ValueError, TypeError) as error:
         raise DataError(f"the data set cannot be read: {error}", where=str(folder), remedy=_REMEDY) from error
 
 
@@ -49,8 +52,7 @@ class Stored:
 
     def picture(self, view: View) -> bytes:
         """The pixels as PNG: the camera's own file is not in the folder."""
-        data = png(self.colours(view))
-        return described(data, self._mark, view.name) if self._mark else data
+        return png(self.colours(view), self._mark)
 
     def colours(self, view: View) -> NDArray[np.uint8]:
         """(H, W, 3) BGR."""
@@ -105,8 +107,7 @@ class _Scaled:
         self._whole, self._views = whole, {view.name: view for view in whole.views}
 
     def picture(self, view: View) -> bytes:
-        data = png(self.colours(view))
-        return described(data, self._whole.mark, view.name) if self._whole.mark else data
+        return png(self.colours(view), self._whole.mark)
 
     def colours(self, view: View) -> NDArray[np.uint8]:
         image = self._whole.pixels.colours(self._views[view.name])
@@ -139,16 +140,24 @@ def _height(camera: CameraModel, width: int) -> int:
 
 
 def _read(folder: Path) -> DataSet:
-    splits = json.loads((folder / "splits.json").read_text(encoding="utf-8"))
-    statement = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))
+    of = _SPLITS.validate_json((folder / "splits.json").read_bytes())
+    statement = parse_json((folder / "dataset.json").read_bytes(), name="dataset.json", remedy=_REMEDY)
+    if not isinstance(statement, dict):
+        raise TypeError("dataset.json is not a JSON object")
     with h5py.File(folder / INDEX, "r") as file:
         simulated = bool(file.attrs["simulated"])
-        mesh = Mesh(np.array(file["mesh/vertices_m"], dtype=np.float64), np.array(file["mesh/faces"], dtype=np.int64))
-    of = Splits(**{name: tuple(splits[name]) for name in ("dense", "sparse", "train", "test")})
+        mesh = _mesh(file["mesh"])
     views = tuple(_view(folder, name) for name in sorted({*of.dense, *of.train, *of.test}))
     identity = hashlib.sha256((folder / SUMS).read_bytes()).hexdigest()
     dataset = DataSet(identity, simulated, statement, views, Stored(folder, ""), mesh, of)
     return dataclasses.replace(dataset, pixels=Stored(folder, dataset.mark))
+
+
+def _mesh(stored: Any) -> Mesh:
+    source = np.array(stored["source"], dtype=np.uint8) if "source" in stored else None
+    sigma_m = np.array(stored["sigma_m"], dtype=np.float64) if "sigma_m" in stored else None
+    vertices_m, faces = np.array(stored["vertices_m"], dtype=np.float64), np.array(stored["faces"], dtype=np.int64)
+    return Mesh(vertices_m, faces, source, sigma_m)
 
 
 def _view(folder: Path, name: str) -> View:

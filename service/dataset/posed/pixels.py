@@ -105,7 +105,7 @@ class Undistorted:
     """The views of a data set as pinhole cameras: `undistorted_data_set` makes them."""
 
     def __init__(self, distorted: DataSet, *, personal: bool) -> None:
-        """Take the distorted data set; its views have the same names."""
+        """Resample the views of `distorted`; they keep their names."""
         self._sources, self._inner = {view.name: view for view in distorted.views}, distorted.pixels
         self._personal = personal
         self._colours = _Last(self._resampled)
@@ -176,7 +176,7 @@ class Cropped:
 
 
 def undistorted_data_set(dataset: DataSet, *, personal: bool = True) -> DataSet:
-    """The same views with pinhole cameras (`pinhole_of`) and resampled pictures; unchanged if none is distorted."""
+    """The views with pinhole cameras (`pinhole_of`) and resampled pictures; unchanged if no camera has distortion."""
     if not any(view.camera.distortion.any() for view in dataset.views):
         return dataset
     views = tuple(dataclasses.replace(view, camera=pinhole_of(view.camera)) for view in dataset.views)

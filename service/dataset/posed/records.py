@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 from typing import Protocol as Interface
 
@@ -28,6 +29,7 @@ class View:
         camera: at the size of the picture; pixel centres at integer coordinates.
         T_world_camera: (4, 4) m; x right, y down, z forward.
         covariance: (6, 6) of (d, w): exp([w]x) R, t + d in the axes of the world, m and rad.
+        taken: time that the photograph states, as EXIF has it; "" if it states none.
     """
 
     name: str
@@ -35,6 +37,7 @@ class View:
     camera: CameraModel
     T_world_camera: Transform
     covariance: Array
+    taken: str = ""
 
     @property
     def file(self) -> str:
@@ -44,10 +47,27 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """The ground truth: vertices (V, 3) in the world frame, m, and faces (F, 3)."""
+    """The ground truth.
+
+    Attributes:
+        vertices_m: (V, 3) in the world frame.
+        faces: (F, 3).
+        source: (V,) where each vertex comes from, 0: CT, 1: scan, 2: blend; None: all from the scan.
+        sigma_m: (V,) stated standard deviation along the normal; None: not stated.
+    """
 
     vertices_m: Array
     faces: NDArray[np.int64]
+    source: NDArray[np.uint8] | None = None
+    sigma_m: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ScanFile:
+    """A file of the scanner's own export: in the frame of the scan and in the unit that the scanner wrote."""
+
+    name: str  # relative, with `/`
+    path: Path
 
 
 class Pixels(Interface):
@@ -93,6 +113,7 @@ class DataSet:
         pose_errors: (6 V, 6 V) joint covariance of the poses in the views' order, as a view's covariance, but without
             the errors that are common to all views; None where it is not stated.
         about: the data set as a whole, for its data card and metadata.
+        scan_files: the scanner's own export, with its textures.
     """
 
     identity: str
@@ -104,6 +125,7 @@ class DataSet:
     splits: Splits
     pose_errors: Array | None = None
     about: About = field(default_factory=About)
+    scan_files: tuple[ScanFile, ...] = ()
 
     @property
     def mark(self) -> str:
@@ -118,7 +140,7 @@ class DataSet:
         return self.pose_errors[np.ix_(rows, rows)]
 
     def keeping(self, names: tuple[str, ...]) -> DataSet:
-        """The same data set with these views only; the splits are cut to them."""
+        """This data set with only these views, also in its splits."""
         chosen = set(names)
         cut = {key: tuple(n for n in split if n in chosen) for key, split in self.splits.named().items()}
         kept = [k for k, view in enumerate(self.views) if view.name in chosen]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,59 +12,15 @@ from service.compute.ground_truth.fusion.fuse import Source
 from service.compute.ground_truth.ply import read_ply
 from service.core.errors import DataError
 from service.core.geometry import Array
-from service.core.records.events import ArtefactRef
-from service.core.run.state import JobState
 from service.core.units import metres
 from service.dataset.preview.records import DrawnRegion, ShownGroundTruth
+from service.dataset.recorded_fusion import RecordedFusion
 from service.dataset.scene_view import MeshColours
-from service.dataset.summary import RunSummary
-from service.jobs.surfaces import fuse
 
-MESH, PICTURE = "ground_truth_mesh", "fusion_picture"  # kinds of the artefacts
+PICTURE = "fusion_picture"  # kind of its artefact
 _HIGH = 99.0  # percentile of the sigmas at the end of the colours
 #: What a vertex can come from, in the order of the colours; the names and colours of the fusion's picture.
 _PARTS = ((Source.CT, "CT", "#d65e00"), (Source.BLEND, "blend", "#f0e442"), (Source.SCAN, "scan", "#0072b2"))
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedFusion:
-    """What the record says of the fusion from which the data set's mesh comes.
-
-    Attributes:
-        step: title of its step.
-        answer: of the job.
-        measures: of the job, by name.
-        spacing_m: of the samples for its Chamfer distance.
-        files: its artefacts by kind.
-    """
-
-    step: str
-    answer: fuse.Answer
-    measures: Mapping[str, float]
-    spacing_m: float
-    files: Mapping[str, ArtefactRef] = field(repr=False)
-
-
-def recorded_fusion(summary: RunSummary) -> RecordedFusion | None:
-    """The fusion whose mesh is the run's ground truth; None if that is the scan.
-
-    Raises:
-        DataError: the job that made the mesh is not in the record.
-    """
-    meshes = summary.artefacts(MESH)
-    if not meshes:
-        return None
-    for step in reversed(summary.protocol.steps):
-        for job in summary.state.steps[step.id].jobs.values():
-            files = {ref.kind: ref for ref in job.artefacts}
-            if job.kind == fuse.KIND.name and files.get(MESH) == meshes[-1]:
-                return _read(step.title, job, files)
-    raise DataError("no recorded job made the ground truth's mesh", where=summary.run_id)
-
-
-def _read(step: str, job: JobState, files: Mapping[str, ArtefactRef]) -> RecordedFusion:
-    spacing_m = float(job.arguments["spacing_m"])
-    return RecordedFusion(step, fuse.KIND.read_answer(job.result), job.measures, spacing_m, files)
 
 
 @dataclass(frozen=True, slots=True)

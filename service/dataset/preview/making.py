@@ -12,12 +12,12 @@ import numpy as np
 from service.compute.pixels.coverage import seen_points
 from service.compute.pixels.crops import marker_free_crops
 from service.core.errors import ComputeError, DataError
-from service.dataset.posed.of_run import data_set_of, specimen_pixels
+from service.dataset.posed.of_run.data_set import data_set_of, specimen_pixels
 from service.dataset.posed.records import DataSet
-from service.dataset.preview.fusion import RecordedFusion, recorded_fusion
 from service.dataset.preview.pictures import CROPS, crop_size, small_pictures
 from service.dataset.preview.records import Preview, ShownView, write_preview
 from service.dataset.preview.surfaces import Simplified, fused_mesh, shown_coverage, shown_distances
+from service.dataset.recorded_fusion import RecordedFusion, recorded_fusion
 from service.dataset.summary import RunSummary
 
 Progress = Callable[[str, int, int], None]  # activity, amount done, total

@@ -20,8 +20,9 @@ from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 from service.core.units import metres, mm
 from service.dataset.posed.records import DataSet, Mesh
-from service.dataset.preview.fusion import MESH, PICTURE, RecordedFusion, shown_ground_truth, vertex_figures
+from service.dataset.preview.fusion import PICTURE, shown_ground_truth, vertex_figures
 from service.dataset.preview.records import AT_LEAST, ShownCoverage, ShownDistances, ShownGroundTruth, put
+from service.dataset.recorded_fusion import MESH, RecordedFusion
 from service.dataset.registrations import last_result
 from service.dataset.scene_view import MeshColours, Scene, SceneMesh, SceneSphere, decimated, scene_json
 from service.dataset.summary import RunSummary
@@ -110,7 +111,7 @@ def shown_distances(folder: Path, summary: RunSummary, fusion: RecordedFusion | 
 
 
 def _compared(folder: Path, summary: RunSummary, ct: Surface, scan: Surface) -> ShownDistances:
-    """Both brought together by their spheres, and compared; the CT in its own frame."""
+    """CT and scan, aligned by their spheres and compared, and the CT in its own frame."""
     found = last_result(summary.protocol, summary.state, "ct_surface", SpheresFound)
     if found is None:
         raise DataError("the run has no CT", where=summary.run_id)
@@ -161,4 +162,14 @@ def _scene(summary: RunSummary, mesh: Simplified, colours: MeshColours, poses: d
     spheres = [SceneSphere(str(k), "registration", centre) for k, centre in enumerate(centres)]
     shown = SceneMesh(mesh.points_m, mesh.triangles, colours=colours)
     radius_m = metres(summary.protocol.spheres.radius_mm)
-    return Scene(poses, dict.fromkeys(poses, ""), spheres, radius_m, shown)
+    return Scene(poses, dict.fromkeys(poses, ""), spheres, radius_m, shown, up=_up(summary))
+
+
+def _up(summary: RunSummary) -> tuple[float, float, float] | None:
+    """From the spheres to the cameras of the run's own registration; the axes of a scan point anywhere."""
+    own = summary.best()
+    if own is None:
+        return None
+    eyes = np.array([np.array(T)[:3, 3] for T in summary.registrations()[own].T_scan_camera.values()])
+    x, y, z = eyes.mean(axis=0) - np.array(summary.scan_spheres_m()).mean(axis=0)
+    return float(x), float(y), float(z)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from service.jobs.capture.hand_view import Answer, HeldArguments
+from service.jobs.capture.hand_view import Answer, HeldArguments, HemisphereArguments
 from service.jobs.kind import JobKind
 
 
-class Arguments(HeldArguments):
-    """The image, the board, and the sensor's width, which gives nominal intrinsics with the focal length."""
+class BoardArguments(HemisphereArguments):
+    """The board, and the sensor's width, which gives nominal intrinsics with the focal length."""
 
     columns: int
     rows: int
     square_m: float
     sensor_width_mm: float
+
+
+class Arguments(HeldArguments, BoardArguments):
+    """Arguments for an image of the board."""
 
 
 KIND = JobKind(

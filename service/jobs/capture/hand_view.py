@@ -28,12 +28,9 @@ class PlannedPlace(JobRecord):
     aim_m: Point
 
 
-class HeldArguments(JobRecord):
-    """Arguments of the jobs on hand-held images, of the specimen or of the board."""
+class HemisphereArguments(JobRecord):
+    """What the jobs on all hand-held images of a step share: the hemisphere to be covered."""
 
-    image: HeldImage
-    earlier: tuple[Hash, ...] = ()
-    surface: Hash | None = None
     places: tuple[PlannedPlace, ...]
     within_deg: float
     first_words: str
@@ -41,8 +38,16 @@ class HeldArguments(JobRecord):
     rough: bool = False  # the spheres have not been measured: the images locate them
 
 
-class Arguments(HeldArguments):
-    """Arguments for an image of the specimen."""
+class HeldArguments(HemisphereArguments):
+    """Arguments of the job on one hand-held image, of the specimen or of the board."""
+
+    image: HeldImage
+    earlier: tuple[Hash, ...] = ()
+    surface: Hash | None = None
+
+
+class SpecimenArguments(HemisphereArguments):
+    """What the jobs on all images of the specimen share: the camera, the spheres and the limits."""
 
     camera: Camera
     spheres_m: tuple[Point, ...]
@@ -52,6 +57,10 @@ class Arguments(HeldArguments):
     limit_m: float
     min_coverage: float
     colour: str | None = None
+
+
+class Arguments(HeldArguments, SpecimenArguments):
+    """Arguments for an image of the specimen."""
 
 
 class ShownPlace(JobRecord):

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from service.jobs.kind import JobKind, NoAnswer
 from service.jobs.records import Hash, ImagesCamera, Matrix, Mounting, ParameterCovariance, Photograph, Point
+
+DetectorName = Literal["classical", "paper", "grounded", "vote"]
 
 
 class SceneArguments(ImagesCamera, Mounting):
@@ -25,11 +29,15 @@ class SceneArguments(ImagesCamera, Mounting):
 
 
 class Arguments(SceneArguments):
-    """How outlines are searched; `model` holds the poses if neither a robot nor spheres provide them."""
+    """How outlines are searched; `model` holds the poses if neither a robot nor spheres provide them.
+
+    The detectors `grounded` and `vote` need the weights of their networks on the worker's machine; the job's file
+    `weights.json` has the hashes of these.
+    """
 
     model: Hash | None = None
     colour: str | None = None
-    detector: str = "classical"
+    detector: DetectorName = "classical"
 
 
 KIND = JobKind(

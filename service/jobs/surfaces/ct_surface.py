@@ -7,7 +7,10 @@ from service.jobs.records import Hash, Matrix, SpheresFound
 
 
 class Arguments(JobRecord):
-    """The decoded volume: `hounsfield` is a NumPy array, `T_ct_voxel` maps its indices to metres."""
+    """The decoded volume: `hounsfield` is a NumPy array, `T_ct_voxel` maps its indices to metres.
+
+    With `labels`, an array of the same shape, the surface is that of the segmented voxels, not at `threshold_hu`.
+    """
 
     radius_m: float
     expected: int
@@ -15,6 +18,7 @@ class Arguments(JobRecord):
     hounsfield: Hash
     T_ct_voxel: Matrix
     threshold_hu: float
+    labels: Hash | None = None
 
 
 KIND = JobKind(

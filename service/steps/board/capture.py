@@ -11,7 +11,7 @@ from service.compute.calibration.board.board import Board
 from service.compute.calibration.board_poses.design import CalibrationTargets, ChosenViews, Prediction
 from service.compute.calibration.board_poses.knowledge import BoardKnowledge, refined_knowledge
 from service.compute.camera_model import CameraModel
-from service.compute.planning.motion_plan import able_postures
+from service.compute.planning.motion_plan import best_posture
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.text.counts import counted
@@ -154,7 +154,7 @@ class BoardCapture:
         enough: Callable[[Prediction, Prediction], bool] | None = None,
         advise: Callable[[int, str, str], str] | None = None,
     ) -> tuple[Viewpoint, ...]:
-        """Plan poses, record and tell them; none if the arm can reach no further pose that shows the board."""
+        """Plan board poses, record them and tell the operator; none if the arm can reach no other useful pose."""
         self.context.progress("planning board poses", 0, 1)
         self.context.busy("planning board poses")
         known = self._knowledge(looks)
@@ -224,7 +224,7 @@ class BoardCapture:
             return lambda _T: True
         start = usual_posture(arm.model, arm.layout, self._mount)
         situation = arm.situation(start, sharp_at_m=apply(known.T_base_board, self.board.points()))
-        return lambda T: bool(able_postures(T, situation))
+        return lambda T: best_posture(T, situation) is not None
 
     def _taken(self, looks: Sequence[SearchedBoardImage], known: BoardKnowledge, planner: Planner) -> ChosenViews:
         """The images that show the board, and the planned poses without an image."""

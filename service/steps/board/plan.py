@@ -32,6 +32,7 @@ Why = Literal["first", "start", "rest", "replacement", "mend"]
 #: The first image is taken from farther away and nearly from above, because the board's place is only roughly known.
 FIRST = ViewRange(tilts_deg=(8.0, 14.0, 24.0), distances_m=(0.78, 0.82, 0.86))
 START = 6  # images after which camera, mount and board are known well enough to plan the rest
+_DRAWS = 8  # of candidates, until the arm can reach enough of them: one with a short reach takes a small share
 _USUAL_FOCAL = 1.2  # focal length over the image's longer side, if the rig file describes no lens
 _UNKNOWN_FOCAL = 0.25  # relative standard deviation of that focal length
 
@@ -76,13 +77,20 @@ class Planner:
     ) -> PlannedBoard:
         """Up to `count` further poses; fewer if the arm can reach no others that show the board."""
         wishes = FIRST if why == "first" else self.wanted.wishes
-        candidates = board_candidates(known, self.board, wishes, self.approach, seed=seed)
         problem = self._problem(known)
-        poses = choose_poses(
-            problem, candidates, count,
-            taken=taken, feasible=lambda T: self.feasible(self.sent(T, known)), enough=enough, seed=seed,
-        )  # fmt: skip
-        return PlannedBoard(poses, problem.predict(self.with_planned(taken, poses, known)))
+        poses = np.zeros((0, 4, 4))
+        predicted = problem.predict(taken)
+        for draw in range(_DRAWS):
+            candidates = board_candidates(known, self.board, wishes, self.approach, seed=seed, draw=draw)
+            more = choose_poses(
+                problem, candidates, count - len(poses), taken=self.with_planned(taken, poses, known),
+                feasible=lambda T: self.feasible(self.sent(T, known)), enough=enough, seed=seed,
+            )  # fmt: skip
+            poses = np.concatenate([poses, more])
+            predicted = problem.predict(self.with_planned(taken, poses, known))
+            if len(poses) >= count or (enough is not None and enough(predicted)):
+                break
+        return PlannedBoard(poses, predicted)
 
     def prediction(self, taken: ChosenViews, known: BoardKnowledge) -> Prediction:
         """The prediction without further images."""

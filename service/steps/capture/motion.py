@@ -46,7 +46,7 @@ def move_and_settle(
     *,
     meanwhile: Callable[[], None] = lambda: None,
 ) -> SettleReport:
-    """Move to joints (6,) and return when the pose stream is quiet. `meanwhile` is called after the motion has begun.
+    """Move to joints (N,) and return when the pose stream is quiet. `meanwhile` is called after the motion has begun.
 
     Raises SafetyStopError, DeviceTimeoutError (the arm is stopped), StepInterruptedError (the arm stands still).
     """

@@ -130,7 +130,7 @@ class _CaptureLoop:
     _tried: set[str] = field(init=False, default_factory=set[str])  # in this execution, successful or not
     _held: Shot | None = field(init=False, default=None)
     _size: str = field(init=False, default="")  # of an image, in words, once there is one
-    _targets: dict[str, Array] = field(init=False, default_factory=dict[str, Array])  # joints (6,) solved ahead
+    _targets: dict[str, Array] = field(init=False, default_factory=dict[str, Array])  # joints (N,) solved ahead
 
     def __post_init__(self) -> None:
         self.given_up = set(self.context.state.skipped_viewpoints)
@@ -241,7 +241,7 @@ class _CaptureLoop:
         return environment
 
     def _solve(self, robot: RobotArm, viewpoint: Viewpoint) -> Array:
-        """Joints (6,) for a viewpoint, solved by the controller. Raises UnreachablePoseError."""
+        """Joints (N,) for a viewpoint, solved by the controller. Raises UnreachablePoseError."""
         near = robot.state().sample.joints_rad if viewpoint.joints_rad is None else viewpoint.joints_rad
         return robot.solve_ik(flange_target(viewpoint.T_base_camera, self.task.T_flange_camera), near)
 

@@ -52,15 +52,16 @@ class Guide:
 
     def begin(self) -> None:
         """Enqueue the specimen's surface if there is a CT, and say where to begin."""
-        mesh = self._mesh()
-        if mesh is not None:
-            kept = {k: self.shared.fields[k] for k in ("spheres_m", "radius_m", "limits")}
-            arguments = coverage_points.Arguments.model_validate({"mesh": mesh, **kept})
+        mesh, shared = self._mesh(), self.shared.values
+        if mesh is not None and isinstance(shared, hand_view.SpecimenArguments):  # a board has no surface
+            arguments = coverage_points.Arguments(
+                mesh=mesh, spheres_m=shared.spheres_m, radius_m=shared.radius_m, limits=shared.limits
+            )
             references = {"spheres_m": self.shared.references["spheres_m"]}
             request = JobRequest.of(coverage_points.KIND, arguments, references)
             self.context.evidence.enqueue(request, "specimen")
         done = self._answers()
-        self._say(_answer_of(done[-1]).words if done else str(self.shared.fields["first_words"]))
+        self._say(_answer_of(done[-1]).words if done else self.shared.values.first_words)
 
     def look(self) -> None:
         """Tell the result of the last image, and enqueue the job for the next one. Returns at once."""
@@ -179,7 +180,8 @@ class Guide:
         earlier = [job.artefacts[0].sha256 for job in done]
         each = Each((key_stem(state, step, self.kind),), state.seq, "artefacts/0/sha256")
         looks = each if resolve(each.record(), jobs_of(state)) == earlier else None
-        arguments = {**self.shared.fields, "image": image, "earlier": earlier, "surface": self._surface()}
+        shared = self.shared.values
+        arguments = {**shared.set_fields(), "image": image, "earlier": earlier, "surface": self._surface()}
         references = {**self.shared.references, "earlier": looks}
         request = (
             JobRequest.of(hand_board.KIND, hand_board.Arguments.model_validate(arguments), references)
@@ -192,7 +194,7 @@ class Guide:
         if job.status == "failed":
             self.context.tell(failure_words(job))
             done = self._answers()
-            self._say_next(_answer_of(done[-1]).words if done else str(self.shared.fields["first_words"]))
+            self._say_next(_answer_of(done[-1]).words if done else self.shared.values.first_words)
             return
         m, answer = job.measures, _answer_of(job)
         parts = [f"{m['images_used']:.0f} used", f"hemisphere {100 * m['hemisphere_coverage']:.0f} %"]

@@ -1,1 +1,1 @@
-"""One file for each step kind, with its Params, Measures, Result, execute() and KIND."""
+"""Step kinds: one file for each, with its Params, Measures, Result, execute() and KIND, in any folder here."""

@@ -95,7 +95,7 @@ class _Model:
     tracks: str | None = None
 
     def fields(self) -> dict[str, str]:
-        """As arguments of the next jobs."""
+        """The files as arguments of the jobs that use them."""
         return {"model": self.model} if self.tracks is None else {"model": self.model, "tracks": self.tracks}
 
 

@@ -28,8 +28,8 @@ _NAMES = {
     "robot_corrected": "robot poses, corrected",
     "spheres": "poses by the spheres in each image",
     "triangulated": "triangulation from corrected robot poses",
-    "colmap": "COLMAP from nothing",
-    "glomap": "GLOMAP from nothing",
+    "colmap": "COLMAP from scratch",
+    "glomap": "GLOMAP from scratch",
     "hybrid": "images, robot and spheres together",
 }
 _GUESS_S = {  # per image
@@ -58,7 +58,7 @@ class PendingResult:
 
     @property
     def text(self) -> str:
-        """`COLMAP from nothing: still computing, about 4 min left`."""
+        """`COLMAP from scratch: still computing, about 4 min left`."""
         if self.failed:
             return f"{self.what}: there will be none, {self.failed}"
         takes = f"about {duration_words(self.seconds)}"

@@ -301,3 +301,21 @@ def to_artefact(row: Row[Any]) -> Artefact:
         monotonic_s=row.monotonic_s,
         record_sha256=row.record_sha256,
     )
+
+
+def open_folder(data_dir: Path, files: Files, ids: IdSource) -> ArtefactFiles:
+    """The files below a data folder; folders that do not exist are made. Raises StoreError if they cannot be."""
+    folder = ArtefactFiles(data_dir / "artefacts", files, ids)
+    try:
+        for directory in (*reversed(data_dir.absolute().parents), data_dir.absolute()):
+            if not directory.exists():
+                files.make_directory(directory)
+                files.sync_directory(directory.parent)
+        folder.prepare()
+    except OSError as error:
+        raise StoreError(
+            f"the data folder cannot be made: {error.strerror or error}",
+            where=str(error.filename or data_dir),
+            remedy="Check the path and its permissions, or choose another folder with --data DIR",
+        ) from error
+    return folder

@@ -16,11 +16,11 @@ from service.store.errors import UnknownRunError
 from service.store.events import read_events
 from service.store.files.artefacts import read_artefacts
 from service.store.records import SITE, Artefact, RunRow
+from service.store.run_rows import read_runs
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import log_findings, read_log
 from service.store.signatures.log_copy import copy_faults
 from service.store.signatures.timestamps import timestamp_findings
-from service.store.store import read_runs
 from service.store.verification import chain_checks as checks
 from service.store.verification import derived_checks as derived
 from service.store.verification import signature_checks as signatures

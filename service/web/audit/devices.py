@@ -9,6 +9,7 @@ from service.audit.overview import findings
 from service.audit.overview.devices import bodies_of_run, clock_offsets, opened_devices, sessions
 from service.audit.record import event_rows
 from service.core.equipment.clocks import clock_offset_words, clock_readings
+from service.steps.notes import deidentified
 from service.web.audit.frame import CurrentAudit, audit_frame
 from service.web.page.rendering import render
 from service.web.security.guards import requires
@@ -32,13 +33,15 @@ def devices_page(request: Request, audit: CurrentAudit, run_id: str) -> Response
         trouble_count = event_rows.count_of_kind(connection, run_id, "device_trouble")
         clocks = clock_offsets(connection, run_id)
         bodies = bodies_of_run(connection, run_id, opened)
-    readings = clock_readings(audit.site.run(run_id).events)
+    log = audit.site.run(run_id)
+    readings = clock_readings(log.events)
     return render(
         request,
         "audit/devices.html.j2",
         audit=frame,
         opened=opened,
         bodies=bodies,
+        removed=[one.words for state in log.state.steps.values() for one in deidentified(state)],
         clock_offset_words=clock_offset_words,
         sessions=sessions(started),
         troubles=troubles[-50:],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 
 from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.responses import HTMLResponse, Response
@@ -14,8 +15,12 @@ from service.audit.overview.devices import bodies_of_run, opened_devices
 from service.audit.overview.digest import Digest
 from service.audit.overview.first_page import GROUPS
 from service.audit.overview.shots import failed_exposures_of, shots_of, together
+from service.audit.overview.signatures import Signature
 from service.audit.overview.signatures import signatures as signatures_of
 from service.audit.record import event_rows, run_rows
+from service.audit.record.event_rows import EventRow
+from service.core.equipment.camera_bodies import CameraBodies
+from service.core.equipment.recorded_devices import RecordedIdentity
 from service.run_record import results_to_come
 from service.steps.poses.time_left import PendingResult
 from service.web.audit.frame import AuditState, CurrentAudit, audit_frame, close_audit, link
@@ -39,27 +44,64 @@ _FIRST = 25  # of a list on the first page
 _READ = [Depends(requires("read"))]
 
 
+@dataclass(frozen=True, slots=True)
+class _Recorded:
+    """What the first page reads from the run's events and from the index of them.
+
+    Attributes:
+        root: first event of the run, None if it is missing.
+        corrected: number of corrections.
+        devices: as they were opened.
+        session: last start of the program that drove the run.
+        sessions: number of starts.
+        exports: events of exports.
+        signatures: of steps, and of the run's release.
+        failures: number of failed exposures of each step.
+        bodies: of the cameras.
+    """
+
+    root: EventRow | None
+    corrected: int
+    devices: dict[str, RecordedIdentity]
+    session: EventRow | None
+    sessions: int
+    exports: list[EventRow]
+    signatures: list[Signature]
+    failures: dict[str, int]
+    bodies: CameraBodies
+
+
+def _recorded(audit: AuditState, run_id: str, digest: Digest | None) -> _Recorded:
+    with audit.site.store.database.reading() as connection:
+        root = event_rows.read_rows(connection, run_id, [1], whole=True)
+        opened = opened_devices(findings.events_of(connection, run_id, "device_opened", newest=True))
+        sessions = findings.events_of(connection, run_id, "session_started", newest=True)
+        return _Recorded(
+            root=root[0] if root else None,
+            corrected=event_rows.count_of_kind(connection, run_id, "record_corrected"),
+            devices={device.name: device.report.identity for device in opened},
+            session=sessions[-1] if sessions else None,
+            sessions=len(sessions),
+            exports=findings.events_of(connection, run_id, "evidence_exported", newest=True),
+            signatures=signatures_of(connection, run_id, digest),
+            failures=failed_exposures_of(connection, run_id),
+            bodies=bodies_of_run(connection, run_id, opened),
+        )
+
+
 @router.get("/audit/runs/{run_id}", name="audit_run", dependencies=_READ, response_class=HTMLResponse)
 def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
     """The first page of a run: deviations first."""
     frame = audit_frame(audit, run_id, "")
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)
-    with audit.site.store.database.reading() as connection:
-        root = event_rows.read_rows(connection, run_id, [1], whole=True)
-        corrected = event_rows.count_of_kind(connection, run_id, "record_corrected")
-        devices = opened_devices(findings.events_of(connection, run_id, "device_opened", newest=True))
-        sessions = findings.events_of(connection, run_id, "session_started", newest=True)
-        exports = findings.events_of(connection, run_id, "evidence_exported", newest=True)
-        signatures = signatures_of(connection, run_id, known)
-        failures = failed_exposures_of(connection, run_id)
-        bodies = bodies_of_run(connection, run_id, devices)
+    recorded = _recorded(audit, run_id, known)
     listed = first_page.findings(known) if known else []
-    run = frame.run
     return render(
         request,
         "audit/run.html.j2",
-        identity=protocol_identity(audit.site.store, run_id, run.protocol, run.version),
+        recorded,
+        identity=protocol_identity(audit.site.store, run_id, frame.run.protocol, frame.run.version),
         audit=frame,
         digest=known,
         progress=digest if isinstance(digest, Progress) else None,
@@ -69,18 +111,10 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
         listed=listed[:_FIRST],
         more=len(listed) - _FIRST,
         accuracy=accuracy_of(known),
-        dataset_exported=any(row.payload.get("what") == "dataset" for row in exports),
-        root=root[0] if root else None,
-        corrected=corrected,
-        shots=shots_of(known, failures),
+        dataset_exported=any(row.payload.get("what") == "dataset" for row in recorded.exports),
+        shots=shots_of(known, recorded.failures),
         together=together,
-        bodies=bodies,
-        devices={device.name: device.report.identity for device in devices},
-        session=sessions[-1] if sessions else None,
-        sessions=len(sessions),
-        exports=exports,
-        releases=[s for s in signatures if not s.step],
-        signatures=signatures,
+        releases=[signature for signature in recorded.signatures if not signature.step],
         late=known.late if known else [],
         to_come=[left.text for left in _to_come(audit, run_id, known)],
     )

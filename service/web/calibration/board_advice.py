@@ -13,18 +13,18 @@ from pydantic import TypeAdapter
 from service.compute.arm.correction import corrected_T_base_flange
 from service.compute.arm.inverse_kinematics import nearest_posture
 from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.plan import suggest_board_poses
+from service.compute.calibration.board_poses.plan import SuggestedPose, suggest_board_poses
 from service.compute.calibration.hand_eye.answers import HandEyeAnswer
 from service.compute.calibration.hand_eye.record import read_arm_correction
 from service.compute.camera_model import CameraModel
+from service.core.arms.known import known_arm
 from service.core.errors import OrthocaptureError
-from service.core.geometry import Transform, inverse
+from service.core.geometry import Array, Transform, inverse
 from service.core.protocol.models import Board as BoardSection
 from service.core.records.events import ViewpointCaptured
 from service.core.units import deg, metres, mm
 from service.jobs.calibration.records import ArmAnswer, HandEye
 from service.jobs.records import Camera
-from service.steps.capture.plan.planning import known_arm
 from service.web.record.pictures import cached
 
 POSES = 6
@@ -127,24 +127,23 @@ def _advise(
     )
     T_board_base = inverse(np.array(best.T_base_board))
     middle = points.mean(axis=0)
-    out: list[PoseAdvice] = []
-    for pose in suggested:
-        T_board_camera = T_board_base @ pose.T_base_camera
-        away = T_board_camera[:3, 3] - middle
-        axis, top = T_board_camera[:3, 2], -T_board_camera[:3, 1]
-        x, y, z = (mm(float(v)) for v in pose.T_base_flange[:3, 3])
-        out.append(
-            PoseAdvice(
-                tilt_deg=deg(np.arccos(min(1.0, abs(float(axis[2]))))),
-                azimuth_deg=deg(np.arctan2(away[1], away[0])),
-                roll_deg=float(round(np.degrees(np.arctan2(top[0], -top[1])), 1)) % 360,
-                distance_m=float(np.linalg.norm(away)),
-                sigma_mm=pose.sigma_mm,
-                sigma_deg=pose.sigma_deg,
-                flange_mm=(x, y, z),
-            )
-        )
-    return tuple(out)
+    return tuple(_advice(pose, T_board_base @ pose.T_base_camera, middle) for pose in suggested)
+
+
+def _advice(pose: SuggestedPose, T_board_camera: Transform, middle_m: Array) -> PoseAdvice:
+    """A suggested pose as a person can follow it; `middle_m` (3,) is the middle of the board, in its frame."""
+    away = T_board_camera[:3, 3] - middle_m
+    axis, top = T_board_camera[:3, 2], -T_board_camera[:3, 1]
+    x, y, z = (mm(float(v)) for v in pose.T_base_flange[:3, 3])
+    return PoseAdvice(
+        tilt_deg=deg(np.arccos(min(1.0, abs(float(axis[2]))))),
+        azimuth_deg=deg(np.arctan2(away[1], away[0])),
+        roll_deg=float(round(np.degrees(np.arctan2(top[0], -top[1])), 1)) % 360,
+        distance_m=float(np.linalg.norm(away)),
+        sigma_mm=pose.sigma_mm,
+        sigma_deg=pose.sigma_deg,
+        flange_mm=(x, y, z),
+    )
 
 
 def _answer(best: HandEye | ArmAnswer) -> HandEyeAnswer:

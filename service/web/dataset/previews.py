@@ -14,7 +14,7 @@ from service.dataset.preview.records import FILE_NAME, Preview, read_preview
 from service.store.durable_effects import Clock
 from service.web.site import CurrentSite
 
-_VERSION = "2"  # of what a preview holds
+_VERSION = "3"  # of what a preview holds
 _LOCK = Lock()
 
 

@@ -18,7 +18,7 @@ from service.rig import RigSection, parse_recorded_rig
 from service.run_record import RunRecord
 from service.steps.capture.plan.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.context import StationLayout
-from service.steps.kinds import calibration
+from service.steps.kinds.captures import calibration
 from service.steps.notes import BOARD_POSES, SUGGESTION, board_plans, suggested_views
 
 Vector = tuple[float, float, float]

@@ -18,7 +18,9 @@ from service.core.units import metres, mm
 from service.dataset.registered_scan import registered_scan
 from service.dataset.registrations import registrations
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
+from service.jobs.records import Point
 from service.jobs.registration.register import Registration
+from service.jobs.surfaces import fuse
 from service.run_record import RunRecord
 from service.web.record.images import captures_of
 from service.web.record.known_spheres import (
@@ -96,6 +98,7 @@ def _registered(log: RunRecord, registered: ShownRegistration) -> KnownScene:
         spheres=[SceneSphere(s.label, s.kind, s.centre_m) for s in spheres],
         radius_m=metres(log.protocol.spheres.radius_mm),
         bases=bases,
+        outlines={"wound of the last fusion": np.array(wound)} if (wound := _wound(log)) else {},
     )
     words = registered.name.replace("_", " ")
     return KnownScene(
@@ -108,6 +111,15 @@ def _registered(log: RunRecord, registered: ShownRegistration) -> KnownScene:
         registered,
         seen,
     )
+
+
+def _wound(log: RunRecord) -> tuple[Point, ...]:
+    """The outline of the wound that the last fusion used, in the frame of the scan; empty where there is none."""
+    steps = [log.state.steps[step.id] for step in log.protocol.steps if step.gives == "ground_truth"]
+    jobs = [job for step in steps for job in step.jobs.values()]
+    done = [job for job in jobs if job.kind == fuse.KIND.name and job.status == "finished"]
+    last = max(done, key=lambda job: job.enqueued_seq, default=None)
+    return () if last is None else fuse.KIND.read_answer(last.result).wound_m
 
 
 def _bases(log: RunRecord, record: Registration) -> tuple[dict[str, Transform], list[str]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from typing import Annotated, Literal, TypeVar
@@ -78,11 +77,13 @@ def draw_region(
             where="3D view",
             remedy="Draw it after the registration, before the run ends",
         )
-    region = RegionDrawn(
-        step=step, source=source, corners_m=_read_corners(corners), seen_along=_read_direction(along)
-    )
-    site.store.record(run_id, [region], actor=person.account)
+    site.store.record(run_id, [read_region(step, source, corners, along)], actor=person.account)
     return RedirectResponse(f"/runs/{run_id}/scene", status_code=303)
+
+
+def read_region(step: str, source: Literal["ct", "scan"], corners: str, along: str) -> RegionDrawn:
+    """The region of the form's fields. Raises ConfigurationError if they are no polygon on the scene."""
+    return RegionDrawn(step=step, source=source, corners_m=_read_corners(corners), seen_along=_read_direction(along))
 
 
 def _read_corners(text: str) -> tuple[_Point, ...]:
@@ -102,8 +103,8 @@ def _read_direction(text: str) -> _Point:
 
 def _read(kind: TypeAdapter[_T], text: str) -> _T:
     try:
-        return kind.validate_python(json.loads(text))
-    except (ValidationError, json.JSONDecodeError) as error:
+        return kind.validate_json(text)
+    except ValidationError as error:
         raise _unusable("the drawn polygon cannot be read") from error
 
 

@@ -11,6 +11,8 @@ import numpy as np
 from service.compute.camera_model import CameraModel
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.detectors import options_for
+from service.compute.markers.grounded.detector import GroundedDetector
+from service.compute.markers.grounded.weights import Weights, weights_in
 from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.image_files import LocatedOutlines, detect_all, locate_outlines, searched_whole
 from service.compute.markers.search.paper_files import detect_file_by_masks
@@ -33,7 +35,8 @@ def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:
     """
     arguments = context.arguments
     images, poses = _posed(context)
-    located = _located(context, images, poses)
+    weights = weights_in() if arguments.detector in ("grounded", "vote") else None
+    located = _located(context, images, poses, weights)
     records = [[outline_record(outline) for outline in found] for found in located.outlines]
     found = {image.viewpoint: [] for image in arguments.images}
     found |= dict(zip((image.viewpoint for image in images), records, strict=True))
@@ -44,7 +47,10 @@ def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:
         "outlines_an_image": total / len(images),
         "images_searched_whole": float(located.count("searched")),
     }
-    return JobAnswer(measures, (ref,))
+    if weights is None:
+        return JobAnswer(measures, (ref,))
+    used = {"detector": arguments.detector, "sha256": dict(weights.sha256())}
+    return JobAnswer(measures, (ref, context.keep_json(used, kind="weights", name="weights.json")))
 
 
 def read_outlines(
@@ -66,7 +72,7 @@ def _posed(context: JobContext[job.Arguments]) -> tuple[Sequence[Photograph], Ar
 
 
 def _located(
-    context: JobContext[job.Arguments], images: Sequence[Photograph], poses: Array | None
+    context: JobContext[job.Arguments], images: Sequence[Photograph], poses: Array | None, weights: Weights | None
 ) -> LocatedOutlines:
     arguments = context.arguments
     files = photographs(context, images)
@@ -77,6 +83,9 @@ def _located(
 
     options = options_for(arguments.colour)
     camera = camera_used(arguments)
+    if weights is not None:
+        networks = GroundedDetector.of(weights, len(arguments.spheres_m), vote=arguments.detector == "vote")
+        return searched_whole(detect_all(files, camera, options, 1, show, detect=networks))
     if arguments.detector == "paper":
         return searched_whole(detect_all(files, camera, options, workers, show, detect=detect_file_by_masks))
     return locate_outlines(

@@ -12,11 +12,12 @@ from service.compute.ground_truth.distances.heat_map import HeatScale
 from service.compute.ground_truth.distances.heat_mesh import write_heat_mesh
 from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.frames import TransformLoop, close_transforms
+from service.compute.ground_truth.fusion.common import common_part
 from service.compute.ground_truth.fusion.cut_out import Markers, without_markers
-from service.compute.ground_truth.fusion.fuse import Fused, FusionSettings, Source, outside, without_specks
+from service.compute.ground_truth.fusion.fuse import Fused, FusionSettings, Source
 from service.compute.ground_truth.fusion.fuse import fuse as fuse_surfaces
 from service.compute.ground_truth.fusion.picture import fusion_picture
-from service.compute.ground_truth.fusion.regions import Balls, Box, Correction, Prism, outline, seen_along
+from service.compute.ground_truth.fusion.regions import Box, Correction, Prism, outline, seen_along
 from service.compute.ground_truth.ply import write_ply
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import DataError
@@ -27,10 +28,6 @@ from service.jobs.records import Point, SpheresFound, matrix
 from service.jobs.surfaces import fuse as job
 from service.worker.job import JobAnswer, JobContext
 
-_MARGIN_M = 0.001  # around a sphere that was taken away: the CT's surface beside it is drawn towards it
-_LEAST_PART_M2 = (
-    5e-5  # smaller unconnected parts of the CT are noise, mostly in wood, whose density is near the threshold
-)
 _MM = 1e-3  # metres in the unit of the files
 _COMMENTS = ("in the frame of the scan, mm", "source 0: CT, 1: scan, 2: blend; sigma along the normal")
 
@@ -42,16 +39,14 @@ def fuse(context: JobContext[job.Arguments]) -> JobAnswer:
     aligned = align_spheres(_spheres(arguments.ct), _spheres(arguments.scan))
     scan = Surface.kept(context.input(arguments.scan_mesh))
     ct = Surface.kept(context.input(arguments.ct_mesh)).moved(aligned.T_scan_ct)
-    centres = np.array(arguments.ct.spheres_m)[list(aligned.only_ct)].reshape(-1, 3)
-    taken = Balls(apply(aligned.T_scan_ct, centres), arguments.radius_m + _MARGIN_M)
     up = scan.area_vectors_m2.sum(axis=0)  # a scan sees its scene from above only: its faces together point up
     frames = _frames(arguments, aligned)
     corrections = tuple(_correction(region, frames, up) for region in arguments.regions)
     context.progress("distances", 1, 4)
-    common = without_specks(outside(ct, taken), _LEAST_PART_M2)
-    score = chamfer(common, scan, ChamferSettings(arguments.spacing_m, to_faces=False))
+    common = common_part(ct, aligned, arguments.radius_m)
+    score = chamfer(common.ct, scan, ChamferSettings(arguments.spacing_m, to_faces=False))
     context.progress("fusion", 2, 4)
-    fused = fuse_surfaces(common, scan, up, _settings(arguments, aligned), corrections, taken)
+    fused = fuse_surfaces(common.ct, scan, up, _settings(arguments, aligned), corrections, common.taken)
     wound_m = _wound(fused, up)
     if arguments.post_radius_m is not None:
         markers = Markers(aligned.scan_spheres_m, arguments.radius_m, up, arguments.post_radius_m)
@@ -66,7 +61,7 @@ def fuse(context: JobContext[job.Arguments]) -> JobAnswer:
         regions=arguments.regions,
         taken_away=aligned.only_ct,
     )
-    files = _files(context, _Compared(common, scan, score), fused)
+    files = _files(context, _Compared(common.ct, scan, score), fused)
     return JobAnswer(_measures(aligned, loop, score, fused), files, answer)
 
 

@@ -11,6 +11,7 @@ from service.compute.layout.ambiguity import check_layout, layout_measures
 from service.compute.layout.confusions import SUBSET as LAYOUT_SUBSET
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.isosurface import surface
+from service.compute.surfaces.label_surface import LEAST_CONTRAST_HU, label_surface, sphere_contrasts
 from service.compute.surfaces.loop_closure import LoopClosure, close_loop
 from service.compute.surfaces.spheres.mesh_spheres import MeshSphere
 from service.compute.surfaces.spheres.mesh_spheres import locate_spheres as find_spheres
@@ -27,26 +28,67 @@ from service.worker.surfaces.records import judged_layout, measured_sphere
 
 
 def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
-    """Compute the surface of a volume (Hounsfield units) at the threshold, and find the spheres in the CT frame."""
+    """Compute the surface of a volume (Hounsfield units) at the threshold, and find the spheres in the CT frame.
+
+    If the volume is segmented, the surface is that of the segments.
+    """
     arguments = context.arguments
     hounsfield = np.load(context.input(arguments.hounsfield), allow_pickle=False, mmap_mode="r")
-    vertices_m, faces = surface(hounsfield, np.array(arguments.T_ct_voxel), arguments.threshold_hu)
+    T_ct_voxel = np.array(arguments.T_ct_voxel)
+    if arguments.labels is None:
+        vertices_m, faces = surface(hounsfield, T_ct_voxel, arguments.threshold_hu)
+    else:
+        labels = np.load(context.input(arguments.labels), allow_pickle=False, mmap_mode="r")
+        vertices_m, faces = label_surface(labels, T_ct_voxel)
     buffer = io.BytesIO()
     np.savez(buffer, vertices_m=vertices_m, faces=faces)
     mesh = context.keep_bytes(
         buffer.getvalue(), kind="ct_mesh", media_type="application/x-npz", name="ct_surface.npz"
     )
-    answer = _search(arguments, vertices_m, faces)
-    return JobAnswer({**answer.measures, "surface_faces": float(len(faces))}, (mesh,), answer.answer)
+    measures, found = search_spheres(arguments, vertices_m, faces)
+    measures["surface_faces"] = float(len(faces))
+    if arguments.labels is not None:
+        measures["label_contrast_hu"] = _contrast(arguments, hounsfield, T_ct_voxel, np.array(found.spheres_m))
+    return JobAnswer(measures, (mesh,), found)
+
+
+def _contrast(arguments: ct_job.Arguments, hounsfield: Any, T_ct_voxel: Array, centres: Array) -> float:
+    """The least contrast, in HU, of the spheres (N, 3) of a segmentation in the volume that it segments.
+
+    Raises ComputeError if there are none: the segmentation is mirrored, or of another series.
+    """
+    contrasts = sphere_contrasts(hounsfield, T_ct_voxel, centres, arguments.radius_m)
+    least = float(contrasts.min())
+    if least >= LEAST_CONTRAST_HU:
+        return least
+    count = int(np.count_nonzero(contrasts < LEAST_CONTRAST_HU))
+    why = "it belongs to another series, or its voxels were moved"
+    grey_m, triangles = surface(hounsfield, T_ct_voxel, arguments.threshold_hu)
+    try:
+        seen = find_spheres(grey_m, triangles, arguments.radius_m, arguments.expected)
+        match_constellations(np.array([s.centre_m for s in seen]), centres)
+    except ComputeError as error:
+        if "mirror images" in error.what:
+            why = "it is mirrored: an axis was negated when it was written"
+    raise ComputeError(
+        f"{count} of {len(centres)} segmented spheres are where the CT series has none ({least:.0f} HU denser than "
+        f"their surroundings, {LEAST_CONTRAST_HU:.0f} HU are needed): {why}",
+        where="segmentation of the CT series",
+        remedy="Open series and segmentation together in another program, correct it, and import it again",
+    )
 
 
 def locate_spheres(context: JobContext[locate_job.Arguments]) -> JobAnswer:
     """Find the spheres of a mesh; with `reference_m`, also how they moved since an earlier measurement."""
     with np.load(context.input(context.arguments.mesh), allow_pickle=False) as mesh:
-        return _search(context.arguments, mesh["vertices_m"], mesh["faces"])
+        measures, found = search_spheres(context.arguments, mesh["vertices_m"], mesh["faces"])
+    return JobAnswer(measures, (), found)
 
 
-def _search(arguments: ct_job.Arguments | locate_job.Arguments, vertices_m: Array, faces: Any) -> JobAnswer:
+def search_spheres(
+    arguments: ct_job.Arguments | locate_job.Arguments, vertices_m: Array, faces: Any
+) -> tuple[dict[str, float], SpheresFound]:
+    """The measures and the spheres of a mesh."""
     radius_m = arguments.radius_m
     spheres = _found(vertices_m, faces, radius_m, arguments.expected)
     centres = np.array([s.centre_m for s in spheres])
@@ -74,7 +116,7 @@ def _search(arguments: ct_job.Arguments | locate_job.Arguments, vertices_m: Arra
             measures["spheres_moved"] = float(len(closure.moved))
             measures["loop_closure_chi2"] = closure.chi2_per_dof
             details = details.model_copy(update={"loop_closure": _closure_record(closure)})
-    return JobAnswer(measures, (), SpheresFound(spheres_m=centres.tolist(), details=details))
+    return measures, SpheresFound(spheres_m=centres.tolist(), details=details)
 
 
 def _found(vertices_m: Array, faces: Any, radius_m: float, expected: int) -> tuple[MeshSphere, ...]:

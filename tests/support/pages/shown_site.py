@@ -12,10 +12,10 @@ from service.core.records.events import ItemTicked, OperatorAction
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from tests.support.pages.web import web_site
-from tests.support.runs.calibrated_run import begin_calibrated_run
+from tests.support.recorded.calibrated_run import begin_calibrated_run
+from tests.support.recorded.reported_run import record_reported_run
 from tests.support.runs.held_run import left_held_run
 from tests.support.runs.recorded_run import record_run
-from tests.support.runs.reported_run import record_reported_run
 
 
 @dataclass(frozen=True)

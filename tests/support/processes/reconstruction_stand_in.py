@@ -35,7 +35,7 @@ def meeting(poses: dict[str, Array]) -> Array:
 
 
 def write_obj(path: Path, vertices: Array) -> None:
-    """Vertices and the solid's faces."""
+    """Write vertices and the solid's faces as OBJ."""
     faces = json.loads(Path(os.environ["STAND_IN"]).read_text(encoding="utf-8"))["faces"]
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in vertices]
@@ -43,7 +43,7 @@ def write_obj(path: Path, vertices: Array) -> None:
 
 
 def write_ply(path: Path, vertices: Array) -> None:
-    """The same as PLY."""
+    """Write vertices and the solid's faces as PLY."""
     faces = json.loads(Path(os.environ["STAND_IN"]).read_text(encoding="utf-8"))["faces"]
     head = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}", *(f"property double {n}" for n in "xyz")]
     head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]

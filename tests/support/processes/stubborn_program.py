@@ -1,6 +1,8 @@
 """A program that moves an arm back and forth and always tries to continue: a process for tests to kill.
 
-Each line that it reads is the name of a person who permits motion. It reports its observations as lines of JSON.
+Its arguments are a driver, its configuration as JSON, the values of the first joint between which it moves, and
+whether it `lives` or `hangs`. Each line that it reads is the name of a person who permits motion. It reports its
+observations as lines of JSON.
 """
 
 from __future__ import annotations
@@ -12,12 +14,11 @@ import time
 from typing import Any
 
 from drivers.errors import DeviceError, DeviceUnavailableError
+from drivers.host.__main__ import load_spec
 from drivers.host.hosted_device import HostedDevice, hosted
 from drivers.interfaces import RobotArm
-from drivers.ur import UrConfig
 
 SPEED_RAD_S, ACCELERATION_RAD_S2 = 1.0, 1.5  # the fastest motion of protocols/demo.yaml
-GOAL_RAD = 2.5
 
 
 def say(**words: object) -> None:
@@ -26,16 +27,16 @@ def say(**words: object) -> None:
 
 
 def main() -> None:
-    host, hangs, unattended_s = sys.argv[1], sys.argv[2] == "hangs", float(sys.argv[3])
-    config = UrConfig(host=host, unattended_s=unattended_s)
-    arm = hosted(RobotArm, "drivers.ur:DRIVER", config, call_timeout_s=30, name="robot")
+    spec, given, *goals, how = sys.argv[1:]
+    config = load_spec(spec).config.model_validate_json(given)
+    goals_rad, hangs = [float(goal) for goal in goals], how == "hangs"
+    arm = hosted(RobotArm, spec, config, call_timeout_s=60, name="robot")
     arm.open()
     persons: list[tuple[str, float]] = []
     threading.Thread(target=_listen, args=(persons,), daemon=True).start()
     device: HostedDevice = vars(arm)["hosted_device"]
     say(driver=device.pid)
     said: Any = None
-    sign = 1.0
     while True:
         try:
             if persons:
@@ -43,7 +44,7 @@ def main() -> None:
                 arm.let_move(name, asked_s)
                 say(let_by=name)
             target = arm.state().sample.joints_rad.copy()
-            target[0] = sign * GOAL_RAD
+            target[0] = goals_rad[0]
             arm.move_joints(target, speed_rad_s=SPEED_RAD_S, acceleration_rad_s2=ACCELERATION_RAD_S2)
             said = None
             say(moves_to=target[0])
@@ -53,7 +54,7 @@ def main() -> None:
             while arm.is_moving():
                 time.sleep(0.02)
             say(arrived=target[0])
-            sign = -sign
+            goals_rad.reverse()
         except DeviceError as error:
             if type(error).__name__ != said:
                 said = type(error).__name__

@@ -31,7 +31,7 @@ class SteppedClock:
 
 
 class CountedIds:
-    """The same ids every time."""
+    """Ids that count up from 1, so that every test run has the same ones."""
 
     def __init__(self) -> None:
         self.count = 0

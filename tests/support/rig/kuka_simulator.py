@@ -8,10 +8,12 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
+#: Starts what answers at the ports of a controller on an address.
+Controller = Callable[[str], contextlib.AbstractContextManager[dict[str, Any]]]
 TRANSCRIPTS = Path(__file__).parents[2] / "data" / "kuka"
 
 

@@ -104,7 +104,7 @@ def tracked_scene(
 
 
 def _seen_with(outline: SphereOutline, true: CameraModel, calibrated: CameraModel) -> SphereOutline:
-    """The same outline as read with the calibrated camera instead of the true one."""
+    """The outline as it is read with the calibrated camera instead of the true one."""
     rim = outline.cone.rays(np.linspace(0, 2 * np.pi, 24), np.full(24, outline.cone.half_angle_rad))
     rays = np.column_stack([calibrated.normalise(true.project(np.vstack([outline.cone.axis, rim]))), np.ones(25)])
     rays /= np.linalg.norm(rays, axis=1)[:, None]

@@ -110,9 +110,11 @@ def report(about: Mapping[str, Any], known: Container[str], new: Sequence[Verdic
     path.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
     told = {field.name for field in fields(Verdict)}
     verdicts = [Verdict(**{key: row[key] for key in row if key in told}) for row in rows.values()]
-    groups: dict[str, list[Verdict]] = defaultdict(list)
-    for verdict in verdicts:
-        groups["/".join(verdict.name.split("/")[:2])].append(verdict)
+    stem.with_suffix(".md").write_text(_page(about, sweeps, verdicts), encoding="utf-8")
+
+
+def _page(about: Mapping[str, Any], sweeps: Sequence[Mapping[str, Any]], verdicts: Sequence[Verdict]) -> str:
+    """The results for people: the sweeps, a table of the wires and states, and the faults."""
     broken = [verdict for verdict in verdicts if verdict.broken]
     commands = [" ".join(["python -m bench.torture.faults", *sweep["options"]]) for sweep in sweeps]
     commands = [words if len(words) < _LONGEST else f"{words[:_LONGEST]} …" for words in commands]
@@ -133,6 +135,9 @@ def report(about: Mapping[str, Any], known: Container[str], new: Sequence[Verdic
         "| left open | longest s |",
         "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
+    groups: dict[str, list[Verdict]] = defaultdict(list)
+    for verdict in verdicts:
+        groups["/".join(verdict.name.split("/")[:2])].append(verdict)
     for name, some in sorted(groups.items()):
         done = [set(verdict.policy) for verdict in some]
         lines.append(
@@ -144,4 +149,4 @@ def report(about: Mapping[str, Any], known: Container[str], new: Sequence[Verdic
     if broken:
         lines += ["", "Faults:", ""]
         lines += [f"- {verdict.name}: {fault}" for verdict in broken for fault in verdict.broken]
-    stem.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return "\n".join(lines) + "\n"

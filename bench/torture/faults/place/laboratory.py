@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from json import loads
 from pathlib import Path
@@ -51,6 +51,15 @@ steps:
       - {measure: moved_during_exposure, max: 0}
     recovery: {retries: 1, wait_s: 0.2}
 """
+TABLE = (
+    PROTOCOL.replace("prefix: v\n", "prefix: v\n          image_top: up\n")
+    .replace(
+        "{tilt_deg: 20, azimuth_from_deg: -40, azimuth_to_deg: 40, count: 3, distance_m: DISTANCE}",
+        "{tilt_deg: 35, azimuth_from_deg: 60, azimuth_to_deg: 120, count: 3, distance_m: 0.62}",
+    )
+    .replace("acceleration_rad_s2: 1.5", "acceleration_rad_s2: 20")
+    .replace("window_s: 0.1", "window_s: 0.3")
+)
 SCAN = """\
 id: faults
 version: "1"
@@ -128,15 +137,17 @@ class Laboratory(Station):
             super().reopen(device)
 
 
-def write_rig(folder: Path, devices: dict[str, Any]) -> Path:
-    """Write a rig file; returns it."""
+def write_rig(
+    folder: Path, devices: dict[str, Any], station: Mapping[str, Any] = _STATION, camera_m: float = 0.1
+) -> Path:
+    """Write a rig file, with the camera so far before the flange; returns it."""
     path = folder / "rig.yaml"
     rig = {
         "name": "faults",
         "simulated": True,
         "devices": devices,
-        "stations": {"station_1": _STATION} if "robot" in devices else {},
-        "T_flange_camera_nominal": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]],
+        "stations": {"station_1": dict(station)} if "robot" in devices else {},
+        "T_flange_camera_nominal": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, camera_m], [0, 0, 0, 1]],
         "collision": {"arm": "not in the table"},
         "lens": {"focal_length_mm": 50, "sensor_width_mm": 35.7, "image_px": [900, 600]},
     }

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -16,6 +18,7 @@ from service.runner.operator import AnswerBy
 from tests.support.rig.bench_rig import ScriptedOperator, agree, answer
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
+_STILL_S = 0.25  # a motion after a longer rest is another one; a place is told ten times a second at least
 _MAY_MOVE = 0b11  # safety_status_bits: normal, reduced
 
 
@@ -70,6 +73,41 @@ class Motions:
     def began(self, _number: int = 0) -> None:
         """Note the start of a motion, reported by an in-memory arm."""
         self.begun_s.append(time.monotonic())
+
+
+class PlaceEye(Motions):
+    """Observes a simulated device through what it tells the simulated world of its place, past the proxy."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.address = "{}:{}".format(*self._listener.getsockname())  # for the option --world
+
+    def begin(self) -> None:
+        """Observe in a thread; not before all simulators are forked."""
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def close(self) -> None:
+        """Stop observing."""
+        self._listener.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                link, _ = self._listener.accept()
+                threading.Thread(target=self._read, args=(link,), daemon=True).start()
+
+    def _read(self, link: socket.socket) -> None:
+        place: object = None
+        moved_s = time.monotonic()
+        with contextlib.suppress(OSError), link, link.makefile("r") as lines:
+            for line in lines:
+                told, now_s = json.loads(line), time.monotonic()
+                before, place = place, told.get("q") or told.get("T_world_camera")
+                if before is not None and before != place:
+                    if now_s - moved_s > _STILL_S:
+                        self.begun_s.append(now_s)
+                    moved_s = now_s
 
 
 class ArmEye(Motions):

@@ -81,6 +81,55 @@ class Lines(_Buffered):
         return found
 
 
+_GRBL = {b"<": "status", b"$": "setting", b"G": "welcome", b"o": "answer", b"e": "answer"}  # by the first letter
+_AT_ONCE = b"\x18?!~\x85"  # commands of one byte
+
+
+class Grbl(_Buffered):
+    """GRBL's lines, and the commands of one byte between them."""
+
+    def __init__(self, *, answers: bool) -> None:
+        super().__init__()
+        self._answers = answers
+
+    def feed(self, data: bytes) -> list[Message]:
+        """Add bytes; returns the lines and commands that are now complete."""
+        found: list[Message] = []
+        for byte in data:
+            one = bytes([byte])
+            if not self._answers and one in _AT_ONCE:
+                found.append(("query" if one == b"?" else "reset" if one == b"\x18" else "hold", one))
+                continue
+            self._buffer += one
+            if one == b"\n":
+                found.append((self._kind(self._buffer), self._buffer))
+                self._buffer = b""
+        return found
+
+    def _kind(self, line: bytes) -> str:
+        if self._answers:
+            return _GRBL.get(line[:1], "")
+        return "jog" if line.startswith(b"$J=") else "line"
+
+
+class JsonLines(_Buffered):
+    """Lines of JSON of the KUKA wire; those of the controller are named after their field `is`."""
+
+    def __init__(self, *, answers: bool) -> None:
+        super().__init__()
+        self._answers = answers
+
+    def feed(self, data: bytes) -> list[Message]:
+        """Add bytes; returns the lines that are now complete."""
+        *whole, self._buffer = (self._buffer + data).split(b"\n")
+        return [(self._kind(line), line + b"\n") for line in whole]
+
+    def _kind(self, line: bytes) -> str:
+        if not self._answers:
+            return "beat" if b'"beat"' in line else "request"
+        return next((kind for kind in ("state", "hello", "ack", "done") if f'"is":"{kind}"'.encode() in line), "")
+
+
 class Script(_Buffered):
     """Programs of the script port: each ends with an unindented line `end`."""
 
@@ -157,7 +206,7 @@ class PtpIp(_Buffered):
 _ACCESS_DENIED = 0x200F
 
 
-def refused(device: str, kind: str, message: bytes) -> bytes:
+def refused(device: str, kind: str, message: bytes) -> bytes:  # noqa: PLR0911 - one for each device
     """The message with which this device refuses a request. Raises KeyError if the device cannot refuse it."""
     if device == "camera":
         if kind in ("connect", "event_connect"):
@@ -167,6 +216,13 @@ def refused(device: str, kind: str, message: bytes) -> bytes:
         raise KeyError(kind)
     if device == "lightbox":
         return b"ERR 2 refused\r\n"
+    if device == "table":
+        return {"answer": b"error:9\r\n", "setting": b"error:8\r\n"}[kind]
+    if device == "kuka":
+        if kind == "hello":
+            return b'{"is":"err","seq":null,"motion":null,"code":"taken","what":"another client is connected"}\n'
+        sequence = b"" if kind != "ack" else message.split(b'"seq":')[1].split(b",")[0].strip(b"}\n")
+        return b'{"is":"err","seq":%s,"motion":null,"code":"failed","what":"refused"}\n' % (sequence or b"null")
     if kind == "answer":
         return b"could not understand: ''\n"
     payload = {"version": b"\0", "start": b"\0", "outputs": b"\0NOT_FOUND", "inputs": b"\0IN_USE"}[kind]

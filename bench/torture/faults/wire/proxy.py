@@ -21,6 +21,8 @@ from bench.torture.faults.wire.framing import (
     RESPONSE,
     START_DATA,
     Framer,
+    Grbl,
+    JsonLines,
     Lines,
     PtpIp,
     PtpTalk,
@@ -55,8 +57,8 @@ class Spoil:
 class Wire:
     """One TCP port or pseudo-terminal: the driver's end and the simulator's address."""
 
-    device: Literal["robot", "camera", "lightbox"]
-    protocol: Literal["rtde", "dashboard", "script", "ptpip", "serial"]
+    device: Literal["robot", "camera", "lightbox", "table", "kuka"]
+    protocol: Literal["rtde", "dashboard", "script", "ptpip", "serial", "grbl", "kuka"]
     listen: tuple[str, int] | str
     upstream: tuple[str, int] | str
 
@@ -297,7 +299,7 @@ class Proxy:
             journal.write(json.dumps({"at_s": time.monotonic(), "what": what, **more}) + "\n")
 
 
-def _framer(wire: Wire, link: _Link, *, answers: bool) -> Framer:
+def _framer(wire: Wire, link: _Link, *, answers: bool) -> Framer:  # noqa: PLR0911 - one for each wire
     match wire.protocol:
         case "rtde":
             return Rtde(answers=answers)
@@ -307,6 +309,10 @@ def _framer(wire: Wire, link: _Link, *, answers: bool) -> Framer:
             return Lines({}) if answers else Script()
         case "ptpip":
             return PtpIp(link.talk, answers=answers)
+        case "grbl":
+            return Grbl(answers=answers)
+        case "kuka":
+            return JsonLines(answers=answers)
         case "serial":
             words = {"*idn": "identity", "light": "light", "temp": "temperature", "shutter": "shutter"}
             return Lines({**words, "pedal": "pedal", "#": "banner"}) if answers else Lines({}, "request")

@@ -160,7 +160,8 @@ def _cloud(suffix: str) -> Callable[[bytes, Path], None]:
 # --- CT -----------------------------------------------------------------------------------------------------------
 
 
-def _write_slices(folder: Path, *, implicit: bool = False) -> None:
+def write_slices(folder: Path, *, implicit: bool = False) -> None:
+    """Write a series of SLICES slices of ROWS × ROWS voxels of 1 mm."""
     volume = np.random.default_rng(3).integers(-1000, 1000, (SLICES, ROWS, ROWS)).astype(np.int16)
     grid = Grid(np.eye(4), 1e-3, (SLICES, ROWS, ROWS))
     write_series(folder, volume, grid, np.eye(4), "1.2.3.4", implicit=implicit, faults=FaultPlan())
@@ -171,7 +172,7 @@ def _slices(folder: Path) -> list[bytes]:
     for implicit in (False, True):
         part = folder / str(implicit)
         part.mkdir()
-        _write_slices(part, implicit=implicit)
+        write_slices(part, implicit=implicit)
         found += [path.read_bytes() for path in sorted(part.iterdir())][1:2]
     return found
 
@@ -185,7 +186,7 @@ def _series(data: bytes, folder: Path) -> None:
     if whole is None or not whole.exists():
         whole = _WHOLE["series"] = folder.parent / "series"
         whole.mkdir()
-        _write_slices(whole)
+        write_slices(whole)
     shutil.copytree(whole, folder / "ct")
     sorted((folder / "ct").iterdir())[1].write_bytes(data)
     source = DicomFolder(DicomFolderConfig(folder=folder / "ct", stable_s=0))

@@ -7,7 +7,9 @@ from typing import cast
 
 from bench.torture.fuzz.targets.target import Target
 
-_MODULES = ("written", "delivered", "records", "wires", "hostile")  # each has a tuple TARGETS
+_MODULES = (  # each has a tuple TARGETS
+    "written", "delivered", "labelled", "viewed", "exported", "streams", "records", "wires", "movers", "hostile",
+)  # fmt: skip
 GROUPS = tuple(f"bench.torture.fuzz.targets.{name}" for name in _MODULES)
 
 

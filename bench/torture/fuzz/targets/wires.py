@@ -11,13 +11,14 @@ import socket
 import struct
 import sys
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.torture.fuzz.mutations import BYTES, JSON, TEXT
+from bench.torture.fuzz.targets.peers import threads_watched
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
 from drivers.lightbox import LightboxConfig, SerialLightbox
 from drivers.ur.link import read_facts
@@ -132,25 +133,6 @@ end
 # --- the simulated camera, light box and world ----------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def _threads_watched() -> Generator[list[BaseException]]:
-    """Collect the exceptions that end threads within the block."""
-    died: list[BaseException] = []
-    before = threading.excepthook
-
-    def keep(arguments: threading.ExceptHookArgs) -> None:
-        if arguments.exc_value is not None:
-            died.append(arguments.exc_value)
-
-    threading.excepthook = keep
-    try:
-        yield died
-    finally:
-        threading.excepthook = before
-    if died:
-        raise died[0]
-
-
 def _sessions(_: Path) -> list[bytes]:
     hello = bytes(16) + "client\0".encode("utf-16-le") + struct.pack("<I", 0x10000)
     parts = [codec.packet(codec.PacketType.INIT_COMMAND_REQUEST, hello)]
@@ -182,7 +164,7 @@ def _say(address: tuple[str, int], data: bytes) -> None:
 
 def _camera(data: bytes, _: Path) -> None:
     body = CameraBody(StillLife(48), FaultPlan(), BodyOptions(fast=True))
-    with _threads_watched(), CameraServer("127.0.0.1", 0, body, FaultPlan()) as server:
+    with threads_watched(), CameraServer("127.0.0.1", 0, body, FaultPlan()) as server:
         _say(server.address, data)
 
 

@@ -16,6 +16,7 @@ from service.core.records.events import DeviceOpened, JobFinished, SessionStarte
 from service.core.text.counts import counted
 from service.core.units import ms, um
 from service.jobs.words import term
+from service.steps.notes import deidentified
 
 _COMPUTES = ("orthocapture", "numpy", "scipy", "opencv-python-headless", "pycolmap", "trimesh", "scikit-image")
 
@@ -27,6 +28,7 @@ def devices_section(run: RecordedRun) -> Section:
     blocks += [Paragraph(f"{text}.") for text in known.explained]
     if known.strange:
         blocks.append(Paragraph(f"{known.strange}.", "stop"))
+    blocks += [Paragraph(f"{one.words}.") for state in run.state.steps.values() for one in deidentified(state)]
     blocks += _clocks(run)
     captures = [view for view in run.summary().captures() if isinstance(view, ViewpointCaptured)]
     if captures:

@@ -34,7 +34,14 @@ class Candidates:
 
 
 def board_candidates(
-    known: BoardKnowledge, board: Board, wishes: ViewRange, approach: Array, *, most: int = _MOST, seed: int = 0
+    known: BoardKnowledge,
+    board: Board,
+    wishes: ViewRange,
+    approach: Array,
+    *,
+    most: int = _MOST,
+    seed: int = 0,
+    draw: int = 0,
 ) -> Candidates:
     """Poses that keep the whole printed board in the frame for every truth within the tolerances.
 
@@ -45,14 +52,14 @@ def board_candidates(
         approach: (3,) horizontal unit vector from the scene towards the base; images are upright for a viewer there.
         most: number of poses tried, drawn at random from all combinations.
         seed: of the draw.
+        draw: 1 for the next so many combinations, which the draw before did not have, and so on.
 
     Returns:
         Candidates, possibly none.
-        Candidates, perhaps none.
     """
     grid = _grid(known, board, wishes, approach)
     rng = np.random.default_rng([seed, 0xCA11])
-    pick = rng.permutation(len(grid) * len(_ANCHORS))[:most]
+    pick = rng.permutation(len(grid) * len(_ANCHORS))[draw * most : (draw + 1) * most]
     poses = np.array([grid[k // len(_ANCHORS)] for k in pick]).reshape(-1, 4, 4)
     anchors = np.array([_ANCHORS[k % len(_ANCHORS)] for k in pick], dtype=np.float64).reshape(-1, 2)
     outline = _outline(board)

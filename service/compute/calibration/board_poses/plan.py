@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -83,19 +84,17 @@ def suggest_board_poses(
     lever = float(np.median(np.linalg.norm((T_base_flange @ X)[:, :3, 3] - middle, axis=1)))
     open_ = list(range(len(flanges)))
     chosen: list[SuggestedPose] = []
-    known: dict[int, bool] = {}
+
+    @cache
+    def within_reach(candidate: int) -> bool:
+        return reachable is None or reachable(flanges[candidate])
+
     while open_ and len(chosen) < count:
         covariance = _covariance_of(so_far + gains[open_])
         cost = np.trace(covariance[:, :3, :3], axis1=1, axis2=2)
         cost = cost + lever**2 * np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2)
-        best = -1
-        for k in np.argsort(cost)[:_MOST_TRIED].tolist():
-            if open_[k] not in known:
-                known[open_[k]] = reachable is None or reachable(flanges[open_[k]])
-            if known[open_[k]]:
-                best = k
-                break
-        if best < 0:
+        best = next((k for k in np.argsort(cost)[:_MOST_TRIED].tolist() if within_reach(open_[k])), None)
+        if best is None:
             break
         pick = open_.pop(best)
         so_far = so_far + gains[pick]

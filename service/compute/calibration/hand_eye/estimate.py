@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.arm.kinematics import ArmModel
 from service.compute.calibration.hand_eye.answers import CorrectedHandEye, HandEyeResult
 from service.compute.calibration.hand_eye.closed_form import (
     CLOSED_FORMS,
@@ -40,6 +39,7 @@ from service.compute.calibration.hand_eye.setup import Setup, check_setup, inver
 from service.compute.calibration.hand_eye.spread import bootstrap_covariance, camera_share, not_below_held_out
 from service.compute.calibration.hand_eye.weighted import Noise
 from service.compute.camera_covariance import CameraCovariance
+from service.core.arms.model import ArmModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
 from service.core.units import deg, mm
@@ -58,7 +58,7 @@ class HandEyeViews:
         T_base_flange: (N, 4, 4) from the robot.
         T_camera_board: (N, 4, 4) from the images.
         corners: the boards' corners, from which the board poses' covariance follows; required by `reprojection`.
-        joints_rad: (N, 6) as recorded with the poses.
+        joints_rad: (N, J) as recorded with the poses.
         arm: the arm's model, with `joints_rad`.
     """
 
@@ -265,8 +265,10 @@ def _measured(views: HandEyeViews) -> HandEyeMeasurements:
     if corners is not None and len(corners.corners_px) != len(hands):
         raise DataError(f"corners of {len(corners.corners_px)} views for {len(hands)} poses")
     joints = None if views.joints_rad is None else np.asarray(views.joints_rad, dtype=np.float64)
-    if joints is not None and (joints.shape != (len(hands), 6) or not np.isfinite(joints).all()):
-        raise DataError(f"joints {joints.shape} instead of ({len(hands)}, 6) finite numbers")
+    if joints is not None:
+        axes = joints.shape[-1] if views.arm is None else views.arm.axes
+        if joints.shape != (len(hands), axes) or not np.isfinite(joints).all():
+            raise DataError(f"joints {joints.shape} instead of ({len(hands)}, {axes}) finite numbers")
     return HandEyeMeasurements(hands, boards, np.zeros((len(hands), 6, 6)), corners, joints, views.arm)
 
 

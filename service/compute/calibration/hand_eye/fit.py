@@ -11,16 +11,14 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from service.compute.arm.correction import (
-    HARMONICS,
-    N_DH,
-    N_GEAR,
     ArmCorrection,
     check_arm,
     corrected_T_base_flange,
     correction_design,
     correction_of,
+    dh_count,
+    gear_count,
 )
-from service.compute.arm.kinematics import ArmModel
 from service.compute.calibration.hand_eye.closed_form import (
     MIN_VIEWS,
     ClosedForm,
@@ -41,6 +39,7 @@ from service.compute.calibration.hand_eye.weighted import (
     select_scales,
     solve,
 )
+from service.core.arms.model import ArmModel
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform
 
@@ -57,16 +56,6 @@ _MAX_EXCLUDED = 1 / 3
 _ARM_FLOOR_M = 3e-6  # no arm is more repeatable
 _MIN_ARM_VIEWS = 9
 _ROUNDS = 6
-
-_GEAR_GROUPS = 1 + np.broadcast_to(
-    np.arange(6)[:, None, None] * len(HARMONICS) + np.arange(len(HARMONICS)), (6, 2, len(HARMONICS))
-)
-_KIND = {
-    "none": np.zeros(0, dtype=np.int64),
-    "geometry": np.zeros(N_DH, dtype=np.int64),
-    "geometry+gears": np.concatenate([np.zeros(N_DH, dtype=np.int64), np.ones(N_GEAR, dtype=np.int64)]),
-}
-_GROUPS = np.concatenate([np.zeros(N_DH, dtype=np.int64), _GEAR_GROUPS.ravel()])
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +81,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class HandEyeMeasurements:
-    """All measurements of N views; `corners` and `joints_rad` (N, 6) if known."""
+    """All measurements of N views; `corners` and `joints_rad` (N, J) if known."""
 
     hands: Array
     boards: Array
@@ -114,13 +103,13 @@ class HandEyeMeasurements:
 
     def views(self, terms: ArmTerms) -> Views:
         """The views for a weighted fit with these parameters of the arm."""
-        kind = _KIND[terms]
         if terms == "none":
-            design = np.zeros((len(self.hands), 6, 0))
+            kind, design = np.zeros(0, dtype=np.int64), np.zeros((len(self.hands), 6, 0))
         else:
             assert self.arm is not None
             assert self.joints_rad is not None
             check_arm(self.arm, self.joints_rad, self.hands)
+            kind = _kinds(self.arm, terms)
             design = correction_design(self.arm, self.joints_rad)[:, :, : len(kind)]
         return Views(self.hands, self.boards, self.covariance, design, kind)
 
@@ -251,21 +240,36 @@ def fit_with_arm(data: HandEyeMeasurements, plain: Answer, terms: ArmTerms, star
     views, noise = data.views(terms), start
     X, B = plain.T_flange_camera, plain.T_base_board
     if terms == "geometry+gears":
-        noise = select_scales(views, start, X, B, _GROUPS)
-        views = dataclasses.replace(views, kind=_GROUPS)
+        groups = _groups(data.arm)
+        noise = select_scales(views, start, X, B, groups)
+        views = dataclasses.replace(views, kind=groups)
     fit = solve(views, noise, X, B)
-    scaled = np.zeros(N_DH + N_GEAR)
+    scaled = np.zeros(dh_count(data.arm) + gear_count(data.arm))
     scaled[: len(fit.arm)] = fit.arm
-    correction = correction_of(data.arm, scaled, _observed(fit, noise, views.kind))
+    correction = correction_of(data.arm, scaled, _observed(data.arm, fit, noise, views.kind))
     return Answer(fit.T_flange_camera, fit.T_base_board, views, noise, fit, correction)
 
 
-def _observed(fit: Fit, noise: Noise, kind: NDArray[np.int64]) -> Array:
-    """(6,) share of the prior variance that the data removed, joint by joint."""
+def _kinds(arm: ArmModel, terms: ArmTerms) -> NDArray[np.int64]:
+    """(P,) 0 for a parameter of the geometry, 1 for one of the gears."""
+    kinds = np.repeat(np.array([0, 1], dtype=np.int64), [dh_count(arm), gear_count(arm)])
+    return kinds[: dh_count(arm)] if terms == "geometry" else kinds
+
+
+def _groups(arm: ArmModel) -> NDArray[np.int64]:
+    """(P,) group of each parameter: 0 for the geometry, then one for each harmonic of each joint."""
+    joints, waves = np.arange(arm.axes)[:, None, None], np.arange(arm.tolerances.harmonics)
+    gears = np.broadcast_to(1 + joints * len(waves) + waves, (arm.axes, 2, len(waves)))
+    return np.concatenate([np.zeros(dh_count(arm), dtype=np.int64), gears.ravel()])
+
+
+def _observed(arm: ArmModel, fit: Fit, noise: Noise, kind: NDArray[np.int64]) -> Array:
+    """(J,) share of the prior variance that the data removed, joint by joint."""
     prior = np.array(noise.scales)[kind] ** 2
     left = np.diag(fit.covariance)[12:]
-    joint = np.concatenate([np.repeat(np.arange(6), 4), np.repeat(np.arange(6), 2 * len(HARMONICS))])[: len(kind)]
-    return np.array([1 - left[joint == j].sum() / prior[joint == j].sum() for j in range(6)])
+    joints = np.arange(arm.axes)
+    of = np.concatenate([np.repeat(joints, 4), np.repeat(joints, 2 * arm.tolerances.harmonics)])[: len(kind)]
+    return np.array([1 - left[of == j].sum() / prior[of == j].sum() for j in joints])
 
 
 def arm_outliers(answer: Answer) -> NDArray[np.bool_]:

@@ -112,7 +112,7 @@ class ArmCorrected:
     T_flange_camera: Transform
 
     def T_base_camera(self, joints_rad: Array, T_base_flange: Array) -> Array:
-        """(N, 4, 4) camera poses from joints (N, 6) and reported poses (N, 4, 4).
+        """(N, 4, 4) camera poses from joints (N, J) and reported poses (N, 4, 4).
 
         Raises:
             DataError: joints and poses of another arm.

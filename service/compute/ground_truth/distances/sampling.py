@@ -58,7 +58,7 @@ def sample(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Samp
     points = np.empty((len(origin), 3))
     for begin in range(0, len(origin), _CHUNK):
         part = slice(begin, begin + _CHUNK)
-        points[part] = _random_places(surface, origin[part], rng)
+        points[part] = random_places(surface, origin[part], rng)
     return Samples(points, origin, None)
 
 
@@ -66,7 +66,7 @@ def random_points(surface: Surface, n: int, rng: np.random.Generator) -> Array:
     """(n, 3) points of a mesh, independent of one another and uniform in area."""
     share = np.cumsum(np.linalg.norm(surface.area_vectors_m2, axis=1))
     chosen = np.searchsorted(share, rng.random(n) * share[-1], side="right")
-    return _random_places(surface, np.minimum(chosen, len(share) - 1), rng)
+    return random_places(surface, np.minimum(chosen, len(share) - 1), rng)
 
 
 def normals_of(surface: Surface, samples: Samples, chosen: IntArray | slice) -> Array | None:
@@ -76,7 +76,7 @@ def normals_of(surface: Surface, samples: Samples, chosen: IntArray | slice) -> 
     return None if samples.normals is None else samples.normals[chosen]
 
 
-def _random_places(surface: Surface, faces: IntArray, rng: np.random.Generator) -> Array:
+def random_places(surface: Surface, faces: IntArray, rng: np.random.Generator) -> Array:
     """(K, 3) one random point on each of these faces (K,)."""
     a, b, c = (surface.vertices_m[surface.faces[faces, k]] for k in range(3))
     u, v = rng.random((2, len(faces), 1))

@@ -76,6 +76,48 @@ def _apart(a: Candidate, b: Candidate) -> bool:
     return abs(a.x - b.x) > near or abs(a.y - b.y) > near or not 0.72 < a.radius / b.radius < 1.39
 
 
+@dataclass(frozen=True, slots=True)
+class _EdgePixels:
+    """Edge pixels and their unit gradients; `margin` pixels are added around the image for centres outside it."""
+
+    x: NDArray[np.int64]
+    y: NDArray[np.int64]
+    dx: NDArray[np.floating]
+    dy: NDArray[np.floating]
+    margin: int
+    shape: tuple[int, int]  # with the margins
+
+    def votes(self, radius: np.int64) -> NDArray[np.float32]:
+        """For each pixel, the share of a circle of this radius around it that votes for it."""
+        rows, columns = self.shape
+        flat = np.concatenate(
+            [
+                np.rint(self.y + sign * radius * self.dy + self.margin).astype(np.int32) * columns
+                + np.rint(self.x + sign * radius * self.dx + self.margin).astype(np.int32)
+                for sign in (1, -1)
+            ]
+        )
+        plane = np.bincount(flat, minlength=rows * columns).reshape(rows, columns).astype(np.float32)
+        plane *= np.float32(1 / (2 * np.pi * float(radius)))
+        return np.asarray(cv2.boxFilter(plane, -1, (5, 5), normalize=False), dtype=np.float32)
+
+
+def _best_radii(pixels: _EdgePixels, radii: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """The most votes for any radius at each pixel, and that radius's index.
+
+    A circle's votes spread over neighbouring radii, so each radius has the sum of its own and those beside it.
+    """
+    best = np.zeros(pixels.shape, dtype=np.float32)
+    best_index = np.zeros(pixels.shape, dtype=np.uint8)
+    planes: list[NDArray[np.float32]] = []
+    for i, radius in enumerate(radii):
+        planes = [*planes[-2:], pixels.votes(radius)]
+        if i > 0:
+            _keep_best(best, best_index, i - 1, planes)
+    _keep_best(best, best_index, len(radii) - 1, planes[-2:])
+    return best, best_index
+
+
 def _keep_best(
     best: NDArray[np.float32], best_index: NDArray[np.uint8], index: int, planes: list[NDArray[np.float32]]
 ) -> None:
@@ -91,36 +133,16 @@ def _keep_best(
 def _search(
     image: NDArray[np.uint8], least: float, greatest: float, min_vote: float, to_input: float
 ) -> list[Candidate]:
-    h, w = image.shape[:2]
     gx, gy = colour_gradient(image)
     ys, xs = np.nonzero(edges(gx, gy))
     if len(xs) == 0:
         return []
     dx, dy = gx[ys, xs].astype(np.float32), gy[ys, xs].astype(np.float32)
     norm = np.hypot(dx, dy)
-    dx, dy = dx / norm, dy / norm
     radii = np.arange(max(3, int(least) - 1), int(np.ceil(greatest)) + 2)
     margin = int(radii[-1])  # a centre may lie outside the image
-    rows, columns = h + 2 * margin, w + 2 * margin
-    # A circle's votes spread over neighbouring radii, so each plane is summed with the two beside it.
-    best = np.zeros((rows, columns), dtype=np.float32)
-    best_index = np.zeros((rows, columns), dtype=np.uint8)
-    planes: list[NDArray[np.float32]] = []
-    for i, r in enumerate(radii):
-        flat = np.concatenate(
-            [
-                np.rint(ys + sign * r * dy + margin).astype(np.int32) * columns
-                + np.rint(xs + sign * r * dx + margin).astype(np.int32)
-                for sign in (1, -1)
-            ]
-        )
-        plane = np.bincount(flat, minlength=rows * columns).reshape(rows, columns).astype(np.float32)
-        plane *= np.float32(1 / (2 * np.pi * float(r)))
-        planes = [*planes[-2:], np.asarray(cv2.boxFilter(plane, -1, (5, 5), normalize=False), dtype=np.float32)]
-        if i == 0:
-            continue
-        _keep_best(best, best_index, i - 1, planes)
-    _keep_best(best, best_index, len(radii) - 1, planes[-2:])
+    shape = image.shape[0] + 2 * margin, image.shape[1] + 2 * margin
+    best, best_index = _best_radii(_EdgePixels(xs, ys, dx / norm, dy / norm, margin, shape), radii)
     peak = (best >= cv2.dilate(best, np.ones((7, 7), np.uint8))) & (best > min_vote)
     py, px = np.nonzero(peak)
     strongest = np.argsort(-best[py, px])[:150]

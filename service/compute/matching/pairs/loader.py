@@ -102,6 +102,11 @@ class MatchingData:
         self.simulated = views["simulated"]
         self.pairs = [pair for pair in pairs["pairs"] if difficulty in ("", pair["difficulty"])]
 
+    @property
+    def names(self) -> set[str]:
+        """Of the views."""
+        return set(self._views)
+
     def view(self, name: str) -> View:
         """A view with its depth, read from its file at each call."""
         record = self._views[name]

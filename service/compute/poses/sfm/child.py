@@ -18,7 +18,7 @@ from service.compute.images.files import read_grey
 from service.compute.poses.colmap.convention import from_colmap_pixels, to_colmap_camera, to_colmap_pixels
 from service.compute.poses.sfm.extraction import extract_sift
 from service.compute.poses.sfm.features import match_descriptors
-from service.compute.poses.sfm.mapping import map_images
+from service.compute.poses.sfm.model.mapping import map_images
 from service.compute.poses.sfm.options import Progress, reduction
 from service.core.errors import DataError, OrthocaptureError
 from service.core.geometry import Array

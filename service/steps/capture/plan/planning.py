@@ -8,18 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.compute.arm.inverse_kinematics import nearest_posture
-from service.compute.arm.kinematics import ArmModel, arm_model
-from service.compute.planning.collision import Capsule, Obstacles, universal_robot_body
+from service.compute.planning.collision import ArmBody, Capsule, Obstacles
 from service.compute.planning.motion_plan import (
     MotionPlan,
     Order,
     PlannedView,
     Situation,
-    infeasible_reason,
+    best_posture,
     plan_motion,
     travel_times_s,
 )
 from service.compute.planning.optics import depth_of_field
+from service.core.arms.known import known_arm
+from service.core.arms.model import ArmModel
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from service.core.protocol.models import Motion
@@ -30,7 +31,6 @@ from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import StationLayout, StepContext
 
 _EXPOSURE_S = 3.0  # estimate of settling, exposure and download at each viewpoint
-_ELBOW_UP_RAD = np.array([0.0, -1.6, 1.9, -1.9, -1.57, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class ArmAtStation:
     motion: Motion
 
     def situation(self, start_rad: Array, *, sharp_at_m: Array | None = None) -> Situation:
-        """The planner's problem for a motion that starts with the joints (6,) at `start_rad`.
+        """The planner's problem for a motion that starts with the joints (N,) at `start_rad`.
 
         `sharp_at_m`: (N, 3) points that must be sharp, base frame; None: the specimen.
         """
@@ -79,16 +79,24 @@ class ArmAtStation:
             focal_m, blur_m = metres(o.focal_length_mm), metres_of_um(o.blur_um)
             sharp = depth_of_field(focal_m, o.aperture_f, o.focus_distance_m, blur_m)
         return Situation(
-            body=universal_robot_body(self.model, self.T_flange_camera, camera),
-            obstacles=Obstacles(float(centre[2]) - c.table_below_scene_m, T_base_specimen, half),
+            body=ArmBody(self.model, self.T_flange_camera, camera),
+            obstacles=Obstacles(
+                float(centre[2]) - c.table_below_scene_m, T_base_specimen, half, others=self._others()
+            ),
             centre_m=centre,
             margin_m=c.margin_m,
             start_rad=np.asarray(start_rad, dtype=np.float64),
-            speed_rad_s=self.motion.speed_rad_s,
+            speed_rad_s=min(self.motion.speed_rad_s, float(self.model.speeds_rad_s.min())),
             acceleration_rad_s2=self.motion.acceleration_rad_s2,
             sharp=sharp,
             must_be_sharp_m=apply(T_base_specimen, corners) if sharp_at_m is None else sharp_at_m,
             pause_s=self.motion.dwell_s + _EXPOSURE_S,
+        )
+
+    def _others(self) -> tuple[tuple[str, Capsule], ...]:
+        return tuple(
+            (name, Capsule(np.array(one.from_m), np.array(one.to_m), one.radius_m))
+            for name, one in self.layout.obstacles
         )
 
     def _specimen(self) -> tuple[Transform, Array]:
@@ -187,22 +195,23 @@ def feasible_extra(
     situation = arm.situation(start)
     out: list[tuple[Viewpoint, float]] = []
     for viewpoint in viewpoints:
-        joints = nearest_posture(arm.model, viewpoint.T_base_camera @ inverse(T_flange_camera), start)
-        if joints is not None and not infeasible_reason(viewpoint.T_base_camera, joints, situation):
+        joints = best_posture(viewpoint.T_base_camera, situation)
+        if joints is not None:
             out.append((viewpoint, float(travel_times_s(np.array([start, joints]), situation)[0, 1])))
     return out
 
 
 def usual_posture(model: ArmModel, layout: StationLayout, T_flange_camera: Transform) -> Array:
-    """Joints (6,) with the elbow up and the camera above the scene, from which a plan without a robot starts.
+    """Joints (N,) with the elbow up and the camera above the scene, from which a plan without a robot starts.
 
     Raises:
         ConfigurationError: the arm does not reach the scene of this station.
     """
     centre, approach = np.array(layout.scene_centre_m), np.array(layout.approach)
     T_base_camera = look_at(centre + np.array([0.0, 0.0, 0.62]) + 0.1 * approach, centre, -approach)
-    near = _ELBOW_UP_RAD.copy()
-    near[0] = np.arctan2(approach[1], approach[0])
+    near = model.usual_rad.copy()
+    turned = near[0] + np.arctan2(-approach[1], -approach[0])
+    near[0] = np.arctan2(np.sin(turned), np.cos(turned))
     joints = nearest_posture(model, T_base_camera @ inverse(T_flange_camera), near)
     if joints is None:
         raise ConfigurationError(
@@ -211,14 +220,6 @@ def usual_posture(model: ArmModel, layout: StationLayout, T_flange_camera: Trans
             remedy="Check scene_centre_m and approach_azimuth_deg in the rig file",
         )
     return joints
-
-
-def known_arm(name: str) -> ArmModel | None:
-    """The kinematics of an arm, by the model name that its controller reports; None for an unknown model."""
-    try:
-        return arm_model(name)
-    except ConfigurationError:
-        return None
 
 
 def _text(plan: MotionPlan) -> str:

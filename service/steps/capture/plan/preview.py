@@ -9,7 +9,9 @@ import numpy as np
 
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.board_poses.design import CalibrationTargets
-from service.compute.planning.motion_plan import able_postures
+from service.compute.planning.motion_plan import best_posture
+from service.core.arms.known import known_arm
+from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply
 from service.core.protocol.models import Protocol, Step
 from service.core.units import metres
@@ -22,11 +24,11 @@ from service.steps.board.plan import (
     prediction_record,
     preview_board,
 )
-from service.steps.capture.plan.planning import ArmAtStation, StepPlan, known_arm, plan_station, usual_posture
+from service.steps.capture.plan.planning import ArmAtStation, StepPlan, plan_station, usual_posture
 from service.steps.capture.plan.viewpoints import plan_viewpoints
 from service.steps.context import StationLayout
-from service.steps.kinds import calibration
-from service.steps.kinds.viewpoint_capture import Params
+from service.steps.kinds.captures import calibration
+from service.steps.kinds.captures.viewpoint_capture import Params
 from service.steps.notes import BoardPrediction
 
 
@@ -92,6 +94,13 @@ def _arm(protocol: Protocol, rig: Rig, layout: StationLayout) -> ArmAtStation | 
     if model is None:
         return None
     nominal = rig.nominal_T_flange_camera()
+    load = rig.section.payload
+    if load is not None and load.mass_kg > model.payload_kg:
+        raise ConfigurationError(
+            f"the payload of {load.mass_kg:g} kg is more than a {model.name} carries, {model.payload_kg:g} kg",
+            where=str(rig.path),
+            remedy="Correct mass_kg, or choose another arm",
+        )
     return ArmAtStation(layout, model, nominal, collision, rig.section.optics, protocol.motion)
 
 
@@ -100,4 +109,4 @@ def _feasible(arm: ArmAtStation | None, sharp_at_m: Array) -> Callable[[Transfor
     if arm is None:
         return lambda _T: True
     situation = arm.situation(usual_posture(arm.model, arm.layout, arm.T_flange_camera), sharp_at_m=sharp_at_m)
-    return lambda T: bool(able_postures(T, situation))
+    return lambda T: best_posture(T, situation) is not None

@@ -71,7 +71,7 @@ class Viewpoint:
     name: str
     station: str
     T_base_camera: Transform
-    joints_rad: Array | None = None  # (6,) as planned; None: the solution nearest to the present posture
+    joints_rad: Array | None = None  # (N,) as planned; None: the solution nearest to the present posture
 
 
 _UP = np.array([0.0, 0.0, 1.0])

@@ -7,14 +7,14 @@
   const bar = document.querySelector("[data-to-view]");
   const said = document.getElementById("drawn");
   const toView = JSON.parse(bar.dataset.toView); // 4 x 4, metres: the frame of the scan to that of the drawing
-  const near = 14; // pixels around the finger within which the frontmost point of the surface is meant
+  const near = 14; // pixels beside an edge of the surface within which that edge is meant
   let corners = []; // millimetres of the drawing
 
   const button = (name) => bar.querySelector(`[data-draw="${name}"]`);
   const scene = () => place._fullLayout.scene._scene;
   const times = (m, [x, y, z, w]) => [0, 1, 2, 3].map((row) => m[row] * x + m[row + 4] * y + m[row + 8] * z + m[row + 12] * w);
 
-  // Pixels of the sheet, and depth, of a place in the drawing, by the matrices with which plotly draws.
+  // Pixels of the sheet, depth and distance of a place in the drawing, by the matrices with which plotly draws.
   const projection = () => {
     const { model, view, projection: lens } = scene().glplot.cameraParams;
     const box = scene().container.getBoundingClientRect();
@@ -26,25 +26,50 @@
         box.left - own.left + ((cx / cw + 1) / 2) * box.width,
         box.top - own.top + ((1 - cy / cw) / 2) * box.height,
         cz / cw,
+        cw,
       ];
     };
   };
 
-  // The frontmost point of the surface under a finger; null beside the surface.
+  // Where the line of sight through a pixel meets a triangle of projected corners: shares of them; null beside it.
+  const shares = ([ax, ay], [bx, by], [cx, cy], px, py) => {
+    const whole = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay);
+    const b = ((px - ax) * (cy - ay) - (cx - ax) * (py - ay)) / whole;
+    const c = ((bx - ax) * (py - ay) - (px - ax) * (by - ay)) / whole;
+    return b >= 0 && c >= 0 && b + c <= 1 ? [1 - b - c, b, c] : null;
+  };
+
+  // The place of the surface under a finger, in the drawing; beside its edge the nearest one; null where none is near.
   const onSurface = (px, py) => {
     const surface = place._fullData.find((trace) => trace.name === "surface");
     if (!surface) return null;
     const project = projection();
+    const corner = (k) => [surface.x[k], surface.y[k], surface.z[k]];
+    const seen = Array.from(surface.x, (_, k) => project(corner(k)));
     let found = null;
     let depth = Infinity;
-    for (let k = 0; k < surface.x.length; k += 1) {
-      const at = [surface.x[k], surface.y[k], surface.z[k]];
-      const [x, y, z] = project(at);
-      if (Math.hypot(x - px, y - py) <= near && z < depth) {
-        depth = z;
-        found = at;
-      }
+    for (let k = 0; k < surface.i.length; k += 1) {
+      const three = [surface.i[k], surface.j[k], surface.k[k]];
+      const [a, b, c] = three.map((at) => seen[at]);
+      if (Math.min(a[3], b[3], c[3]) <= 0) continue; // behind the viewer
+      const share = shares(a, b, c, px, py);
+      if (!share) continue;
+      const z = share[0] * a[2] + share[1] * b[2] + share[2] * c[2];
+      if (z >= depth) continue;
+      depth = z;
+      const weight = [a, b, c].map((at, m) => share[m] / at[3]); // the perspective shortens what is far
+      const sum = weight[0] + weight[1] + weight[2];
+      found = [0, 1, 2].map((axis) => three.reduce((at, v, m) => at + (weight[m] / sum) * corner(v)[axis], 0));
     }
+    if (found) return found;
+    let best = near;
+    seen.forEach(([x, y, , w], k) => {
+      const away = Math.hypot(x - px, y - py);
+      if (w > 0 && away <= best) {
+        best = away;
+        found = corner(k);
+      }
+    });
     return found;
   };
 
@@ -108,6 +133,9 @@
       say("");
     },
   };
+
+  // The picture has another size now: the corners are drawn where they are in it.
+  place.on?.("plotly_afterplot", () => { if (corners.length) show(); });
 
   bar.addEventListener("click", (event) => {
     const act = event.target.closest("button")?.dataset.draw;

@@ -1,0 +1,135 @@
+"""The rigs of a case with a turntable under GRBL, a KUKA arm, or a video camera."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import socket
+import time
+from contextlib import closing, suppress
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from bench.torture.faults.place.person import PlaceEye
+from bench.torture.faults.wire.proxy import Wire
+from tests.support.rig.grbl_simulator import CENTRE_M, TURN, mount
+
+if TYPE_CHECKING:
+    from bench.torture.faults.trial import Trial
+
+TABLE_STATION: dict[str, Any] = {
+    "robot": "robot", "scene_centre_m": CENTRE_M.tolist(), "approach_azimuth_deg": -90.0,
+}  # fmt: skip
+KUKA_STATION: dict[str, Any] = {
+    "robot": "robot", "scene_centre_m": [0.55, 0.0, 0.0], "approach_azimuth_deg": 180,
+}  # fmt: skip
+_FRAME_S = 0.04
+
+
+def table_rig(trial: Trial, plan: list[str]) -> dict[str, Any]:
+    """A turntable; returns its section of the rig file."""
+    far, line = trial.folder / "far", trial.folder / "line"
+    eye = PlaceEye()
+    trial.simulators.start(
+        "grbl", "--link", str(far), "--world", eye.address, "--speed-up", "3",
+        "--setting", "25=36000", "24=1200", "120=250", *plan,
+    )  # fmt: skip
+    trial.wired(Wire("table", "grbl", str(line), str(far)))
+    trial.watch(eye)
+    return {
+        "driver": "grbl", "port": str(line if trial.proxy else far), "connect_timeout_s": 4.0,
+        "axes": [TURN.model_dump(mode="json", exclude_none=True)], "T_base_flange_zero": mount().tolist(),
+    }  # fmt: skip
+
+
+def kuka_rig(trial: Trial, plan: list[str]) -> dict[str, Any]:
+    """A KUKA arm; returns its section of the rig file."""
+    near = trial.arm_host[:-1] + "2"
+    eye = PlaceEye()
+    trial.simulators.start("kuka", "--host", trial.arm_host, "--speed-up", "3", "--world", eye.address, *plan)
+    trial.wired(Wire("kuka", "kuka", (near, 30010), (trial.arm_host, 30010)))
+    trial.watch(eye)
+    host = near if trial.proxy else trial.arm_host
+    return {
+        "driver": "kuka_sunrise",
+        "host": host,
+        "connect_timeout_s": 4.0,
+        "answer_timeout_s": 2.0,
+        "stale_after_s": 4.0,
+    }
+
+
+def pendant(trial: Trial, order: str) -> None:
+    """Do what a person does at the smartPAD."""
+    with socket.create_connection((trial.arm_host, 30011), timeout=5) as link, link.makefile("rw") as lines:
+        lines.write(order + "\n")
+        lines.flush()
+        lines.readline()
+
+
+# --- video --------------------------------------------------------------------------------------------------------
+
+
+class Film:
+    """The program that writes a camera's JPEG files into a named pipe, 25 a second, in a process of its own."""
+
+    def __init__(self, pipe: Path) -> None:
+        self.pipe = pipe
+        self._process: BaseProcess | None = None
+
+    def run(self, how: str = "") -> None:
+        """Begin, or begin anew: `frozen`, `damaged`, `other_size` or `noise` say what is wrong with the images."""
+        self.end()
+        process = multiprocessing.get_context("fork").Process(target=_write, args=(self.pipe, how), daemon=True)
+        process.start()
+        self._process = process
+
+    def end(self) -> None:
+        """End it, as a camera that is pulled."""
+        if self._process is not None and self._process.pid is not None:
+            with suppress(ProcessLookupError):
+                os.kill(self._process.pid, signal.SIGKILL)
+            self._process.join(5.0)
+
+    def pause(self) -> None:
+        """Let it stand still."""
+        if self._process is not None and self._process.pid is not None:
+            os.kill(self._process.pid, signal.SIGSTOP)
+
+
+def video_rig(trial: Trial) -> dict[str, Any]:
+    """A video camera; returns its section of the rig file."""
+    pipe = trial.folder / "pipe"
+    os.mkfifo(pipe)
+    trial.film = Film(pipe)
+    trial.film.run()
+    trial.ends.append(trial.film.end)
+    return {
+        "driver": "video", "port": str(pipe), "aperture_f": 22.0, "exposure_s": 0.02, "iso": 100,
+        "frame_timeout_s": 3.0, "latency_s": 0.1,
+    }  # fmt: skip
+
+
+def _write(pipe: Path, how: str) -> None:
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    rng = np.random.default_rng(os.getpid())
+    size = (48, 64) if how == "other_size" else (96, 144)
+    with closing(pipe.open("wb")) as stream:
+        jpeg = b""
+        while True:
+            if not jpeg or how != "frozen":
+                picture = rng.integers(90, 120, (*size, 3), dtype=np.uint8)
+                jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
+            sent = jpeg
+            if how == "damaged":
+                sent = jpeg[: len(jpeg) // 2] + rng.bytes(len(jpeg) // 4) + jpeg[-2:]
+            if how == "noise":
+                sent = rng.bytes(len(jpeg))
+            stream.write(sent)
+            stream.flush()
+            time.sleep(_FRAME_S)

@@ -1,0 +1,124 @@
+"""Fuzz targets for binary streams and volumes: FRI's datagrams, messages of ROS 2, labels in NIfTI files."""
+
+from __future__ import annotations
+
+import functools
+import gzip
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from bench.machine import REPOSITORY
+from bench.torture.fuzz.targets.target import MisbehavedError, Target
+from drivers.dicom_folder.nifti import check_nifti, read_nifti, without_texts
+from drivers.kuka.fri.wire import FriError, decode
+from service.compute.camera_model import CameraModel
+from service.compute.poses.ros.cdr import CdrError
+from service.compute.poses.ros.messages import (
+    StampedImage,
+    StampedTransform,
+    decode_camera_info,
+    decode_image,
+    decode_pose,
+    decode_tf,
+    encode_camera_info,
+    encode_image,
+    encode_pose,
+    encode_tf,
+)
+
+_MOST_VOXELS = 1 << 20
+_CAMERA = CameraModel(480, 320, 700.0, 700.0, 239.5, 159.5, -0.05, 0.01)
+
+
+# --- FRI ----------------------------------------------------------------------------------------------------------
+
+
+def _datagrams(_: Path) -> list[bytes]:
+    rows = (REPOSITORY / "tests" / "data" / "kuka" / "fri.jsonl").read_text().splitlines()
+    return [bytes.fromhex(row["hex"]) for row in map(json.loads, rows) if "q" in row]
+
+
+def _datagram(data: bytes, _: Path) -> None:
+    message = decode(data)
+    if not np.isfinite([*message.joints_rad, *(message.commanded_rad or ()), message.time_s]).all():
+        raise MisbehavedError("a joint that is not finite is accepted")
+
+
+# --- ROS 2 --------------------------------------------------------------------------------------------------------
+
+
+def _pose() -> StampedTransform:
+    T = np.eye(4)
+    T[:3, 3] = 0.1, 0.2, 0.3
+    return StampedTransform(1_000_000_000, "world", "camera", T)
+
+
+def _messages(_: Path) -> list[bytes]:
+    image = StampedImage(1_000_000_000, "camera", "jpeg", b"\xff\xd8\xff\xd9")
+    pose = encode_pose(1_000_000_000, "world", _pose().T_parent_child, np.eye(6))
+    return [
+        bytes([kind]) + data
+        for kind, data in enumerate(
+            (
+                encode_image(image),
+                encode_camera_info(1_000_000_000, "camera", _CAMERA),
+                pose,
+                encode_tf([_pose()] * 3),
+            )
+        )
+    ]
+
+
+def _message(data: bytes, _: Path) -> None:
+    """The first byte chooses the type of the message."""
+    decoders: tuple[Callable[[bytes], object], ...] = (decode_image, decode_camera_info, decode_pose, decode_tf)
+    found = decoders[(data[:1] or b"\0")[0] % len(decoders)](data[1:])
+    poses = found if isinstance(found, list) else [found]
+    if not all(np.isfinite(one.T_parent_child).all() for one in poses if isinstance(one, StampedTransform)):
+        raise MisbehavedError("a pose that is not finite is accepted")
+
+
+# --- NIfTI --------------------------------------------------------------------------------------------------------
+
+
+def _label_image() -> bytes:
+    """A label image of 4 × 5 × 6 voxels of one millimetre, as NIfTI-1 says."""
+    head = bytearray(352)
+    struct.pack_into("<i", head, 0, 348)
+    struct.pack_into("<8h", head, 40, 3, 4, 5, 6, 1, 1, 1, 1)
+    struct.pack_into("<2h", head, 70, 2, 8)
+    struct.pack_into("<8f", head, 76, 1, 1, 1, 1, 0, 0, 0, 0)
+    struct.pack_into("<3f", head, 108, 352, 1, 0)
+    head[123] = 2
+    head[148:158] = b"a patient."
+    struct.pack_into("<2h", head, 252, 1, 1)
+    struct.pack_into("<12f", head, 280, 1, 0, 0, -2, 0, 1, 0, -2, 0, 0, 1, -2)
+    head[344:348] = b"n+1\0"
+    return bytes(head) + bytes(k % 3 for k in range(4 * 5 * 6))
+
+
+def _labels(name: str, data: bytes, folder: Path) -> None:
+    path = folder / name
+    path.write_bytes(data)
+    check_nifti(path)
+    block, _ = read_nifti(path, (), _MOST_VOXELS)
+    if not np.isfinite(block.T_ct_block).all():
+        raise MisbehavedError("a place that is not finite is accepted")
+    without_texts(path, folder / f"clean-{name}")
+
+
+_NIFTI = "drivers.dicom_folder.nifti:read_nifti"
+TARGETS: tuple[Target, ...] = (
+    Target("fri", "drivers.kuka.fri.wire:decode", _datagram, _datagrams, errors=(FriError,), says_place=False),
+    Target(
+        "ros_message", "service.compute.poses.ros.messages", _message, _messages, errors=(CdrError,), says_place=False
+    ),
+    Target("nifti", _NIFTI, functools.partial(_labels, "labels.nii"), lambda _: [_label_image()]),
+    Target(
+        "nifti_gz", _NIFTI, functools.partial(_labels, "labels.nii.gz"), lambda _: [gzip.compress(_label_image())]
+    ),
+)

@@ -1,0 +1,53 @@
+"""Decodes the pixels of slices into Hounsfield units."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydicom.dataset import FileDataset
+from pydicom.pixels.utils import pixel_array
+
+from drivers.dicom_folder.files import PARSE_ERRORS, read_dicom
+from drivers.dicom_folder.headers import SliceHeader
+from drivers.errors import UnreadableFileError
+
+# What pydicom, its plug-ins and Pillow raise for pixels that are truncated, damaged or of a missing codec.
+DECODE_ERRORS = (*PARSE_ERRORS, RuntimeError, OSError)
+
+
+def hounsfield(headers: Sequence[SliceHeader]) -> Iterator[NDArray[np.int16]]:
+    """The pixels of each slice in Hounsfield units, (J, I), in the order of the headers.
+
+    Raises UnreadableFileError, which names the slice and the file.
+    """
+    opened: tuple[Path, FileDataset] | None = None
+    for header in headers:
+        try:
+            if opened is None or opened[0] != header.path:
+                opened = (header.path, read_dicom(header.path))
+            stored = _stored(opened[1], header.frame)
+        except DECODE_ERRORS as error:
+            raise UnreadableFileError(
+                f"the image of slice {header.name} cannot be decoded ({error})",
+                where=str(header.path),
+                remedy=f"Export it again, uncompressed (it has transfer syntax {header.transfer_syntax})",
+            ) from error
+        if stored.shape != (header.rows, header.columns):
+            raise UnreadableFileError(
+                f"slice {header.name} holds an image of shape {stored.shape} instead of "
+                f"{(header.rows, header.columns)}",
+                where=str(header.path),
+                remedy="Export the series again as single monochrome slices",
+            )
+        slope, intercept = header.rescale or (1.0, 0.0)  # a series without them is refused before
+        yield np.clip(np.rint(stored * slope + intercept), -32768, 32767).astype(np.int16)
+
+
+def _stored(dataset: FileDataset, frame: int | None) -> NDArray[np.generic]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return np.asarray(dataset.pixel_array if frame is None else pixel_array(dataset, index=frame))

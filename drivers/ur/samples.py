@@ -1,0 +1,145 @@
+"""Samples of the arm from ur_rtde's receive interface, the modes of the controller, and its inverse kinematics."""
+
+from __future__ import annotations
+
+import time
+from typing import TypeVar
+
+import numpy as np
+
+from drivers.arm.latch import Latch
+from drivers.errors import (
+    DeviceFaultError,
+    DeviceRefusedError,
+    DeviceUnavailableError,
+    UnreachablePoseError,
+)
+from drivers.interfaces import Array, RobotSample, Transform
+from drivers.ur import vendor as library
+from drivers.ur.safety import safety_state
+from service.core.geometry import from_rotation_vector, inverse, to_rotation_vector
+
+RESTART = "Restart the controller; see the log of the pendant if it happens again"
+PLAYING = 2  # runtime_state
+VARIABLES = (
+    "timestamp",
+    "actual_q",
+    "actual_qd",
+    "target_qd",
+    "actual_TCP_pose",
+    "actual_TCP_speed",
+    "safety_status_bits",
+    "robot_mode",
+    "runtime_state",
+    "target_speed_fraction",
+)
+_ROBOT_MODES = {
+    -1: "NO_CONTROLLER",
+    0: "DISCONNECTED",
+    1: "CONFIRM_SAFETY",
+    2: "BOOTING",
+    3: "POWER_OFF",
+    4: "POWER_ON",
+    5: "IDLE",
+    6: "BACKDRIVE",
+    7: "RUNNING",
+}
+T = TypeVar("T")
+
+
+class SampleReader:
+    """Reads whole samples from the receive interface, and shows their safety state to the latch."""
+
+    def __init__(self, latch: Latch) -> None:
+        self._latch = latch
+        self._controller_time_s = -1.0  # of the last sample
+        self.receive: library.Receive | None = None  # None while the arm is not connected
+        self.T_flange_tcp: Transform = np.eye(4)  # as the controller states it
+
+    def read_from(self, receive: library.Receive) -> None:
+        """Read from a new connection."""
+        self.receive = receive
+        self._controller_time_s = -1.0
+
+    def read(self) -> RobotSample | None:
+        """The newest sample; None if none came since the last call, or if the arm is not connected."""
+        receive = self.receive
+        if receive is None:
+            return None
+        # Each getter locks separately: read the set again if a new package arrived in between.
+        for _ in range(3):
+            before_s = receive.getTimestamp()
+            if before_s == self._controller_time_s:
+                return None
+            sample = self._take(receive, before_s)
+            if receive.getTimestamp() == before_s:
+                self._controller_time_s = before_s
+                self._latch.see(sample.safety, sample.monotonic_s)
+                return sample
+        return None
+
+    def _take(self, receive: library.Receive, controller_time_s: float) -> RobotSample:
+        return RobotSample(
+            controller_time_s=controller_time_s,
+            monotonic_s=time.monotonic(),
+            joints_rad=np.array(receive.getActualQ()),
+            joint_velocities_rad_s=np.array(receive.getActualQd()),
+            target_velocities_rad_s=np.array(receive.getTargetQd()),
+            T_base_flange=from_rotation_vector(np.array(receive.getActualTCPPose())) @ inverse(self.T_flange_tcp),
+            tcp_speed_m_s=float(np.linalg.norm(receive.getActualTCPSpeed()[:3])),
+            safety=safety_state(receive.getSafetyStatusBits()),
+        )
+
+
+def robot_mode(receive: library.Receive) -> str:
+    """The mode of the arm in the vendor's words, such as RUNNING."""
+    mode = receive.getRobotMode()
+    return _ROBOT_MODES.get(mode, str(mode))
+
+
+def joints_for(
+    control: library.Control, T_base_flange: Transform, T_flange_tcp: Transform, near: list[float], where: str
+) -> Array:
+    """The joints (6,), in radians, nearest to `near`, that bring the flange to a pose.
+
+    Checks first that a solution exists, because an unreachable pose would end the control script.
+
+    Raises:
+        UnreachablePoseError: there is no solution, or it lies beyond the safety limits.
+        DeviceFaultError: the controller gave no answer.
+    """
+    pose = to_rotation_vector(T_base_flange @ T_flange_tcp).tolist()
+    if not control.getInverseKinematicsHasSolution(pose, near):
+        x, y, z = T_base_flange[:3, 3]
+        raise UnreachablePoseError(
+            f"the arm cannot reach the flange pose at ({x:.3f}, {y:.3f}, {z:.3f}) m in its base frame",
+            where=where,
+            remedy="Choose another viewpoint or move the station",
+        )
+    joints = control.getInverseKinematics(pose, near)
+    if len(joints) != 6:
+        raise DeviceFaultError("inverse kinematics returned no joints", where=where, remedy=RESTART)
+    if not control.isJointsWithinSafetyLimits(joints):
+        raise UnreachablePoseError(
+            "the pose lies beyond the controller's safety limits",
+            where=where,
+            remedy="Choose another viewpoint, or widen the limits on the pendant if that is safe",
+        )
+    return np.asarray(joints, dtype=np.float64)
+
+
+def joint_values(values: Array, where: str) -> list[float]:
+    """Six joints, in radians, as the vendor's library takes them. Raises DeviceRefusedError for anything else."""
+    joints = np.asarray(values, dtype=np.float64)
+    if joints.shape != (6,) or not np.all(np.isfinite(joints)):
+        raise DeviceRefusedError(
+            f"joints must be six finite numbers, not {values}", where=where, remedy="Choose another viewpoint"
+        )
+    return [float(v) for v in joints]
+
+
+def opened(part: T | None, where: str) -> T:
+    """A part of the connection. Raises DeviceUnavailableError if the arm is not connected."""
+    if part is None:
+        raise DeviceUnavailableError("the robot is not connected", where=where, remedy="Open it first")
+    return part

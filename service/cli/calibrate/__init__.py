@@ -1,0 +1,1 @@
+"""`orthocapture calibrate`: intrinsics and hand-eye calibration from images of a board."""

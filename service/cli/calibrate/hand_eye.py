@@ -1,0 +1,229 @@
+"""`orthocapture calibrate hand-eye`: the camera's pose on the robot's flange, from images of a board."""
+
+from __future__ import annotations
+
+import json as json_module
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.markup import escape
+
+from service.cli.calibrate.board_options import (
+    DEFAULT_DICTIONARY,
+    BoardOption,
+    DictionaryOption,
+    LegacyOption,
+    MarkerOption,
+    PatternOption,
+    SquareOption,
+    described_board,
+    searched,
+)
+from service.cli.common import (
+    JsonOption,
+    StrictOption,
+    console,
+    print_json,
+    reporting_errors,
+    require_writable,
+)
+from service.compute.arm.joint_file import read_joints_csv
+from service.compute.arm.kinematics import matching_arm, solve_joints
+from service.compute.calibration.board_poses.plan import SuggestedPose, suggest_board_poses
+from service.compute.calibration.board_poses.plan_plot import draw_board_plan
+from service.compute.calibration.hand_eye.answers import HandEyeResult
+from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
+from service.compute.calibration.hand_eye.fit import Method
+from service.compute.calibration.hand_eye.record import board_corners, hand_eye_record
+from service.compute.calibration.hand_eye.setup import Setup
+from service.compute.calibration.intrinsics.estimate import locate_view
+from service.compute.camera_covariance import read_camera_covariance
+from service.compute.images.folder import image_folder
+from service.compute.poses.files.camera_files import read_camera_json
+from service.compute.poses.files.pose_files import posed_images
+from service.core.arms.known import arm_model
+from service.core.arms.model import ArmModel
+from service.core.errors import ConfigurationError
+from service.core.geometry import Array, Transform
+from service.core.text.counts import counted
+from service.core.units import mm
+
+
+def hand_eye_command(
+    images: Annotated[Path, typer.Option("--images", help="Folder of the board images.")],
+    robot_poses: Annotated[
+        Path, typer.Option("--robot-poses", help="CSV image,x,y,z,qx,qy,qz,qw: T_base_flange in metres.")
+    ],
+    camera: Annotated[Path, typer.Option("--camera", help="camera.json of a calibrated camera.")],
+    board: BoardOption,
+    square_mm: SquareOption,
+    out: Annotated[Path, typer.Option("--out", help="The hand_eye.json to write.")],
+    pattern: PatternOption = "checkerboard",
+    marker_mm: MarkerOption = None,
+    dictionary: DictionaryOption = DEFAULT_DICTIONARY,
+    legacy: LegacyOption = False,
+    setup: Annotated[
+        Setup,
+        typer.Option("--setup", help="eye-to-hand: the camera stands beside the robot, the board is on its flange."),
+    ] = "eye-in-hand",
+    method: Annotated[Method, typer.Option("--method", help="The method that gives the result.")] = "weighted",
+    joints: Annotated[
+        Path | None,
+        typer.Option("--joints", help="CSV image,q1,…,qN in radians; the arm's own error is then estimated too."),
+    ] = None,
+    arm: Annotated[
+        str | None,
+        typer.Option("--arm", help="Arm model, such as UR10e or LBR Med 14; default: found from the joints."),
+    ] = (None),
+    suggest: Annotated[int, typer.Option("--suggest", help="Number of further board poses to suggest.", min=0)] = 6,
+    preview: Annotated[
+        Path | None, typer.Option("--preview", help="PNG to write of the suggested poses and those taken.")
+    ] = None,
+    strict: StrictOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Calibrate the camera's pose on the robot's flange, with its uncertainty."""
+    with reporting_errors(json):
+        target = described_board(board, square_mm, pattern, marker_mm, dictionary, legacy=legacy)
+        _require_possible(setup, joints, arm, preview)
+        model = read_camera_json(camera)
+        folder = image_folder(images, size=(model.width, model.height), strict=strict)
+        known, folder = posed_images(robot_poses, folder, images, strict=strict)
+        files = folder.files
+        for file in filter(None, (out, preview)):
+            require_writable(file)
+        usable = searched(files, target, quiet=json)
+        names = [files[k].name for k in usable.indices]
+        T_base_flange = np.array([known[name] for name in names])
+        T_camera_board = np.array([locate_view(view, target, model)[0] for view in usable.views])
+        joints_rad, kinematics = _arm(joints, arm, names, T_base_flange)
+        corners = board_corners(usable.views, target, model)
+        result = calibrate_hand_eye(
+            HandEyeViews(T_base_flange, T_camera_board, corners=corners, joints_rad=joints_rad, arm=kinematics),
+            method=method,
+            T_board_turned=target.half_turn(),
+            setup=setup,
+            camera_covariance=read_camera_covariance(camera),
+        )
+        best = result if result.corrected is None else result.corrected
+        suggested = suggest_board_poses(
+            best,
+            T_base_flange,
+            corners.points_m,
+            model,
+            corner_sigma_px=result.corner_sigma_px or 0.0,
+            count=suggest if setup == "eye-in-hand" else 0,  # a camera that stands still has no poses to suggest
+            reachable=_reachability(kinematics, joints_rad, T_base_flange),
+        )
+        without_board = {files[k].name: reason for k, reason in sorted(usable.excluded.items())}
+        record = hand_eye_record(result, names, setup) | {
+            "left_out": folder.left_out,
+            "images_without_board": without_board,
+            "suggested_poses": [_suggestion(pose) for pose in suggested],
+            "suggestions_reachable": kinematics is not None,
+        }
+        out.write_text(json_module.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        if preview is not None:
+            cameras = T_base_flange @ best.T_flange_camera
+            preview.write_bytes(draw_board_plan(cameras, suggested, best.T_base_board, corners.points_m, model))
+        if json:
+            print_json(record)
+            return
+        _tell(result, record, setup)
+        console.print(f"written: {out}")
+
+
+def _require_possible(setup: Setup, joints: Path | None, arm: str | None, preview: Path | None) -> None:
+    """Refuse options that exclude each other, and an unknown arm, before the images are searched."""
+    if setup == "eye-to-hand" and (joints is not None or arm is not None):
+        raise typer.BadParameter("--joints and --arm are for a camera on the flange, not for --setup eye-to-hand")
+    if setup == "eye-to-hand" and preview is not None:
+        raise typer.BadParameter("--preview shows suggested poses of a camera that the robot moves")
+    if arm is not None:
+        arm_model(arm)
+
+
+class _Reachability:
+    """Whether an arm can reach a pose from the joint positions of the nearest recorded pose."""
+
+    def __init__(self, arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
+        self._arm, self._joints, self._poses = arm, joints_rad, T_base_flange
+
+    def __call__(self, T_base_flange: Transform) -> bool:
+        turn = np.trace(np.swapaxes(self._poses[:, :3, :3], 1, 2) @ T_base_flange[:3, :3], axis1=1, axis2=2)
+        away = np.linalg.norm(self._poses[:, :3, 3] - T_base_flange[:3, 3], axis=1)
+        nearest = int(np.argmin(away + 0.5 * np.arccos(np.clip((turn - 1) / 2, -1, 1))))
+        return solve_joints(self._arm, T_base_flange, self._joints[nearest]) is not None
+
+
+def _reachability(arm: ArmModel | None, joints_rad: Array | None, T_base_flange: Array) -> _Reachability | None:
+    return None if arm is None or joints_rad is None else _Reachability(arm, joints_rad, T_base_flange)
+
+
+def _arm(
+    joints: Path | None, arm: str | None, names: list[str], T_base_flange: Array
+) -> tuple[Array | None, ArmModel | None]:
+    if joints is None:
+        if arm is not None:
+            raise typer.BadParameter("--arm needs --joints")
+        return None, None
+    rows = read_joints_csv(joints, names)
+    values = np.array([rows[name] for name in names])
+    if arm is not None:
+        return values, arm_model(arm)
+    found = matching_arm(values, T_base_flange)
+    if found is None:
+        raise ConfigurationError(
+            "no known arm has these poses at these joint angles",
+            where=str(joints),
+            remedy="Check that angles are in radians and poses are of the flange, or name the model with --arm",
+        )
+    return values, found
+
+
+def _suggestion(pose: SuggestedPose) -> dict[str, Any]:
+    return {
+        "T_base_flange": pose.T_base_flange.tolist(),
+        "T_base_camera": pose.T_base_camera.tolist(),
+        "predicted_sigma_mm": pose.sigma_mm,
+        "predicted_sigma_deg": pose.sigma_deg,
+    }
+
+
+def _tell(result: HandEyeResult, record: dict[str, Any], setup: Setup) -> None:
+    x, y, z = mm(result.T_flange_camera[:3, 3])
+    frame = "flange" if setup == "eye-in-hand" else "robot's base"
+    console.print(
+        f"{counted(len(result.held_out_mm), 'image')}: camera at {x:.2f}, {y:.2f}, {z:.2f} mm in the {frame} frame "
+        f"± {result.sigma_mm:.3f} mm, ± {result.sigma_deg:.4f}° ({result.method})"
+    )
+    held_mm, held_deg = np.median(result.held_out_mm), np.median(result.held_out_deg)
+    console.print(
+        f"held-out images: {held_mm:.3f} mm, {held_deg:.4f}° (median); "
+        f"other methods up to {result.spread_mm:.3f} mm away; condition {result.condition:.1f}"
+    )
+    camera_mm, camera_deg = record["sigma"]["camera_mm"], record["sigma"]["camera_deg"]
+    if camera_mm:
+        console.print(f"of that ± {camera_mm:.3f} mm, ± {camera_deg:.4f}° from the uncertainty of the camera")
+    else:
+        console.print("camera.json states no covariance: the camera is taken as exactly known")
+    if result.robot_noise_mm is not None and result.robot_noise_deg is not None:
+        console.print(f"robot noise for each axis: {result.robot_noise_mm:.3f} mm, {result.robot_noise_deg:.4f}°")
+    if result.corrected is not None:
+        console.print(
+            f"with the arm's own error estimated ({result.corrected.terms}): held-out images "
+            f"{np.median(result.corrected.held_out_mm):.3f} mm, robot noise {result.corrected.robot_noise_mm:.3f} mm"
+        )
+    elif len(result.arm_held_out_mm) > 1:
+        console.print("estimating the arm's own error does not improve held-out images: not used")
+    for name, reason in {**record["left_out"], **record["excluded"], **record["images_without_board"]}.items():
+        console.print(f"not used: {escape(name)}: {escape(reason)}")
+    suggested = record["suggested_poses"]
+    if suggested:
+        checked = "" if record["suggestions_reachable"] else " (reach not checked: no joints)"
+        console.print(
+            f"{len(suggested)} more board poses{checked} would bring the fit's own sigma to "
+            f"{suggested[-1]['predicted_sigma_mm']:.3f} mm"
+        )

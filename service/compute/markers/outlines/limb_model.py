@@ -1,0 +1,233 @@
+"""Forward model of the limb of spheres in profiles across their outlines, from light to JPEG, with its derivatives.
+
+In linear light: inside a shaded sphere, outside a surface with a slope, both blurred by the lens and the pixel; then
+the transfer curve, luma and colour differences, and JPEG's loss of resolution in the colour differences.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from service.core.geometry import Array
+
+Array32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# Rows: Y, Cb, Cr of B, G, R (ITU-R BT.601, which JPEG uses).
+TO_YCC = np.array([[0.114, 0.587, 0.299], [0.5, -0.331264, -0.168736], [-0.081312, -0.418688, 0.5]])
+_MIX = TO_YCC.astype(np.float32)
+# Of a profile: A (3), limb, inner slope, D (3), outer slope, offset; these are its OWN. Of an outline: blur, extra
+# blur of the colours. ALL is their number, and the index of the residual.
+LIMB, SLOPE, OUTER, OFFSET, OWN, ALL = 3, 4, 8, 9, 10, 12
+_TABLE = np.linspace(-12.0, 12.0, 1201)
+
+
+@dataclass(frozen=True, slots=True)
+class LimbProfiles:
+    """Values along K profiles across each of G outlines, lengths in the unit of the offsets.
+
+    Attributes:
+        coded_bgr: (G, K, J, 3).
+        offsets: (J,) positions across the outline, evenly spaced, positive outside.
+        inside: (G, K) whether a profile lies in the image.
+        radius: (G,) of the outlines.
+        srgb: whether values are sRGB coded.
+    """
+
+    coded_bgr: NDArray[np.uint8]
+    offsets: Array
+    inside: Mask
+    radius: Array
+    srgb: bool
+
+
+@dataclass(frozen=True, slots=True)
+class LimbModel:
+    """What the forward model is evaluated on.
+
+    Attributes:
+        data: (G, 3, K, J) Y, Cb, Cr of the profiles.
+        t: (J,) offsets.
+        wide: (J',) offsets with margins for the blur.
+        sharp: (J', J) interpolation from `wide` to `t`.
+        radius: (G,) of the outlines.
+        tone: (G, 3) the spheres' colour in linear light.
+        srgb: whether values are sRGB coded.
+    """
+
+    data: Array32
+    t: Array
+    wide: Array
+    sharp: Array32
+    radius: Array
+    tone: Array32
+    srgb: bool
+
+    @classmethod
+    def of(cls, profiles: LimbProfiles, tone: Array32) -> LimbModel:
+        """The model of these profiles of spheres with these colours."""
+        t = profiles.offsets
+        step = float(t[1] - t[0])
+        margin = int(np.ceil(3.6 / step)) if step < 0.8 else 3
+        wide = t[0] - margin * step + step * np.arange(len(t) + 2 * margin)
+        data = _mixed(np.moveaxis(profiles.coded_bgr, 3, 1).astype(np.float32) / np.float32(255))
+        return cls(data, t, wide, _interpolation(t, wide), profiles.radius, tone, profiles.srgb)
+
+
+@lru_cache(maxsize=1)
+def _limb_table() -> tuple[Array32, Array32]:
+    """E[sqrt(max(0, -(x + z)))] for z ~ N(0, 1), and its derivative, at _TABLE."""
+    z = np.linspace(-6, 6, 2401)
+    weight = np.exp(-0.5 * z**2)
+    weight /= weight.sum()
+    value = np.sqrt(np.maximum(0.0, -(_TABLE[:, None] + z))) @ weight
+    return value.astype(np.float32), np.gradient(value, _TABLE).astype(np.float32)
+
+
+@lru_cache(maxsize=2)
+def light_of(*, srgb: bool) -> Array32:
+    """(256,) linear light of each coded value."""
+    x = np.arange(256) / 255
+    linear = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4) if srgb else x
+    return linear.astype(np.float32)
+
+
+def _coded(linear: Array32, *, srgb: bool) -> tuple[Array32, Array32]:
+    """Coded values of linear light, and their derivative."""
+    if not srgb:
+        return linear, np.ones_like(linear)
+    x = np.maximum(linear, np.float32(1e-5))
+    root = np.exp(np.log(x) * np.float32(1 / 2.4))  # twice as fast as a power
+    low = x <= 0.0031308
+    value = np.where(low, np.float32(12.92) * linear, np.float32(1.055) * root - np.float32(0.055))
+    return value, np.where(low, np.float32(12.92), np.float32(1.055 / 2.4) * root / x)
+
+
+def _smoothing(t: Array, wide: Array, blur: Array) -> tuple[Array32, Array32]:
+    """(G, J', J) matrices that blur values at `wide` by Gaussians (G,) and sample at `t`, and their derivative."""
+    s = blur[:, None, None]
+    square = (t - wide[:, None]) ** 2
+    weight = np.exp(-0.5 * square / s**2)
+    weight /= weight.sum(axis=1, keepdims=True)
+    slope = weight * square / s**3
+    slope -= weight * slope.sum(axis=1, keepdims=True)
+    return weight.astype(np.float32), slope.astype(np.float32)
+
+
+def _interpolation(t: Array, wide: Array) -> Array32:
+    """(J', J) mean effect of Lanczos interpolation on a profile, averaged over sub-pixel positions.
+
+    The kernel is stretched to the mean over directions: along the pixels' diagonal it is narrower.
+    """
+    d = 1.1 * (t - wide[:, None])
+    weight = np.where(np.abs(d) < 4, np.sinc(d) * np.sinc(d / 4), 0.0)
+    return np.asarray(weight / weight.sum(axis=0), dtype=np.float32)
+
+
+def _mixed(channels: Array32) -> Array32:
+    """Y, Cb, Cr of channels (G, 3, K, J)."""
+    return (_MIX @ channels.reshape(*channels.shape[:2], -1)).reshape(channels.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """The model before interpolation and the colours' blur.
+
+    Attributes:
+        mixed: (G, 3, 6, K, J') of Y, Cb, Cr: derivatives by limb, inner and outer slope, offset and blur; the value.
+        slope: (G, 3, K, J') of the coded values by linear light, of B, G, R.
+        share: (G, K, J') of the sphere in each sample.
+    """
+
+    mixed: Array32
+    slope: Array32
+    share: Array32
+
+
+def _shown(p: Array, blur: Array, model: LimbModel) -> _Shown:
+    """Predict grey values: the light of sphere and surroundings, blurred by lens and pixel, then gamma-encoded."""
+    s = blur.astype(np.float32)[:, None, None]
+    R = model.radius.astype(np.float32)[:, None, None]
+    q = p.astype(np.float32)
+    tones = model.tone[:, :, None, None]
+    u = model.wide.astype(np.float32) - q[..., OFFSET, None]  # (G, K, J')
+    x = np.clip(u / s, -12, 12)
+    S = ndtr(-x)
+    density = np.exp(-0.5 * x * x) * (np.float32(0.3989422804) / s)
+    limb, d_limb = _limb_light(u, x, s, R)
+    outer = u * (1 - S) + s * s * density  # E max(0, u + s z)
+    inner = (outer - u) / R
+    near = np.minimum(outer, 8)
+    b, c, e = q[..., LIMB, None], q[..., SLOPE, None], q[..., OUTER, None]
+    A, D = (np.ascontiguousarray(np.moveaxis(q[..., k : k + 3], 2, 1))[..., None] for k in (0, 5))  # (G, 3, K, 1)
+    rest = 1 - S
+    L = A * S[:, None] + tones * (b * limb + c * inner)[:, None] + D * (rest + e * near)[:, None]
+    value, slope = _coded(np.asarray(L, dtype=np.float32), srgb=model.srgb)
+    G, K, wider = u.shape
+    by_tone, by_outer = _mixed(tones * slope), _mixed(D * slope)
+    jump = _mixed(A * slope) - by_outer
+    mixed = np.empty((G, 3, 6, K, wider), dtype=np.float32)
+    mixed[:, :, 0] = limb[:, None] * by_tone
+    mixed[:, :, 1] = inner[:, None] * by_tone
+    mixed[:, :, 2] = near[:, None] * by_outer
+    mixed[:, :, 3] = (
+        density[:, None] * jump - (b * d_limb - c * S / R)[:, None] * by_tone - (e * rest)[:, None] * by_outer
+    )
+    mixed[:, :, 4] = (
+        (x * density)[:, None] * jump
+        + (b * (0.5 * limb / s - x * d_limb) + c * s * density / R)[:, None] * by_tone
+        + (e * s * density)[:, None] * by_outer
+    )
+    mixed[:, :, 5] = _mixed(value)
+    return _Shown(mixed, slope, S)
+
+
+def _limb_light(u: Array32, x: Array32, s: Array32, R: Array32) -> tuple[Array32, Array32]:
+    """The blurred light of a sphere towards its limb, and its derivative by the offset, without its sign.
+
+    Args:
+        u: (G, K, J') distances from the edge, positive outside.
+        x: the same in standard deviations of the blur, within ± 12.
+        s: (G, 1, 1) standard deviations of the blur.
+        R: (G, 1, 1) radii of the outlines.
+    """
+    table, d_table = _limb_table()
+    # sqrt(1 - rho^2) = sqrt(d (2 - d)) at the depth d in radii; the second factor is smooth.
+    deep = np.sqrt(np.maximum(0.2, 1 + np.minimum(u, 0) * (0.5 / R))) * np.sqrt(2 * s / R)
+    place = (x + 12) * np.float32(50)
+    low = np.minimum(place.astype(np.int32), len(_TABLE) - 2)
+    part = place - low.astype(np.float32)
+    value = (table[low] * (1 - part) + table[low + 1] * part) * deep
+    slope = d_table[low] * deep / s
+    return np.asarray(value, dtype=np.float32), np.asarray(slope, dtype=np.float32)
+
+
+def evaluate(p: Array, blur: Array, chroma_blur: Array, model: LimbModel) -> tuple[Array32, Array32]:
+    """Jacobian and, last, residual (G, 13, 3, K, J) of the model in Y, Cb, Cr; the sphere's share (G, K, J)."""
+    shown = _shown(p, blur, model)
+    mixed, S, sharp = shown.mixed, shown.share, model.sharp
+    G, K, wider = S.shape
+    J = len(model.t)
+    smooth, d_smooth = _smoothing(model.t, model.wide, chroma_blur)
+    rows = np.empty((G, ALL + 1, 3, K, J), dtype=np.float32)
+    columns = [LIMB, SLOPE, OUTER, OFFSET, OWN, ALL]
+    rows[:, columns, 0] = (mixed[:, 0].reshape(G, -1, wider) @ sharp).reshape(G, 6, K, J)
+    colour = (mixed[:, 1:].reshape(G, -1, wider) @ smooth).reshape(G, 2, 6, K, J)
+    rows[:, columns, 1], rows[:, columns, 2] = colour[:, 0], colour[:, 1]
+    rows[:, ALL] = model.data - rows[:, ALL]
+    rows[:, OWN + 1, 0] = 0
+    rows[:, OWN + 1, 1:] = (mixed[:, 1:, 5].reshape(G, -1, wider) @ d_smooth).reshape(G, 2, K, J)
+    # Columns of a colour's own parameters affect only its channel.
+    for first, part_of in ((0, S), (5, 1 - S)):
+        single = (shown.slope * part_of[:, None]).reshape(G, -1, wider)
+        rows[:, first : first + 3, 0] = (single @ sharp).reshape(G, 3, K, J) * _MIX[0][:, None, None]
+        blurred = (single @ smooth).reshape(G, 3, K, J)
+        for k in (1, 2):
+            rows[:, first : first + 3, k] = blurred * _MIX[k][:, None, None]
+    first = (wider - J) // 2
+    return rows, S[..., first : first + J]

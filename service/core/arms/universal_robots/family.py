@@ -1,0 +1,73 @@
+"""What all arms of Universal Robots have in common: the form of their DH table, their links, and what may touch."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.core.arms.model import ArmModel, Link
+
+_ALLOWED = frozenset(
+    {
+        # Neighbouring links touch by design, and the mount holds the camera beside the last two joints. Shoulder and
+        # base do not move relative to the table, so it is not checked against them.
+        ("base", "shoulder"), ("base", "upper arm"), ("shoulder", "upper arm"), ("upper arm", "forearm"),
+        ("forearm", "wrist 1"), ("forearm", "wrist 2"), ("wrist 1", "wrist 2"), ("wrist 1", "wrist 3"),
+        ("wrist 2", "wrist 3"), ("wrist 1", "camera"), ("wrist 2", "camera"), ("wrist 3", "camera"),
+        ("base", "table"), ("shoulder", "table"), ("upper arm", "table"),
+        ("base", "specimen"), ("base", "spheres"), ("base", "surroundings"),
+    }
+)  # fmt: skip
+_BASE_DEPTH_M = 0.10  # pedestal top below the base frame
+
+
+def universal_robot(
+    name: str,
+    *,
+    a_m: tuple[float, float],
+    d_m: tuple[float, float, float, float],
+    speeds_deg_s: tuple[float, ...],
+    payload_kg: float,
+    elbow_deg: float = 360.0,
+) -> ArmModel:
+    """An arm of Universal Robots.
+
+    The capsules are sized for the UR10e, and scaled by the wrist's offset for others.
+
+    Args:
+        name: as the controller states it.
+        a_m: lengths of upper arm and forearm, negative.
+        d_m: offsets 1, 4, 5 and 6.
+        speeds_deg_s: (6,) of the joints.
+        payload_kg: on the flange.
+        elbow_deg: range of the elbow to each side; all others turn by 360°.
+    """
+    half = np.pi / 2
+    limits_deg = np.array([360.0, 360.0, elbow_deg, 360.0, 360.0, 360.0])
+    return ArmModel(
+        name=name,
+        family="universal_robot",
+        a_m=np.array([0, *a_m, 0, 0, 0]),
+        d_m=np.array([d_m[0], 0, 0, *d_m[1:]]),
+        alpha_rad=np.array([half, 0, 0, half, -half, 0]),
+        limits_rad=np.radians(limits_deg),
+        speeds_rad_s=np.radians(speeds_deg_s),
+        links=_links(*a_m, *d_m[1:]),
+        allowed=_ALLOWED,
+        usual_rad=np.array([np.pi, -1.6, 1.9, -1.9, -1.57, 0.0]),  # at 0 the arm lies along -x
+        payload_kg=payload_kg,
+    )
+
+
+def _links(a2: float, a3: float, d4: float, d5: float, d6: float) -> tuple[Link, ...]:
+    scale = d4 / 0.17415
+    # The long links lie beside the plane of the DH model, along the second axis.
+    upper, fore = 1.012 * d4, 0.226 * d4
+    return (
+        Link("base", 0, (0, 0, -_BASE_DEPTH_M), (0, 0, 0.05), 0.095 * scale),
+        Link("shoulder", 1, (0, 0, 0), (0, 0, upper), 0.095 * scale),
+        Link("upper arm", 2, (-a2, 0, upper), (0, 0, upper), 0.075 * scale),
+        Link("forearm", 3, (-a3, 0, fore), (0, 0, fore), 0.065 * scale),
+        Link("wrist 1", 3, (0, 0, fore), (0, 0, d4), 0.055 * scale),
+        Link("wrist 2", 4, (0, 0, 0), (0, 0, d5), 0.055 * scale),
+        Link("wrist 3", 5, (0, 0, 0), (0, 0, d6), 0.05 * scale),
+    )

@@ -1,0 +1,236 @@
+"""The posed data set of a finished run, from its record."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from service.compute.camera_model import CameraModel
+from service.compute.pixels.masks import Ball, Post, hull_mask, posts_below
+from service.compute.pixels.ray_mesh import RayMesh
+from service.compute.pixels.splits import splits
+from service.core.errors import DataError
+from service.core.geometry import Array, apply, inverse
+from service.core.picture_files import PNG_BEGINS
+from service.core.records.data_set import FIRST_VERSION, DataSetStatement
+from service.core.units import metres
+from service.dataset.control_spheres import control_centres
+from service.dataset.posed.of_run.about_run import about_run
+from service.dataset.posed.of_run.pose_errors import own_pose_errors
+from service.dataset.posed.of_run.scan_files import scan_files
+from service.dataset.posed.of_run.statement import described_run
+from service.dataset.posed.of_run.view_covariances import view_covariances
+from service.dataset.posed.pixels import Photographs
+from service.dataset.posed.records import DataSet, Mesh, View
+from service.dataset.registered_scan import control_scan
+from service.dataset.registrations import result_of_step
+from service.dataset.summary import RunSummary
+from service.jobs.records import SpheresFound
+from service.jobs.registration.register import Registration
+
+_POINTS = 2000  # of the mesh, by which the sparse views are chosen
+_CANDIDATES = 300  # faces whose normals are tried as the board's
+_WITHIN, _LEVEL = 0.7, 0.996  # cosines: of the board from the cameras' direction, of level faces from the board
+_LEAST_LEVEL = 0.05  # share of the surface that must be level
+
+
+def data_set_of(
+    summary: RunSummary,
+    not_in_yet: Sequence[str] = (),
+    *,
+    personal: bool = True,
+    stated: DataSetStatement | None = None,
+    version: str = FIRST_VERSION,
+) -> DataSet:
+    """Images, poses and mesh of a run in the frame of its scan, which is the data set's `world`.
+
+    The poses are those of the run's own registration, with the camera that it was made with. Images that were taken
+    for the evaluation alone are left out. Control spheres are masked in all images: they were taken away before the
+    scan. So are posts, if the scan shows the board on which they stand.
+
+    Args:
+        summary: the run.
+        not_in_yet: results that have not arrived yet, in words.
+        personal: False leaves GPS, owner and serial numbers out of the pictures, and people and serial numbers out of
+            the metadata.
+        stated: title, licence, ethics, creators and citation; they replace those of the protocol.
+        version: of the data set.
+
+    Raises:
+        DataError: the run has no evaluated registration, no scan, or no registered image.
+    """
+    own, registered, files = _registered(summary)
+    truth = summary.ground_truth()
+    mesh = Mesh(truth.vertices_m, truth.faces, truth.source, truth.sigma_m)
+    joint = own_pose_errors(summary, registered, sorted(files))
+    stated_errors = view_covariances(summary, own, registered, sorted(files), joint)
+    taken = {capture.viewpoint: str(capture.camera.get("exif_time") or "") for capture in summary.captures()}
+    views = tuple(
+        _view(name, path, registered, stated_errors.covariance[name], taken[name])
+        for name, (path, _) in sorted(files.items())
+    )
+    pixels, masks = _pixels(summary, files, views, mesh, personal=personal)
+    hashes = {view.file: files[view.name][1] for view in views}
+    about = about_run(summary, own, not_in_yet, stated=stated, version=version, personal=personal)
+    return DataSet(
+        identity=_identity(summary, own, registered, {**hashes, "mesh": truth.sha256}),
+        simulated=summary.root.simulated,
+        statement={
+            **described_run(summary, own, not_in_yet, personal=personal),
+            "mesh": truth.words,
+            "mesh_sha256": truth.sha256,
+            "masks": masks,
+            "image_sha256": hashes,
+        },
+        views=views,
+        pixels=pixels,
+        mesh=mesh,
+        splits=splits({view.name: _sees(view, mesh) for view in views}),
+        about=dataclasses.replace(
+            about, masks=masks, mesh=f"{truth.words}, in the frame of the scan", covariance=stated_errors.words
+        ),
+        pose_errors=joint,
+        scan_files=scan_files(summary),
+    )
+
+
+def specimen_pixels(summary: RunSummary, view: View) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """(H, W) pixels between the spheres, which stand around the specimen."""
+    return hull_mask(view.camera, view.T_world_camera, np.array(summary.scan_spheres_m()))
+
+
+def _registered(summary: RunSummary) -> tuple[str, Registration, dict[str, tuple[Path, str]]]:
+    """The run's own registration with its name, and its images.
+
+    Raises:
+        DataError: there is none, no scan, or no image.
+    """
+    own = summary.best()
+    if own is None or not summary.scan_spheres_m():
+        raise DataError("the run has no evaluated registration", where=summary.run_id, remedy="Finish the run first")
+    registered = summary.registrations()[own]
+    files = _photographs(summary, registered)
+    if not files:
+        raise DataError(
+            "no image of the data set is registered", where=summary.run_id, remedy="Repeat the registration"
+        )
+    return own, registered, files
+
+
+def _pixels(
+    summary: RunSummary, files: dict[str, tuple[Path, str]], views: Sequence[View], mesh: Mesh, *, personal: bool
+) -> tuple[Photographs, str]:
+    """Photographs, depth and masks of the views, and what the masks hold, in words."""
+    balls, posts = _markers(summary, views)
+    pixels = Photographs(
+        {name: path for name, (path, _) in files.items()},
+        RayMesh(mesh.vertices_m, mesh.faces),
+        balls,
+        posts,
+        personal=personal,
+        mark="SIMULATED" if summary.root.simulated else "",
+    )
+    return pixels, _masked(balls, posts)
+
+
+def _photographs(summary: RunSummary, registered: Registration) -> dict[str, tuple[Path, str]]:
+    """File and hash of each registered image, by viewpoint."""
+    found: dict[str, tuple[Path, str]] = {}
+    for capture in summary.captures():
+        photograph = capture.artefacts[0]
+        if capture.viewpoint in registered.T_scan_camera and photograph.kind == "image":
+            path = summary.store.artefact_path(photograph.sha256)
+            found[capture.viewpoint] = (path, photograph.sha256)
+    return found
+
+
+def _view(name: str, path: Path, registered: Registration, covariance: Array, taken: str) -> View:
+    with path.open("rb") as file:
+        suffix = ".png" if file.read(len(PNG_BEGINS)) == PNG_BEGINS else ".jpg"
+    camera = CameraModel.from_record((registered.full_camera or registered.camera).model_dump())
+    T_scan_camera = np.array(registered.T_scan_camera[name])
+    return View(name, suffix, camera, T_scan_camera, covariance, taken)
+
+
+def _markers(summary: RunSummary, views: Sequence[View]) -> tuple[tuple[Ball, ...], tuple[Post, ...]]:
+    """All spheres that an image may show, and the posts of the registration spheres."""
+    radius_m = metres(summary.protocol.spheres.radius_mm)
+    balls, extra = (
+        tuple(Ball(np.array(centre), radius_m) for centre in centres)
+        for centres in (summary.scan_spheres_m(), control_spheres(summary))
+    )
+    vertices_m, faces = summary.scan_mesh()
+    scan = Mesh(np.asarray(vertices_m, dtype=np.float64), np.asarray(faces, dtype=np.int64))
+    return (*balls, *extra), _posts(balls, scan, views)
+
+
+def _masked(balls: Sequence[Ball], posts: Sequence[Post]) -> str:
+    """What the masks hold, in words."""
+    if posts:
+        return f"{len(balls)} spheres, and the posts below {len(posts)} of them"
+    return f"{len(balls)} spheres; posts are not masked, because the scan shows no board on which they stand"
+
+
+def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ...]:
+    """Centres of the control spheres, which the images show and the scan does not."""
+    before = control_scan(summary.protocol)
+    if not before or not summary.state.steps[before].result:
+        return ()
+    return control_centres(summary.scan_spheres_m(), result_of_step(summary.state, before, SpheresFound).spheres_m)
+
+
+def _posts(balls: Sequence[Ball], mesh: Mesh, views: Sequence[View]) -> tuple[Post, ...]:
+    """A post is not recorded: it stands below its sphere, is thinner, and ends on the board, if a scan shows one."""
+    eyes = np.mean([view.T_world_camera[:3, 3] for view in views], axis=0)
+    up = upwards(mesh, eyes - np.mean(mesh.vertices_m, axis=0))
+    lowest = float((mesh.vertices_m @ up).min()) if up.any() else 0.0
+    return tuple(
+        post
+        for ball in balls
+        if up.any()
+        for post in posts_below([ball], up, max(ball.radius_m, float(ball.centre_m @ up) - lowest), ball.radius_m)
+    )
+
+
+def upwards(mesh: Mesh, about: Array) -> Array:
+    """Unit normal (3,) of the board: the direction, within 45° of `about`, to which most of the surface is level.
+
+    Zero where no direction has a twentieth of the surface: the mesh shows no board.
+    """
+    a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
+    vector = np.cross(b - a, c - a)
+    area = np.linalg.norm(vector, axis=1)
+    normal = vector / np.maximum(area, 1e-300)[:, None]
+    up = about / np.linalg.norm(about)
+    normal *= np.where(normal @ up < 0, -1.0, 1.0)[:, None]  # of a scan, faces may turn either way
+    candidates = normal[:: max(1, len(normal) // _CANDIDATES)]
+    candidates = candidates[candidates @ up > _WITHIN]
+    if not len(candidates):
+        return np.zeros(3)
+    level = np.array([area[normal @ candidate > _LEVEL].sum() for candidate in candidates])
+    best = int(level.argmax())
+    if level[best] < _LEAST_LEVEL * area.sum():
+        return np.zeros(3)
+    mean = (area[:, None] * normal)[normal @ candidates[best] > _LEVEL].sum(axis=0)
+    return mean / np.linalg.norm(mean)
+
+
+def _sees(view: View, mesh: Mesh) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Which of some vertices of the mesh are within the image."""
+    points = mesh.vertices_m[:: max(1, len(mesh.vertices_m) // _POINTS)]
+    camera = view.camera
+    before = apply(inverse(view.T_world_camera), points)
+    with np.errstate(all="ignore"):
+        pixels = camera.project(before)
+    inside = (pixels > -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)
+    return inside[:, 0] & inside[:, 1] & (before[:, 2] > 0)
+
+
+def _identity(summary: RunSummary, own: str, registered: Registration, hashes: dict[str, str]) -> str:
+    inputs = json.dumps([own, registered.model_dump(mode="json"), hashes], sort_keys=True)
+    return f"{summary.run_id} {hashlib.sha256(inputs.encode()).hexdigest()}"

@@ -1,0 +1,1 @@
+"""Steps that a person does by hand, and confirms."""

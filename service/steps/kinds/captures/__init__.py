@@ -1,0 +1,1 @@
+"""Steps that take images or the camera's calibration at the table."""

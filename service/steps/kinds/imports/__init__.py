@@ -1,0 +1,1 @@
+"""Steps that bring in what other devices made: CT, scan, photographs."""

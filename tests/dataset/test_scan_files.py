@@ -1,0 +1,97 @@
+"""A textured scan from the scanner's folder to the data set: mesh, material and picture stay together."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from drivers.interfaces import Scanner
+from drivers.scan_folder import ScanFolder, ScanFolderConfig
+from service.core.protocol.models import parse_protocol
+from service.dataset.posed.exporter import exporter, write_data_set
+from service.dataset.posed.of_run.scan_files import scan_files
+from service.dataset.summary import summarise
+from service.steps import params_models
+from service.store.store import Store
+from service.worker.loop import work
+from tests.ground_truth.test_fuse_command import CENTRES_M, with_spheres
+from tests.ground_truth.test_fusion import scan_mesh
+from tests.support.rig.bench_rig import BenchRig
+from tests.support.runs.bench_run import begin_run
+from tests.support.scenes.posed import posed_data_set
+
+PROTOCOL = """\
+id: textured
+version: "1"
+title: A textured scan
+spheres: {radius_mm: 6, registration: 5, control: 0}
+camera: {aperture_f: 22, exposure_s: 1/50, iso: 100}
+steps:
+  - id: scan
+    kind: scan_import
+    title: Scan
+    confirm: false
+    params: {spheres: 5, wait_s: 20}
+"""
+
+
+class OneScanner(BenchRig):
+    folder: Path
+
+    def scanner(self, name: str | None = None) -> Scanner:
+        return cast(Scanner, ScanFolder(ScanFolderConfig(folder=self.folder, stable_s=0, unit="mm")))
+
+
+def write_textured(folder: Path) -> None:
+    """An OBJ as trimesh writes it, with its texture moved into a folder and named in capitals."""
+    surface = with_spheres(scan_mesh(), CENTRES_M)
+    uv = np.random.default_rng(0).uniform(0, 1, (len(surface.vertices_m), 2))
+    picture = np.zeros((8, 16, 3), np.uint8)
+    picture[..., 2] = 200
+    (folder / "tex").mkdir(parents=True)
+    tools: Any = trimesh
+    visual = tools.visual.TextureVisuals(uv=uv, image=Image.fromarray(picture))
+    mesh = trimesh.Trimesh(1e3 * surface.vertices_m, surface.faces, visual=visual, process=False)
+    written = tools.exchange.obj.export_obj(mesh, return_texture=True, mtl_name="scan.mtl")
+    text, parts = cast("tuple[str, dict[str, bytes]]", written)
+    (picture_name,) = [name for name in parts if name.endswith(".png")]
+    (folder / "scan.obj").write_text(text)
+    material = parts["scan.mtl"].decode().replace(picture_name, "tex/Skin.png")
+    (folder / "SCAN.MTL").write_text(material)
+    (folder / "tex" / "SKIN.PNG").write_bytes(parts[picture_name])
+
+
+@pytest.mark.slow
+def test_a_textured_scan_leaves_as_it_came(tmp_path: Path) -> None:
+    write_textured(tmp_path / "scans")
+    rig = OneScanner()
+    rig.folder = tmp_path / "scans"
+    with Store.open(tmp_path / "data") as store:
+        bench = dataclasses.replace(begin_run(store, PROTOCOL, tmp_path), rig=rig)
+
+        def compute(_seconds: float) -> None:
+            work(store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _all: None)
+
+        bench.on_wait = compute
+        state = bench.run()
+        assert state.status == "completed", state
+        assert state.steps["scan"].measures["scan_textures"] == 1
+        protocol = parse_protocol(PROTOCOL.encode(), params_models(), name="textured.yaml").protocol
+        files = scan_files(summarise(store, bench.run_id, protocol))
+        assert {file.name for file in files} == {"scan.obj", "scan.mtl", "tex/Skin.png"}
+        (tmp_path / "photographs").mkdir()
+        data = dataclasses.replace(posed_data_set(tmp_path / "photographs", 2), scan_files=files)
+        write_data_set(data, exporter("plain"), tmp_path / "set")
+    loaded: Any = trimesh.load_mesh(tmp_path / "set" / "scan" / "scan.obj", process=False)
+    assert loaded.visual.material.image.size == (16, 8)
+    assert np.ptp(np.asarray(loaded.vertices), axis=0).max() > 100  # millimetres, as the scanner wrote them
+    copy = (tmp_path / "set" / "scan" / "tex" / "Skin.png").read_bytes()
+    assert copy == (tmp_path / "scans" / "tex" / "SKIN.PNG").read_bytes()
+    assert cv2.imdecode(np.frombuffer(copy, np.uint8), cv2.IMREAD_COLOR) is not None

@@ -1,0 +1,9 @@
+// A signature of KUKA's API, for the compiler alone.
+package com.kuka.roboticsAPI.motionModel;
+
+import com.kuka.roboticsAPI.deviceModel.Device;
+import java.util.List;
+
+public interface IErrorHandler {
+    ErrorHandlingAction handleError(Device device, IMotionContainer failed, List<IMotionContainer> cancelled);
+}

@@ -1,0 +1,10 @@
+// A signature of KUKA's API, for the compiler alone.
+package com.kuka.motion;
+
+public interface IMotionContainer {
+    boolean isFinished();
+
+    void cancel();
+
+    String getErrorMessage();
+}

@@ -1,0 +1,6 @@
+// A signature of KUKA's API, for the compiler alone.
+package com.kuka.roboticsAPI.motionModel;
+
+public enum ErrorHandlingAction {
+    PAUSE_MOTION, IGNORE
+}

@@ -1,0 +1,78 @@
+"""Runs a program that always moves its arm on, for tests that kill or suspend it or its driver."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+from pydantic import BaseModel
+
+WATCHED_S = 4.0  # an arm that moved by itself did so after 2.3 s
+
+
+class Program:
+    """tests.support.processes.stubborn_program as a process.
+
+    Args:
+        spec, config: the driver.
+        goals_rad: between which its first joint moves.
+        hangs: its main loop hangs once the arm moves.
+    """
+
+    def __init__(self, spec: str, config: BaseModel, goals_rad: tuple[float, float], *, hangs: bool = False) -> None:
+        words = (spec, config.model_dump_json(), *map(str, goals_rad), "hangs" if hangs else "lives")
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.support.processes.stubborn_program", *words],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        self._lines: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        self.driver = int(self.next("driver")["driver"])
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def let_move(self, person: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(person + "\n")
+        self._process.stdin.flush()
+        assert self.next("let_by")["let_by"] == person
+
+    def send(self, *signals: tuple[str, signal.Signals]) -> None:
+        """Send signals to `program` or `driver`."""
+        for to, which in signals:
+            os.kill(self.driver if to == "driver" else self.pid, which)
+
+    def next(self, key: str, within_s: float = 120.0) -> dict[str, Any]:
+        """The next line with this key."""
+        deadline_s = time.monotonic() + within_s
+        while True:
+            line = self._lines.get(timeout=max(0.01, deadline_s - time.monotonic()))
+            if key in line:
+                return line
+
+    def close(self) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.driver, signal.SIGCONT)
+        self._process.kill()
+        self._process.wait(10)
+        self._reader.join(10)
+        for pipe in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError):
+                if pipe is not None:
+                    pipe.close()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.put(json.loads(line))

@@ -1,0 +1,75 @@
+"""Observes a simulated device through what it tells the simulated world of its place, past driver and program."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import threading
+import time
+from collections.abc import Generator
+from dataclasses import dataclass
+
+LONGEST_STEP_S = 0.05  # longest gap that counts; in a longer one the simulator or this process was not scheduled
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """A place, and when it was told: host time.monotonic()."""
+
+    at_s: float
+    place: object
+
+
+class WorldWatch:
+    """Listens like the world; a device connects by itself."""
+
+    def __init__(self) -> None:
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._seen: list[_Seen] = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    @property
+    def address(self) -> str:
+        """HOST:PORT for the option --world."""
+        host, port = self._listener.getsockname()
+        return f"{host}:{port}"
+
+    def close(self) -> None:
+        self._listener.close()
+
+    def mark(self) -> float:
+        """The present moment, for `moved_for_s`."""
+        return time.monotonic()
+
+    def moved_for_s(self, since_s: float) -> float:
+        """Time from a mark until the place last changed; 0 if it never did."""
+        elapsed_s = last_s = 0.0
+        for before, after in zip(self._seen, self._seen[1:], strict=False):
+            if after.at_s > since_s:
+                elapsed_s += min(after.at_s - max(before.at_s, since_s), LONGEST_STEP_S)
+                if before.place != after.place:
+                    last_s = elapsed_s
+        return last_s
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                link, _ = self._listener.accept()
+                threading.Thread(target=self._read, args=(link,), daemon=True).start()
+
+    def _read(self, link: socket.socket) -> None:
+        with contextlib.suppress(OSError), link, link.makefile("r") as lines:
+            for line in lines:
+                told = json.loads(line)
+                self._seen.append(_Seen(time.monotonic(), told.get("q") or told.get("T_world_camera")))
+
+
+@contextlib.contextmanager
+def watched_world() -> Generator[WorldWatch]:
+    """Observe the devices that are given its address."""
+    watch = WorldWatch()
+    try:
+        yield watch
+    finally:
+        watch.close()
