@@ -1,4 +1,4 @@
-"""Both ends of the KUKA wire against golden transcripts that neither was made from (docs/reference)."""
+"""Both ends of the KUKA wire against golden transcripts that came from neither (docs/reference)."""
 
 from __future__ import annotations
 
