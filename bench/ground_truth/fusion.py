@@ -18,6 +18,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bench.machine import RESULTS, commit, machine
@@ -37,6 +38,7 @@ LOW_M, HIGH_M = np.array([-0.165, -0.095, 0.004]), np.array([0.165, 0.095, 0.100
 THRESHOLD_HU = -475.0
 _INSIDE_M = 0.003  # from the ends of the volume, where the CT's surface is cut
 PATCHES_M = (2e-3, 5e-3)  # radii
+_FAR_M = 5e-4
 _PLACES, _FEWEST = 2000, 5  # on the line, and vertices of a strip that are averaged
 _BESIDE_M, _STRIP_M = 1.5e-3, 5e-4  # of the line where no seam is, from the overlap; and the strips beside it
 
@@ -110,6 +112,18 @@ def rms_mm(values: Array) -> float:
     return round(mm(float(np.sqrt(np.mean(values**2)))), 4)
 
 
+def largest(points: Array, height: Array, source: NDArray[np.uint8]) -> dict[str, Any]:
+    """The largest error with its place and source, and each source's share of errors over half a millimetre."""
+    worst = int(np.abs(height).argmax())
+    far = np.abs(height) > _FAR_M
+    return {
+        "error_mm": round(mm(float(height[worst])), 3),
+        "place_mm": [round(mm(float(x)), 1) for x in points[worst]],
+        "source": Source(int(source[worst])).name.lower(),
+        "share_over_half_mm": {s.name.lower(): round(float(np.mean(far[source == s])), 6) for s in Source},
+    }
+
+
 def measured(seed: int, voxel_m: float, spacing_m: float, high: Array) -> dict[str, Any]:
     """Fuse one scene, and compare the result with its true surface."""
     scene = Scene.generate(seed)
@@ -131,6 +145,7 @@ def measured(seed: int, voxel_m: float, spacing_m: float, high: Array) -> dict[s
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
         "rms_mm": rms_mm(height),
         "rms_by_source_mm": {s.name.lower(): rms_mm(height[fused.source[inside] == s]) for s in Source},
+        "largest": largest(points, height, fused.source[inside]),
         "share_by_source": {s.name.lower(): round(fused.share(s), 3) for s in Source},
         "wound_share": round(float(fused.wound.mean()), 4),
         "seam_step_mm": {f"{2 * mm(r):g} mm": steps_mm(points, height, seam, r) for r in PATCHES_M},
