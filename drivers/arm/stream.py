@@ -48,6 +48,7 @@ class PoseStream:
         self._vendor_errors = vendor_errors
         self._samples: deque[RobotSample] = deque()
         self._lock = threading.Lock()
+        self._reading = threading.Lock()
         self._stop = threading.Event()
         self._death = ""
         self._looked_s = self._looking_since_s = -float("inf")  # time of the last poll; start of gapless polling
@@ -130,18 +131,34 @@ class PoseStream:
             if now_s - self._looked_s > STALL_S:
                 self._looking_since_s = now_s
             self._looked_s = now_s
+            self._take()
+            if self._death:
+                return
+
+    def catch_up(self) -> None:
+        """Take all samples that have arrived, and not only one at each poll.
+
+        For a source that has its samples at hand: after a pause of this process many are waiting.
+        """
+        while self._take():
+            pass
+
+    def _take(self) -> bool:
+        """Take one sample, in the order in which they come; returns whether there was one."""
+        with self._reading:
             try:
-                sample = self._read()
+                sample = None if self._death else self._read()
             except self._vendor_errors as error:
                 self._death = f" ({error})"
                 _LOG.warning("%s: pose stream: %s", self._where, error)
-                return
+                return False
             if sample is None:
-                continue
+                return False
             with self._lock:
                 self._samples.append(sample)
                 while self._samples[0].monotonic_s < sample.monotonic_s - BUFFER_S:
                     self._samples.popleft()
+            return True
 
 
 def within(samples: deque[RobotSample], start_s: float, end_s: float) -> tuple[RobotSample, ...]:

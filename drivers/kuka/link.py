@@ -44,6 +44,7 @@ class Ended:
 
     code: str
     what: str
+    at_s: float  # host time.monotonic() when that was heard
 
 
 class Link:
@@ -186,7 +187,7 @@ class Link:
                 self._answers[whole(line, "seq")] = line
             elif line.get("motion") is not None:
                 code, what = (str(line.get("code")), str(line.get("what"))) if line["is"] == "err" else ("", "")
-                self._ended[whole(line, "motion")] = Ended(code, what)
+                self._ended[whole(line, "motion")] = Ended(code, what, now_s)
             else:
                 _LOG.warning("%s: %s", self._where, line)
             self._news.notify_all()

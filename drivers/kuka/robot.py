@@ -11,7 +11,7 @@ from typing import NoReturn
 import numpy as np
 
 from drivers.arm.latch import Latch
-from drivers.arm.stream import PoseStream, judge, ringing_s
+from drivers.arm.stream import MINIMUM_COVERAGE, PoseStream, judge, ringing_s
 from drivers.errors import (
     DeviceError,
     DeviceFaultError,
@@ -36,7 +36,7 @@ from drivers.kuka import KukaConfig
 from drivers.kuka.fri.poses import FriPoses
 from drivers.kuka.link import Link
 from drivers.kuka.speeds import Speeds
-from drivers.kuka.wire import JOINTS, State, to_abc
+from drivers.kuka.wire import JOINTS, State, agree, to_abc
 from service.core.arms.known import known_arms
 from service.core.arms.model import ArmModel
 from service.core.geometry import to_rotation_vector
@@ -67,6 +67,7 @@ class KukaRobot:
         self._state: State | None = None
         self._T_flange_tcp: Transform = np.eye(4)
         self._motion = 0  # the last one whose end was not observed yet
+        self._last_motion = 0
         self._permitted = False
         self._attended_s = -np.inf
         self._left_alone = False
@@ -128,7 +129,7 @@ class KukaRobot:
         if self._link is not None:
             self._link.close()
         self._stream = self._link = self._state = self._fri = None
-        self._motion = 0
+        self._motion = self._last_motion = 0
 
     def report(self) -> DeviceReport:
         """Return versions, clock offset, and what prevents the arm from moving."""
@@ -221,7 +222,7 @@ class KukaRobot:
         }
         answer = self._request("tool", **{**wanted, "mass_kg": payload.mass_kg})
         for name, values in wanted.items():
-            if not _agree(answer.get(name), values):
+            if not agree(answer.get(name), values):
                 raise DeviceFaultError(
                     f"{name} reads back as {answer.get(name)!r}, not {values}",
                     where=self._where,
@@ -275,7 +276,7 @@ class KukaRobot:
         if not isinstance(motion, int):
             raise DeviceFaultError(f"the motion's number is {motion!r}", where=self._where, remedy=_REMEDY_STOP)
         self._attend()
-        self._motion = motion
+        self._motion = self._last_motion = motion
 
     def stop(self) -> None:
         """Decelerate and return when the arm stands still. Raises DeviceTimeoutError if it does not come to rest."""
@@ -317,10 +318,13 @@ class KukaRobot:
         """Judge the last window of the pose stream against the criteria. Returns at once; meant to be polled."""
         self._attend()
         stream = self._streaming()
-        # Asked before the window is read: a motion that ends in between has left no trace in it. Stillness alone does
-        # not tell, as the brakes may still be on before a motion begins.
-        under_way = bool(self._motion) and self._linked().ended(self._motion) is None
         now_s = stream.latest().monotonic_s
+        # Stillness alone does not tell: the brakes may still be on before a motion begins, and the window may end
+        # before a motion of which the end is known already.
+        ended = self._linked().ended(self._last_motion)
+        under_way = bool(self._last_motion) and (
+            ended is None or now_s - ended.at_s < MINIMUM_COVERAGE * criteria.window_s
+        )
         report = judge(self.samples(now_s - criteria.window_s, now_s), criteria)
         if under_way:
             report = dataclasses.replace(report, settled=False)
@@ -371,7 +375,9 @@ class KukaRobot:
         return self._link or self._not_open()
 
     def _streaming(self) -> PoseStream:
-        return self._stream or self._not_open()
+        stream = self._stream or self._not_open()
+        stream.catch_up()
+        return stream
 
     def _newest(self) -> State:
         return self._state or self._not_open()
@@ -388,12 +394,3 @@ class KukaRobot:
                 remedy="Choose another viewpoint",
             )
         return [float(v) for v in joints]
-
-
-def _agree(answer: object, values: list[float]) -> bool:
-    """Whether the controller's answer, a number or a list of numbers, equals the values."""
-    try:
-        found = np.atleast_1d(np.asarray(answer, dtype=np.float64))
-    except (ValueError, TypeError):
-        return False
-    return found.shape == (len(values),) and bool(np.max(np.abs(found - np.array(values))) < 1e-6)

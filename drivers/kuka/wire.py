@@ -126,6 +126,15 @@ def to_abc(T: Transform) -> tuple[list[float], list[float]]:
     return T[:3, 3].tolist(), [float(np.arctan2(R[1, 0], R[0, 0])), b, float(np.arctan2(R[2, 1], R[2, 2]))]
 
 
+def agree(answer: object, values: list[float]) -> bool:
+    """Whether the controller's answer, a number or a list of numbers, equals the values."""
+    try:
+        found = np.atleast_1d(np.asarray(answer, dtype=np.float64))
+    except (ValueError, TypeError):
+        return False
+    return found.shape == (len(values),) and bool(np.max(np.abs(found - np.array(values))) < 1e-6)
+
+
 def _text(line: Line, name: str) -> str:
     value = line.get(name)
     if not isinstance(value, str):

@@ -77,8 +77,8 @@ def test_a_folder_of_photographs_becomes_a_camera_that_every_command_reads(folde
     assert set(reasons) == {"empty.jpg", "larger.png"}
     assert "no board" in reasons["empty.jpg"]
     assert "1200 × 800" in reasons["larger.png"]
-    camera = read_camera_json(out, (900, 600))
-    assert camera.fx == record["fx"]
+    camera = read_camera_json(out)
+    assert (camera.width, camera.height, camera.fx) == (900, 600, record["fx"])
     for name in ("coverage.png", "residuals.png", "uncertainty.png"):
         with Image.open(report / name) as plot:
             assert plot.width > 800

@@ -294,21 +294,25 @@ def fused(dataset: DataSet) -> DataSet:
 
 
 def test_a_fused_mesh_has_source_and_sigma_of_each_vertex(fused: DataSet, dataset: DataSet, tmp_path: Path) -> None:
+    source, sigma_m = fused.mesh.source, fused.mesh.sigma_m
+    assert source is not None
+    assert sigma_m is not None
     mesh = trimesh.load_mesh(written(fused, "plain", tmp_path) / "mesh.ply", process=False)
     told = mesh.metadata["_ply_raw"]["vertex"]["data"]
     assert np.array_equal(np.asarray(mesh.vertices), dataset.mesh.vertices_m)
-    assert np.array_equal(np.asarray(told["source"]).ravel(), fused.mesh.source)
-    assert np.asarray(told["sigma_m"]).ravel() == pytest.approx(fused.mesh.sigma_m, rel=1e-6)
+    assert np.array_equal(np.asarray(told["source"]).ravel(), source)
+    assert np.asarray(told["sigma_m"]).ravel() == pytest.approx(sigma_m, rel=1e-6)
     with h5py.File(written(fused, "hdf5", tmp_path) / "data.h5") as file:
         stored: Any = file["mesh"]
-        assert np.array_equal(stored["source"], fused.mesh.source)
-        assert np.array_equal(stored["sigma_m"], fused.mesh.sigma_m)
+        assert np.array_equal(stored["source"], source)
+        assert np.array_equal(stored["sigma_m"], sigma_m)
     again = data_set_of_folder(tmp_path / "hdf5").mesh
     assert again.sigma_m is not None
-    assert np.array_equal(again.sigma_m, fused.mesh.sigma_m)
+    assert np.array_equal(again.sigma_m, sigma_m)
     (tmp_path / "scan").mkdir()
     with h5py.File(written(dataset, "hdf5", tmp_path / "scan") / "data.h5") as file:
-        assert set(file["mesh"]) == {"vertices_m", "faces"}
+        stored = file["mesh"]
+        assert set(stored) == {"vertices_m", "faces"}
 
 
 def test_bop_model_projects_to_the_depth_image(dataset: DataSet, pinholes: DataSet, tmp_path: Path) -> None:
@@ -422,7 +426,7 @@ def says_simulated(path: Path) -> bool:
 
 #: Files that cannot say it: bare numbers, or a form of which every key is a number of an image.
 SILENT = (
-    "*.bin", "scene_*.json", "models_info.json", "*.png", "SHA256SUMS", "loader.py", "*ground_truth_depth/*",
+    "*.bin", "scene_*.json", "models_info.json", "SHA256SUMS", "loader.py", "ground_truth_depth/*/*",
     "camera.json", "poses.csv",
 )  # fmt: skip
 
@@ -434,8 +438,6 @@ def test_a_simulated_data_set_says_so_in_every_file_that_can(dataset: DataSet, t
     heard = [path for path in files if not any(path.relative_to(folder).match(form) for form in SILENT)]
     assert heard
     assert [path.name for path in heard if not says_simulated(path)] == []
-    pictures = [path for path in files if path.parent.name == "images" and name != "neus2"]
-    assert all(says_simulated(path) for path in pictures)
     assert document(folder / "splits.json")["dense"] == [view.name for view in dataset.views]
 
 

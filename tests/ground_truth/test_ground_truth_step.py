@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from service.dataset.posed.about_run import about_run
 
 from drivers.interfaces import CtSource, Mesh, ScanExport, ScannedMesh, Scanner
 from service.compute.ground_truth.ply import read_ply
@@ -23,6 +22,7 @@ from service.core.geometry import inverse, transform
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import RegionDrawn
 from service.core.run.state import RunState
+from service.dataset.posed.of_run.about_run import about_run
 from service.dataset.preview.surfaces import Simplified, fused_mesh, shown_distances
 from service.dataset.recorded_fusion import recorded_fusion
 from service.dataset.summary import summarise

@@ -43,7 +43,7 @@ def opened(host: str, unattended_s: float = 5.0) -> Generator[RobotArm]:
     arm = hosted(
         RobotArm,
         "drivers.kuka:DRIVER",
-        KukaConfig(host=host, unattended_s=unattended_s),
+        KukaConfig(host=host, unattended_s=unattended_s, stale_after_s=20.0),  # on a busy machine
         call_timeout_s=30,
         name="robot",
     )

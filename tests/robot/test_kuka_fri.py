@@ -120,7 +120,7 @@ def test_a_session_that_could_command_gets_no_reply() -> None:
 
 @contextlib.contextmanager
 def opened(host: str, port: int = 30200) -> Generator[RobotArm]:
-    config = KukaConfig(host=host, fri_port=port, fri_host=host, connect_timeout_s=20.0)
+    config = KukaConfig(host=host, fri_port=port, fri_host=host, connect_timeout_s=20.0, stale_after_s=20.0)
     arm = hosted(RobotArm, "drivers.kuka:DRIVER", config, call_timeout_s=60, name="robot")
     try:
         arm.open()
@@ -209,7 +209,8 @@ def test_an_application_without_fri_and_a_port_in_use_are_refused() -> None:
 def test_doctor_says_how_fri_fares(tmp_path: Path) -> None:
     host = address(96)
     rig = tmp_path / "rig.yaml"
-    keys = f"driver: kuka_sunrise, host: {host}, fri_port: 30200, fri_host: {host}, connect_timeout_s: 20"
+    keys = f"driver: kuka_sunrise, host: {host}, fri_port: 30200, fri_host: {host}"
+    keys += ", connect_timeout_s: 20, stale_after_s: 20"
     rig.write_text(f"name: FRI\ndevices:\n  robot: {{{keys}}}\n")
     with simulated_kuka(host, "--fri-version", "2.7"):
         done = orthocapture("doctor", "--rig", str(rig), "--data", str(tmp_path), "--json", timeout_s=120)

@@ -1,4 +1,4 @@
-"""Both ends of the KUKA wire against golden transcripts that came from neither (docs/reference/kuka_protocol.md)."""
+"""Both ends of the KUKA wire against golden transcripts that came from neither (docs/reference)."""
 
 from __future__ import annotations
 

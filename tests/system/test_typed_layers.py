@@ -40,7 +40,6 @@ EDGES = {
     # files
     "service/compute/arm/correction.py": "part of hand_eye.json",
     "service/compute/calibration/hand_eye/record.py": "writes hand_eye.json",
-    "service/compute/calibration/intrinsics/record.py": "writes camera.json",
     "service/compute/capture/hand_bundle.py": "writes and reads the file of a hand-held image",
     "service/compute/markers/archive.py": "writes and reads files of outlines",
     "service/compute/pipeline.py": "writes the result of `orthocapture register`",

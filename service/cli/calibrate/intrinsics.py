@@ -37,7 +37,6 @@ from service.compute.calibration.intrinsics.adjustment import LensModel
 from service.compute.calibration.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics
 from service.compute.calibration.intrinsics.optics import Optics, compare_optics, states_focus, summary
 from service.compute.calibration.intrinsics.plots import calibration_plots
-from service.compute.calibration.intrinsics.record import intrinsics_record
 from service.compute.calibration.intrinsics.uncertainty import (
     ProjectionUncertainty,
     board_distance_m,
@@ -53,6 +52,8 @@ from service.compute.images.files import image_size
 from service.compute.images.folder import image_folder
 from service.core.errors import ComputeError, DataError
 from service.core.text.counts import counted
+from service.jobs.calibration.records import Intrinsics
+from service.worker.calibration.records import intrinsics_record
 
 _WITHOUT_EXIF = {".pgm", ".ppm", ".pnm"}
 
@@ -104,14 +105,14 @@ def intrinsics_command(
         names = [files[k].name for k in used]
         left_out = folder.left_out | {files[k].name: excluded[k] for k in sorted(excluded)}
         stated = intrinsics_record(result, validation, uncertainty, warnings, names, left_out)
-        record: dict[str, Any] = {**result.camera.record(), **stated, "optics": optics}
+        record: dict[str, Any] = {**result.camera.record(), **stated.plain(), "optics": optics}
         _write(out, json_module.dumps(record, indent=1, allow_nan=False) + "\n")
         if report is not None:
             _write_plots(report, result, uncertainty)
         if json:
             print_json(record)
             return
-        _tell(record, result, validation, uncertainty)
+        _tell(stated, result, validation, uncertainty)
         console.print(f"written: {out}")
 
 
@@ -190,7 +191,7 @@ def _write_plots(folder: Path, result: IntrinsicsResult, uncertainty: Projection
 
 
 def _tell(
-    record: dict[str, Any],
+    record: Intrinsics,
     result: IntrinsicsResult,
     validation: CrossValidation | None,
     uncertainty: ProjectionUncertainty,
@@ -204,7 +205,7 @@ def _tell(
         f"({uncertainty.centre_mm:.4f} mm) at the centre, {uncertainty.worst_px:.3f} px "
         f"({uncertainty.worst_mm:.4f} mm) at worst"
     )
-    for view in record["excluded"]:
-        console.print(f"[yellow]left out[/] {escape(view['image'])}: {escape(view['reason'])}")
-    for warning in record["warnings"]:
+    for view in record.excluded:
+        console.print(f"[yellow]left out[/] {escape(view.image)}: {escape(view.reason)}")
+    for warning in record.warnings:
         console.print(f"[yellow]warning[/] {escape(warning)}")

@@ -51,13 +51,13 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
         )
         folder.file(
             f"{_SCENE}/depth/{name}.png",
-            lambda view=view: png(coded_depth(dataset.pixels.depth_m(view))),
+            lambda view=view: png(coded_depth(dataset.pixels.depth_m(view)), dataset.mark),
             Part("depth", view.name),
         )
         for mask in ("mask", "mask_visib"):
             folder.file(
                 f"{_SCENE}/{mask}/{name}_000000.png",
-                lambda view=view: mask_png(dataset.pixels.depth_m(view) > 0),
+                lambda view=view: mask_png(dataset.pixels.depth_m(view) > 0, dataset.mark),
                 Part("mask", view.name),
             )
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.ground_truth.ply import ply_bytes
+from service.compute.pixels.metadata import described
 from service.core.errors import DataError
 from service.core.geometry import Array
 from service.dataset.posed.records import Mesh
@@ -30,8 +31,8 @@ def ground_truth_ply(mesh: Mesh, comment: str) -> bytes:
     return ply_bytes(columns, mesh.faces, comments)
 
 
-def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
-    """A PNG of (H, W) grey, (H, W, 3) BGR or (H, W, 4) BGRA values.
+def png(image: NDArray[np.uint8] | NDArray[np.uint16], mark: str = "") -> bytes:
+    """A PNG of (H, W) grey, (H, W, 3) BGR or (H, W, 4) BGRA values; a mark is its description.
 
     Raises:
         DataError: it cannot be encoded.
@@ -39,9 +40,9 @@ def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     encoded, data = cv2.imencode(".png", image)
     if not encoded:
         raise DataError("an image cannot be encoded as PNG", remedy="Export at a lower resolution")
-    return data.tobytes()
+    return described(data.tobytes(), mark) if mark else data.tobytes()
 
 
-def mask_png(mask: NDArray[np.bool_]) -> bytes:
+def mask_png(mask: NDArray[np.bool_], mark: str) -> bytes:
     """A PNG with 255 where the mask (H, W) is true and 0 elsewhere."""
-    return png(np.where(mask, np.uint8(255), np.uint8(0)))
+    return png(np.where(mask, np.uint8(255), np.uint8(0)), mark)

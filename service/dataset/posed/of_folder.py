@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.metadata import described
 from service.compute.pixels.splits import Splits
 from service.core.errors import DataError
 from service.core.text.json_text import parse_json
@@ -53,8 +52,7 @@ class Stored:
 
     def picture(self, view: View) -> bytes:
         """The pixels as PNG: the camera's own file is not in the folder."""
-        data = png(self.colours(view))
-        return described(data, self._mark, view.name) if self._mark else data
+        return png(self.colours(view), self._mark)
 
     def colours(self, view: View) -> NDArray[np.uint8]:
         """(H, W, 3) BGR."""
@@ -109,8 +107,7 @@ class _Scaled:
         self._whole, self._views = whole, {view.name: view for view in whole.views}
 
     def picture(self, view: View) -> bytes:
-        data = png(self.colours(view))
-        return described(data, self._whole.mark, view.name) if self._whole.mark else data
+        return png(self.colours(view), self._whole.mark)
 
     def colours(self, view: View) -> NDArray[np.uint8]:
         image = self._whole.pixels.colours(self._views[view.name])

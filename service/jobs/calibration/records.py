@@ -1,7 +1,7 @@
 """Records of a camera calibration and of a hand-eye calibration, as the worker writes them into its answer.
 
-Written by service/compute/calibration/intrinsics/record.py and service/compute/calibration/hand_eye/record.py. Parts
-that are None here are not in the records of early versions.
+Written by service/worker/calibration/records.py and service/compute/calibration/hand_eye/record.py. Parts that are
+None here are not in the records of early versions.
 """
 
 from __future__ import annotations
@@ -37,13 +37,26 @@ class CrossValidation(JobRecord):
 
 
 class ProjectionUncertainty(JobRecord):
-    """Standard deviation of a projected point: in px, and in mm at the board's distance; on a grid, row by row."""
+    """Standard deviation of a projected point, in px, and in mm at the board's distance.
+
+    Attributes:
+        distance_m: of the board.
+        centre_px, centre_mm: at the image's centre.
+        worst_px, worst_mm: the largest.
+        rms_px, rms_mm: over the image.
+        x_px, y_px: columns and rows of the grid.
+        sigma_px, sigma_mm: on the grid, row by row.
+    """
 
     distance_m: float
     centre_px: float
     worst_px: float
+    rms_px: float | None = None
     centre_mm: float
     worst_mm: float
+    rms_mm: float | None = None
+    x_px: tuple[float, ...] = ()
+    y_px: tuple[float, ...] = ()
     sigma_px: Matrix
     sigma_mm: Matrix
 
@@ -86,6 +99,13 @@ class BoardSeen(JobRecord):
     square_mm: float
 
 
+class Tilt(JobRecord):
+    """The largest angle of the board to the image plane, and between two of its normals."""
+
+    largest_deg: float
+    spread_deg: float
+
+
 class Intrinsics(JobRecord):
     """What is known of the calibrated camera beside its parameters.
 
@@ -96,7 +116,12 @@ class Intrinsics(JobRecord):
         images: names of the images used.
         rms_px: residual of all corners.
         per_view_rms_px: residual of each image's corners, in the order of `images`.
+        excluded: images that were not used.
         sigma: standard deviation of each free parameter of the camera, in the parameter's own unit.
+        sigma_independent: the same if the errors of corners were independent.
+        sigma_by_image: the same from the scatter between images; None if there are too few.
+        sigma_corner_px: standard deviation of a corner.
+        inflation: of the covariance, because errors within an image are alike.
         covariance: of the free parameters.
     """
 
@@ -106,11 +131,16 @@ class Intrinsics(JobRecord):
     images: tuple[str, ...] = ()
     rms_px: float | None = None
     per_view_rms_px: tuple[float, ...] = ()
-    sigma: dict[str, float] = Field(default_factory=dict)
-    covariance: ParameterCovariance | None = None
     excluded: tuple[ExcludedImage, ...] = ()
+    sigma: dict[str, float] = Field(default_factory=dict)
+    sigma_independent: dict[str, float] = Field(default_factory=dict)
+    sigma_by_image: dict[str, float | None] = Field(default_factory=dict)
+    sigma_corner_px: float | None = None
+    inflation: float | None = None
+    covariance: ParameterCovariance | None = None
     coverage: Coverage | None = None
     residuals: ResidualField | None = None
+    tilt: Tilt | None = None
     cross_validation: CrossValidation | None = None
     uncertainty: ProjectionUncertainty | None = None
     warnings: tuple[str, ...] = ()

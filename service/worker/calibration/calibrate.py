@@ -13,7 +13,6 @@ from service.compute.calibration.hand_eye.answers import HandEyeResult
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.record import board_corners, hand_eye_record
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
-from service.compute.calibration.intrinsics.record import intrinsics_record
 from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.calibration.intrinsics.validation import (
     MIN_VIEWS_TO_VALIDATE,
@@ -26,6 +25,7 @@ from service.jobs.calibration import calibrate as job
 from service.jobs.calibration.records import HandEye, Intrinsics
 from service.jobs.records import Photograph
 from service.worker.calibration.board_view import board_of, boards_of
+from service.worker.calibration.records import intrinsics_record
 from service.worker.camera import camera_of, camera_record
 from service.worker.job import JobAnswer, JobContext
 
@@ -147,4 +147,4 @@ def _intrinsics(
     if validation is not None:
         measures["five_fold_rms_px"] = validation.five_fold_rms_px
         measures["leave_one_out_rms_px"] = validation.leave_one_out_rms_px
-    return solved.camera, measures, Intrinsics.model_validate(record)
+    return solved.camera, measures, record

@@ -14,7 +14,6 @@ from service.compute.calibration.board.board import BoardView
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.record import hand_eye_record
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics
-from service.compute.calibration.intrinsics.record import intrinsics_record
 from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.calibration.intrinsics.validation import calibration_warnings, cross_validate
 from service.core.gates.verdict import evaluate_gates
@@ -33,6 +32,7 @@ from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact
 from service.store.signatures.signing import checkpoint
+from service.worker.calibration.records import intrinsics_record
 from tests.support.boards.board_sessions import BOARD, Session, noisy_session
 from tests.support.pages.web import WebSite
 
@@ -136,7 +136,9 @@ def _calibrated() -> tuple[Session, dict[str, Any], dict[str, float]]:
         "T_base_board": hand_eye["T_base_board"],
         "hand_eye": hand_eye,
         "robots": ["robot"],
-        "details": {"intrinsics": intrinsics_record(solved, validation, uncertainty, warnings, used, excluded)},
+        "details": {
+            "intrinsics": intrinsics_record(solved, validation, uncertainty, warnings, used, excluded).plain()
+        },
     }
     return session, result, {"rms_px": solved.rms_px, "hand_eye_held_out_mm": float(np.median(hands.held_out_mm))}
 

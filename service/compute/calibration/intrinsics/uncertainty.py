@@ -12,7 +12,7 @@ from service.compute.calibration.intrinsics.adjustment import Adjustment, projec
 from service.compute.calibration.intrinsics.estimate import IntrinsicsResult
 from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
-from service.core.geometry import Array
+from service.core.geometry import Array, place_jacobian
 from service.core.units import mm
 
 
@@ -160,7 +160,7 @@ def _implied_motion(result: EstimatedCamera) -> tuple[Array, Array]:
     for k, (view, corners) in enumerate(zip(result.adjustment.views, result.corners, strict=True)):
         T = boards[k]
         points = board[corners.indices] @ T[:3, :3].T + T[:3, 3]
-        M = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), -_cross_matrices(points)], axis=2).reshape(-1, 6)
+        M = place_jacobian(points).reshape(-1, 6)
         L = _point_by_pose(board[corners.indices], result.adjustment.poses[k])
         pull = M.T @ L
         normal += M.T @ M
@@ -168,11 +168,6 @@ def _implied_motion(result: EstimatedCamera) -> tuple[Array, Array]:
         spread += pull @ np.linalg.solve(view.pose_normal, pull.T)
     H = np.linalg.inv(normal)
     return H @ by_parameters, result.variance * H @ spread @ H
-
-
-def _cross_matrices(points: Array) -> Array:
-    """(N, 3, 3) matrices [p]x of points (N, 3)."""
-    return np.cross(points[:, None, :], np.eye(3)[None], axisa=2, axisb=2).swapaxes(1, 2)
 
 
 def _point_by_pose(points: Array, pose: Array) -> Array:

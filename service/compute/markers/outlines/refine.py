@@ -56,14 +56,12 @@ def refine_outline(
     camera: CameraModel,
     rough: Cone,
     options: DetectionOptions = DEFAULTS,
-    *,
-    score: float = 1.0,
 ) -> SphereOutline | None:
     """The outline near `rough` at full resolution, reading only its region; None if no reliable one is found.
 
     `rough` comes from the coarse search or from a prediction and must be good to about a tenth of the radius.
     """
-    return refine_outlines(image_bgr, camera, [rough], options, scores=[score])[0]
+    return refine_outlines(image_bgr, camera, [rough], options, scores=[1.0])[0]
 
 
 def refine_outlines(

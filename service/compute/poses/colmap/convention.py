@@ -12,11 +12,11 @@ from service.core.geometry import Array, Transform, inverse, transform
 HALF_PIXEL = 0.5  # COLMAP's first pixel spans 0..1 with its centre at 0.5; ours is centred at 0
 
 
-def to_colmap_camera(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
+def to_colmap_camera(camera: CameraModel) -> pycolmap.Camera:
     """COLMAP's camera for our calibrated one: OPENCV, or FULL_OPENCV if it has more than k1, k2, p1, p2."""
     more = [camera.k3, camera.k4, camera.k5, camera.k6]
     return pycolmap.Camera(
-        camera_id=camera_id,
+        camera_id=1,
         model="FULL_OPENCV" if any(more) else "OPENCV",
         width=camera.width,
         height=camera.height,

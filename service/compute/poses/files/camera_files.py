@@ -37,14 +37,14 @@ _CALIBRATION_KEYS = (
 )  # fmt: skip
 
 
-def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> CameraModel:
+def read_camera_json(path: Path) -> CameraModel:
     """Camera from {"width","height","fx","fy","cx","cy"} and, if not zero, "k1" … "k6", "p1", "p2" (as in OpenCV).
 
     A file written by `calibrate intrinsics` also holds the calibration's results. Any other key is refused, since it
     could change the meaning of the numbers.
 
     Raises:
-        DataError: a key is missing, unknown or not a number, or the size is not the images' (width, height).
+        DataError: a key is missing, unknown or not a number.
     """
     document = json_object(path)
     _check_keys(document, set(_CAMERA_KEYS), {*_DISTORTION, *_CALIBRATION_KEYS}, path)
@@ -61,12 +61,6 @@ def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> C
             remedy="correct them",
         )
     size = (int(values["width"]), int(values["height"]))
-    if image_size is not None and size != image_size:
-        raise DataError(
-            f"the camera is calibrated at {size[0]}×{size[1]}, the images are {image_size[0]}×{image_size[1]}",
-            where=str(path),
-            remedy="use images of the calibrated size, or calibrate at theirs",
-        )
     return CameraModel(*size, *(float(values[k]) for k in (*_CAMERA_KEYS, *_DISTORTION)[2:]))
 
 

@@ -97,7 +97,7 @@ def identify(
 
 
 def identify_each(
-    outlines: Sequence[Sequence[SphereOutline]], camera: CameraModel, spheres: ScanSpheres, names: Sequence[str] = ()
+    outlines: Sequence[Sequence[SphereOutline]], camera: CameraModel, spheres: ScanSpheres
 ) -> tuple[Assignment, ...]:
     """Assign the registration spheres to the outlines of each image on its own, without poses.
 
@@ -106,7 +106,7 @@ def identify_each(
     Raises:
         ComputeError: no image shows four spheres, or all that do are ambiguous.
     """
-    labels = list(names) or [f"image {i}" for i in range(len(outlines))]
+    labels = [f"image {i}" for i in range(len(outlines))]
     centres = np.asarray(spheres.centres_m, dtype=np.float64)
     readings = [image_hypotheses(o, centres, spheres.radius_m, camera) for o in outlines]
     _require_any(readings, outlines, labels, len(centres))

@@ -24,9 +24,15 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     folder.file("cameras.npz", lambda: _cameras(dataset))
     for k, view in enumerate(dataset.views):
         folder.file(
-            f"image/{k:06d}.png", lambda view=view: png(dataset.pixels.colours(view)), Part("image", view.name)
+            f"image/{k:06d}.png",
+            lambda view=view: png(dataset.pixels.colours(view), dataset.mark),
+            Part("image", view.name),
         )
-        folder.file(f"mask/{k:06d}.png", lambda view=view: mask_png(_shown(dataset, view)), Part("mask", view.name))
+        folder.file(
+            f"mask/{k:06d}.png",
+            lambda view=view: mask_png(_shown(dataset, view), dataset.mark),
+            Part("mask", view.name),
+        )
 
 
 def _shown(dataset: DataSet, view: View) -> NDArray[np.bool_]:

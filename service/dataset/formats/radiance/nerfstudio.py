@@ -52,12 +52,12 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     for view in dataset.views:
         folder.file(
             f"depth/{view.name}.png",
-            lambda view=view: png(coded_depth(dataset.pixels.depth_m(view))),
+            lambda view=view: png(coded_depth(dataset.pixels.depth_m(view)), dataset.mark),
             Part("depth", view.name),
         )
         folder.file(
             f"masks/{view.name}.png",
-            lambda view=view: mask_png(dataset.pixels.valid(view) & ~dataset.pixels.markers(view)),
+            lambda view=view: mask_png(dataset.pixels.valid(view) & ~dataset.pixels.markers(view), dataset.mark),
             Part("mask", view.name),
         )
 

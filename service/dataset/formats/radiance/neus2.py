@@ -55,7 +55,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
 def _with_alpha(dataset: DataSet, view: View) -> bytes:
     pixels = dataset.pixels
     shown = (pixels.depth_m(view) > 0) & pixels.valid(view) & ~pixels.markers(view)
-    return png(np.dstack([pixels.colours(view), np.where(shown, np.uint8(255), np.uint8(0))]))
+    return png(np.dstack([pixels.colours(view), np.where(shown, np.uint8(255), np.uint8(0))]), dataset.mark)
 
 
 KIND = Exporter("neus2", "NeuS2: RGBA images with masks, the scene in the unit box", write, pinhole=True)

@@ -2,7 +2,7 @@
 
 A mapper need not see everything: it gets some hundreds of the longest tracks per image, spread over the image, which
 gives poses in a fraction of the time. All tracks are then triangulated from these poses and adjusted with them
-(poses.sfm.adjustment), so the accuracy is that of all features, whatever the source of the initial poses.
+(`adjustment`), so the accuracy is that of all features, whatever the source of the initial poses.
 """
 
 from __future__ import annotations

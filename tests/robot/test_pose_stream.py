@@ -1,0 +1,28 @@
+"""The buffer of an arm's samples keeps up after a pause of the process."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from drivers.arm.stream import PoseStream
+from drivers.interfaces import RobotSample, SafetyState
+
+
+def sample(at_s: float) -> RobotSample:
+    zeros = np.zeros(7)
+    return RobotSample(at_s, at_s, zeros, zeros, zeros, np.eye(4), 0.0, SafetyState.NORMAL)
+
+
+def test_all_that_arrived_meanwhile_is_taken_at_once_and_in_order() -> None:
+    arrived = deque([sample(0.01 * i) for i in range(20_000)])
+    stream = PoseStream(
+        lambda: arrived.popleft() if arrived else None, stale_after_s=1.0, where="a test", vendor_errors=()
+    )
+    try:
+        stream.catch_up()
+        taken = stream.between(0.0, 200.0)
+    finally:
+        stream.close()
+    assert [s.monotonic_s for s in taken] == [0.01 * i for i in range(20_000)]
