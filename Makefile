@@ -76,13 +76,14 @@ torture-faults: $(TOOLS)
 soak: $(TOOLS)
 	$(BIN)/python -m bench.soak
 
-# New locks: needs uv (pip install uv). The second holds the first and the tools of tests and lint.
+# New locks: needs uv (pip install uv). The second holds the first and the tools of tests and lint. The third has no
+# huggingface-hub 2: it brings httpx2, which the tests' web client would then use instead of httpx.
 COMPILE = uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \
 	--python-version 3.11 --group build pyproject.toml
 lock:
 	$(COMPILE) -o constraints.txt
 	$(COMPILE) --extra dev --constraint constraints.txt -o constraints-dev.txt
-	echo 'transformers sympy networkx filelock fsspec jinja2 typing-extensions' | tr ' ' '\n' | \
+	echo 'transformers huggingface-hub<2 sympy networkx filelock fsspec jinja2 typing-extensions' | tr ' ' '\n' | \
 		$(subst --group build pyproject.toml,--constraint constraints-dev.txt -,$(COMPILE)) -o constraints-grounded.txt
 	sed -i '1i # Locked versions and hashes of everything that orthocapture needs; made by `make lock`.' constraints.txt
 	sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' constraints-dev.txt
