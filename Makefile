@@ -90,20 +90,21 @@ lock:
 	sed -i '1i # Locked versions and hashes of what the detector grounded needs beside PyTorch; made by `make lock`.' \
 		constraints-grounded.txt
 
-# Ready-made packages only: nothing is compiled on the way, and what has none for this Python is named at once.
+# Ready-made packages only: nothing is compiled on the way, and what has none for this Python is named at once. PyTorch
+# has a file for newer Pythons alone, which older ones cannot compile.
 $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/python || { python="$(PYTHON)"; python="$${python:-$$(.ci/find-python)}" && "$$python" -m venv .venv; }
 	$(BIN)/python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14) and \
 		"orthocapture runs on Python 3.11 to 3.13, not on %d.%d: make clean, then make" % sys.version_info[:2])'
 	$(PIP) --no-compile --only-binary :all: --require-hashes -r constraints.txt
 	$(PIP) --no-deps --no-build-isolation --editable .
-	$(BIN)/python -m compileall -qq -j 0 -x '/include/' .venv/lib service drivers simulators
+	$(BIN)/python -m compileall -qq -j 0 -x '/include/|/torch/testing/' .venv/lib service drivers simulators
 	touch $(READY)
 
 # jsonpath-rw, which mlcroissant needs, is published as a source archive alone: plain Python, built with our setuptools.
 $(TOOLS): $(READY) constraints-dev.txt
 	$(PIP) --no-compile --only-binary :all: --no-binary jsonpath-rw --no-build-isolation --require-hashes -r constraints-dev.txt
-	$(BIN)/python -m compileall -qq -j 0 -x '/include/' .venv/lib
+	$(BIN)/python -m compileall -qq -j 0 -x '/include/|/torch/testing/' .venv/lib
 	touch $(TOOLS)
 
 # The packages of the detector `grounded`, for its tests: PyTorch without CUDA where the index has that build. Its hash
