@@ -82,7 +82,7 @@ def seam_of(weight: Array) -> Strips:
 
 def no_seam_of(points: Array, weight: Array) -> Strips:
     """A line in the scan's own part with strips as wide as the seam's: what is found there is noise of the scan."""
-    away = distance_to(points, weight < 1)
+    away = distance_to(points, weight < 1, np.inf)
     line = np.flatnonzero(np.abs(away - _BESIDE_M) < _STRIP_M / 10)
     above = (away > _BESIDE_M) & (away < _BESIDE_M + _STRIP_M)
     return Strips(line, above, (away < _BESIDE_M) & (away > _BESIDE_M - _STRIP_M))

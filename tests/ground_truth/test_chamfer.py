@@ -158,6 +158,13 @@ def test_the_nearest_point_does_not_depend_on_the_order_of_the_points(shuffled: 
     distance, index = PointIndex(points).nearest(places)
     assert distance == pytest.approx(cdist(places, points).min(axis=1))
     assert np.linalg.norm(points[index] - places, axis=1) == pytest.approx(distance)
+    bound_m = float(np.median(distance))
+    bounded, found = PointIndex(points).nearest(places, bound_m)
+    near = distance < bound_m
+    assert np.array_equal(bounded[near], distance[near])
+    assert np.array_equal(found[near], index[near])
+    assert np.all(np.isinf(bounded[~near]))
+    assert np.all(found[~near] == -1)
 
 
 def test_samples_lie_on_the_faces_at_the_spacing_whatever_the_size_of_the_faces() -> None:

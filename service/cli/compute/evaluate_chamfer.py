@@ -50,7 +50,7 @@ def chamfer_command(
         score = chamfer(judged, truth, settings)
         scale = HeatScale.of(score, settings.outlier_m)
         if heat_map is not None:
-            distance_m = PointIndex(score.gt.samples.points_m).nearest(judged.vertices_m)[0]
+            distance_m = PointIndex(score.gt.samples.points_m).nearest(judged.vertices_m, scale.outlier_m)[0]
             write_heat_mesh(heat_map, judged, distance_m, scale, METRES_PER_UNIT[files[0].unit])
         if picture is not None:
             picture.write_bytes(cv2.imencode(".png", heat_picture(judged, truth, score, scale))[1].tobytes())

@@ -80,11 +80,12 @@ def fuse_command(
             )
         unit_m = METRES_PER_UNIT[of_scan.unit]
         write_ply(out, fused.surface, unit_m, {"source": fused.source, "sigma_mm": mm(fused.sigma_m)}, _COMMENTS)
+        scale = HeatScale.of(score, ChamferSettings().outlier_m)
         if heat_map is not None:
-            distance_m = PointIndex(score.gt.samples.points_m).nearest(common.ct.vertices_m)[0]
-            write_heat_mesh(heat_map, common.ct, distance_m, HeatScale.of(score, 0.02), unit_m)
+            distance_m = PointIndex(score.gt.samples.points_m).nearest(common.ct.vertices_m, scale.outlier_m)[0]
+            write_heat_mesh(heat_map, common.ct, distance_m, scale, unit_m)
         if picture is not None:
-            picture.write_bytes(fusion_picture(common.ct, scanned, score, HeatScale.of(score, 0.02), fused))
+            picture.write_bytes(fusion_picture(common.ct, scanned, score, scale, fused))
         record = fusion_record(aligned, score, fused)
         if json:
             print_json(record)

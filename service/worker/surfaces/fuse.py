@@ -145,7 +145,7 @@ def _files(context: JobContext[job.Arguments], compared: _Compared, fused: Fused
     mesh, heat = context.scratch / "ground_truth.ply", context.scratch / "ct_to_scan.ply"
     properties = {"source": fused.source, "sigma_mm": mm(fused.sigma_m)}
     write_ply(mesh, fused.surface, _MM, properties, _COMMENTS)
-    distance_m = PointIndex(compared.score.gt.samples.points_m).nearest(compared.ct.vertices_m)[0]
+    distance_m = PointIndex(compared.score.gt.samples.points_m).nearest(compared.ct.vertices_m, scale.outlier_m)[0]
     write_heat_mesh(heat, compared.ct, distance_m, scale, _MM)
     picture = fusion_picture(compared.ct, compared.scan, compared.score, scale, fused)
     kept = (

@@ -71,7 +71,7 @@ class Direction:
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """Samples of one surface, with the distance (N,) of each to the other's samples."""
+    """Samples of one surface, with the distance (N,) of each to the other's samples, infinite beyond the limit."""
 
     samples: Samples = field(repr=False)
     distance_m: Array = field(repr=False)
@@ -121,8 +121,8 @@ def chamfer(pred: Surface, gt: Surface, settings: ChamferSettings | None = None)
     rng = np.random.default_rng(chosen.seed)
     a, b = sample(pred, chosen.spacing_m, rng), sample(gt, chosen.spacing_m, rng)
     index_a, index_b = PointIndex(a.points_m), PointIndex(b.points_m)
-    to_b, nearest_b = index_b.nearest(a.points_m)
-    to_a, nearest_a = index_a.nearest(b.points_m)
+    to_b, nearest_b = index_b.nearest(a.points_m, chosen.outlier_m)
+    to_a, nearest_a = index_a.nearest(b.points_m, chosen.outlier_m)
     floor_a, floor_b = _floor(pred, a, index_a, rng), _floor(gt, b, index_b, rng)
     forth = _direction(_Way(pred, a, gt, b, to_b, nearest_b), floor_b, chosen, rng)
     back = _direction(_Way(gt, b, pred, a, to_a, nearest_a), floor_a, chosen, rng)
@@ -131,7 +131,7 @@ def chamfer(pred: Surface, gt: Surface, settings: ChamferSettings | None = None)
 
 @dataclass(frozen=True, slots=True)
 class _Way:
-    """From the samples of one surface to another: distance (N,) and nearest sample (N,)."""
+    """From the samples of one surface to another: distance (N,), infinite if too far, and nearest sample (N,)."""
 
     source: Surface
     samples: Samples
@@ -142,11 +142,12 @@ class _Way:
 
 
 def _direction(way: _Way, floor_m: float, settings: ChamferSettings, rng: np.random.Generator) -> Direction:
-    near = way.distance <= settings.outlier_m
+    near = np.isfinite(way.distance)
     if not near.any():
+        apart = PointIndex(way.targets.points_m).nearest(way.samples.points_m)[0]
         raise ComputeError(
             f"no point lies within {mm(settings.outlier_m):g} mm of the other surface; the nearest is "
-            f"{mm(float(way.distance.min())):.4g} mm away",
+            f"{mm(float(apart.min())):.4g} mm away",
             remedy="Check that both are in the same frame and that their units are right",
         )
     kept = way.distance[near]

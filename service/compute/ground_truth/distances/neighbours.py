@@ -26,16 +26,23 @@ class PointIndex:
         points = points_m if self._order is None else points_m[self._order]
         self._tree = KDTree(np.ascontiguousarray(points, dtype=np.float64))
 
-    def nearest(self, queries_m: Array) -> tuple[Array, IntArray]:
-        """Distance (Q,) in metres from each query (Q, 3) to the nearest point, and that point's index (Q,)."""
+    def nearest(self, queries_m: Array, within_m: float = np.inf) -> tuple[Array, IntArray]:
+        """Distance (Q,) in metres from each query (Q, 3) to the nearest point, and that point's index (Q,).
+
+        With no point nearer than `within_m`, the distance is infinite and the index -1. A bound makes the search
+        many times faster for queries that are far from all points.
+        """
         order = spatial_order(queries_m)
         distance, index = np.empty(len(queries_m)), np.empty(len(queries_m), dtype=np.int64)
         for begin in range(0, len(queries_m), _CHUNK):
             end = min(begin + _CHUNK, len(queries_m))
             part: slice | IntArray = slice(begin, end) if order is None else order[begin:end]
-            d, i = self._tree.query(np.ascontiguousarray(queries_m[part], dtype=np.float64))
+            queries = np.ascontiguousarray(queries_m[part], dtype=np.float64)
+            d, i = self._tree.query(queries, distance_upper_bound=within_m)
+            found, i = np.isfinite(d), i.astype(np.int64)
+            i[~found] = 0
             distance[part] = d
-            index[part] = i if self._order is None else self._order[i]
+            index[part] = np.where(found, i if self._order is None else self._order[i], -1)
         return distance, index
 
     def neighbours(self, queries_m: Array, k: int) -> IntArray:

@@ -130,7 +130,7 @@ def fuse(
     height = seen.offset_m[usable] if usable.any() else np.zeros(1)
     offset = float(np.median(height))
     spread = 1.4826 * float(np.median(np.abs(height - offset)))
-    within = distance_to(carrier.vertices_m, ~usable) / chosen.blend_m
+    within = distance_to(carrier.vertices_m, ~usable, chosen.blend_m) / chosen.blend_m
     weight, detail = _smooth_step(within), _smooth_step((within - _DETAIL_FROM) / (1 - _DETAIL_FROM))
     known_m = np.where(usable, -seen.offset_m, 0.0)
     followed = deviation_field(carrier, known_m, usable, chosen.lengths)[:, None] * vertex_normals(carrier)
@@ -203,7 +203,7 @@ class _Addition:
         """(F,) faces of the scan that are far from the CT, or touch what was taken away since."""
         far_m = 2 * self.settings.overlap.distance_m
         vertices, faces = self.scan.vertices_m, self.scan.faces
-        far = PointIndex(carrier.vertices_m).nearest(vertices)[0] > far_m
+        far = PointIndex(carrier.vertices_m).nearest(vertices, far_m)[0] > far_m
         taken: Mask = np.all(far[faces], axis=1)
         if self.removed is not None:
             taken |= np.any(self.removed.contains(vertices)[faces], axis=1)

@@ -53,8 +53,9 @@ def overlap(ct: Surface, scan: Surface, limits: OverlapLimits | None = None) -> 
     """Compare a CT mesh with a scan, both in one frame, with outward faces."""
     bounds = limits or OverlapLimits()
     used = np.unique(scan.faces)
-    rough, vertex = PointIndex(scan.vertices_m[used]).nearest(ct.vertices_m)
-    near = np.flatnonzero(rough <= bounds.distance_m + _longest_edge(scan))
+    reach_m = bounds.distance_m + _longest_edge(scan)
+    rough, vertex = PointIndex(scan.vertices_m[used]).nearest(ct.vertices_m, reach_m)
+    near = np.flatnonzero(np.isfinite(rough))
     place, face = _on_faces_around(scan, used[vertex[near]], ct.vertices_m[near])
     normals = vertex_normals(ct)
     way = ct.vertices_m[near] - place
@@ -68,7 +69,7 @@ def overlap(ct: Surface, scan: Surface, limits: OverlapLimits | None = None) -> 
     rim = rim_vertices(scan)
     if len(rim):
         index = np.flatnonzero(covered)
-        away = PointIndex(scan.vertices_m[rim]).nearest(nearest[index])[0]
+        away = PointIndex(scan.vertices_m[rim]).nearest(nearest[index], bounds.rim_m)[0]
         covered[index[away < bounds.rim_m]] = False
     return Overlap(nearest, offset, covered)
 
@@ -179,17 +180,18 @@ def vertex_normals(surface: Surface) -> Array:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
 
-def distance_to(points: Array, chosen: Mask) -> Array:
-    """(N,) distance from each point (N, 3) to the nearest chosen one; infinite if none is chosen."""
-    if not chosen.any():
-        return np.full(len(points), np.inf)
-    return PointIndex(points[chosen]).nearest(points)[0]
+def distance_to(points: Array, chosen: Mask, within_m: float) -> Array:
+    """(N,) distance from each point (N, 3) to the nearest chosen one; infinite if none is nearer than `within_m`."""
+    distance = np.where(chosen, 0.0, np.inf)
+    if chosen.any() and not chosen.all():
+        distance[~chosen] = PointIndex(points[chosen]).nearest(points[~chosen], within_m)[0]
+    return distance
 
 
 def _closed(points: Array, chosen: Mask, radius: float) -> Mask:
     """Grown and shrunk by a radius, so that gaps and islands between chosen points are chosen, too."""
-    grown = distance_to(points, chosen) <= radius
-    return chosen | (distance_to(points, ~grown) > radius)
+    grown = distance_to(points, chosen, radius) <= radius
+    return chosen | (distance_to(points, ~grown, radius) > radius)
 
 
 def _longest_edge(surface: Surface) -> float:
