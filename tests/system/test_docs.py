@@ -351,18 +351,18 @@ RUN_ELSEWHERE = {
         "tests/robot/test_grbl_run.py::test_a_run_with_the_turntable_instead_of_the_arm",
     ),
     "orthocapture dicom-listen --folder ct --from CTSUITE": (
-        "tests/scanner/test_dicom_listen.py::test_dcmtk_sends_a_series_and_the_importer_reads_it"
+        "tests/ct/test_dicom_listen.py::test_dcmtk_sends_a_series_and_the_importer_reads_it"
     ),
     "orthocapture export latest --format mcap --out bag --data runs": (
         "tests/dataset/test_mcap.py::test_rosbags_opens_the_folder_as_a_recording_of_ros"
     ),
     "orthocapture import-ros bag --out files --base base_link --flange tool0 --camera-frame camera_optical": (
-        "tests/calibration/test_import_ros.py::test_a_recording_calibrates_a_hand_eye_as_its_files_would"
+        "tests/poses/test_import_ros.py::test_a_recording_calibrates_a_hand_eye_as_its_files_would"
     ),
     'orthocapture simulate rig --scene 7 --dir rig --arm "LBR Med 14"': (
-        "tests/arms/test_kuka_run.py::test_it_comes_to_its_end_with_every_view"
+        "tests/kuka/test_kuka_run.py::test_it_comes_to_its_end_with_every_view"
     ),
-    "orthocapture simulate kuka": "tests/robot/test_kuka_driver.py::test_a_day_without_trouble",
+    "orthocapture simulate kuka": "tests/kuka/test_kuka_driver.py::test_a_day_without_trouble",
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/recovery/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
     ),

@@ -28,9 +28,9 @@ from simulators.ct_suite.suite import write_series
 from simulators.ct_suite.volume import Grid
 from simulators.faults import FaultPlan
 from tests.ground_truth.test_fuse_command import CENTRES_M, RADIUS_M, T_WORLD_CT
-from tests.scanner.test_ct_labels import write_nifti
 from tests.support.rig.bench_rig import BenchRig
 from tests.support.runs.bench_run import Bench, begin_run, say
+from tests.support.scenes.ct_labels import write_nifti
 
 pytestmark = pytest.mark.slow
 VOXEL_M = 0.8e-3
