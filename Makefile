@@ -85,10 +85,10 @@ lock:
 	$(COMPILE) --extra dev --constraint constraints.txt -o constraints-dev.txt
 	echo 'transformers huggingface-hub<2 sympy networkx filelock fsspec jinja2 typing-extensions' | tr ' ' '\n' | \
 		$(subst --group build pyproject.toml,--constraint constraints-dev.txt -,$(COMPILE)) -o constraints-grounded.txt
-	sed -i '1i # Locked versions and hashes of everything that orthocapture needs; made by `make lock`.' constraints.txt
-	sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' constraints-dev.txt
 	sed -i '1i # Locked versions and hashes of what the detector grounded needs beside PyTorch; made by `make lock`.' \
 		constraints-grounded.txt
+	sed -i '1i # Locked versions and hashes of everything that orthocapture needs; made by `make lock`.' constraints.txt
+	sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' constraints-dev.txt
 
 # Ready-made packages only: nothing is compiled on the way, and what has none for this Python is named at once. PyTorch
 # has a file for newer Pythons alone, which older ones cannot compile.

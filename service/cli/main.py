@@ -50,7 +50,7 @@ _COMMANDS = {
     ),
     "note": _Command(
         "service.cli.run.act:note_command",
-        "Write a note on a step of a run, with or without a photograph. It is recorded and has no other effect.",
+        "Write a note on a step of a run, with or without a photograph; it has no effect on the run.",
     ),
     "status": _Command("service.cli.run.status:status_command", "Show the state of a run: steps, gates, deviations."),
     "runs": _Command(
@@ -81,7 +81,7 @@ _COMMANDS = {
     ),
     "import-ros": _Command(
         "service.cli.compute.import_ros:import_ros_command",
-        "Take images, robot poses, camera and mount from a recording of ROS 2; the files fit the other commands.",
+        "Take images, robot poses, camera and mount from a ROS 2 recording; the files fit the other commands.",
     ),
     "sfm": _Command(
         "service.cli.compute.sfm:sfm_command",

@@ -75,7 +75,7 @@ def hand_eye_command(
     ] = None,
     arm: Annotated[
         str | None,
-        typer.Option("--arm", help="Arm model, such as UR10e or LBR Med 14; default: found from the joints."),
+        typer.Option("--arm", help="Arm model, such as UR10e, UR5e, UR3e, LBR Med 14; default: found by the joints."),
     ] = (None),
     suggest: Annotated[int, typer.Option("--suggest", help="Number of further board poses to suggest.", min=0)] = 6,
     preview: Annotated[

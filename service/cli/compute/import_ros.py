@@ -64,7 +64,7 @@ def import_ros_command(
     ] = 0.0,
     json: JsonOption = False,
 ) -> None:
-    """Take images, robot poses, camera and mount from a recording of ROS 2; the files fit the other commands.
+    """Take images, robot poses, camera and mount from a ROS 2 recording; the files fit the other commands.
 
     Writes T_base_flange of every image. Poses are interpolated only with --interpolate-ms.
     """
