@@ -50,7 +50,7 @@ _COMMANDS = {
     ),
     "note": _Command(
         "service.cli.run.act:note_command",
-        "Write a note on a step of a run, with or without a photograph; it has no effect on the run.",
+        "Write a note on a step of a run, with or without a photograph. It is recorded and has no other effect.",
     ),
     "status": _Command("service.cli.run.status:status_command", "Show the state of a run: steps, gates, deviations."),
     "runs": _Command(

@@ -175,7 +175,7 @@ def test_a_technician_is_led_through_a_run_and_a_second_person_releases_it(
             tablet.hold("Redo v1_001")
         else:
             redo.click()
-        expect(page.get_by_text(re.compile("replaced", re.IGNORECASE)).first).to_be_visible(timeout=LONG_MS)
+        expect(page.get_by_role("link", name="Show 1 replaced")).to_be_visible(timeout=LONG_MS)
 
         tablet.go(f"/runs/{run}")
         tablet.hold("Resume")
