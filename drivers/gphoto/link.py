@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ BROKEN_VERSIONS = ("2.5.31",)
 LEAST_VERSION = (2, 5, 30)
 OPEN_ATTEMPTS = 3
 PTPIP_MODEL = "PTP/IP Camera"
+_REPORTED = re.compile(r'PTP Property [0-9a-f]{4} changed, "(?P<name>[^"]+)"')
 
 _ERRORS: dict[int, tuple[type[DeviceError], str]] = {
     gp.GP_ERROR_CAMERA_BUSY: (DeviceBusyError, "Wait a moment and repeat"),
@@ -101,6 +103,7 @@ class Link:
         self._port = port
         self._model = model
         self._camera: Gphoto | None = None
+        self.reported: set[str] = set()  # widgets whose values the camera itself has reported
 
     def open(self) -> None:
         """Connect, with back-off, because cameras need a moment after a lost session."""
@@ -182,7 +185,14 @@ class Link:
 
     def next_event(self, wait_ms: int) -> tuple[int, Any]:
         """Wait for the next event of the camera; returns its type, or GP_EVENT_TIMEOUT, and its data."""
-        return self.call("Waiting for the camera", lambda camera: camera.wait_for_event(wait_ms))
+        event, data = self.call("Waiting for the camera", lambda camera: camera.wait_for_event(wait_ms))
+        if event == gp.GP_EVENT_UNKNOWN and (found := _REPORTED.match(str(data))):
+            self.reported.add(found["name"])
+        return event, data
+
+    def names(self) -> frozenset[str]:
+        """The names of all widgets that the camera has."""
+        return self.call("Listing the settings", lambda camera: frozenset(str(n) for n, _ in camera.list_config()))
 
     def value(self, name: str) -> str:
         """Return the value of one widget. Raises DeviceRefusedError if the camera has no such setting."""

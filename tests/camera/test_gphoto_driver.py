@@ -25,7 +25,8 @@ from drivers.errors import (
 )
 from drivers.gphoto import DRIVER, GphotoConfig
 from drivers.gphoto.link import check_library_version
-from drivers.gphoto.settings import choose_number, choose_word, number_of, quality_of
+from drivers.gphoto.profile import choose_number, choose_word, number_of, quality_of
+from drivers.gphoto.profiles.sony_ilce import SONY_ILCE
 from drivers.host.hosted_device import hosted
 from drivers.interfaces import Camera, CameraSettings
 from tests.support.rig.camera_simulator import RunningCamera, camera_simulator
@@ -260,8 +261,8 @@ def test_numbers_in_the_camera_s_words(word: str, number: float | None) -> None:
 
 def test_words_of_another_usb_mode() -> None:
     offered = ("RAW", "RAW+JPEG (Fine)", "Extra Fine", "Fine")
-    assert choose_word("imagequality", "JPEG", offered, "here") == "Extra Fine"
-    assert choose_word("imagequality", "RAW+JPEG", offered, "here") == "RAW+JPEG (Fine)"
+    assert choose_word(SONY_ILCE.quality, "JPEG", offered, "here") == "Extra Fine"
+    assert choose_word(SONY_ILCE.quality, "RAW+JPEG", offered, "here") == "RAW+JPEG (Fine)"
     assert [quality_of(word) for word in offered] == ["RAW", "RAW+JPEG", "JPEG", "JPEG"]
     with pytest.raises(DeviceRefusedError, match="offers no values"):
-        choose_number("f-number", 22.0, ("--",), "here")
+        choose_number(SONY_ILCE.f_number, 22.0, ("--",), "here")
