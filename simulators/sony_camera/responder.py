@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
-from simulators.faults import Fault, FaultPlan
+from simulators.faults import FaultPlan
+from simulators.ptpip import codec
+from simulators.ptpip.reply import (
+    ACCESS_DENIED,
+    DEVICE_BUSY,
+    GENERAL_ERROR,
+    INVALID_HANDLE,
+    INVALID_STORAGE,
+    INVALID_VALUE,
+    NOT_SUPPORTED,
+    REJECTIONS,
+    STORE_FULL,
+    Reply,
+)
 from simulators.serve import SimulatorError
-from simulators.sony_camera import codec
-from simulators.sony_camera.body import CARD_BYTES, FORMAT_ARW, FORMAT_JPEG, BusyError, CameraBody, CardFullError
+from simulators.sony_camera.body import FORMAT_ARW, SonyBody
 from simulators.sony_camera.properties import CONTROLS, Code, NotWritableError, RefusedValueError
-from simulators.sony_camera.scene import NotReadyError
+from simulators.still_camera.body import CARD_BYTES, FORMAT_JPEG, BusyError, CardFullError
+from simulators.still_camera.scene import NotReadyError
 
 STORAGE = 0x00010001
 SHOT_HANDLE, LIVE_VIEW_HANDLE = 0xFFFFC001, 0xFFFFC002
 OBJECT_ADDED = 0xC201
-OK, GENERAL_ERROR, SESSION_NOT_OPEN, NOT_SUPPORTED = 0x2001, 0x2002, 0x2003, 0x2005
-INVALID_STORAGE, INVALID_HANDLE, STORE_FULL, ACCESS_DENIED = 0x2008, 0x2009, 0x200C, 0x200F
-DEVICE_BUSY, INVALID_VALUE = 0x2019, 0x201C
-_REJECTIONS = {
-    "busy": DEVICE_BUSY,
-    "disk_full": STORE_FULL,
-    "reject": ACCESS_DENIED,
-    "error": GENERAL_ERROR,
-    "ignore": OK,
-}
 _CODES: dict[type[Exception], int] = {
     BusyError: DEVICE_BUSY,
     CardFullError: STORE_FULL,
@@ -38,20 +40,10 @@ _CODES: dict[type[Exception], int] = {
 _POLL_WHILE_EXPOSING_S = 0.005
 
 
-@dataclass(frozen=True, slots=True)
-class Reply:
-    """The answer: response code, its parameters, a data phase; the socket carries out `wire_fault`."""
-
-    code: int = OK
-    parameters: tuple[int, ...] = ()
-    data: bytes | None = None
-    wire_fault: Fault | None = None
-
-
-class Responder:
+class SonyResponder:
     """One session's operations on the camera."""
 
-    def __init__(self, body: CameraBody, faults: FaultPlan) -> None:
+    def __init__(self, body: SonyBody, faults: FaultPlan) -> None:
         self._body = body
         self._faults = faults
         self._operations: dict[int, tuple[str, Callable[[codec.Request, bytes], Reply]]] = {
@@ -83,8 +75,8 @@ class Responder:
         fault = self._faults.check("camera", self._message(name, request, data))
         if fault is not None and fault.kind == "disk_full":
             self._body.free_bytes = 0
-        if fault is not None and fault.kind in _REJECTIONS:
-            return Reply(_REJECTIONS[fault.kind])
+        if fault is not None and fault.kind in REJECTIONS:
+            return Reply(REJECTIONS[fault.kind])
         try:
             reply = operation(request, data)
         except tuple(_CODES) as error:
@@ -115,6 +107,8 @@ class Responder:
             events=(OBJECT_ADDED, 0xC202, 0xC203),
             properties=(),
             image_formats=(0x3001, FORMAT_JPEG, FORMAT_ARW),
+            vendor_extension=0x11,
+            vendor_description="Sony PTP Extensions",
         )
         return Reply(data=info.encode())
 
@@ -127,7 +121,7 @@ class Responder:
         if request.parameters[:1] != (STORAGE,):
             return Reply(INVALID_STORAGE)
         free = self._body.free_bytes
-        return Reply(data=codec.StorageInfo(CARD_BYTES, free, free // 60_000_000).encode())
+        return Reply(data=codec.StorageInfo(CARD_BYTES, free, free // 60_000_000, "CFexpress Type A").encode())
 
     def _object_count(self, request: codec.Request, data: bytes) -> Reply:
         del request, data
