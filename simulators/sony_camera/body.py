@@ -11,12 +11,12 @@ from simulators.sony_camera.exif import PLATE
 from simulators.sony_camera.properties import (
     MANUAL_FOCUS,
     Code,
-    NotWritableError,
     PropertyTable,
     shutter_code,
 )
 from simulators.still_camera.body import BodyOptions, CameraBody, CameraFile, FileNames
 from simulators.still_camera.exif import ExposureSettings
+from simulators.still_camera.operations import NotWritableError
 from simulators.still_camera.scene import ImageSource
 
 FORMAT_ARW = 0xB101

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from simulators.still_camera.exif import ExposureSettings
+from simulators.still_camera.operations import NotWritableError, RefusedValueError
 
 PROTOCOL_VERSION = 300
 _FORMATS = {1: "<b", 2: "<B", 3: "<h", 4: "<H", 5: "<i", 6: "<I"}
@@ -52,14 +53,6 @@ class Enabled(IntEnum):
     GREY = 0
     ON = 1
     DISPLAY_ONLY = 2
-
-
-class RefusedValueError(Exception):
-    """The camera does not offer this value."""
-
-
-class NotWritableError(Exception):
-    """The property cannot be set, or does not exist."""
 
 
 @dataclass(slots=True)

@@ -13,9 +13,10 @@ from simulators.ptpip import codec
 from simulators.ptpip.codec import PacketType
 from simulators.serve import SimulatorError
 from simulators.sony_camera.body import SonyBody
-from simulators.sony_camera.properties import Code, PropertyTable, RefusedValueError
+from simulators.sony_camera.properties import Code, PropertyTable
 from simulators.sony_camera.responder import SonyResponder
 from simulators.still_camera.body import BodyOptions
+from simulators.still_camera.operations import RefusedValueError
 from simulators.still_camera.scene import PictureFiles, StillLife, exposure_gain
 
 GUID = bytes(range(16))
