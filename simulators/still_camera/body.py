@@ -103,6 +103,9 @@ class CameraBody(ABC):
     def keep(self, files: list[CameraFile], settings: ExposureSettings) -> None:
         """Put finished files where the client fetches them, and announce them."""
 
+    def begun(self) -> None:  # noqa: B027 - most cameras do not announce it
+        """What the camera says when an exposure begins."""
+
     def done(self) -> None:  # noqa: B027 - most cameras do not announce it
         """What the camera says when an exposure has ended, with or without a file."""
 
@@ -126,6 +129,7 @@ class CameraBody(ABC):
         fault = self._faults.check("camera", "image")
         counter = self._counter
         self._counter += 1
+        self.begun()
         threading.Thread(target=self._expose, args=(counter, settings, fault), name="exposure", daemon=True).start()
 
     def _expose(self, counter: int, settings: ExposureSettings, fault: Fault | None) -> None:
