@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from drivers.errors import DeviceBusyError, DeviceError, DeviceRefusedError
+from drivers.errors import DeviceBusyError, DeviceError, DeviceRefusedError, DeviceUnavailableError
 from drivers.gphoto.link import AddedFile, Link
 from drivers.gphoto.profile import Profile, Widget, choose_number, choose_word, number_of, quality_of
 from drivers.interfaces import CameraSettings
@@ -109,10 +109,12 @@ class Dials:
         for _ in range(SET_ATTEMPTS):
             if self._link.value(name) == word:
                 return
+            self.refresh()  # what the camera reported before does not count
             self._link.reported.clear()
             try:
                 self._link.put(name, word)
-            except (DeviceRefusedError, DeviceBusyError) as error:
+            except (DeviceRefusedError, DeviceBusyError, DeviceUnavailableError) as error:
+                # A refusal and a lost link both give -1: reading back shows which it was.
                 refusal = error
             if self._reads_back(name, word):
                 return

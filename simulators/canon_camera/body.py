@@ -8,6 +8,7 @@ from simulators.canon_camera import events
 from simulators.canon_camera.properties import (
     APERTURE_PRIORITY,
     ISO,
+    MEMORY,
     ONE_SHOT,
     Code,
     Properties,
@@ -34,6 +35,7 @@ class CanonBody(CameraBody):
         super().__init__(source, faults, options, PLATE, FileNames("IMG_{:04d}", ".CR3", FORMAT_CR3))
         self.properties = Properties(SERIAL, LENS)
         self.count_shots()
+        self.has_card = True
         self._files: dict[int, CameraFile] = {}
         self._lock = threading.Lock()
 
@@ -43,6 +45,11 @@ class CanonBody(CameraBody):
             self.properties.put(Code.FOCUS, ONE_SHOT)
         if aperture_priority:
             self.properties.put(Code.EXPOSURE_MODE, APERTURE_PRIORITY)
+
+    def take_card_out(self) -> None:
+        """From now on, files go to the memory only."""
+        self.has_card = False
+        self.properties.offer(Code.DESTINATION, (MEMORY,))
 
     def count_shots(self) -> None:
         """Say how many pictures the card still holds."""

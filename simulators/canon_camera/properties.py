@@ -193,6 +193,11 @@ class Properties:
             self._numbers[code].value = value
             self._news += self._value_of(code)
 
+    def offer(self, code: Code, choices: tuple[int, ...]) -> None:
+        """Offer only these values from now on, and take the first of them."""
+        self._numbers[code].choices = choices
+        self.put(code, choices[0])
+
     def charge(self, percent: int) -> None:
         """Set the charge of the battery, of which the camera only tells quarters."""
         self.put(Code.BATTERY, next((code for least, code in _BATTERY if percent >= least), _NEARLY_EMPTY))

@@ -106,7 +106,7 @@ class CanonResponder(Operations):
 
     def _storage_ids(self, request: codec.Request, data: bytes) -> Reply:
         del request, data
-        return Reply(data=codec.array_u32((STORAGE,)))
+        return Reply(data=codec.array_u32((STORAGE,) if self._body.has_card else ()))
 
     def _storage_info(self, request: codec.Request, data: bytes) -> Reply:
         del data
