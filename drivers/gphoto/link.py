@@ -9,6 +9,8 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 from drivers.errors import (
@@ -29,6 +31,7 @@ BROKEN_VERSIONS = ("2.5.31",)
 LEAST_VERSION = (2, 5, 30)
 OPEN_ATTEMPTS = 3
 PTPIP_MODEL = "PTP/IP Camera"
+_TO_CARD = "ptp2=capturetarget=card"  # as libgphoto2 writes it
 _REPORTED = re.compile(r'PTP Property [0-9a-f]{4} changed, "(?P<name>[^"]+)"')
 
 _ERRORS: dict[int, tuple[type[DeviceError], str]] = {
@@ -87,6 +90,29 @@ def keep_descriptor_zero() -> None:
             os.close(null)
 
 
+@cache
+def keep_own_settings() -> None:
+    """Give libgphoto2 a settings file of this program, instead of the one that it shares with the user's others.
+
+    It keeps where Canon and Nikon bodies put files, and the identity with which cameras on the network are paired.
+    """
+    home = os.environ.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config")
+    own = Path(home) / "orthocapture"
+    file = own / "gphoto" / "settings"
+    try:
+        lines = file.read_text(encoding="ascii").splitlines() if file.exists() else []
+        if _TO_CARD not in lines:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            kept = [line for line in lines if not line.startswith(_TO_CARD.rpartition("=")[0])]
+            partial = file.with_name(f"settings.{os.getpid()}")
+            partial.write_text("\n".join([*kept, _TO_CARD]) + "\n", encoding="ascii")
+            partial.replace(file)
+    except (OSError, UnicodeDecodeError) as error:
+        _LOG.warning("libgphoto2 uses the settings of the user: %s", error)
+        return
+    os.environ["XDG_CONFIG_HOME"] = str(own)
+
+
 @dataclass(frozen=True, slots=True)
 class AddedFile:
     """A file that the camera announced."""
@@ -108,6 +134,7 @@ class Link:
     def open(self) -> None:
         """Connect, with back-off, because cameras need a moment after a lost session."""
         check_library_version(library_version())
+        keep_own_settings()
         self.close()
         for attempt in range(1, OPEN_ATTEMPTS + 1):
             keep_descriptor_zero()

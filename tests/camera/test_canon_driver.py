@@ -126,7 +126,7 @@ def test_large_files_come_in_parts(tmp_path: Path) -> None:
 
 def test_a_setting_refused_in_silence_is_an_error_and_not_what_was_sent() -> None:
     """The client then answers with what was sent: only the camera's own report, or a new connection, tells."""
-    with camera_simulator([{"on": "set", "kind": "ignore", "times": 50}], name="canon") as simulator:
+    with camera_simulator([{"on": "set", "kind": "ignore", "times": 500}], name="canon") as simulator:
         _, echoed = vendor_session(simulator.gphoto_port, ["set", "iso", "100"], ["value", "iso"])
         assert echoed == "100"
         assert vendor_session(simulator.gphoto_port, ["value", "iso"]) == ["400"]
