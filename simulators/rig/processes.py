@@ -115,7 +115,8 @@ class _Rig:
                 f"--initial-joints={joints}", "--world", world, "--arm", arm, *self._model(),
             )  # fmt: skip
         camera = self._child(
-            "camera", CAMERAS[self.args.camera], "--port", "0", "--world", world, "--image-width", str(self.args.image_width),
+            "camera", CAMERAS[self.args.camera], "--port", "0", "--world", world,
+            "--image-width", str(self.args.image_width),
             "--exposures-log", str(self.folder / "truth_exposures.jsonl"),
             *(("--send-to", str(self.folder / "photographs")) if self.args.without_cable else ()),
         )  # fmt: skip

@@ -1,0 +1,145 @@
+"""The profiles of cameras, against what libgphoto2 offers and what bodies were seen to offer."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DeviceRefusedError
+from drivers.gphoto.profile import Profile, battery_fraction, choose_number, choose_word, quality_of
+from drivers.gphoto.profiles import PROFILES, profile_for
+from drivers.gphoto.profiles.canon_eos import CANON_EOS
+from drivers.gphoto.profiles.nikon_z import NIKON_Z
+from drivers.gphoto.profiles.sony_ilce import SONY_ILCE
+
+
+@dataclass(frozen=True)
+class Listed:
+    """What a body offered, according to the listing of its settings in libgphoto2's sources (camlibs/ptp2/cameras)."""
+
+    manufacturer: str
+    model: str
+    offered: dict[str, tuple[str, ...]]
+    profile: Profile
+    now: dict[str, str] = field(default_factory=dict[str, str])
+
+
+_NIKON_WHITE = ("Automatic", "Daylight", "Fluorescent", "Tungsten", "Flash", "Cloudy", "Shade", "Color Temperature")
+_NIKON_QUALITY = (
+    "JPEG Basic",
+    "JPEG Normal",
+    "JPEG Fine",
+    "Unknown value 0003",
+    "NEF (Raw)",
+    "NEF+Basic",
+    "NEF+Fine",
+)
+_STOPS = ("f/5.6", "f/8", "f/11", "f/16")
+LISTED = (
+    Listed(
+        "Nikon Corporation", "Z 6_2",
+        {
+            "f-number": _STOPS, "iso": ("50", "64", "80", "100", "200", "400"), "imagequality": _NIKON_QUALITY,
+            "shutterspeed2": ("1/20", "1/15", "1/13", "1/3", "10/25", "Bulb", "Time"),
+            "whitebalance": _NIKON_WHITE, "focusmode": ("Manual", "AF-S", "AF-C"), "isoauto": ("On", "Off"),
+            "capturetarget": ("Internal RAM", "Memory card"), "capturemode": ("Single Shot", "Burst", "Timer"),
+        },
+        NIKON_Z, {"expprogram": "M", "batterylevel": "100%"},
+    ),
+    Listed(
+        "Nikon Corporation", "Z 9",
+        {"whitebalance": _NIKON_WHITE, "capturetarget": ("Internal RAM", "Memory card"), "imagequality": _NIKON_QUALITY},
+        NIKON_Z, {"expprogram": "M", "batterylevel": "60%"},
+    ),
+    Listed(
+        "Nikon Corporation", "Z f",
+        {"focusmode": ("Manual", "AF-S", "AF-C", "AF-F"), "imagequality": _NIKON_QUALITY, "f-number": _STOPS},
+        NIKON_Z, {"expprogram": "M", "batterylevel": "60%"},
+    ),
+    Listed(
+        "Canon.Inc", "Canon EOS R5",
+        {
+            "aperture": ("5.6", "8", "11", "16"), "shutterspeed": ("1/20", "1/15", "1/13"), "iso": ("Auto", "100", "200"),
+            "imageformat": ("Large Fine JPEG", "Large Normal JPEG", "RAW + Large Fine JPEG", "cRAW + Smaller JPEG", "RAW"),
+            "whitebalance": ("Auto", "AWB White", "Daylight", "Shadow", "Color Temperature"),
+            "capturetarget": ("Internal RAM", "Memory card"), "drivemode": ("Single", "Continuous low speed"),
+        },
+        CANON_EOS, {"autoexposuremode": "Manual", "batterylevel": "50%"},
+    ),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("body", LISTED, ids=lambda body: body.model)
+def test_a_body_that_was_listed_is_driven_by_its_profile(body: Listed) -> None:
+    profile = profile_for(body.manufacturer, body.model, "", "here")
+    assert profile is body.profile
+    offered = body.offered
+    numbers = ((profile.f_number, 8.0), (profile.shutter, 1 / 15), (profile.iso, 100.0))
+    for widget, wanted in ((w, n) for w, n in numbers if w.name in offered):
+        assert choose_number(widget, wanted, offered[widget.name], "here") in ("8", "f/8", "1/15", "100")
+    if profile.quality.name in offered:
+        for wanted in ("JPEG", "RAW", "RAW+JPEG"):
+            assert quality_of(choose_word(profile.quality, wanted, offered[profile.quality.name], "here")) == wanted
+    fixed = ((profile.white_balance.name, profile.fixed_white_balance), *profile.fixed)
+    for name, word in (*fixed, (profile.target.name, next(iter(profile.targets.values())))):
+        assert word in offered.get(name, (word,))
+    assert body.now[profile.program.name] == profile.manual_program
+    assert battery_fraction(body.now["batterylevel"]) in (0.5, 0.6, 1.0)
+    if profile.focus.name in offered:
+        assert {profile.focus.ours(word) for word in offered[profile.focus.name]} == {"Manual", "Automatic"}
+
+
+def words_of(profile: Profile) -> set[str]:
+    """Names and words of a profile that libgphoto2 has as texts; numbers and hexadecimal names it makes itself."""
+    widgets = (
+        profile.f_number, profile.shutter, profile.iso, profile.focus, profile.quality, profile.white_balance,
+        profile.program, profile.target,
+    )  # fmt: skip
+    parts = {widget.name for widget in widgets} | {
+        profile.serial,
+        profile.manual_program,
+        profile.fixed_white_balance,
+    }
+    parts |= {*profile.floating_white_balance, *profile.targets.values()}
+    parts |= {text for pair in profile.fixed for text in pair}
+    for best in (words[0] for widget in widgets for words in widget.words.values()):
+        parts |= set(best.split(" + "))
+    return {part for part in parts if not re.fullmatch(r"d[0-9a-f]{3}|\d+", part)}
+
+
+@pytest.mark.parametrize("profile", PROFILES, ids=lambda profile: profile.name)
+def test_the_names_and_words_are_those_of_the_installed_library(profile: Profile) -> None:
+    spec = find_spec("gphoto2")
+    assert spec is not None
+    assert spec.origin is not None
+    (library,) = Path(spec.origin).parent.rglob("ptp2.so")
+    texts = library.read_bytes()
+    assert len(words_of(profile)) > 10
+    assert not [word for word in sorted(words_of(profile)) if b"\0" + word.encode() + b"\0" not in texts]
+
+
+@pytest.mark.parametrize(
+    ("manufacturer", "model", "profile"),
+    [
+        ("Sony Corporation", "ILCE-7RM5", SONY_ILCE),
+        ("Canon.Inc", "Canon EOS R5", CANON_EOS),
+        ("Canon Inc.", "Canon EOS 5D Mark IV", CANON_EOS),
+        ("Nikon Corporation", "Z6_3", NIKON_Z),
+        ("Nikon Corporation", "NIKON Z 8", NIKON_Z),
+    ],
+)
+def test_the_profile_is_chosen_by_the_body_s_names(manufacturer: str, model: str, profile: Profile) -> None:
+    assert profile_for(manufacturer, model, "", "here") is profile
+
+
+@pytest.mark.parametrize(
+    ("manufacturer", "model"),
+    [("Nikon Corporation", "D850"), ("Canon.Inc", "Canon PowerShot G7 X"), ("Sony Corporation", "DSC-RX100M7")],
+)
+def test_other_bodies_of_these_makers_have_no_profile(manufacturer: str, model: str) -> None:
+    with pytest.raises(DeviceRefusedError, match=re.escape(model)):
+        profile_for(manufacturer, model, "", "here")
