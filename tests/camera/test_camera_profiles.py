@@ -19,7 +19,7 @@ from drivers.gphoto.profiles.sony_ilce import SONY_ILCE
 
 @dataclass(frozen=True)
 class Listed:
-    """What a body offered, according to the listing of its settings in libgphoto2's sources (camlibs/ptp2/cameras)."""
+    """What a body offered, by the listing of its settings in libgphoto2's sources (camlibs/ptp2/cameras)."""
 
     manufacturer: str
     model: str
@@ -38,6 +38,7 @@ _NIKON_QUALITY = (
     "NEF+Basic",
     "NEF+Fine",
 )
+_PLACES = ("Internal RAM", "Memory card")
 _STOPS = ("f/5.6", "f/8", "f/11", "f/16")
 LISTED = (
     Listed(
@@ -46,13 +47,13 @@ LISTED = (
             "f-number": _STOPS, "iso": ("50", "64", "80", "100", "200", "400"), "imagequality": _NIKON_QUALITY,
             "shutterspeed2": ("1/20", "1/15", "1/13", "1/3", "10/25", "Bulb", "Time"),
             "whitebalance": _NIKON_WHITE, "focusmode": ("Manual", "AF-S", "AF-C"), "isoauto": ("On", "Off"),
-            "capturetarget": ("Internal RAM", "Memory card"), "capturemode": ("Single Shot", "Burst", "Timer"),
+            "capturetarget": _PLACES, "capturemode": ("Single Shot", "Burst", "Timer"),
         },
         NIKON_Z, {"expprogram": "M", "batterylevel": "100%"},
     ),
     Listed(
         "Nikon Corporation", "Z 9",
-        {"whitebalance": _NIKON_WHITE, "capturetarget": ("Internal RAM", "Memory card"), "imagequality": _NIKON_QUALITY},
+        {"whitebalance": _NIKON_WHITE, "capturetarget": _PLACES, "imagequality": _NIKON_QUALITY},
         NIKON_Z, {"expprogram": "M", "batterylevel": "60%"},
     ),
     Listed(
@@ -63,10 +64,11 @@ LISTED = (
     Listed(
         "Canon.Inc", "Canon EOS R5",
         {
-            "aperture": ("5.6", "8", "11", "16"), "shutterspeed": ("1/20", "1/15", "1/13"), "iso": ("Auto", "100", "200"),
-            "imageformat": ("Large Fine JPEG", "Large Normal JPEG", "RAW + Large Fine JPEG", "cRAW + Smaller JPEG", "RAW"),
+            "aperture": ("5.6", "8", "11", "16"), "shutterspeed": ("1/20", "1/15", "1/13"),
+            "iso": ("Auto", "100", "200"),
+            "imageformat": ("Large Fine JPEG", "Large Normal JPEG", "RAW + Large Fine JPEG", "RAW"),
             "whitebalance": ("Auto", "AWB White", "Daylight", "Shadow", "Color Temperature"),
-            "capturetarget": ("Internal RAM", "Memory card"), "drivemode": ("Single", "Continuous low speed"),
+            "capturetarget": _PLACES, "drivemode": ("Single", "Continuous low speed"),
         },
         CANON_EOS, {"autoexposuremode": "Manual", "batterylevel": "50%"},
     ),
@@ -119,7 +121,8 @@ def test_the_names_and_words_are_those_of_the_installed_library(profile: Profile
     (library,) = Path(spec.origin).parent.rglob("ptp2.so")
     texts = library.read_bytes()
     assert len(words_of(profile)) > 10
-    assert not [word for word in sorted(words_of(profile)) if b"\0" + word.encode() + b"\0" not in texts]
+    # A text may be the end of a longer one, which the linker joined with it.
+    assert not [word for word in sorted(words_of(profile)) if word.encode() + b"\0" not in texts]
 
 
 @pytest.mark.parametrize(
