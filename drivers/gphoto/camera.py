@@ -49,8 +49,8 @@ class GphotoConfig(DriverConfig):
     port: str = ""  # as libgphoto2 names it; usb: is the only camera on USB
     model: str = ""  # part of the model name, to choose among several cameras on USB
     profile: str = ""  # sony_ilce, canon_eos or nikon_z; empty: chosen by the body's name
-    # What the camera keeps the image on until it is fetched; empty: what the profile prefers.
-    capture_target: Literal["", "computer", "card", "both"] = ""
+    # What the camera keeps the image on until it is fetched; without it, what the profile prefers.
+    capture_target: Literal["computer", "card", "both"] | None = None
     white_balance: str = ""  # in the camera's words; empty: as it is set, or daylight if it is automatic
     capture_timeout_s: float = 40.0  # from the release to the file
 

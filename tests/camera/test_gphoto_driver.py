@@ -5,10 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import signal
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -23,38 +22,14 @@ from drivers.errors import (
     StaleImageError,
     UnreadableFileError,
 )
-from drivers.gphoto import DRIVER, GphotoConfig
 from drivers.gphoto.link import check_library_version
 from drivers.gphoto.profile import choose_number, choose_word, number_of, quality_of
 from drivers.gphoto.profiles.sony_ilce import SONY_ILCE
-from drivers.host.hosted_device import hosted
 from drivers.interfaces import Camera, CameraSettings
-from tests.support.rig.camera_simulator import RunningCamera, camera_simulator
+from tests.support.rig.camera_simulator import camera_simulator
+from tests.support.rig.gphoto_rig import PAPER, driver, gphoto_rig
 
-PAPER = CameraSettings(aperture_f=22.0, exposure_s=1 / 15, iso=100, focus_mode="Manual", image_quality="JPEG")
-
-
-def driver(port: str, **config: Any) -> Camera:
-    return hosted(
-        Camera,
-        "drivers.gphoto:DRIVER",
-        GphotoConfig(port=port, **config),
-        call_timeout_s=DRIVER.call_timeout_s,
-        name="camera",
-    )
-
-
-@contextmanager
-def rig(
-    faults: list[dict[str, Any]] | None = None, *options: str, **config: Any
-) -> Generator[tuple[Camera, RunningCamera]]:
-    with camera_simulator(faults or [], *options) as simulator:
-        camera = driver(simulator.gphoto_port, **config)
-        try:
-            camera.open()
-            yield camera, simulator
-        finally:
-            camera.close()
+rig = partial(gphoto_rig, "camera")
 
 
 @pytest.fixture(scope="module")

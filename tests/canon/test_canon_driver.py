@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -20,40 +19,16 @@ from drivers.errors import (
     StaleImageError,
     UnreadableFileError,
 )
-from drivers.gphoto import DRIVER, GphotoConfig
-from drivers.host.hosted_device import hosted
 from drivers.interfaces import Camera, CameraSettings
 from simulators.faults import FaultPlan
 from simulators.ptpip import codec
 from simulators.ptpip.reply import NOT_SUPPORTED, Reply
 from simulators.ptpip.server import PtpIpServer
-from tests.support.rig.camera_simulator import RunningCamera, camera_simulator
+from tests.support.rig.camera_simulator import camera_simulator
+from tests.support.rig.gphoto_rig import PAPER, driver, gphoto_rig
 from tests.support.vendor.camera_vendor_session import vendor_session
 
-PAPER = CameraSettings(aperture_f=22.0, exposure_s=1 / 15, iso=100, focus_mode="Manual", image_quality="JPEG")
-
-
-def driver(port: str, **config: Any) -> Camera:
-    return hosted(
-        Camera,
-        "drivers.gphoto:DRIVER",
-        GphotoConfig(port=port, **config),
-        call_timeout_s=DRIVER.call_timeout_s,
-        name="camera",
-    )
-
-
-@contextmanager
-def rig(
-    faults: list[dict[str, Any]] | None = None, *options: str, **config: Any
-) -> Generator[tuple[Camera, RunningCamera]]:
-    with camera_simulator(faults or [], *options, name="canon") as simulator:
-        camera = driver(simulator.gphoto_port, **config)
-        try:
-            camera.open()
-            yield camera, simulator
-        finally:
-            camera.close()
+rig = partial(gphoto_rig, "canon")
 
 
 @pytest.fixture(scope="module")
@@ -124,12 +99,15 @@ def test_large_files_come_in_parts(tmp_path: Path) -> None:
     assert hashlib.sha256(raw.path.read_bytes()).hexdigest() == json.loads(log.read_text())["sha256"]
 
 
-def test_a_setting_refused_in_silence_is_an_error_and_not_what_was_sent() -> None:
-    """The client then answers with what was sent: only the camera's own report, or a new connection, tells."""
+def test_the_client_answers_with_what_was_sent() -> None:
+    """Only the camera's own report, or a new connection, tells what it has: the reason for the next test."""
     with camera_simulator([{"on": "set", "kind": "ignore", "times": 500}], name="canon") as simulator:
         _, echoed = vendor_session(simulator.gphoto_port, ["set", "iso", "100"], ["value", "iso"])
         assert echoed == "100"
         assert vendor_session(simulator.gphoto_port, ["value", "iso"]) == ["400"]
+
+
+def test_a_setting_refused_in_silence_is_an_error_and_not_what_was_sent() -> None:
     with rig([{"on": "set", "kind": "ignore", "nth": 2, "times": 500}]) as (camera, _):
         with pytest.raises(DeviceRefusedError, match="keeps shutterspeed at 1/60 instead of 1/15"):
             camera.apply(PAPER)
@@ -180,9 +158,12 @@ def test_full_card(tmp_path: Path) -> None:
         assert any("free" in problem for problem in camera.report().problems)
 
 
-def test_busy_camera_is_asked_again_but_not_for_ever(tmp_path: Path) -> None:
+def test_busy_camera_is_asked_again(tmp_path: Path) -> None:
     with rig([{"on": "shutter", "kind": "busy", "times": 2}]) as (camera, _):
         assert camera.capture(tmp_path).counter == 1
+
+
+def test_camera_that_stays_busy(tmp_path: Path) -> None:
     with rig([{"on": "shutter", "kind": "busy", "times": 50}]) as (camera, _), pytest.raises(DeviceBusyError):
         camera.capture(tmp_path)
 
