@@ -107,6 +107,12 @@ def test_the_client_answers_with_what_was_sent() -> None:
         assert vendor_session(simulator.gphoto_port, ["value", "iso"]) == ["400"]
 
 
+def test_a_setting_refused_in_silence_once_is_noticed_and_sent_again() -> None:
+    with rig([{"on": "set", "kind": "ignore", "nth": 2}]) as (camera, _):
+        assert camera.apply(PAPER) == PAPER
+
+
+@pytest.mark.slow
 def test_a_setting_refused_in_silence_is_an_error_and_not_what_was_sent() -> None:
     with rig([{"on": "set", "kind": "ignore", "nth": 2, "times": 500}]) as (camera, _):
         with pytest.raises(DeviceRefusedError, match="keeps shutterspeed at 1/60 instead of 1/15"):
