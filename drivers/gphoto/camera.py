@@ -48,7 +48,7 @@ class GphotoConfig(DriverConfig):
 
     port: str = ""  # as libgphoto2 names it; usb: is the only camera on USB
     model: str = ""  # part of the model name, to choose among several cameras on USB
-    profile: str = ""  # sony_ilce, canon_eos or nikon_z; empty: chosen by the body's name
+    profile: str = ""  # such as canon_eos; empty: chosen by the body's name
     # What the camera keeps the image on until it is fetched; without it, what the profile prefers.
     capture_target: Literal["computer", "card", "both"] | None = None
     white_balance: str = ""  # in the camera's words; empty: as it is set, or daylight if it is automatic
@@ -70,6 +70,7 @@ class GphotoCamera:
         self._last: CapturedImage | None = None
         self._hashes: set[str] = set()
         self._clock_offset_s: float | None = None
+        self._profile_name = ""
         self._opened: tuple[Profile, Dials] | None = None
 
     @property
@@ -91,7 +92,7 @@ class GphotoCamera:
         """Connect or reconnect, set the capture target and return the camera's identity."""
         self._link.open()
         maker, model = self._link.value("manufacturer"), self._link.value("cameramodel")
-        profile = profile_for(maker, model, self._config.profile, self._link.where)
+        self._profile_name, profile = profile_for(maker, model, self._config.profile, self._link.where)
         self._opened = profile, Dials(self._link, profile, self._config.white_balance)
         self._dials.set(profile.target.name, self._target_word(profile))
         self._identity = DeviceIdentity(
@@ -109,7 +110,7 @@ class GphotoCamera:
         wanted = self._config.capture_target or next(iter(profile.targets))
         if wanted not in profile.targets:
             raise DeviceRefusedError(
-                f"capture_target {wanted} is not possible with the profile {profile.name}",
+                f"capture_target {wanted} is not possible with the profile {self._profile_name}",
                 where=self._link.where,
                 remedy=f"Possible: {', '.join(profile.targets)}",
             )
@@ -140,7 +141,7 @@ class GphotoCamera:
             clock_offset_s=self._clock_offset_s,
             free_bytes=free,
             battery_fraction=battery,
-            details={"profile": profile.name, **{one.name: self._link.value(one.name) for one in names}},
+            details={"profile": self._profile_name, **{one.name: self._link.value(one.name) for one in names}},
             problems=self._problems(battery, free),
         )
 

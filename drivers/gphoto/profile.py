@@ -39,7 +39,6 @@ class Widget:
 class Profile:
     """The configuration of a family of bodies by libgphoto2's names."""
 
-    name: str  # as in rig.yaml
     bodies: str  # for messages
     manufacturer: str  # how the camera's own name of its maker begins
     model: str  # pattern of the whole model name, as libgphoto2 reports it

@@ -11,13 +11,7 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import (
-    DeviceBusyError,
     DeviceRefusedError,
-    DeviceStorageFullError,
-    DeviceTimeoutError,
-    DeviceUnavailableError,
-    StaleImageError,
-    UnreadableFileError,
 )
 from drivers.interfaces import Camera, CameraSettings
 from simulators.faults import FaultPlan
@@ -58,12 +52,6 @@ def test_a_setting_that_the_camera_lacks_is_refused_with_its_neighbours(camera: 
     with pytest.raises(DeviceRefusedError, match="22") as refused:
         camera.apply(CameraSettings(23.7, 1 / 15, 100))
     assert "aperture 23.7" in refused.value.what
-
-
-def test_live_view(camera: Camera) -> None:
-    frame = camera.preview()
-    assert frame[:2] == b"\xff\xd8"
-    assert frame[-2:] == b"\xff\xd9"
 
 
 def test_files_are_those_on_the_card_and_advance(tmp_path: Path) -> None:
@@ -155,50 +143,6 @@ def test_no_card(tmp_path: Path) -> None:
     """libgphoto2 numbers files from the memory itself: two of one exposure would look like two exposures."""
     with rig([], "--no-card") as (camera, _), pytest.raises(DeviceRefusedError, match="not from its card"):
         camera.capture(tmp_path)
-
-
-def test_full_card(tmp_path: Path) -> None:
-    with rig([{"on": "shutter", "kind": "disk_full"}]) as (camera, _):
-        with pytest.raises(DeviceStorageFullError):
-            camera.capture(tmp_path)
-        assert any("free" in problem for problem in camera.report().problems)
-
-
-def test_busy_camera_is_asked_again(tmp_path: Path) -> None:
-    with rig([{"on": "shutter", "kind": "busy", "times": 2}]) as (camera, _):
-        assert camera.capture(tmp_path).counter == 1
-
-
-def test_camera_that_stays_busy(tmp_path: Path) -> None:
-    with rig([{"on": "shutter", "kind": "busy", "times": 50}]) as (camera, _), pytest.raises(DeviceBusyError):
-        camera.capture(tmp_path)
-
-
-def test_shutter_without_an_image(tmp_path: Path) -> None:
-    with rig([{"on": "image", "kind": "no_image"}], capture_timeout_s=2.0) as (camera, _):
-        with pytest.raises(DeviceTimeoutError, match="none"):
-            camera.capture(tmp_path)
-        assert camera.capture(tmp_path).counter == 2
-
-
-def test_a_damaged_and_a_stale_image(tmp_path: Path) -> None:
-    faults = [{"on": "image", "kind": "truncate", "nth": 2}, {"on": "image", "kind": "stale", "nth": 4}]
-    with rig(faults) as (camera, _):
-        camera.capture(tmp_path)
-        with pytest.raises(UnreadableFileError, match=r"IMG_0002\.JPG"):
-            camera.capture(tmp_path)
-        assert camera.capture(tmp_path).counter == 3
-        with pytest.raises(StaleImageError):
-            camera.capture(tmp_path)
-
-
-def test_link_lost_in_mid_download_then_open_again(tmp_path: Path) -> None:
-    with rig([{"on": "get_object", "kind": "drop", "nth": 2}]) as (camera, _):
-        camera.capture(tmp_path)
-        with pytest.raises(DeviceUnavailableError):
-            camera.capture(tmp_path)
-        camera.open()
-        assert camera.capture(tmp_path).counter == 3
 
 
 class UnknownBody:

@@ -6,8 +6,7 @@ from types import MappingProxyType
 
 from drivers.gphoto.profile import Profile, Widget
 
-CANON_EOS = Profile(
-    name="canon_eos",
+PROFILE = Profile(
     bodies="Canon EOS",
     manufacturer="Canon",
     model=r"Canon EOS .+",

@@ -6,8 +6,7 @@ from types import MappingProxyType
 
 from drivers.gphoto.profile import Profile, Widget
 
-NIKON_Z = Profile(
-    name="nikon_z",
+PROFILE = Profile(
     bodies="Nikon Z",
     manufacturer="Nikon",
     model=r"(NIKON )?Z ?\w+",  # "Z 9", "Z 6_2", "Z f", "Z6_3"

@@ -6,8 +6,7 @@ from types import MappingProxyType
 
 from drivers.gphoto.profile import Profile, Widget
 
-SONY_ILCE = Profile(
-    name="sony_ilce",
+PROFILE = Profile(
     bodies="Sony ILCE",
     manufacturer="Sony",
     model=r"ILCE-.+",
