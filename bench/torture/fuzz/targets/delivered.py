@@ -27,12 +27,11 @@ from simulators.ct_suite.suite import write_series
 from simulators.ct_suite.volume import Grid
 from simulators.faults import FaultPlan
 from simulators.scan_station.formats import encode
-from simulators.sony_camera.exif import Shot, encode_jpeg, encode_raw
-from simulators.sony_camera.properties import ExposureSettings
+from simulators.sony_camera.exif import PLATE
+from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg, encode_raw
 
 SLICES, ROWS = 3, 6
-_SETTINGS = ExposureSettings(22.0, 1 / 50, (1, 50), 100, manual_focus=True, file_format=2, jpeg_quality=2,
-                             capture_target=1)  # fmt: skip
+_SETTINGS = ExposureSettings(22.0, 1 / 50, (1, 50), 100)
 
 
 def _put(folder: Path, name: str, data: bytes) -> Path:
@@ -46,7 +45,7 @@ def _put(folder: Path, name: str, data: bytes) -> Path:
 
 def _shot() -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.uint8]], Shot]:
     picture = np.random.default_rng(5).integers(0, 255, (32, 48, 3), dtype=np.uint8)
-    return picture, Shot(_SETTINGS, 7, datetime(2026, 11, 22, 10, 0, 0, 120_000, tzinfo=UTC))
+    return picture, Shot(_SETTINGS, 7, datetime(2026, 11, 22, 10, 0, 0, 120_000, tzinfo=UTC), PLATE)
 
 
 def _jpegs(_: Path) -> list[bytes]:

@@ -26,9 +26,10 @@ from drivers.host.hosted_device import hosted
 from drivers.interfaces import Camera, RobotArm
 from drivers.ur import UrConfig
 from simulators.faults import FaultPlan
-from simulators.sony_camera.body import BodyOptions, CameraBody
-from simulators.sony_camera.scene import StillLife
-from simulators.sony_camera.server import CameraServer
+from simulators.sony_camera.body import SonyBody
+from simulators.sony_camera.server import SonyServer
+from simulators.still_camera.body import BodyOptions
+from simulators.still_camera.scene import StillLife
 from simulators.ur_controller.controller import Controller
 from simulators.ur_controller.kinematics import MODELS
 from simulators.ur_controller.server import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT, Server
@@ -106,7 +107,7 @@ class _CameraRig:
 @cache
 def _camera_rig() -> _CameraRig:
     """The camera rig, made once per process; the driver's process ends with it."""
-    server = CameraServer("127.0.0.1", 0, CameraBody(StillLife(96), FaultPlan(), BodyOptions(fast=True)), FaultPlan())
+    server = SonyServer("127.0.0.1", 0, SonyBody(StillLife(96), FaultPlan(), BodyOptions(fast=True)), FaultPlan())
     server.__enter__()
     spoiler = _Spoiler(("127.0.0.1", 0), server.address)
     config = GphotoConfig(port=f"ptpip:127.0.0.1:{spoiler.port}:{spoiler.port}", capture_timeout_s=3.0)

@@ -27,14 +27,15 @@ from service.core.run.noted import HandWork
 from service.store.events import canonical
 from simulators.faults import FaultPlan
 from simulators.lightbox import Lightbox
+from simulators.ptpip import codec
 from simulators.rig.world_server import World, WorldServer
 from simulators.scene.world import Scene
 from simulators.serve import SimulatorError
-from simulators.sony_camera import codec
-from simulators.sony_camera.body import BodyOptions, CameraBody
+from simulators.sony_camera.body import SonyBody
 from simulators.sony_camera.properties import Code
-from simulators.sony_camera.scene import StillLife
-from simulators.sony_camera.server import CameraServer
+from simulators.sony_camera.server import SonyServer
+from simulators.still_camera.body import BodyOptions
+from simulators.still_camera.scene import StillLife
 from simulators.ur_controller import rtde_codec
 from simulators.ur_controller.controller import Controller
 from simulators.ur_controller.kinematics import MODELS
@@ -163,8 +164,8 @@ def _say(address: tuple[str, int], data: bytes) -> None:
 
 
 def _camera(data: bytes, _: Path) -> None:
-    body = CameraBody(StillLife(48), FaultPlan(), BodyOptions(fast=True))
-    with threads_watched(), CameraServer("127.0.0.1", 0, body, FaultPlan()) as server:
+    body = SonyBody(StillLife(48), FaultPlan(), BodyOptions(fast=True))
+    with threads_watched(), SonyServer("127.0.0.1", 0, body, FaultPlan()) as server:
         _say(server.address, data)
 
 
@@ -351,7 +352,7 @@ TARGETS: tuple[Target, ...] = (
     Target("ur_rtde", f"{_ROBOT}RtdeLink.receive", _robot(RtdeLink), _rtde_streams, **_SIMULATOR),
     Target("ur_dashboard", f"{_ROBOT}LineLink.receive", _robot(LineLink), _dashboard_lines, TEXT, **_SIMULATOR),
     Target("ur_script", f"{_ROBOT}ScriptLink.receive", _robot(ScriptLink), _scripts, TEXT, **_SIMULATOR),
-    Target("ptpip", "simulators.sony_camera.server:CameraServer", _camera, _sessions, **_SIMULATOR),
+    Target("ptpip", "simulators.sony_camera.server:SonyServer", _camera, _sessions, **_SIMULATOR),
     Target("lightbox_requests", "simulators.lightbox:Lightbox.serve_once", _box, _box_requests, TEXT, **_SIMULATOR),
     Target("world_requests", "simulators.rig.world_server:WorldServer", _world, _world_requests, JSON, **_SIMULATOR),
     Target("fault_plan", "simulators.faults:FaultPlan.parse", _fault_plan, _fault_plans, JSON, **_SIMULATOR),

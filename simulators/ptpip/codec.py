@@ -172,8 +172,8 @@ class DeviceInfo:
     events: tuple[int, ...]
     properties: tuple[int, ...]
     image_formats: tuple[int, ...]
-    vendor_extension: int = 0x11
-    vendor_description: str = "Sony PTP Extensions"
+    vendor_extension: int
+    vendor_description: str
 
     def encode(self) -> bytes:
         """Encode the DeviceInfo dataset (PIMA 15740, 5.5.1)."""
@@ -206,6 +206,8 @@ class ObjectInfo:
     height: int
     name: str
     captured: str  # YYYYMMDDThhmmss
+    parent: int = 0  # handle of the folder
+    folder: bool = False
 
     def encode(self) -> bytes:
         """Encode the ObjectInfo dataset (PIMA 15740, 5.3.1)."""
@@ -213,7 +215,7 @@ class ObjectInfo:
             (
                 struct.pack("<IHHI", self.storage, self.format, 0, self.size_bytes),
                 struct.pack("<HIII", 0x3808, 0, 0, 0),
-                struct.pack("<IIIIHII", self.width, self.height, 24, 0, 0, 0, 0),
+                struct.pack("<IIIIHII", self.width, self.height, 24, self.parent, int(self.folder), 0, 0),
                 string(self.name),
                 string(self.captured),
                 string(self.captured),
@@ -229,8 +231,9 @@ class StorageInfo:
     capacity_bytes: int
     free_bytes: int
     free_images: int
+    name: str
 
     def encode(self) -> bytes:
         """Encode the StorageInfo dataset (PIMA 15740, 5.6.1): removable RAM, DCF, read-write."""
         head = struct.pack("<HHHQQI", 4, 3, 0, self.capacity_bytes, self.free_bytes, self.free_images)
-        return head + string("CFexpress Type A") + string("")
+        return head + string(self.name) + string("")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from simulators.hand.effects import hand_in_picture
 from simulators.serve import SimulatorError
-from simulators.sony_camera.properties import ExposureSettings
+from simulators.still_camera.exif import ExposureSettings
 
 Rgb = NDArray[np.uint8]  # (H, W, 3)
 _REFERENCE = (22.0, 1.0 / 15.0, 100.0)  # f-number, seconds and ISO at which a grey card is rendered mid-grey
