@@ -27,6 +27,7 @@ from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import GatesEvaluated, StepNote
 from service.jobs.capture import live_view
 from service.store.store import Store
+from service.worker.calibration.records import arm_correction_record
 from service.worker.job import JobAnswer, JobContext, RecordedContext
 from service.worker.loop import HANDLERS, work
 from service.worker.poses.robot_poses import robot_camera_poses
@@ -121,11 +122,8 @@ def erring_arm(made: Scene) -> tuple[Array, list[dict[str, Any]], dict[str, Any]
         gap = inverse(flange) @ corrected_T_base_flange(joints, flange, correction)
         reported.append({"T_base_flange": (flange @ inverse(gap)).tolist(), "joints_rad": joints.tolist()})
     mounted = {"T_flange_camera": T_flange_camera.tolist()}
-    return (
-        T_base_world,
-        reported,
-        mounted | {"arm_correction": correction.as_json() | mounted | {"stations": [STATION]}},
-    )
+    record = arm_correction_record(correction, T_flange_camera).plain()
+    return T_base_world, reported, mounted | {"arm_correction": record | {"stations": [STATION]}}
 
 
 def test_jobs_go_from_images_to_a_gate_and_a_suggestion(
