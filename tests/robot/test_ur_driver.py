@@ -25,9 +25,9 @@ from drivers.interfaces import Array, Payload, RobotArm, SafetyState, SettleCrit
 from drivers.ur import UrConfig
 from drivers.ur.safety import safety_state
 from service.core.geometry import inverse, rotation_angle_rad, transform
+from tests.support.arms.arm_watch import watched_arm
+from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.processes.waiting import until
-from tests.support.rig.arm_watch import watched_arm
-from tests.support.rig.ur_simulator import address, simulated_ur
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 SPEED_UP = "3"
