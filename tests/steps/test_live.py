@@ -29,10 +29,11 @@ from service.jobs.capture import live_view
 from service.store.store import Store
 from service.worker.calibration.records import arm_correction_record
 from service.worker.job import JobAnswer, JobContext, RecordedContext
-from service.worker.loop import HANDLERS, work
+from service.worker.loop import HANDLERS
 from service.worker.poses.robot_poses import robot_camera_poses
 from tests.support.rig.bench_rig import answer, other_settings
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
+from tests.support.runs.computing_run import compute_jobs
 from tests.support.runs.measuring_rig import CENTRE_M, MEASURED, SPHERES_M, BenchCt, MeasuringRig, hill
 from tests.support.scenes.sphere_images import (
     RADIUS_M,
@@ -273,7 +274,7 @@ def measured_run(
         job = bench.store.claim_job("test", 30, kinds=list(known))
         if job is not None:
             bench.store.finish_job(job, measures={}, duration_s=0.1, result=known[job.kind])
-        work(bench.store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _total: None)
+        compute_jobs(bench.store)
 
     monkeypatch.setitem(HANDLERS, "live_view", look)
     monkeypatch.setattr("service.worker.capture.live_view.find_spheres", exactly)
