@@ -13,7 +13,6 @@ from enum import IntEnum
 
 from drivers.kuka.fri.protobuf import ProtobufError, doubles, fields, message_field, number_field
 
-LONGEST_MESSAGE = 1500
 JOINTS = 7
 _MONITORING, _REPLY = 0x245142, 0x34001  # identifiers of the messages of an LBR
 _FRAME = struct.Struct("<I")
