@@ -23,7 +23,7 @@ class FriError(ValueError):
 
 
 class Session(IntEnum):
-    """State of the session. Only in the last two could a client command; this one does not then answer."""
+    """State of the session. A client could command only in the last two; this one does not answer in them."""
 
     IDLE = 0
     MONITORING_WAIT = 1

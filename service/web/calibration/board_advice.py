@@ -58,7 +58,7 @@ _KEPT = TypeAdapter(tuple[PoseAdvice, ...])
 
 
 def empty_regions(corners: Sequence[Sequence[int]]) -> list[tuple[str, int, int]]:
-    """Ninths of the image that have cells without corners: name, empty cells, all its cells; worst first."""
+    """The ninths of the image in which cells hold no corner, worst first: name, such cells, all cells."""
     grid = np.array(corners)
     out: list[tuple[str, int, int]] = []
     for r, rows in enumerate(np.array_split(np.arange(grid.shape[0]), 3)):
