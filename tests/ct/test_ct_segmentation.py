@@ -25,11 +25,11 @@ from service.store.verification.verify import verify
 from simulators.ct_suite.suite import write_series
 from simulators.ct_suite.volume import Grid
 from simulators.faults import FaultPlan
+from tests.support.ct.ct_labels import write_nifti
+from tests.support.ct.fused_scene import CENTRES_M, RADIUS_M, T_WORLD_CT
 from tests.support.rig.bench_rig import BenchRig
 from tests.support.runs.bench_run import Bench, say
 from tests.support.runs.computing_run import begin_computing_run
-from tests.support.scenes.ct_labels import write_nifti
-from tests.support.scenes.fused_scene import CENTRES_M, RADIUS_M, T_WORLD_CT
 
 pytestmark = pytest.mark.slow
 VOXEL_M = 0.8e-3

@@ -18,8 +18,8 @@ from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.summary import summarise
 from service.steps import params_models
 from service.store.store import Store
+from tests.support.ct.fused_scene import CENTRES_M, scan_mesh, with_spheres
 from tests.support.runs.computing_run import OneScanner, begin_computing_run
-from tests.support.scenes.fused_scene import CENTRES_M, scan_mesh, with_spheres
 from tests.support.scenes.posed import posed_data_set
 
 PROTOCOL = """\

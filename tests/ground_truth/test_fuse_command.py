@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 from service.cli.main import app
 from service.core.geometry import Array, apply, inverse
-from tests.support.scenes.fused_scene import (
+from tests.support.ct.fused_scene import (
     BIAS_M,
     CENTRES_M,
     HALF_M,

@@ -20,7 +20,7 @@ from service.compute.ground_truth.fusion.regions import Box, Correction, Prism, 
 from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, transform
-from tests.support.scenes.fused_scene import BIAS_M, HALF_M, WOUND_M, ct_mesh, height, scan_mesh
+from tests.support.ct.fused_scene import BIAS_M, HALF_M, WOUND_M, ct_mesh, height, scan_mesh
 
 UP = np.array([0.0, 0.0, 1.0])
 CT_NOISE_M, SCAN_NOISE_M = 4e-5, 5e-5

@@ -29,11 +29,11 @@ from service.steps import params_models
 from service.store.store import Store
 from service.worker.job import JobContext
 from service.worker.loop import HANDLERS
+from tests.support.ct.fused_scene import CENTRES_M, RADIUS_M, T_WORLD_CT, ct_mesh, height, scan_mesh, with_spheres
 from tests.support.recorded.registration_record import registration_record
 from tests.support.rig.bench_rig import BenchRig, ScriptedOperator, answer
 from tests.support.runs.bench_run import Bench
 from tests.support.runs.computing_run import begin_computing_run
-from tests.support.scenes.fused_scene import CENTRES_M, RADIUS_M, T_WORLD_CT, ct_mesh, height, scan_mesh, with_spheres
 
 TAKEN_M = np.array([0.018, 0.012, 0.0360])  # a control sphere on the specimen, which the scan does not show
 PROTOCOL = """\
