@@ -20,8 +20,8 @@ from drivers.errors import (
 )
 from drivers.interfaces import Array, RobotArm, SafetyState, SettleCriteria
 from service.core.geometry import Transform, rotation_angle_rad, transform
+from tests.support.arms.grbl_simulator import CENTRE_M, LIFT, TURN, Tap, fault, mount, opened, table
 from tests.support.processes.waiting import until
-from tests.support.rig.grbl_simulator import CENTRE_M, LIFT, TURN, Tap, fault, mount, opened, table
 
 pytestmark = pytest.mark.slow  # each test homes a machine of its own
 

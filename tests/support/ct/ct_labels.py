@@ -15,7 +15,7 @@ from pydicom.sr.codedict import codes
 from pydicom.uid import generate_uid
 
 from drivers.interfaces import Array
-from tests.support.scenes.ct_series import SHAPE
+from tests.support.ct.ct_series import SHAPE
 
 LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 LABELS: NDArray[np.uint8] = np.random.default_rng(8).integers(0, 3, SHAPE).astype(np.uint8)  # K, J, I

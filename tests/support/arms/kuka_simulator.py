@@ -6,11 +6,11 @@ import contextlib
 import json
 import os
 import socket
-import subprocess
-import sys
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
+
+from tests.support.rig.simulator_process import simulator
 
 #: Starts what answers at the ports of a controller on an address.
 Controller = Callable[[str], contextlib.AbstractContextManager[dict[str, Any]]]
@@ -20,17 +20,8 @@ TRANSCRIPTS = Path(__file__).parents[2] / "data" / "kuka"
 @contextlib.contextmanager
 def simulated_kuka(host: str, *options: str) -> Generator[dict[str, Any]]:
     """Run `python -m simulators kuka`; yields its ready line."""
-    command = [sys.executable, "-m", "simulators", "kuka", "--host", host, "--parent", str(os.getpid()), *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            line = process.stdout.readline()
-            assert line, f"the simulator did not start: {' '.join(command)}"
-            yield json.loads(line)
-        finally:
-            process.terminate()
-            status = process.wait(10)
-    assert status == 0, f"the simulator ended with status {status}"
+    with simulator("kuka", "--host", host, "--parent", str(os.getpid()), *options) as running:
+        yield running.ready
 
 
 def pendant(host: str, order: str) -> None:

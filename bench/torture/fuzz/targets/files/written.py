@@ -15,7 +15,6 @@ from bench.machine import REPOSITORY
 from bench.torture.fuzz.mutations import JSON, TEXT
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
 from service.compute.arm.joint_file import read_joints_csv
-from service.compute.calibration.hand_eye.record import read_arm_correction
 from service.compute.camera_model import CameraModel
 from service.compute.markers.search.paper_files import read_boxes
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json, write_camera_json
@@ -31,9 +30,12 @@ from service.core.protocol.models import parse_protocol
 from service.core.records.import_list import ImportedFile, ImportedView, ImportList
 from service.core.text.json_text import parse_json
 from service.import_folder import import_rig
+from service.jobs.kind import read_part
+from service.jobs.records import Mounting
 from service.rig import load_rig
 from service.station import Station
 from service.steps import params_models
+from service.worker.calibration.records import corrected_mounting
 
 CAMERA = CameraModel(480, 320, 700.0, 700.0, 239.5, 159.5, -0.05, 0.01)
 MODEL_PARTS = ("cameras", "images", "frames", "points3D", "rigs")
@@ -161,7 +163,9 @@ def _hand_eye(data: bytes, folder: Path) -> None:
     _finite(read_hand_eye(path))
     document = parse_json(data, name="hand_eye.json", remedy="")  # as it was parsed
     if isinstance(document.get("arm_correction"), dict):
-        read_arm_correction(document["arm_correction"])
+        correction = read_part(Mounting, document).arm_correction
+        if correction is not None:
+            corrected_mounting(correction)
 
 
 def _box_files(_: Path) -> list[bytes]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
-import subprocess
-import sys
 from collections.abc import Generator
+
+from tests.support.rig.simulator_process import simulator
 
 
 def address(number: int) -> str:
@@ -19,14 +18,5 @@ def address(number: int) -> str:
 @contextlib.contextmanager
 def simulated_ur(host: str, *options: str) -> Generator[dict[str, str]]:
     """Run `python -m simulators ur`; yields its ready line."""
-    command = [sys.executable, "-m", "simulators", "ur", "--host", host, "--parent", str(os.getpid()), *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            line = process.stdout.readline()
-            assert line, f"the simulator did not start: {' '.join(command)}"
-            yield json.loads(line)
-        finally:
-            process.terminate()
-            status = process.wait(10)
-    assert status == 0, f"the simulator ended with status {status}"
+    with simulator("ur", "--host", host, "--parent", str(os.getpid()), *options) as running:
+        yield running.ready

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.torture.fuzz.mutations import BYTES, TEXT
-from bench.torture.fuzz.targets.delivered import ROWS, SLICES, write_slices
+from bench.torture.fuzz.targets.files.delivered import ROWS, SLICES, write_slices
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
 from drivers.dicom_folder import DicomFolder, DicomFolderConfig
 from drivers.dicom_folder.deidentify import deidentify

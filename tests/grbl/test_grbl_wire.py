@@ -11,7 +11,7 @@ import pytest
 import serial
 
 from drivers.grbl.wire import Alarm, Feedback, Ok, Refused, Setting, Status, Welcome, jog, parse
-from tests.support.rig.grbl_simulator import table
+from tests.support.arms.grbl_simulator import table
 
 _SESSION = Path(__file__).parents[1] / "data" / "grbl" / "session.txt"
 

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from bench.torture.fuzz.mutations import BYTES, JSON, TEXT
-from bench.torture.fuzz.targets.peers import threads_watched
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
+from bench.torture.fuzz.targets.wires.peers import threads_watched
 from drivers.lightbox import LightboxConfig, SerialLightbox
 from drivers.ur.link import read_facts
 from service.cli.run.terminal.hands import SimulatedHands

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from bench.torture.fuzz.mutations import BYTES, JSON, TEXT
-from bench.torture.fuzz.targets.peers import Peer, threads_watched
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
+from bench.torture.fuzz.targets.wires.peers import Peer, threads_watched
 from drivers.grbl import GrblAxis, GrblConfig
 from drivers.grbl.table import GrblTable
 from drivers.interfaces import RobotArm, SettleCriteria

@@ -13,7 +13,7 @@ import yaml
 from service.core.geometry import inverse, rotation_angle_rad
 from service.core.records.events import ViewpointCaptured
 from service.store.store import Store
-from tests.support.rig.grbl_simulator import CENTRE_M, TURN, mount, table
+from tests.support.arms.grbl_simulator import CENTRE_M, TURN, mount, table
 from tests.support.rig.rig import orthocapture, simulated_rig
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
