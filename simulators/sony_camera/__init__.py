@@ -33,12 +33,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--send-to", type=Path, metavar="DIR", help="no cable: send every file into this folder")
     parser.add_argument("--battery", type=int, default=87, metavar="PERCENT", help="charge of the battery")
+    parser.add_argument("--camera", default="", metavar="NAME", help="which camera of the world; default: the first")
+    parser.add_argument("--clock-ahead-s", type=float, default=0.0, metavar="S", help="how far its clock is ahead")
     parser.add_argument("--fast", action="store_true", help="exposures take no time")
 
 
 def _source(args: argparse.Namespace) -> ImageSource:
     if args.world:
-        return WorldSource(args.world, args.image_width or DEFAULT_WIDTH)
+        return WorldSource(args.world, args.image_width or DEFAULT_WIDTH, camera=args.camera)
     if args.image:
         return PictureFiles(args.image, args.image_width)
     return StillLife(args.image_width or DEFAULT_WIDTH)
@@ -62,7 +64,9 @@ def _attend_button(source: WorldSource, body: CameraBody, stop: threading.Event)
 def serve(args: argparse.Namespace) -> None:
     """Print the ready line and serve until SIGTERM."""
     termination = Termination()
-    options = BodyOptions(args.fast, args.first_counter, args.exposures_log, args.announce, args.send_to)
+    options = BodyOptions(
+        args.fast, args.first_counter, args.exposures_log, args.announce, args.send_to, args.clock_ahead_s
+    )
     source, stop = _source(args), threading.Event()
     body = CameraBody(source, args.faults, options)
     body.properties.put(Code.BATTERY, args.battery)

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import cv2
@@ -76,6 +76,7 @@ class BodyOptions:
     exposures_log: Path | None = None
     announce: str = "both"  # event, property or both: how the client learns of a new file
     send_to: Path | None = None  # wireless transfer: files are written into this folder instead of being downloaded
+    clock_ahead_s: float = 0.0  # of this machine's
 
 
 class CameraBody:
@@ -152,7 +153,7 @@ class CameraBody:
         started = time.monotonic()
         try:
             moment = self._source.freeze(counter)
-            taken = datetime.now().astimezone()
+            taken = datetime.now().astimezone() + timedelta(seconds=self.options.clock_ahead_s)
             files = self._develop(moment, settings, Shot(settings, counter, taken), fault)
             if not self.options.fast:
                 time.sleep(max(0.0, settings.exposure_s + HANDLING_S - (time.monotonic() - started)))
