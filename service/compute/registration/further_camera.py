@@ -104,9 +104,12 @@ def sighted_pose(
 def fixed_pose(views: Mapping[str, SightedPose]) -> FurtherPose:
     """T_scan_camera of a camera that stood still.
 
+    It saw each sphere at the same pixels in every image. What the outlines err there is the same in each, so many
+    images are no more certain than one; they show whether the camera was moved.
+
     Raises ComputeError: there is no view, or fewer than half agree.
     """
-    return _joined({name: (v.T_scan_camera, v.noise, v.common) for name, v in views.items()})
+    return _joined({name: (v.T_scan_camera, v.noise, v.noise + v.common) for name, v in views.items()})
 
 
 def rigid_pose(views: Mapping[str, SightedPose], first: Mapping[str, OuterFrame]) -> FurtherPose:
