@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from service.jobs.kind import JobKind, JobRecord
-from service.jobs.records import Camera, Hash, ImageFile, Matrix, Point
+from service.jobs.records import Camera, Hash, ImageFile, Matrix, ParameterCovariance, Point
 
 
 class FirstCamera(JobRecord):
@@ -16,11 +16,17 @@ class FirstCamera(JobRecord):
     Attributes:
         T_world_scan: with its covariance (6, 6).
         T_scan_camera: by viewpoint.
+        camera: its intrinsics.
+        outlines: file with the outlines in its images.
+        intrinsics_covariance: None: not known.
     """
 
     T_world_scan: Matrix
     covariance: Matrix
     T_scan_camera: dict[str, Matrix]
+    camera: Camera
+    outlines: Hash
+    intrinsics_covariance: ParameterCovariance | None = None
 
 
 class Arguments(JobRecord):

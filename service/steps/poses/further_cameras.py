@@ -10,11 +10,13 @@ from service.core.records.events import FurtherExposure, ViewpointCaptured
 from service.core.run.state import JobState
 from service.jobs.records import ImageFile
 from service.jobs.registration import further_camera
-from service.jobs.registration.further_camera import FirstCamera
 from service.steps.context import JobRequest, JobResult, StepContext
 from service.steps.poses.sources import most_preferred
 
 _SHARED = ("spheres_m", "sphere_covariance_m2", "radius_m", "colour")  # arguments of the search for outlines
+
+_OF_REGISTRATION = ("T_world_scan", "covariance", "T_scan_camera", "camera", "outlines")  # parts of its answer
+_OF_LENS = ("intrinsics_covariance",)
 
 
 def locate_further_cameras(
@@ -65,6 +67,6 @@ def _request(
     }
     if last.mounted == "rigid":
         job = registered[most_preferred(registered)]
-        fields = FirstCamera.model_fields
-        arguments["first"] = {name: Reference(job.job, f"result/{name}").record() for name in fields}
+        first = {name: Reference(job.job, f"result/{name}").record() for name in _OF_REGISTRATION}
+        arguments["first"] = first | {name: recorded[name] for name in _OF_LENS if name in recorded}
     return JobRequest(further_camera.KIND.name, arguments, version=further_camera.KIND.version)
