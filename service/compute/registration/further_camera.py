@@ -107,7 +107,7 @@ def fixed_pose(views: Mapping[str, SightedPose]) -> FurtherPose:
     It saw each sphere at the same pixels in every image. What the outlines err there is the same in each, so many
     images are no more certain than one; they show whether the camera was moved.
 
-    Raises ComputeError: there is no view, or fewer than half agree.
+    Raises ComputeError: there is no view.
     """
     return _joined({name: (v.T_scan_camera, v.noise, v.noise + v.common) for name, v in views.items()})
 
@@ -117,7 +117,7 @@ def rigid_pose(views: Mapping[str, SightedPose], first: Mapping[str, OuterFrame]
 
     What both cameras' poses have in common by the spheres is counted twice, which states more than there is.
 
-    Raises ComputeError: there is no such view, or fewer than half agree.
+    Raises ComputeError: there is no such view.
     """
     nothing = np.zeros((6, 6))
     found: dict[str, tuple[Transform, Array, Array]] = {}

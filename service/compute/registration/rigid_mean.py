@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.compute.descent import gauss_newton
-from service.core.errors import ComputeError, DataError
+from service.core.errors import DataError
 from service.core.geometry import Array, Transform, increment
 
 _OUTLIER_CHI2 = 22.46  # of six degrees of freedom: exceeded by chance once in a thousand
@@ -52,7 +52,8 @@ def rigid_mean(poses: Array, covariances: Array) -> RigidMean:
 
     It minimises the sum of squared Mahalanobis distances of the poses that agree; the others are excluded. A distance
     is judged against the stated covariances times a common factor, the median distance over its expectation, if that
-    is above 1: so the poses may scatter more than stated, as long as few stand out.
+    is above 1: so the poses may scatter more than stated, as long as few stand out. If all contradict one another,
+    none is excluded, and `covariance`, `chi2_reduced` and `rms_m` show it.
 
     Args:
         poses: (N, 4, 4) measurements of T.
@@ -60,27 +61,23 @@ def rigid_mean(poses: Array, covariances: Array) -> RigidMean:
 
     Raises:
         DataError: the shapes do not agree, or there is no pose.
-        ComputeError: fewer than half of the poses agree.
     """
     n = len(poses)
     if n == 0 or poses.shape != (n, 4, 4) or covariances.shape != (n, 6, 6):
         raise DataError(f"{poses.shape} poses and {covariances.shape} covariances")
     weights = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
     mean, kept = poses[_middle(poses, weights)], np.ones(n, dtype=np.bool_)
+    for _ in range(_ROUNDS):  # the nearer a pose, the more it counts, so that the start does not decide
+        chi2 = _chi2(_deviations(poses, mean), weights)
+        nearness = 1.0 / (1.0 + chi2 / (6 * _scatter(chi2)))
+        mean = _mean(poses, weights * nearness[:, None, None], mean)
     for _ in range(_ROUNDS):
         chi2 = _chi2(_deviations(poses, mean), weights)
         agree = chi2 <= _OUTLIER_CHI2 * _scatter(chi2)
-        if not agree.any():
-            break
         mean = _mean(poses[agree], weights[agree], mean)
         if np.array_equal(agree, kept):
             break
         kept = agree
-    if 2 * kept.sum() < n or not kept.any():
-        raise ComputeError(
-            f"{int(kept.sum())} of {n} views agree on one pose",
-            remedy="Check that the camera was fixed, and its calibration",
-        )
     deviations = _deviations(poses, mean)
     chi2 = _chi2(deviations[kept], weights[kept])
     count = int(kept.sum())
