@@ -10,7 +10,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import cv2
@@ -58,6 +58,7 @@ class BodyOptions:
     exposures_log: Path | None = None
     announce: str = "both"  # event, property or both: how the client learns of a new file
     send_to: Path | None = None  # wireless transfer: files are written into this folder instead of being downloaded
+    clock_ahead_s: float = 0.0  # of this machine's
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +137,7 @@ class CameraBody(ABC):
         started = time.monotonic()
         try:
             moment = self.source.freeze(counter)
-            taken = datetime.now().astimezone()
+            taken = datetime.now().astimezone() + timedelta(seconds=self.options.clock_ahead_s)
             files = self._develop(moment, settings, Shot(settings, counter, taken, self._plate), fault)
             if not self.options.fast:
                 time.sleep(max(0.0, settings.exposure_s + HANDLING_S - (time.monotonic() - started)))
