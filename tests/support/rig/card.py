@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from simulators.sony_camera.exif import Shot, encode_jpeg, encode_raw
-from simulators.sony_camera.properties import ExposureSettings
+from simulators.sony_camera.exif import PLATE
+from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg, encode_raw
 
 BEGAN = datetime(2026, 11, 21, 10, 0, tzinfo=UTC)
 _COPY = """\
@@ -30,11 +30,10 @@ with open(target, "wb") as stream:
 
 def photograph(number: int, taken: datetime, *, iso: int = 100, raw: bool = False) -> bytes:
     """A small image file, different for each number."""
-    settings = ExposureSettings(22.0, 1 / 50, (1, 50), iso, manual_focus=True, file_format=2, jpeg_quality=2,
-                                capture_target=16)  # fmt: skip
+    settings = ExposureSettings(22.0, 1 / 50, (1, 50), iso, on_card=True)
     picture = np.full((64, 96, 3), 40 + number, dtype=np.uint8)
     picture[number % 64] = 255
-    return (encode_raw if raw else encode_jpeg)(picture, Shot(settings, number, taken))
+    return (encode_raw if raw else encode_jpeg)(picture, Shot(settings, number, taken, PLATE))
 
 
 def after(seconds: float) -> datetime:

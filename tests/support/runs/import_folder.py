@@ -17,8 +17,8 @@ from simulators.rendering.render import REFERENCE, Renderer
 from simulators.scan_station.formats import encode
 from simulators.scan_station.station import scan_scene
 from simulators.scene.world import NOMINAL_LUX, SCENE_CENTRE_M, Scene
-from simulators.sony_camera.exif import Shot, encode_jpeg
-from simulators.sony_camera.properties import ExposureSettings
+from simulators.sony_camera.exif import PLATE
+from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg
 
 SEED = 7
 SETTINGS = ExposureSettings(
@@ -26,10 +26,7 @@ SETTINGS = ExposureSettings(
     exposure_s=1 / 15,
     exposure_fraction=(1, 15),
     iso=100,
-    manual_focus=True,
-    file_format=2,
-    jpeg_quality=1,
-    capture_target=1,
+    jpeg_level=1,
 )
 _BEGAN = datetime(2024, 3, 1, 10, 0, 0, tzinfo=UTC)
 
@@ -69,7 +66,7 @@ class Photographer:
             picture = self.renderer.render(view, REFERENCE, self.counter)
             taken = _BEGAN + timedelta(minutes=self.counter)
             name = f"DSC{self.counter:05d}"
-            jpeg = encode_jpeg(picture, Shot(SETTINGS, self.counter, taken))
+            jpeg = encode_jpeg(picture, Shot(SETTINGS, self.counter, taken, PLATE))
             (self.folder / part / f"{name}.JPG").write_bytes(jpeg)
             self.T_world_camera[name] = pose
 
