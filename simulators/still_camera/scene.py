@@ -191,7 +191,7 @@ class WorldSource:
         return self._built
 
     def _view(self) -> dict[str, Any]:
-        answer = self._ask({"op": "view", "camera": self._camera})
+        answer = self._ask({"op": "view", **({"camera": self._camera} if self._camera else {})})
         if "T_world_camera" not in answer:
             raise SimulatorError(f"the world refused a view: {answer.get('error', answer)}")
         return answer

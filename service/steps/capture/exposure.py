@@ -16,7 +16,7 @@ from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, 
 from drivers.stillness import PoseSpread, pose_spread
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, Transform
-from service.core.records.events import ArtefactRef, Matrix4, ViewpointCaptured
+from service.core.records.events import ArtefactRef, FurtherExposure, Matrix4, ViewpointCaptured
 from service.steps.capture.further_cameras import FurtherImage, expose_further, files_of, keep_further
 from service.steps.capture.motion import settle_criteria
 from service.steps.capture.plan.viewpoints import Viewpoint
@@ -130,12 +130,25 @@ def record_shot(context: StepContext, shot: Shot) -> None:
             )
             for file in image.files
         ]
-        further = tuple(keep_further(context, one, camera_record) for one in shot.further)
+        further = tuple(_further_exposure(context, one) for one in shot.further)
     refs.append(_pose_log(context, viewpoint, shot.window))
     rows = [_row(context, shot, ref, "robot" if ref.kind == "pose_log" else "camera") for ref in refs]
     rows += [_row(context, shot, ref, one.device) for one in further for ref in files_of(context, one)]
     captured = _captured(context, shot, refs).model_copy(update={"further": further})
     context.evidence.record(captured, artefacts=tuple(rows))
+
+
+def _further_exposure(context: StepContext, further: FurtherImage) -> FurtherExposure:
+    files, calibration = keep_further(context, further)
+    return FurtherExposure(
+        device=further.taken_by.name,
+        mounted=further.taken_by.section.mounted,
+        artefacts=files,
+        calibration=calibration,
+        camera=camera_record(further.image),
+        trigger_monotonic_s=further.image.trigger_monotonic_s,
+        arrival_monotonic_s=further.image.arrival_monotonic_s,
+    )
 
 
 def _row(context: StepContext, shot: Shot, ref: ArtefactRef, device: str) -> NewArtefact:

@@ -67,34 +67,25 @@ def expose_further(
     return tuple(images)
 
 
-def keep_further(
-    context: StepContext, further: FurtherImage, camera_record: Callable[[CapturedImage], dict[str, object]]
-) -> FurtherExposure:
-    """Put the files of a further camera's image into the store, and with them its calibration."""
-    image, taken_by = further.image, further.taken_by
+def keep_further(context: StepContext, further: FurtherImage) -> tuple[tuple[ArtefactRef, ...], ArtefactRef]:
+    """Put the files of a further camera's image into the store, and its calibration; returns both."""
+    taken_by = further.taken_by
+    images = tuple(
+        context.evidence.put_file(
+            file.path,
+            kind=IMAGE_KIND if file.media_type == "image/jpeg" else "raw",
+            media_type=file.media_type,
+            original_name=file.camera_name,
+        )
+        for file in further.image.files
+    )
     calibration = context.evidence.put_file(
         taken_by.calibration,
         kind=CALIBRATION_KIND,
         media_type="application/json",
         original_name=taken_by.calibration.name,
     )
-    return FurtherExposure(
-        device=taken_by.name,
-        mounted=taken_by.section.mounted,
-        artefacts=tuple(
-            context.evidence.put_file(
-                file.path,
-                kind=IMAGE_KIND if file.media_type == "image/jpeg" else "raw",
-                media_type=file.media_type,
-                original_name=file.camera_name,
-            )
-            for file in image.files
-        ),
-        calibration=calibration,
-        camera=camera_record(image),
-        trigger_monotonic_s=image.trigger_monotonic_s,
-        arrival_monotonic_s=image.arrival_monotonic_s,
-    )
+    return images, calibration
 
 
 def files_of(context: StepContext, exposure: FurtherExposure) -> tuple[ArtefactRef, ...]:
