@@ -17,8 +17,9 @@ import cv2
 
 from simulators.faults import Fault, FaultPlan
 from simulators.rendering.picture_faults import Lens
+from simulators.rendering.sensor import camera_picture, read_out
 from simulators.serve import SimulatorError
-from simulators.sony_camera.exif import Shot, encode_jpeg, encode_raw
+from simulators.sony_camera.exif import Shot, encode_jpeg
 from simulators.sony_camera.properties import (
     FILE_JPEG,
     FILE_RAW,
@@ -30,6 +31,7 @@ from simulators.sony_camera.properties import (
     PropertyTable,
     shutter_code,
 )
+from simulators.sony_camera.raw_file import encode_raw
 from simulators.sony_camera.scene import ImageSource, Moment
 
 FORMAT_JPEG, FORMAT_ARW = 0x3801, 0xB101
@@ -166,7 +168,13 @@ class CameraBody:
     def _develop(
         self, moment: Moment, settings: ExposureSettings, shot: Shot, fault: Fault | None
     ) -> list[CameraFile]:
-        picture = self._lens.picture(self._source.develop(moment, settings), fault, moment.view)
+        mosaic = None
+        if settings.file_format == FILE_JPEG:
+            picture = self._lens.picture(self._source.develop(moment, settings), fault, moment.view)
+        else:  # both files are of one exposure of the sensor
+            light = self._lens.picture(self._source.light(moment, settings), fault, moment.view)
+            mosaic = read_out(light, settings.iso, moment.counter)
+            picture = camera_picture(mosaic)
         if fault is not None and fault.kind == "wrong_exif":  # somebody turned a dial at the last moment
             shot = replace(shot, settings=replace(settings, iso=2 * settings.iso))
         captured = f"{shot.taken:%Y%m%dT%H%M%S}"
@@ -176,8 +184,8 @@ class CameraBody:
         if settings.file_format != FILE_RAW and not (fault is not None and fault.kind == "raw_only"):
             jpeg = encode_jpeg(picture, shot)
             files.append(CameraFile(f"{stem}.JPG", FORMAT_JPEG, jpeg, width, height, captured))
-        if settings.file_format != FILE_JPEG:
-            raw = encode_raw(picture, shot)
+        if mosaic is not None:
+            raw = encode_raw(mosaic, shot)
             files.append(CameraFile(f"{stem}.ARW", FORMAT_ARW, raw, width, height, captured))
         return files
 

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from simulators.sony_camera.exif import Shot, encode_jpeg, encode_raw
+from simulators.rendering.sensor import bordered, read_out
+from simulators.sony_camera.exif import Shot, encode_jpeg
 from simulators.sony_camera.properties import ExposureSettings
+from simulators.sony_camera.raw_file import encode_raw
 
 BEGAN = datetime(2026, 11, 21, 10, 0, tzinfo=UTC)
 _COPY = """\
@@ -34,7 +36,8 @@ def photograph(number: int, taken: datetime, *, iso: int = 100, raw: bool = Fals
                                 capture_target=16)  # fmt: skip
     picture = np.full((64, 96, 3), 40 + number, dtype=np.uint8)
     picture[number % 64] = 255
-    return (encode_raw if raw else encode_jpeg)(picture, Shot(settings, number, taken))
+    shot = Shot(settings, number, taken)
+    return encode_raw(read_out(bordered(picture), iso, number), shot) if raw else encode_jpeg(picture, shot)
 
 
 def after(seconds: float) -> datetime:
