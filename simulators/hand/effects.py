@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import cv2
 import numpy as np
@@ -28,7 +28,8 @@ def _shaken(picture: P, dx: float, dy: float) -> P:
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1), dtype=np.float32)
     for t in np.linspace(-0.5, 0.5, 8 * reach):
         kernel[round(reach + t * dy), round(reach + t * dx)] += 1
-    return np.asarray(cv2.filter2D(picture, -1, kernel / kernel.sum()), dtype=picture.dtype)
+    smeared = cv2.filter2D(picture, -1, kernel / kernel.sum())
+    return cast("P", smeared.astype(picture.dtype))
 
 
 def _finger(picture: P) -> P:
@@ -38,4 +39,5 @@ def _finger(picture: P) -> P:
     centre, axes = (round(1.02 * width), round(0.6 * height)), (round(0.48 * width), round(0.45 * height))
     cv2.ellipse(mask, centre, axes, 25.0, 0.0, 360.0, 1.0, -1)
     mask = np.asarray(cv2.GaussianBlur(mask, (0, 0), 0.02 * width), dtype=np.float32)[..., None]
-    return np.asarray(picture * (1 - mask) + np.array(_SKIN, dtype=np.float32) * mask, dtype=picture.dtype)
+    touched = picture * (1 - mask) + np.array(_SKIN, dtype=np.float32) * mask
+    return cast("P", touched.astype(picture.dtype))

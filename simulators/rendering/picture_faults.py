@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import cv2
 import numpy as np
@@ -47,7 +47,8 @@ class Lens:
 
 
 def _blurred(picture: P, share: float) -> P:
-    return np.asarray(cv2.GaussianBlur(picture, (0, 0), share * picture.shape[1]), dtype=picture.dtype)
+    blurred = cv2.GaussianBlur(picture, (0, 0), share * picture.shape[1])
+    return cast("P", blurred.astype(picture.dtype))
 
 
 def _covered(picture: P, share: float) -> P:
@@ -57,4 +58,4 @@ def _covered(picture: P, share: float) -> P:
     edge = width * share + 0.02 * width * np.sin(9.0 * y / height)
     folds = 0.8 + 0.2 * np.sin(25.0 * (x + 0.4 * y) / width)
     cloth = folds[..., None] * np.array(_CLOTH, dtype=np.float32)
-    return np.where((x < edge)[..., None], cloth, picture).astype(picture.dtype)
+    return cast("P", np.where((x < edge)[..., None], cloth, picture).astype(picture.dtype))

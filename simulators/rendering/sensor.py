@@ -1,4 +1,4 @@
-"""The sensor behind the lens: photosites under red, green and blue filters, noise and 14 bits; and the camera's picture.
+"""The sensor behind the lens: photosites under coloured filters, noise and 14 bits; and the picture made of them.
 
 The sensor is larger than the picture: the JPEG leaves out a border of photosites, and beyond these lie shielded ones,
 which a raw file has too.
