@@ -23,7 +23,7 @@ Pixels16 = NDArray[np.uint16]
 _P = TypeVar("_P", NDArray[np.uint8], Pixels16)
 INSTALL = 'pip install "orthocapture[raw]"'
 MOST_SHIFT_PX = 0.25  # of the developed picture against the JPEG; half a pixel would be another convention
-_NEAR_PX = 40  # margins that cameras leave out of their JPEGs are not wider
+_MOST_ROOM_PX = 160  # around the JPEG in the exposed area; cameras leave out some tens of pixels
 _TIFF = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE,
          cv2.IMWRITE_TIFF_PREDICTOR, cv2.IMWRITE_TIFF_PREDICTOR_HORIZONTAL]  # fmt: skip
 
@@ -124,14 +124,15 @@ def develop(path: Path, jpeg_bgr: NDArray[np.uint8] | None, parameters: DevelopP
         parameters: fixed for a series of pictures.
 
     Raises:
-        ConfigurationError: rawpy is not installed.
+        ConfigurationError: rawpy is not installed, or it does not know the demosaic algorithm.
         DataError: the file cannot be developed, has no part that matches the JPEG, or the JPEG was corrected for
             distortion by the camera.
     """
     rawpy = _rawpy()
+    options = _options(rawpy, parameters)
     try:
         with rawpy.imread(str(path)) as raw:
-            area = np.ascontiguousarray(raw.postprocess(**_options(rawpy, parameters))[..., ::-1], dtype=np.uint16)
+            area = np.ascontiguousarray(raw.postprocess(**options)[..., ::-1], dtype=np.uint16)
             sizes = raw.sizes
             white_balance = tuple(float(gain) for gain in raw.camera_whitebalance)
             black_level = tuple(int(level) for level in raw.black_level_per_channel)
@@ -207,6 +208,11 @@ def _rawpy() -> Any:
 
 def _options(rawpy: Any, parameters: DevelopParameters) -> dict[str, Any]:
     """The parameters as rawpy takes them; those that it would otherwise choose by the content are set too."""
+    names = [algorithm.name for algorithm in rawpy.DemosaicAlgorithm]
+    if parameters.demosaic not in names:
+        raise ConfigurationError(
+            f"there is no demosaic algorithm {parameters.demosaic}", where="demosaic", remedy=f"Use {', '.join(names)}"
+        )
     return {
         "demosaic_algorithm": rawpy.DemosaicAlgorithm[parameters.demosaic],
         "use_camera_wb": parameters.white_balance == "camera",
@@ -238,7 +244,7 @@ def _matched(
     """The crop whose pixels are the JPEG's, its shift against the JPEG, and the largest shift of a part."""
     height, width = jpeg_bgr.shape[:2]
     room = area.shape[1] - width, area.shape[0] - height
-    if min(room) < 0 or max(room) > 4 * _NEAR_PX:
+    if min(room) < 0 or max(room) > _MOST_ROOM_PX:
         raise DataError(
             f"the raw file has {area.shape[1]} × {area.shape[0]} pixels and the JPEG {width} × {height}: "
             "they are not two pictures of one size",
