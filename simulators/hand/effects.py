@@ -8,10 +8,11 @@ from typing import Any, TypeVar, cast
 import cv2
 import numpy as np
 
-from simulators.geometry import Array32, Bytes
+from simulators.geometry import Bytes
+from simulators.rendering.sensor import Light, colour_on
 
 _SKIN = (205, 150, 125)  # RGB
-P = TypeVar("P", Bytes, Array32)  # both sRGB coded, 255 at saturation
+P = TypeVar("P", Bytes, Light)
 
 
 def hand_in_picture(picture: P, view: Mapping[str, Any]) -> P:
@@ -39,5 +40,5 @@ def _finger(picture: P) -> P:
     centre, axes = (round(1.02 * width), round(0.6 * height)), (round(0.48 * width), round(0.45 * height))
     cv2.ellipse(mask, centre, axes, 25.0, 0.0, 360.0, 1.0, -1)
     mask = np.asarray(cv2.GaussianBlur(mask, (0, 0), 0.02 * width), dtype=np.float32)[..., None]
-    touched = picture * (1 - mask) + np.array(_SKIN, dtype=np.float32) * mask
+    touched = picture * (1 - mask) + colour_on(picture, _SKIN) * mask
     return cast("P", touched.astype(picture.dtype))

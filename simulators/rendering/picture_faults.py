@@ -10,13 +10,14 @@ import cv2
 import numpy as np
 
 from simulators.faults import Fault
-from simulators.geometry import Array32, Bytes
+from simulators.geometry import Bytes
+from simulators.rendering.sensor import Light, colour_on
 
 # Fault kinds of the message `image`: `smear` lasts until somebody cleans the lens; `blur`, `black` and `covered` last
 # one picture. `value` is σ as a fraction of the picture's width (smear, blur), or the fraction of it that is covered.
 _BLUR, _COVERED = 0.004, 0.5
 _CLOTH = (60, 105, 120)  # RGB of a surgical drape
-P = TypeVar("P", Bytes, Array32)  # both sRGB coded, 255 at saturation
+P = TypeVar("P", Bytes, Light)
 
 
 class Lens:
@@ -57,5 +58,5 @@ def _covered(picture: P, share: float) -> P:
     x, y = np.arange(width, dtype=np.float32)[None, :], np.arange(height, dtype=np.float32)[:, None]
     edge = width * share + 0.02 * width * np.sin(9.0 * y / height)
     folds = 0.8 + 0.2 * np.sin(25.0 * (x + 0.4 * y) / width)
-    cloth = folds[..., None] * np.array(_CLOTH, dtype=np.float32)
+    cloth = folds[..., None] * colour_on(picture, _CLOTH)
     return cast("P", np.where((x < edge)[..., None], cloth, picture).astype(picture.dtype))

@@ -11,7 +11,7 @@ import numpy as np
 
 from simulators.geometry import Array, Array32, Bools, Bytes, Ints, inverse
 from simulators.rendering.overlays import Frame, draw_calibration_board, draw_sphere
-from simulators.rendering.sensor import EXPOSED, FULL_WELL_E, READ_NOISE_E, coded
+from simulators.rendering.sensor import EXPOSED, FULL_WELL_E, READ_NOISE_E, Light, light_of
 from simulators.rendering.surfaces import Surfaces
 from simulators.scene.intrinsics import Intrinsics
 from simulators.scene.world import NOMINAL_LUX, RADIUS_M, Moved, Scene
@@ -73,17 +73,14 @@ class Renderer:
         """
         return self._rendered(View.from_json(view, self.image_width), camera_settings, seed)
 
-    def light(self, view: Mapping[str, Any], camera_settings: Mapping[str, float]) -> Array32:
-        """The light on the sensor, without noise: RGB (H, W, 3) of the picture and the border around it.
-
-        Values are sRGB coded, not rounded, 255 at saturation; brighter light has larger ones.
-        """
+    def light(self, view: Mapping[str, Any], camera_settings: Mapping[str, float]) -> Light:
+        """The light on the sensor, without noise: linear RGB (H, W, 3) of the picture and the border around it."""
         seen = View.from_json(view, self.image_width)
         seen = replace(seen, intrinsics=_with_border(seen.intrinsics))
         scale = _electrons(seen, camera_settings) * _amplification(camera_settings)
-        out = np.empty((seen.intrinsics.height, seen.intrinsics.width, 3), dtype=np.float32)
+        out = np.empty((seen.intrinsics.height, seen.intrinsics.width, 3), dtype=np.uint16)
         for first, rows in self._blurred_tiles(seen):
-            out[first : first + len(rows)] = coded(rows * np.float32(scale))
+            out[first : first + len(rows)] = light_of(rows * np.float32(scale))
         return out
 
     def preview(self, view: Mapping[str, Any]) -> Bytes:

@@ -20,6 +20,8 @@ BLACK, WHITE = 512, 16_383  # of 14 bits
 BALANCE = (2.1, 1.0, 1.6)  # gains of red, green and blue that make grey grey: the filters differ
 _BASE_ISO = 100.0
 _TILE_ROWS = 256
+_FULL = 65_535
+Light = NDArray[np.uint16]  # (H, W, 3) RGB, linear
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,43 +38,69 @@ EXPOSED = Border(12, 8, 20, 16)  # photosites that receive light but are not in 
 SHIELDED = Border(32, 16, 0, 0)  # photosites that receive none
 
 
-def bordered(picture: Bytes) -> Array32:
-    """A picture (H, W, 3) with the border of exposed photosites, for which its edge pixels are repeated."""
+def bordered(picture: Bytes) -> Light:
+    """The light of an sRGB picture (H, W, 3) on the sensor; its edge pixels are repeated in the border."""
     b = EXPOSED
     wide = cv2.copyMakeBorder(picture, b.top, b.bottom, b.left, b.right, cv2.BORDER_REPLICATE)
-    return np.asarray(wide, dtype=np.float32)
+    return _LIGHT[np.asarray(wide, dtype=np.uint8)]
 
 
-def read_out(light: Array32, iso: float, seed: int) -> NDArray[np.uint16]:
+def light_of(linear: Array32) -> Light:
+    """Linear light, 1 at saturation, as the sensor's read-out takes it."""
+    return np.clip(linear * np.float32(_FULL) + np.float32(0.5), 0, _FULL).astype(np.uint16)
+
+
+def read_out(light: Light, iso: float, seed: int) -> NDArray[np.uint16]:
     """The sensor's values, RGGB, with the shielded photosites.
 
     Args:
-        light: (H, W, 3) RGB of the exposed photosites, sRGB coded, 255 at saturation.
+        light: (H, W, 3) RGB of the exposed photosites, linear, 65535 at saturation.
         iso: sensitivity; the higher, the fewer electrons make a value.
         seed: of the noise.
     """
     height, width = light.shape[:2]
-    out = np.full((height + SHIELDED.top, width + SHIELDED.left), 0.0, dtype=np.float32)
     rng = np.random.default_rng([seed, 14])
     full_e = FULL_WELL_E * _BASE_ISO / iso
-    for first in range(0, height, _TILE_ROWS):  # a multiple of two rows: the pattern goes on
-        part = _linear(light[first : first + _TILE_ROWS]) * np.float32(full_e)
-        sites = out[SHIELDED.top + first : SHIELDED.top + first + len(part), SHIELDED.left :]
+    values = np.empty((height + SHIELDED.top, width + SHIELDED.left), dtype=np.uint16)
+    for first in range(0, len(values), _TILE_ROWS):  # even, as is the shielded part: the pattern goes on
+        sites = np.zeros((min(_TILE_ROWS, len(values) - first), values.shape[1]), dtype=np.float32)
+        seen = light[max(0, first - SHIELDED.top) : first - SHIELDED.top + len(sites)]
+        exposed = sites[len(sites) - len(seen) :, SHIELDED.left :]
         for (row, column), channel in _sites():
-            sites[row::2, column::2] = part[row::2, column::2, channel] / np.float32(BALANCE[channel])
-    out += rng.standard_normal(out.shape, dtype=np.float32) * np.sqrt(out + np.float32(READ_NOISE_E**2))
-    values = np.float32(BLACK) + out * np.float32((WHITE - BLACK) / full_e)
-    return np.clip(np.rint(values), 0, WHITE).astype(np.uint16)
+            share = np.float32(full_e / _FULL / BALANCE[channel])
+            exposed[row::2, column::2] = seen[row::2, column::2, channel] * share
+        sites += rng.standard_normal(sites.shape, dtype=np.float32) * np.sqrt(sites + np.float32(READ_NOISE_E**2))
+        level = np.float32(BLACK) + sites * np.float32((WHITE - BLACK) / full_e)
+        values[first : first + len(sites)] = np.clip(np.rint(level), 0, WHITE)
+    return values
+
+
+def picture_without_filters(light: Light, iso: float, seed: int) -> Bytes:
+    """The picture (H, W, 3) RGB of a sensor that measures three colours at every pixel: sRGB, without the border."""
+    inner = light[EXPOSED.top : -EXPOSED.bottom, EXPOSED.left : -EXPOSED.right]
+    rng = np.random.default_rng([seed, 8])
+    full_e = FULL_WELL_E * _BASE_ISO / iso
+    out = np.empty(inner.shape, dtype=np.uint8)
+    for first in range(0, len(inner), _TILE_ROWS):
+        part = inner[first : first + _TILE_ROWS] * np.float32(full_e / _FULL)
+        part += rng.standard_normal(part.shape, dtype=np.float32) * np.sqrt(part + np.float32(READ_NOISE_E**2))
+        out[first : first + len(part)] = _CODED[light_of(part / np.float32(full_e))]
+    return out
+
+
+def colour_on(picture: NDArray[np.uint8] | Light, rgb: tuple[int, int, int]) -> Array32:
+    """An sRGB colour in the values of a picture, or of light."""
+    values = np.array(rgb, dtype=np.uint8)
+    return (values if picture.dtype == np.uint8 else _LIGHT[values]).astype(np.float32)
 
 
 def camera_picture(mosaic: NDArray[np.uint16]) -> Bytes:
-    """The picture (H, W, 3) RGB that the camera makes of its sensor's values: colours, sRGB, 8 bits, no border."""
+    """The picture (H, W, 3) RGB that a camera makes of its sensor's values: colours, sRGB, 8 bits, no border."""
     active = mosaic[SHIELDED.top :, SHIELDED.left :].astype(np.float32)
     share = np.maximum(active - BLACK, 0.0) / np.float32(WHITE - BLACK)
     for (row, column), channel in _sites():
         share[row::2, column::2] *= BALANCE[channel]
-    balanced = np.rint(np.clip(share, 0.0, 1.0) * 65535).astype(np.uint16)
-    colour = cv2.demosaicing(balanced, cv2.COLOR_BayerRGGB2RGB_EA)
+    colour = cv2.demosaicing(light_of(share), cv2.COLOR_BayerRGGB2RGB_EA)
     b = EXPOSED
     colour = colour[b.top : -b.bottom, b.left : -b.right]
     return _CODED[np.asarray(colour, dtype=np.uint16)]
@@ -83,16 +111,17 @@ def _sites() -> Iterator[tuple[tuple[int, int], int]]:
     yield from (((0, 0), 0), ((0, 1), 1), ((1, 0), 1), ((1, 1), 2))
 
 
-def _linear(coded: Array32) -> Array32:
-    x = np.maximum(coded, 0.0) / np.float32(255)
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def coded(linear: Array32) -> Array32:
-    """Linear light, 1 at saturation, as sRGB values with 255 at saturation, not rounded and not clipped."""
-    x = np.maximum(linear, np.float32(0))
+def _coded_table() -> Bytes:
+    """sRGB values of all values of light (IEC 61966-2-1)."""
+    x = np.arange(_FULL + 1) / _FULL
     value = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-9), 1 / 2.4) - 0.055)
-    return (255.0 * value).astype(np.float32)
+    return np.rint(255.0 * value).astype(np.uint8)
 
 
-_CODED = np.rint(coded(np.linspace(0.0, 1.0, 65536, dtype=np.float32))).astype(np.uint8)
+def _light_table() -> Light:
+    """Light of all sRGB values."""
+    x = np.arange(256) / 255
+    return np.rint(_FULL * np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)).astype(np.uint16)
+
+
+_CODED, _LIGHT = _coded_table(), _light_table()

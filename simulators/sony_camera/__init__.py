@@ -34,6 +34,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--send-to", type=Path, metavar="DIR", help="no cable: send every file into this folder")
     parser.add_argument("--battery", type=int, default=87, metavar="PERCENT", help="charge of the battery")
     parser.add_argument("--fast", action="store_true", help="exposures take no time")
+    parser.add_argument(
+        "--mosaic-jpeg",
+        action="store_true",
+        help="make the JPEG beside a raw file of the same values, as a camera does; "
+        "otherwise it is that of a sensor that measures three colours at every pixel",
+    )
 
 
 def _source(args: argparse.Namespace) -> ImageSource:
@@ -62,7 +68,9 @@ def _attend_button(source: WorldSource, body: CameraBody, stop: threading.Event)
 def serve(args: argparse.Namespace) -> None:
     """Print the ready line and serve until SIGTERM."""
     termination = Termination()
-    options = BodyOptions(args.fast, args.first_counter, args.exposures_log, args.announce, args.send_to)
+    options = BodyOptions(
+        args.fast, args.first_counter, args.exposures_log, args.announce, args.mosaic_jpeg, args.send_to
+    )
     source, stop = _source(args), threading.Event()
     body = CameraBody(source, args.faults, options)
     body.properties.put(Code.BATTERY, args.battery)

@@ -17,7 +17,7 @@ import cv2
 
 from simulators.faults import Fault, FaultPlan
 from simulators.rendering.picture_faults import Lens
-from simulators.rendering.sensor import camera_picture, read_out
+from simulators.rendering.sensor import camera_picture, picture_without_filters, read_out
 from simulators.serve import SimulatorError
 from simulators.sony_camera.exif import Shot, encode_jpeg
 from simulators.sony_camera.properties import (
@@ -77,6 +77,7 @@ class BodyOptions:
     first_counter: int = 1
     exposures_log: Path | None = None
     announce: str = "both"  # event, property or both: how the client learns of a new file
+    mosaic_jpeg: bool = False  # beside a raw file: whether the JPEG is made of the same values, as a camera's is
     send_to: Path | None = None  # wireless transfer: files are written into this folder instead of being downloaded
 
 
@@ -171,10 +172,13 @@ class CameraBody:
         mosaic = None
         if settings.file_format == FILE_JPEG:
             picture = self._lens.picture(self._source.develop(moment, settings), fault, moment.view)
-        else:  # both files are of one exposure of the sensor
+        else:
             light = self._lens.picture(self._source.light(moment, settings), fault, moment.view)
             mosaic = read_out(light, settings.iso, moment.counter)
-            picture = camera_picture(mosaic)
+            if self.options.mosaic_jpeg:
+                picture = camera_picture(mosaic)
+            else:
+                picture = picture_without_filters(light, settings.iso, moment.counter)
         if fault is not None and fault.kind == "wrong_exif":  # somebody turned a dial at the last moment
             shot = replace(shot, settings=replace(settings, iso=2 * settings.iso))
         captured = f"{shot.taken:%Y%m%dT%H%M%S}"

@@ -16,9 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.geometry import Array32
 from simulators.hand.effects import hand_in_picture
-from simulators.rendering.sensor import bordered
+from simulators.rendering.sensor import Light, bordered
 from simulators.serve import SimulatorError
 from simulators.sony_camera.properties import ExposureSettings
 
@@ -54,10 +53,10 @@ class ImageSource(Protocol):
         """Render the picture of that moment as (H, W, 3) RGB."""
         ...
 
-    def light(self, moment: Moment, settings: ExposureSettings) -> Array32:
+    def light(self, moment: Moment, settings: ExposureSettings) -> Light:
         """The light on the sensor at that moment, for a raw file.
 
-        RGB (H, W, 3) of the picture and its border, sRGB coded, 255 at saturation.
+        Linear RGB (H, W, 3) of the picture and its border.
         """
         ...
 
@@ -131,7 +130,7 @@ class StillLife:
         cv2.putText(picture, f"{moment.counter:05d}", corner, 0, height / 300, (255, 255, 255), thickness)
         return picture
 
-    def light(self, moment: Moment, settings: ExposureSettings) -> Array32:
+    def light(self, moment: Moment, settings: ExposureSettings) -> Light:
         """Return the light of that picture; its edge pixels are repeated in the border."""
         return bordered(self.develop(moment, settings))
 
@@ -168,7 +167,7 @@ class PictureFiles:
         """Return the counter's file with the settings' brightness."""
         return expose(self._load(moment.counter), exposure_gain(settings))
 
-    def light(self, moment: Moment, settings: ExposureSettings) -> Array32:
+    def light(self, moment: Moment, settings: ExposureSettings) -> Light:
         """Return the light of that picture; its edge pixels are repeated in the border."""
         return bordered(self.develop(moment, settings))
 
@@ -181,7 +180,7 @@ class PictureFiles:
 class _Renderer(Protocol):
     def render(self, view: Mapping[str, Any], camera_settings: Mapping[str, float], seed: int) -> Rgb: ...
 
-    def light(self, view: Mapping[str, Any], camera_settings: Mapping[str, float]) -> Array32: ...
+    def light(self, view: Mapping[str, Any], camera_settings: Mapping[str, float]) -> Light: ...
 
     def preview(self, view: Mapping[str, Any]) -> Rgb: ...
 
@@ -242,7 +241,7 @@ class WorldSource:
             picture = self._renderer.render(moment.view, _lens(settings), moment.counter)
         return hand_in_picture(picture, moment.view)
 
-    def light(self, moment: Moment, settings: ExposureSettings) -> Array32:
+    def light(self, moment: Moment, settings: ExposureSettings) -> Light:
         """Render the light of the recorded view."""
         with self._rendering:
             light = self._renderer.light(moment.view, _lens(settings))

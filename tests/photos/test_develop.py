@@ -173,7 +173,7 @@ def test_the_command_writes_a_tiff_and_its_record(pair: tuple[Path, Path], tmp_p
     assert again.exit_code == 1
     assert "exists" in again.output
     jpeg.unlink()
-    alone = CliRunner().invoke(app, [*words[:-1], str(tmp_path / "alone"), "--demosaic", "VNG", "--json"])
+    alone = CliRunner().invoke(app, [*words[:-1], str(tmp_path / "alone"), "--demosaic", "AHD", "--json"])
     assert json.loads(alone.output)[0]["shift_px"] is None
     assert json.loads(alone.output)[0]["parameters"]["demosaic"] == "VNG"
     unknown = CliRunner().invoke(app, [*words[:-1], str(tmp_path / "other"), "--demosaic", "magic"])

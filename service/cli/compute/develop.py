@@ -20,7 +20,7 @@ _JPEGS = (".jpg", ".jpeg")
 
 
 def develop_command(
-    files: Annotated[list[Path], typer.Argument(help="Raw files of any camera that LibRaw knows: ARW, CR3, NEF, DNG.")],
+    files: Annotated[list[Path], typer.Argument(help="Raw files that LibRaw reads: ARW, CR3, NEF, DNG.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the TIFFs and their records.", file_okay=False)],
     demosaic: Annotated[
         str, typer.Option("--demosaic", help="LibRaw's algorithm, as rawpy names it.")
@@ -69,13 +69,17 @@ def _write(made: Developed, raw: Path, jpeg: Path | None, out: Path) -> dict[str
     data = encode_tiff(made.image_bgr)
     (out / f"{raw.stem}.tif").write_bytes(data)
     record: dict[str, Any] = {
-        "raw": {"name": raw.name, "sha256": hashlib.sha256(raw.read_bytes()).hexdigest()},
-        "jpeg": None if jpeg is None else {"name": jpeg.name, "sha256": hashlib.sha256(jpeg.read_bytes()).hexdigest()},
-        "tiff": {"name": f"{raw.stem}.tif", "sha256": hashlib.sha256(data).hexdigest()},
+        "raw": _named(raw.name, raw.read_bytes()),
+        "jpeg": None if jpeg is None else _named(jpeg.name, jpeg.read_bytes()),
+        "tiff": _named(f"{raw.stem}.tif", data),
         **made.how.plain(),
     }
     (out / f"{raw.stem}.json").write_text(json_module.dumps(record, indent=1) + "\n", encoding="utf-8")
     return record
+
+
+def _named(name: str, data: bytes) -> dict[str, str]:
+    return {"name": name, "sha256": hashlib.sha256(data).hexdigest()}
 
 
 def _tell(record: dict[str, Any], jpeg: Path | None) -> None:

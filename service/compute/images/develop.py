@@ -44,7 +44,7 @@ class DevelopParameters:
         bits: of a channel.
     """
 
-    demosaic: str = "PPG"
+    demosaic: str = "VNG"
     white_balance: str = "camera"
     primaries: str = "sRGB"
     gamma: tuple[float, float] = (1.0, 1.0)
@@ -211,7 +211,9 @@ def _options(rawpy: Any, parameters: DevelopParameters) -> dict[str, Any]:
     names = [algorithm.name for algorithm in rawpy.DemosaicAlgorithm]
     if parameters.demosaic not in names:
         raise ConfigurationError(
-            f"there is no demosaic algorithm {parameters.demosaic}", where="demosaic", remedy=f"Use {', '.join(names)}"
+            f"there is no demosaic algorithm {parameters.demosaic}",
+            where="demosaic",
+            remedy=f"Use {', '.join(names)}",
         )
     return {
         "demosaic_algorithm": rawpy.DemosaicAlgorithm[parameters.demosaic],
