@@ -73,7 +73,7 @@ def test_brightness_is_that_of_the_light_whatever_the_picture_shows(tmp_path: Pa
         patch = made.image_bgr[:, column * 120 + 20 : column * 120 + 100] / 65535
         assert patch.mean(axis=(0, 1)) == pytest.approx(np.full(3, light), abs=2e-4 + 4e-3 * light)
     dark = develop(exposure(tmp_path, np.full_like(patches, 10))[0], None)
-    assert dark.image_bgr.mean() / 65535 == pytest.approx(linear[10], abs=2e-4), "nothing makes a dark picture brighter"
+    assert dark.image_bgr.mean() / 65535 == pytest.approx(linear[10], abs=2e-4), "nothing brightens a dark picture"
     assert made.how.white_balance[:3] == pytest.approx((2.1, 1.0, 1.6), abs=1e-3)
     assert (made.how.black_level, made.how.white_level) == ((512,) * 4, 16383)
 
@@ -175,7 +175,7 @@ def test_the_command_writes_a_tiff_and_its_record(pair: tuple[Path, Path], tmp_p
     jpeg.unlink()
     alone = CliRunner().invoke(app, [*words[:-1], str(tmp_path / "alone"), "--demosaic", "AHD", "--json"])
     assert json.loads(alone.output)[0]["shift_px"] is None
-    assert json.loads(alone.output)[0]["parameters"]["demosaic"] == "VNG"
+    assert json.loads(alone.output)[0]["parameters"]["demosaic"] == "AHD"
     unknown = CliRunner().invoke(app, [*words[:-1], str(tmp_path / "other"), "--demosaic", "magic"])
     assert unknown.exit_code == 1
     assert "magic" in unknown.output

@@ -70,11 +70,11 @@ class Photographer:
                 "light_lux": NOMINAL_LUX,
             }
             mosaic = read_out(self.renderer.light(view, REFERENCE), SETTINGS.iso, self.counter) if self.raw else None
-            picture = self.renderer.render(view, REFERENCE, self.counter) if mosaic is None else camera_picture(mosaic)
+            whole = self.renderer.render(view, REFERENCE, self.counter) if mosaic is None else camera_picture(mosaic)
             taken = _BEGAN + timedelta(minutes=self.counter)
             name = f"DSC{self.counter:05d}"
             shot = Shot(SETTINGS, self.counter, taken)
-            (self.folder / part / f"{name}.JPG").write_bytes(encode_jpeg(picture, shot))
+            (self.folder / part / f"{name}.JPG").write_bytes(encode_jpeg(whole, shot))
             if mosaic is not None:
                 (self.folder / part / f"{name}.ARW").write_bytes(encode_raw(mosaic, shot))
             self.T_world_camera[name] = pose
