@@ -32,6 +32,7 @@ def small_protocol(folder: Path) -> Path:
     next(gate for gate in calibration["gates"] if gate["measure"] == "tilt_deg")["min"] = 25
     registration = steps["registration"]["params"]
     registration["poses"] = ["spheres", "colmap"]
+    steps["ground_truth"]["params"]["chamfer_spacing_mm"] = 1.0
     registration["structure_from_motion"] = {"max_image_size": 1600, "max_features": 1500, "neighbours": 8}
     path = folder / "handheld_small.yaml"
     path.write_text(yaml.safe_dump(protocol, sort_keys=False))

@@ -20,10 +20,13 @@ def without_ct(folder: Path) -> Path:
     """The small protocol without the CT steps and without comparisons with them."""
     path = small_protocol(folder)
     protocol = yaml.safe_load(path.read_text())
-    protocol["steps"] = [step for step in protocol["steps"] if not step["id"].startswith("ct_")]
+    protocol["steps"] = [step for step in protocol["steps"] if not step["id"].startswith(("ct_", "ground_truth"))]
     for step in protocol["steps"]:
         step["gates"] = [gate for gate in step["gates"] if gate.get("unless_skipped") != "ct_import"]
         params = step.get("params", {})
+        if step["kind"] == "registration":
+            params["poses"] = ["spheres"]  # structure from motion is the same with and without a CT
+            step["gates"] = [{"measure": "spheres_markers", "min": 10, "unit": "spheres"}]
         if params.get("compare_with") == "ct_import":
             del params["compare_with"]
         if "spheres_of" in params:

@@ -13,7 +13,13 @@ _FEWEST = {"intrinsics": 15, "hand_eye": 12}
 
 
 def shortened(
-    protocol: Path, divisor: int, into: Path, *, slice_mm: float | None = None, settle_s: float | None = None
+    protocol: Path,
+    divisor: int,
+    into: Path,
+    *,
+    slice_mm: float | None = None,
+    settle_s: float | None = None,
+    chamfer_spacing_mm: float | None = None,
 ) -> Path:
     """Write the protocol with one view in `divisor`, and with the gates that count views lowered accordingly.
 
@@ -21,9 +27,9 @@ def shortened(
 
     Args:
         slice_mm: CT slice thickness that its gate shall accept, so that a coarse simulated CT, which takes seconds,
-        can
-            be imported; None: as in the protocol.
+            can be imported; None: as in the protocol.
         settle_s: settling time of the coating; None: as in the protocol.
+        chamfer_spacing_mm: distance between the samples of CT and scan that are compared; None: as in the protocol.
     """
     document: dict[str, Any] = yaml.safe_load(protocol.read_text(encoding="utf-8"))
     for step in document["steps"]:
@@ -33,8 +39,9 @@ def shortened(
                 gate["min"] = max(1, gate["min"] * taken // planned)
             if slice_mm is not None and gate["measure"] == "slice_spacing_mm":
                 gate["max"] = slice_mm
-        if settle_s is not None and "settle_s" in step.get("params", {}):
-            step["params"]["settle_s"] = settle_s
+        for name, value in (("settle_s", settle_s), ("chamfer_spacing_mm", chamfer_spacing_mm)):
+            if value is not None and name in step.get("params", {}):
+                step["params"][name] = value
     document["id"] += "_short"
     document["title"] += f", one view of {divisor}"
     into.write_text(yaml.safe_dump(document, sort_keys=False, allow_unicode=True), encoding="utf-8")
