@@ -22,13 +22,12 @@ from drivers.errors import (
     DeviceTimeoutError,
     DeviceUnavailableError,
     DriverMissingError,
-    StaleImageError,
     UnreadableFileError,
 )
-from drivers.genicam.library import AravisCamera, AravisError, Frame, LibraryMissingError, NoImageError, version
+from drivers.genicam.library import AravisCamera, AravisError, LibraryMissingError, NoImageError, version
 from drivers.genicam.pixels import picture
-from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
-from drivers.photos.photo_file import check_jpeg_complete, sha256_of
+from drivers.interfaces import CameraSettings, CapturedImage, DeviceIdentity, DeviceReport
+from drivers.photos.frames import FrameFiles
 from drivers.plugin import DriverConfig, DriverSpec
 
 _TOLERANCE = 0.02  # of aperture and exposure time, as for photographs
@@ -59,8 +58,7 @@ class GenicamCamera:
         self._where = f"GenICam camera {config.camera}"
         self._link: AravisCamera | None = None
         self._identified: DeviceIdentity | None = None
-        self._size: tuple[int, int] | None = None
-        self._hashes: set[str] = set()
+        self._files = FrameFiles("camera", self._where)
         self._taken = 0
 
     # --- every device -----------------------------------------------------------------------------------
@@ -82,7 +80,8 @@ class GenicamCamera:
             ) from error
         except AravisError as error:
             raise self._unavailable(str(error)) from error
-        self._link, self._size = link, None
+        self._link = link
+        self._files.reopened()
         try:
             self._identified = self._checked_identity(link)
             link.set_pixel_format(self._config.pixel_format)
@@ -182,13 +181,12 @@ class GenicamCamera:
         """
         settings = self.settings()
         triggered_s = time.monotonic()
-        pixels, _ = self._acquired(settings.exposure_s)
+        pixels = self._acquired(settings.exposure_s)
         arrived_s = time.monotonic()
         self._taken += 1
-        file = self._written(pixels, folder)
+        file = self._files.write(self._taken, self._jpeg(pixels), folder)
         size = int(pixels.shape[1]), int(pixels.shape[0])
-        self._check_new(file, size)
-        self._hashes.add(file.sha256)
+        self._files.accept(file, size)
         return CapturedImage(
             files=(file,),
             counter=self._taken,
@@ -211,9 +209,9 @@ class GenicamCamera:
 
     def preview(self) -> bytes:
         """Take an image and return it as JPEG bytes."""
-        return self._jpeg(self._acquired(self.settings().exposure_s)[0])
+        return self._jpeg(self._acquired(self.settings().exposure_s))
 
-    def _acquired(self, exposure_s: float) -> tuple[NDArray[np.uint8], Frame]:
+    def _acquired(self, exposure_s: float) -> NDArray[np.uint8]:
         try:
             frame = self._connected().acquire(exposure_s + self._config.frame_timeout_s)
         except NoImageError as error:
@@ -231,37 +229,13 @@ class GenicamCamera:
                 where=self._where,
                 remedy="Close other programs that use the camera, and open it again",
             )
-        return pixels, frame
+        return pixels
 
     def _jpeg(self, pixels: NDArray[np.uint8]) -> bytes:
         done, encoded = cv2.imencode(".jpg", pixels, _JPEG)
         if not done:
             raise UnreadableFileError("An image cannot be encoded", where=self._where, remedy="Repeat the exposure")
         return encoded.tobytes()
-
-    def _written(self, pixels: NDArray[np.uint8], folder: Path) -> CapturedFile:
-        target = folder / f"FRAME{self._taken:06d}.JPG"
-        data = self._jpeg(pixels)
-        partial = target.with_name(target.name + ".part")
-        partial.write_bytes(data)
-        check_jpeg_complete(partial)
-        partial.rename(target)
-        return CapturedFile(target, target.name, sha256_of(target), len(data), "image/jpeg")
-
-    def _check_new(self, file: CapturedFile, size: tuple[int, int]) -> None:
-        if file.sha256 in self._hashes:
-            raise StaleImageError(
-                f"{file.camera_name} is byte for byte the same as an earlier image",
-                where=self._where,
-                remedy="The camera is frozen: open it again and repeat the exposure",
-            )
-        if self._size not in (None, size):
-            raise UnreadableFileError(
-                f"{file.camera_name} has {size[0]} × {size[1]} px, those before it another size",
-                where=self._where,
-                remedy="Calibration holds for one size: set the camera back and repeat the exposure",
-            )
-        self._size = size
 
     # --- the link ---------------------------------------------------------------------------------------------
 
