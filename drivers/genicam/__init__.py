@@ -42,7 +42,9 @@ class GenicamConfig(DriverConfig):
     aperture_f: float = Field(gt=0, description="as it is set on the lens")
     iso: int = Field(default=100, gt=0, description="what the protocol calls this gain")
     gain: float = Field(default=0.0, description="in the camera's own unit, usually dB")
-    pixel_format: Literal["Mono8", "BayerGR8", "BayerRG8", "BayerGB8", "BayerBG8", "RGB8"] = "BayerRG8"
+    pixel_format: Literal["Mono8", "BayerGR8", "BayerRG8", "BayerGB8", "BayerBG8", "RGB8"] = Field(
+        default="BayerRG8", description="by its GenICam name"
+    )
     frame_timeout_s: float = Field(
         default=5.0, gt=0, le=30, description="longest wait for an image, beyond its exposure"
     )

@@ -85,7 +85,7 @@ _COMMANDS = {
     ),
     "develop": _Command(
         "service.cli.compute.develop:develop_command",
-        "Develop raw files to linear TIFFs of 16 bits, always in the same way. Needs the extra `raw`.",
+        "Develop raw files to linear TIFFs of 16 bits, always in the same way; needs the extra `raw`.",
     ),
     "sfm": _Command(
         "service.cli.compute.sfm:sfm_command",

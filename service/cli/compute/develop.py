@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json as json_module
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,7 +27,7 @@ def develop_command(
     ] = PARAMETERS.demosaic,
     json: JsonOption = False,
 ) -> None:
-    """Develop raw files to linear TIFFs of 16 bits, always in the same way. Needs the extra `raw`.
+    """Develop raw files to linear TIFFs of 16 bits, always in the same way; needs the extra `raw`.
 
     A JPEG of the same name beside a raw file gives the picture its size, and its place is checked against it.
     """
@@ -72,7 +72,7 @@ def _write(made: Developed, raw: Path, jpeg: Path | None, out: Path) -> dict[str
         "raw": _named(raw.name, raw.read_bytes()),
         "jpeg": None if jpeg is None else _named(jpeg.name, jpeg.read_bytes()),
         "tiff": _named(f"{raw.stem}.tif", data),
-        **made.how.plain(),
+        **asdict(made.how),
     }
     (out / f"{raw.stem}.json").write_text(json_module.dumps(record, indent=1) + "\n", encoding="utf-8")
     return record

@@ -8,7 +8,7 @@ such as the white balance that the camera recorded, is returned and goes into th
 from __future__ import annotations
 
 import importlib
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -100,10 +100,6 @@ class Development:
     largest_shift_px: float | None
     rawpy: str
     libraw: str
-
-    def plain(self) -> dict[str, Any]:
-        """As JSON-compatible data."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)

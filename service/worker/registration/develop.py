@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import cv2
 
 from service.compute.images.develop import DevelopParameters, develop, encode_tiff
@@ -20,6 +22,6 @@ def develop_raw(context: JobContext[job.Arguments]) -> JobAnswer:
     tiff = context.keep_bytes(
         encode_tiff(made.image_bgr), kind="developed", media_type="image/tiff", name=f"{arguments.viewpoint}.tif"
     )
-    answer = job.Answer.model_validate({**made.how.plain(), "raw": arguments.raw})
+    answer = job.Answer.model_validate({**asdict(made.how), "raw": arguments.raw})
     largest = 0.0 if made.how.largest_shift_px is None else made.how.largest_shift_px
     return JobAnswer({"largest_shift_px": largest}, (tiff,), answer)
