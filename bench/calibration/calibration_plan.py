@@ -26,7 +26,7 @@ from service.compute.calibration.board.board import Board, BoardView
 from service.compute.calibration.board_poses.design import NOTHING, CalibrationTargets, ChosenViews
 from service.compute.calibration.board_poses.knowledge import BoardKnowledge, refined_knowledge
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.calibration.hand_eye.record import board_corners
+from service.compute.calibration.hand_eye.reprojection import board_corners
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
 from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.camera_model import CameraModel

@@ -2,9 +2,8 @@
 
 Run: python -m bench.ground_truth.fusion [--scenes 7 …] [--voxel-mm 0.4] [--spacing-mm 0.5] [--half] [--out NAME]
 
-A step at the seam is the difference between the mean errors of two strips, 0.5 mm wide, on both sides of the line
-where CT and scan count alike, over 4 mm and over 10 mm of that line. The noise of scan and CT is in it; how much that
-is, the same measure says in the scan's own part, where no seam is.
+`bench.ground_truth.seam` says how the step at the seam is measured. The same is measured in the scan's own part,
+where there is no seam: what is found there is noise.
 """
 
 from __future__ import annotations
@@ -13,20 +12,19 @@ import argparse
 import json
 import resource
 import time
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from bench.ground_truth.seam import no_seam, seam, steps, strips
 from bench.machine import RESULTS, commit, machine
 from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.distances.triangle_tree import TriangleTree
 from service.compute.ground_truth.fusion.fuse import FusionSettings, Source, fuse
-from service.compute.ground_truth.fusion.overlap import Mask, distance_to, vertex_normals
-from service.compute.ground_truth.surface import IntArray, Surface
+from service.compute.ground_truth.fusion.overlap import vertex_normals
+from service.compute.ground_truth.surface import Surface
 from service.compute.surfaces.isosurface import surface
 from service.core.geometry import Array, apply
 from service.core.units import metres, mm
@@ -37,10 +35,9 @@ from simulators.scene.world import Scene
 LOW_M, HIGH_M = np.array([-0.165, -0.095, 0.004]), np.array([0.165, 0.095, 0.100])  # the specimen above the board
 THRESHOLD_HU = -475.0
 _INSIDE_M = 0.003  # from the ends of the volume, where the CT's surface is cut
-PATCHES_M = (2e-3, 5e-3)  # radii
+STRIPS_M = (2e-3, 5e-3)  # radii about places on the seam
+FIT_M = 3e-3
 _FAR_M = 5e-4
-_PLACES, _FEWEST = 2000, 5  # on the line, and vertices of a strip that are averaged
-_BESIDE_M, _STRIP_M = 1.5e-3, 5e-4  # of the line where no seam is, from the overlap; and the strips beside it
 
 
 def sources(scene: Scene, voxel_m: float, spacing_m: float, high: Array) -> tuple[Surface, Surface]:
@@ -63,48 +60,6 @@ def heights(truth: Surface, points: Array, normals: Array) -> Array:
     found = TriangleTree(truth).nearest(points, rough)
     outside = np.einsum("ni,ni->n", points - found.points_m, normals) > 0
     return np.where(outside, found.distance_m, -found.distance_m)
-
-
-@dataclass(frozen=True, slots=True)
-class Strips:
-    """Two strips of vertices on both sides of a line, as masks (N,), and which vertices (K,) are on the line."""
-
-    line: IntArray
-    above: Mask
-    below: Mask
-
-
-def seam_of(weight: Array) -> Strips:
-    """The seam, where CT and scan count alike, from the weights (N,) of the scan; strips of about 0.5 mm."""
-    line = np.flatnonzero(np.abs(weight - 0.5) < 0.05)
-    return Strips(line, (weight > 0.5) & (weight < 0.8), (weight < 0.5) & (weight > 0.2))
-
-
-def no_seam_of(points: Array, weight: Array) -> Strips:
-    """A line in the scan's own part with strips as wide as the seam's: what is found there is noise of the scan."""
-    away = distance_to(points, weight < 1, np.inf)
-    line = np.flatnonzero(np.abs(away - _BESIDE_M) < _STRIP_M / 10)
-    above = (away > _BESIDE_M) & (away < _BESIDE_M + _STRIP_M)
-    return Strips(line, above, (away < _BESIDE_M) & (away > _BESIDE_M - _STRIP_M))
-
-
-def steps_mm(points: Array, height: Array, strips: Strips, radius_m: float) -> dict[str, float]:
-    """Sizes of the differences between the mean errors of both strips within a radius of places on the line."""
-    chosen = np.flatnonzero(strips.above | strips.below)
-    above, error = strips.above[chosen], height[chosen]
-    places = points[strips.line[:: max(1, len(strips.line) // _PLACES)]]
-    steps: list[float] = []
-    for near in cKDTree(points[chosen]).query_ball_point(places, radius_m):
-        side = above[near]
-        if min(side.sum(), (~side).sum()) >= _FEWEST:
-            steps.append(abs(float(error[near][side].mean() - error[near][~side].mean())))
-    return {
-        "places": len(steps),
-        **{
-            name: round(mm(float(np.percentile(steps, q))), 4)
-            for name, q in (("median", 50), ("p99", 99), ("max", 100))
-        },
-    }
 
 
 def rms_mm(values: Array) -> float:
@@ -134,9 +89,9 @@ def measured(seed: int, voxel_m: float, spacing_m: float, high: Array) -> dict[s
     vertices, faces = scene.solid_mesh(control_spheres=False)
     points, normals = fused.surface.vertices_m, vertex_normals(fused.surface)
     inside = np.flatnonzero(np.all((points > LOW_M + _INSIDE_M) & (points < high - _INSIDE_M), axis=1))
-    points, weight = points[inside], fused.weight[inside]
-    height = heights(Surface(vertices, faces.astype(np.int64)), points, normals[inside])
-    seam, beside = seam_of(weight), no_seam_of(points, weight)
+    points, normals, weight = points[inside], normals[inside], fused.weight[inside]
+    height = heights(Surface(vertices, faces.astype(np.int64)), points, normals)
+    lines = {"seam": seam(points, weight, FIT_M), "scan_alone": no_seam(points, weight, FIT_M)}
     return {
         "scene": seed,
         "ct_faces": len(ct.faces),
@@ -148,8 +103,11 @@ def measured(seed: int, voxel_m: float, spacing_m: float, high: Array) -> dict[s
         "largest": largest(points, height, fused.source[inside]),
         "share_by_source": {s.name.lower(): round(fused.share(s), 3) for s in Source},
         "wound_share": round(float(fused.wound.mean()), 4),
-        "seam_step_mm": {f"{2 * mm(r):g} mm": steps_mm(points, height, seam, r) for r in PATCHES_M},
-        "scan_alone_mm": {f"{2 * mm(r):g} mm": steps_mm(points, height, beside, r) for r in PATCHES_M},
+        "step_mm": {name: steps(points, normals, height, line, FIT_M).told() for name, line in lines.items()},
+        "strips_mm": {
+            name: {f"{2 * mm(r):g} mm": strips(points, height, line, r) for r in STRIPS_M}
+            for name, line in lines.items()
+        },
         "ct_offset_mm": round(mm(fused.ct_offset_m), 4),
         "ct_spread_mm": round(mm(fused.ct_spread_m), 4),
         "folded_faces": fused.folded,

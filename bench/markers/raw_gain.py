@@ -40,9 +40,9 @@ from service.core.units import mm
 from simulators.rendering.render import Renderer
 from simulators.rendering.sensor import camera_picture, read_out
 from simulators.scene.world import Scene
-from simulators.sony_camera.exif import Shot, encode_jpeg
-from simulators.sony_camera.properties import ExposureSettings
-from simulators.sony_camera.raw_file import encode_raw
+from simulators.sony_camera.exif import PLATE
+from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg
+from simulators.still_camera.raw_file import encode_raw
 
 JPEG, RAW, NO_FILTERS = "JPEG", "developed raw file", "JPEG without colour filters"
 _TARGET_M = np.array([0.0, 0.0, 0.05])  # middle of the specimen, frame of the world
@@ -72,8 +72,7 @@ class Files:
 def expose(scene: Scene, renderer: Renderer, conditions: Conditions, folder: Path) -> list[tuple[Files, Array]]:
     """The files of each view, and T_world_camera (4, 4)."""
     out: list[tuple[Files, Array]] = []
-    settings = ExposureSettings(22.0, 1 / 15, (1, 15), conditions.iso, manual_focus=True, file_format=2,
-                                jpeg_quality=2, capture_target=1)  # fmt: skip
+    settings = ExposureSettings(22.0, 1 / 15, (1, 15), conditions.iso)
     # At a higher sensitivity the exposure is shorter, so that the picture is as bright.
     light = SETTINGS | {"iso": conditions.iso, "exposure_s": SETTINGS["exposure_s"] * 100 / conditions.iso}
     for number, planned in enumerate(plan_shots(scene, conditions.views)):
@@ -84,7 +83,7 @@ def expose(scene: Scene, renderer: Renderer, conditions: Conditions, folder: Pat
             "scene": {"seed": scene.seed, "spray": False, "control_spheres": True, "board": None},
             "light_lux": scene.light_lux,
         }
-        shot = Shot(settings, number, datetime.now(UTC))
+        shot = Shot(settings, number, datetime.now(UTC), PLATE)
         mosaic = read_out(renderer.light(view, light), conditions.iso, number)
         files = Files(*(folder / f"{number}{end}" for end in (".jpg", ".arw", "_no_filters.jpg")))
         files.jpeg.write_bytes(encode_jpeg(camera_picture(mosaic), shot))

@@ -1,4 +1,4 @@
-"""Driver for still cameras through libgphoto2, over USB or PTP/IP; written for the Sony Alpha 7R V."""
+"""Driver for still cameras through libgphoto2, over USB or PTP/IP, by profiles of Sony, Canon and Nikon bodies."""
 
 from __future__ import annotations
 

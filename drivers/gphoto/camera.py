@@ -12,7 +12,6 @@ from typing import Literal
 
 from drivers.errors import (
     DeviceBusyError,
-    DeviceError,
     DeviceRefusedError,
     DeviceStorageFullError,
     DeviceTimeoutError,
@@ -20,19 +19,28 @@ from drivers.errors import (
     StaleImageError,
     UnreadableFileError,
 )
-from drivers.gphoto import settings as words
+from drivers.gphoto.dials import Dials
 from drivers.gphoto.link import AddedFile, Link, gp, library_version
+from drivers.gphoto.profile import Profile, battery_fraction
+from drivers.gphoto.profiles import profile_for
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
 from drivers.photos.photo_file import check_jpeg_complete, read_exif, sha256_of
 from drivers.plugin import DriverConfig
 
 _LOG = logging.getLogger(__name__)
-SET_ATTEMPTS, BUSY_ATTEMPTS = 3, 5
-READ_BACK_TIMEOUT_S = 2.0
+BUSY_ATTEMPTS = 5
 PREVIEW_PATIENCE_S = 15.0
 LEAST_FREE_BYTES = 200_000_000  # room for one RAW+JPEG exposure of 61 megapixels
-MEDIA_TYPES = {".JPG": "image/jpeg", ".JPEG": "image/jpeg", ".ARW": "image/x-sony-arw"}
-_NAME = re.compile(r"(?:capt_)?(?P<stem>[A-Za-z_]*?(?P<counter>\d+))(?P<suffix>\.\w+)$")
+MEDIA_TYPES = {
+    ".JPG": "image/jpeg",
+    ".JPEG": "image/jpeg",
+    ".ARW": "image/x-sony-arw",
+    ".CR2": "image/x-canon-cr2",
+    ".CR3": "image/x-canon-cr3",
+    ".NEF": "image/x-nikon-nef",
+}
+# DCF: four free characters, which may be digits, and a number of four.
+_NAME = re.compile(r"(?:capt_)?(?P<stem>\w*?(?P<counter>\d{1,4}))(?P<suffix>\.\w+)$")
 
 
 class GphotoConfig(DriverConfig):
@@ -40,8 +48,10 @@ class GphotoConfig(DriverConfig):
 
     port: str = ""  # as libgphoto2 names it; usb: is the only camera on USB
     model: str = ""  # part of the model name, to choose among several cameras on USB
-    # What the camera keeps the image on until it is fetched.
-    capture_target: Literal["computer", "card", "both"] = "computer"
+    profile: str = ""  # such as canon_eos; empty: chosen by the body's name
+    # What the camera keeps the image on until it is fetched; without it, what the profile prefers.
+    capture_target: Literal["computer", "card", "both"] | None = None
+    white_balance: str = ""  # in the camera's words; empty: as it is set, or daylight if it is automatic
     capture_timeout_s: float = 40.0  # from the release to the file
 
     @property
@@ -60,25 +70,51 @@ class GphotoCamera:
         self._last: CapturedImage | None = None
         self._hashes: set[str] = set()
         self._clock_offset_s: float | None = None
-        self._announced: list[AddedFile] = []  # files announced during other calls and not downloaded yet
+        self._profile_name = ""
+        self._opened: tuple[Profile, Dials] | None = None
+
+    @property
+    def _profile(self) -> Profile:
+        return self._need()[0]
+
+    @property
+    def _dials(self) -> Dials:
+        return self._need()[1]
+
+    def _need(self) -> tuple[Profile, Dials]:
+        if self._opened is None:
+            raise DeviceUnavailableError("The camera is not open", where=self._link.where, remedy="Open it first")
+        return self._opened
 
     # --- every device -----------------------------------------------------------------------------------
 
     def open(self) -> DeviceIdentity:
         """Connect or reconnect, set the capture target and return the camera's identity."""
         self._link.open()
-        self._announced.clear()
-        self._set(words.TARGET, words.TARGET_CODES[self._config.capture_target])
+        maker, model = self._link.value("manufacturer"), self._link.value("cameramodel")
+        self._profile_name, profile = profile_for(maker, model, self._config.profile, self._link.where)
+        self._opened = profile, Dials(self._link, profile, self._config.white_balance)
+        self._dials.set(profile.target.name, self._target_word(profile))
         self._identity = DeviceIdentity(
             kind="camera",
-            model=self._link.value("cameramodel"),
-            serial=self._link.value("serialnumber").lstrip("0"),
+            model=model,
+            serial=self._link.value(profile.serial).lstrip("0"),
             firmware=self._link.value("deviceversion"),
             driver="gphoto",
             driver_version=f"python-gphoto2 {version('gphoto2')}, libgphoto2 {library_version()}",
             address=self._config.port or "usb",
         )
         return self._identity
+
+    def _target_word(self, profile: Profile) -> str:
+        wanted = self._config.capture_target or next(iter(profile.targets))
+        if wanted not in profile.targets:
+            raise DeviceRefusedError(
+                f"capture_target {wanted} is not possible with the profile {self._profile_name}",
+                where=self._link.where,
+                remedy=f"Possible: {', '.join(profile.targets)}",
+            )
+        return profile.targets[wanted]
 
     def close(self) -> None:
         """Disconnect from the camera; does not raise if the link is dead."""
@@ -88,26 +124,37 @@ class GphotoCamera:
         """Return battery, free space and settings; the clock offset comes from the EXIF time of the last exposure."""
         if self._identity is None:
             raise DeviceUnavailableError("The camera is not open", where=self._link.where, remedy="Open it first")
-        self._refresh()
+        profile = self._profile
+        self._dials.refresh()
         free = self._link.free_bytes()
-        battery = words.number_of(self._link.value("batterylevel").rstrip("%"))
-        program = self._link.value("expprogram")
-        problems: list[str] = []
-        if battery is not None and battery < 20:
-            problems.append(f"Battery at {battery:g} %: change it, or use mains power")
-        if program != "M":
-            problems.append(f"Exposure program is {program}: turn the mode dial to M")
-        if free is not None and free < LEAST_FREE_BYTES:
-            problems.append(f"{free / 1e6:.0f} MB free in the camera: empty or change the card")
-        names = (words.F_NUMBER, words.SHUTTER, words.ISO, words.FOCUS, words.QUALITY)
+        battery = battery_fraction(self._link.value("batterylevel"))
+        names = (
+            profile.f_number,
+            profile.shutter,
+            profile.iso,
+            profile.focus,
+            profile.quality,
+            profile.white_balance,
+        )
         return DeviceReport(
             identity=self._identity,
             clock_offset_s=self._clock_offset_s,
             free_bytes=free,
-            battery_fraction=None if battery is None else battery / 100.0,
-            details={name: self._link.value(name) for name in names},
-            problems=tuple(problems),
+            battery_fraction=battery,
+            details={"profile": self._profile_name, **{one.name: self._link.value(one.name) for one in names}},
+            problems=self._problems(battery, free),
         )
+
+    def _problems(self, battery: float | None, free: int | None) -> tuple[str, ...]:
+        problems: list[str] = []
+        if battery is not None and battery < 0.2:
+            problems.append(f"Battery at {100 * battery:g} %: change it, or use mains power")
+        program = self._link.value(self._profile.program.name)
+        if program != self._profile.manual_program:
+            problems.append(f"Exposure program is {program}: turn the mode dial to M")
+        if free is not None and free < LEAST_FREE_BYTES:
+            problems.append(f"{free / 1e6:.0f} MB free in the camera: empty or change the card")
+        return tuple(problems)
 
     # --- settings -----------------------------------------------------------------------------------------
 
@@ -116,69 +163,11 @@ class GphotoCamera:
 
         Raises DeviceRefusedError if the camera does not offer a value or does not keep it.
         """
-        self._refresh()
-        self._apply_word(words.QUALITY, settings.image_quality)
-        self._apply_word(words.FOCUS, settings.focus_mode)
-        self._apply_number(words.F_NUMBER, settings.aperture_f)
-        self._apply_number(words.SHUTTER, settings.exposure_s)
-        self._apply_number(words.ISO, float(settings.iso))
-        return self.settings()
+        return self._dials.apply(settings)
 
     def settings(self) -> CameraSettings:
         """Return the camera's current settings; drains events first, which clears libgphoto2's 2 s cache."""
-        self._refresh()
-        return CameraSettings(
-            aperture_f=self._number(words.F_NUMBER),
-            exposure_s=self._number(words.SHUTTER),
-            iso=round(self._number(words.ISO)),
-            focus_mode=self._link.value(words.FOCUS),
-            image_quality=words.quality_of(self._link.value(words.QUALITY)),
-        )
-
-    def _number(self, name: str) -> float:
-        word = self._link.value(name)
-        number = words.number_of(word)
-        if number is None:
-            raise DeviceRefusedError(
-                f"The camera reports {name} {word!r}, which is not a number",
-                where=self._link.where,
-                remedy="Turn the mode dial to M; check that the lens is locked in place",
-            )
-        return number
-
-    def _apply_number(self, name: str, wanted: float) -> None:
-        self._set(name, words.choose_number(name, wanted, self._link.choices(name), self._link.where))
-
-    def _apply_word(self, name: str, wanted: str) -> None:
-        self._set(name, words.choose_word(name, wanted, self._link.choices(name), self._link.where))
-
-    def _set(self, name: str, word: str) -> None:
-        refusal: DeviceError | None = None
-        for _ in range(SET_ATTEMPTS):
-            if self._link.value(name) == word:
-                return
-            try:
-                self._link.put(name, word)
-            except (DeviceRefusedError, DeviceBusyError) as error:
-                refusal = error
-            if self._reads_back(name, word):
-                return
-        now = self._link.value(name)
-        raise DeviceRefusedError(
-            f"The camera keeps {name} at {now} instead of {word}",
-            where=self._link.where,
-            remedy="Turn the mode dial to M and check what the camera's menu allows in this mode",
-        ) from refusal
-
-    def _reads_back(self, name: str, word: str) -> bool:
-        deadline = time.monotonic() + READ_BACK_TIMEOUT_S
-        while True:
-            self._refresh()
-            if self._link.value(name) == word:
-                return True
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(0.1)
+        return self._dials.settings()
 
     # --- exposures -----------------------------------------------------------------------------------------
 
@@ -195,12 +184,12 @@ class GphotoCamera:
             DeviceTimeoutError: files that did not arrive in time.
             DeviceRefusedError, DeviceBusyError, DeviceUnavailableError: the shutter was not released.
         """
-        self._refresh()
-        for left in self._announced:
+        dials = self._dials
+        dials.refresh()
+        for left in dials.announced:
             _LOG.warning("%s is left over from before and does not belong to this exposure", left.name)
-        self._announced.clear()
-        quality = words.quality_of(self._link.value(words.QUALITY))
-        focus = self._link.value(words.FOCUS)
+        dials.announced.clear()
+        quality, focus = dials.quality(), dials.focus()
         self._check_space()
         trigger_s = self._trigger()
         added = self._collect(2 if quality == "RAW+JPEG" else 1, trigger_s)
@@ -212,43 +201,44 @@ class GphotoCamera:
         Waits up to `timeout_s` for the first one. The camera announces files as events; RAW and JPEG of one exposure
         form one image. `since_utc_s` is not needed, because announced files are always new.
         """
+        announced = self._dials.announced
         deadline_s = time.monotonic() + timeout_s
         images: list[CapturedImage] = []
         while True:
-            if self._announced:
+            if announced:
                 images.append(self._released(folder))
                 continue
             left_ms = max(1, round(1000 * (deadline_s - time.monotonic())))
             event, data = self._link.next_event(1 if images else min(200, left_ms))
             if event == gp.GP_EVENT_FILE_ADDED:
-                self._announced.append(AddedFile(str(data.folder), str(data.name)))
+                announced.append(AddedFile(str(data.folder), str(data.name)))
             elif event == gp.GP_EVENT_TIMEOUT and (images or time.monotonic() >= deadline_s):
                 return tuple(images)
 
     def _released(self, folder: Path) -> CapturedImage:
         """Collect and download the exposure whose file was announced first."""
         announced_s = time.monotonic()
-        quality = words.quality_of(self._link.value(words.QUALITY))
-        focus = self._link.value(words.FOCUS)
+        announced = self._dials.announced
+        quality, focus = self._dials.quality(), self._dials.focus()
         expected = 2 if quality == "RAW+JPEG" else 1
-        first, self._announced = self._announced[:expected], self._announced[expected:]
+        first = announced[:expected]
+        del announced[:expected]
         added = self._collect(expected, announced_s, *first)
         return self._image(added, folder, announced_s, quality, focus)
-
-    def _refresh(self) -> None:
-        """Drain events, so that values are read afresh; keeps announced files for `released_images`."""
-        self._announced += self._link.refresh()
 
     def _image(
         self, added: list[AddedFile], folder: Path, trigger_s: float, quality: str, focus: str
     ) -> CapturedImage:
         """Download the files of one exposure and check that they are new."""
         arrival_s = time.monotonic()
+        self._check_place(added)
         stems = {_parse(one.name)[0] for one in added}
         if len(stems) != 1:
             raise self._stale(f"Files of different exposures arrived together: {', '.join(sorted(stems))}")
         files = sorted((self._save(one, folder) for one in added), key=lambda file: file.media_type != "image/jpeg")
         exif = read_exif(files[0].path)
+        if not exif.make.upper().startswith(self._profile.exif_make.upper()):
+            raise self._stale(f"{files[0].camera_name} says that it was taken by {exif.make or 'an unknown'} camera")
         image = CapturedImage(
             files=tuple(files),
             counter=_parse(added[0].name)[1],
@@ -271,11 +261,19 @@ class GphotoCamera:
         self._hashes.update(file.sha256 for file in files)
         return image
 
+    def _check_place(self, added: list[AddedFile]) -> None:
+        """Files without a folder come from a memory in which libgphoto2 numbers them itself."""
+        if "computer" not in self._profile.targets and any(one.folder == "/" for one in added):
+            raise DeviceRefusedError(
+                f"{added[0].name} came from the camera's memory and not from its card",
+                where=self._link.where,
+                remedy="Insert a card, and open the camera again",
+            )
+
     def _check_space(self) -> None:
         free = self._link.free_bytes()
-        if free is not None and (
-            free == 0 or (self._config.capture_target != "computer" and free < LEAST_FREE_BYTES)
-        ):
+        target = self._config.capture_target or next(iter(self._profile.targets))
+        if free is not None and (free == 0 or (target != "computer" and free < LEAST_FREE_BYTES)):
             raise DeviceStorageFullError(
                 f"{free / 1e6:.0f} MB free in the camera", where=self._link.where, remedy="Empty or change the card"
             )

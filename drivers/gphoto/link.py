@@ -5,9 +5,12 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 from drivers.errors import (
@@ -28,6 +31,8 @@ BROKEN_VERSIONS = ("2.5.31",)
 LEAST_VERSION = (2, 5, 30)
 OPEN_ATTEMPTS = 3
 PTPIP_MODEL = "PTP/IP Camera"
+_TO_CARD = "ptp2=capturetarget=card"  # as libgphoto2 writes it
+_REPORTED = re.compile(r'PTP Property [0-9a-f]{4} changed, "(?P<name>[^"]+)"')
 
 _ERRORS: dict[int, tuple[type[DeviceError], str]] = {
     gp.GP_ERROR_CAMERA_BUSY: (DeviceBusyError, "Wait a moment and repeat"),
@@ -85,6 +90,29 @@ def keep_descriptor_zero() -> None:
             os.close(null)
 
 
+@cache
+def keep_own_settings() -> None:
+    """Give libgphoto2 a settings file of this program, instead of the one that it shares with the user's others.
+
+    It keeps where Canon and Nikon bodies put files, and the identity with which cameras on the network are paired.
+    """
+    home = os.environ.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config")
+    own = Path(home) / "orthocapture"
+    file = own / "gphoto" / "settings"
+    try:
+        lines = file.read_text(encoding="ascii").splitlines() if file.exists() else []
+        if _TO_CARD not in lines:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            kept = [line for line in lines if not line.startswith(_TO_CARD.rpartition("=")[0])]
+            partial = file.with_name(f"settings.{os.getpid()}")
+            partial.write_text("\n".join([*kept, _TO_CARD]) + "\n", encoding="ascii")
+            partial.replace(file)
+    except (OSError, UnicodeDecodeError) as error:
+        _LOG.warning("libgphoto2 uses the settings of the user: %s", error)
+        return
+    os.environ["XDG_CONFIG_HOME"] = str(own)
+
+
 @dataclass(frozen=True, slots=True)
 class AddedFile:
     """A file that the camera announced."""
@@ -101,10 +129,12 @@ class Link:
         self._port = port
         self._model = model
         self._camera: Gphoto | None = None
+        self.reported: set[str] = set()  # widgets whose values the camera itself has reported
 
     def open(self) -> None:
         """Connect, with back-off, because cameras need a moment after a lost session."""
         check_library_version(library_version())
+        keep_own_settings()
         self.close()
         for attempt in range(1, OPEN_ATTEMPTS + 1):
             keep_descriptor_zero()
@@ -182,7 +212,14 @@ class Link:
 
     def next_event(self, wait_ms: int) -> tuple[int, Any]:
         """Wait for the next event of the camera; returns its type, or GP_EVENT_TIMEOUT, and its data."""
-        return self.call("Waiting for the camera", lambda camera: camera.wait_for_event(wait_ms))
+        event, data = self.call("Waiting for the camera", lambda camera: camera.wait_for_event(wait_ms))
+        if event == gp.GP_EVENT_UNKNOWN and (found := _REPORTED.match(str(data))):
+            self.reported.add(found["name"])
+        return event, data
+
+    def names(self) -> frozenset[str]:
+        """The names of all widgets that the camera has."""
+        return self.call("Listing the settings", lambda camera: frozenset(str(n) for n, _ in camera.list_config()))
 
     def value(self, name: str) -> str:
         """Return the value of one widget. Raises DeviceRefusedError if the camera has no such setting."""

@@ -107,7 +107,7 @@ class KukaRobot:
     def heartbeat(self, sent_monotonic_s: float) -> None:
         """Pass a heartbeat, sent at this host time.monotonic(), on to the controller.
 
-        Not if it waited in a queue, and not for a moving arm that nobody has looked at for `unattended_s`.
+        It is not passed on if it waited in a queue, or if nobody has looked at a moving arm for `unattended_s`.
         """
         now_s = time.monotonic()
         self._left_alone = bool(self._motion) and now_s - self._attended_s > self._config.unattended_s
@@ -194,7 +194,7 @@ class KukaRobot:
     # --- arm -----------------------------------------------------------------------------------------------
 
     def let_move(self, confirmed_by: str, not_before_monotonic_s: float) -> None:
-        """Permit motion after a person's confirmation; clears stops over by `not_before_monotonic_s`.
+        """Permit motion after a person's confirmation; clears stops that ended before `not_before_monotonic_s`.
 
         Raises SafetyStopError or LeaveNeededError if a stop is active or was seen after that time.
         """

@@ -14,7 +14,7 @@ SPEED_WINDOW_S = 0.05  # over one period the encoders' steps would dominate
 
 
 class Speeds:
-    """The recent states of one stream, from whose differences the speeds are taken."""
+    """The recent states of one stream, from whose differences the speeds are computed."""
 
     def __init__(self) -> None:
         self._recent: deque[State] = deque()  # over SPEED_WINDOW_S

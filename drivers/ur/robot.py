@@ -165,7 +165,7 @@ class UrRobot:
     # --- arm -----------------------------------------------------------------------------------------------
 
     def let_move(self, confirmed_by: str, not_before_monotonic_s: float) -> None:
-        """Permit motion after a person's confirmation; clears stops over by `not_before_monotonic_s`.
+        """Permit motion after a person's confirmation; clears stops that ended before `not_before_monotonic_s`.
 
         Raises SafetyStopError or LeaveNeededError if a stop is active or was seen after that time.
         """

@@ -94,10 +94,24 @@ class Photograph(ImageFile):
 
 
 class ArmCorrection(JobRecord):
-    """The errors of an arm as the hand-eye calibration estimated them, with the corresponding T_flange_camera."""
+    """The errors of an arm as the hand-eye calibration estimated them, for N joints.
+
+    Attributes:
+        T_flange_camera: of the camera on the flange, for corrected poses.
+        arm: name of the arm's model.
+        model: which parameters the correction has, in words.
+        dh_deltas: (N, 4) added to a, d (metres), α, θ (radians) of each joint.
+        gear_cos_rad, gear_sin_rad: (N, H) amplitudes of the periodic errors of each joint.
+        observed: share of each joint's error that the images determine, 0 … 1.
+    """
 
     T_flange_camera: Matrix
     arm: str
+    model: str = ""
+    dh_deltas: Matrix
+    gear_cos_rad: Matrix
+    gear_sin_rad: Matrix
+    observed: tuple[float, ...]
     stations: tuple[str, ...] | None = None  # stations of that arm, in arguments of version 1
 
 

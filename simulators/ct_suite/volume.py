@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from simulators.geometry import Array, Array32, apply, inverse
 from simulators.scene.parts import Part
 from simulators.scene.world import RADIUS_M, Scene
+from simulators.serve import SimulatorError
 
 AIR, WOOD, TISSUE, BONE, PLASTIC, STEEL = -1000.0, -480.0, 50.0, 650.0, 150.0, 3000.0
 HOUNSFIELD = {"specimen": TISSUE, "board": WOOD, "post": WOOD, "steel": STEEL}
@@ -23,7 +24,12 @@ _SUBRAY_PITCH_M = 0.27e-3  # lateral antialiasing; along the ray the coverage is
 _MOST_SUBRAYS = 3  # per side; more would not be visible above the noise
 _ROWS = 24  # rows J computed at a time
 _HALO = 3  # additional rows on each side that the blur needs
-_RESTART_M = 2e-6  # offset past a hit when searching for the next one
+_RESTART_M = 1e-7  # offset past a hit when searching for the next one: the surface may fold closely
+_PAST_M = 2e-6  # the same, when the face that was left is met again
+_BELOW_M = 1e-3  # of a solid, where the rays start
+_ASIDE_M = 2e-6  # by which a ray that lost a crossing is moved at first
+_MOST_ATTEMPTS = 9  # at the last, it is half a millimetre aside, about a voxel
+_GOLDEN_ANGLE_RAD = 2.399963
 
 
 Box = tuple[slice, slice, slice]
@@ -53,7 +59,7 @@ class _Solid:
     """One closed part in an embree scene, in the frame of the grid."""
 
     def __init__(self, part: Part, grid: Grid) -> None:
-        self.hounsfield = HOUNSFIELD[part.material]
+        self.name, self.hounsfield = part.name, HOUNSFIELD[part.material]
         p = apply(inverse(grid.T_world_grid), part.vertices_m)[part.faces]
         self.low, self.high = p.reshape(-1, 3).min(axis=0), p.reshape(-1, 3).max(axis=0)
         self._scene = EmbreeScene()
@@ -76,29 +82,61 @@ class _Solid:
         y = ((np.arange(low[1], high[1])[:, None] + first_row + sub) * h).ravel()
         gy, gx = np.meshgrid(y, x, indexing="ij")
         cell = (np.repeat(np.arange(n_j), side)[:, None] * n_i + np.repeat(np.arange(n_i), side)[None]).ravel()
-        start = np.full(gx.size, float(self.low[2]) - h)
-        origins = np.stack([gx.ravel(), gy.ravel(), start], axis=1).astype(np.float32)
-        up = np.zeros_like(origins)
-        up[:, 2] = 1.0
-        voxels: list[NDArray[np.int64]] = []
-        shares: list[Array] = []
-        while len(origins):
-            face = np.asarray(self._scene.run(origins, up[: len(origins)]))
-            hit = face >= 0
-            origins, cell, face = origins[hit], cell[hit], face[hit]
-            z = self._depth(origins, face)
-            # Voxel k spans k - 0.5 to k + 0.5: the voxel of entry gets the rest of its length, later ones are full.
-            u = np.clip(z / h + 0.5 - low[2], 0.0, n_k)
-            k = u.astype(np.int64)
-            sign = np.where(self._entering[face], 1.0, -1.0)
-            voxels += [k * (n_j * n_i) + cell, (k + 1) * (n_j * n_i) + cell]
-            shares += [sign * (1.0 - u + k), sign * (u - k)]
-            origins[:, 2] = np.maximum(z + _RESTART_M, np.nextafter(origins[:, 2], np.float32(np.inf)))
-        change = np.bincount(np.concatenate(voxels), np.concatenate(shares), (n_k + 2) * n_j * n_i)
+        ray, z, sign = self._crossings(gx.ravel(), gy.ravel())
+        # Voxel k spans k - 0.5 to k + 0.5: the voxel of entry gets the rest of its length, later ones are full.
+        u = np.clip(z / h + 0.5 - low[2], 0.0, n_k)
+        k = u.astype(np.int64)
+        at = k * (n_j * n_i) + cell[ray]
+        voxels = np.concatenate([at, at + n_j * n_i])
+        shares = np.concatenate([sign * (1.0 - u + k), sign * (u - k)])
+        change = np.bincount(voxels, shares, (n_k + 2) * n_j * n_i)
         inside = np.cumsum(change.reshape(n_k + 2, n_j, n_i)[:n_k].astype(np.float32), axis=0)
         inside *= np.float32(1.0 / side**2)
         box = (slice(low[2], high[2]), slice(low[1], high[1]), slice(low[0], high[0]))
         return box, np.clip(inside, 0.0, 1.0, out=inside)
+
+    def _crossings(self, x: Array, y: Array) -> tuple[NDArray[np.int64], Array, Array]:
+        """Where vertical lines at x, y (N,) cross the surface: each one's line, z, and 1 (into the solid) or -1.
+
+        A line through an edge may miss a face there. It then enters more or less often than it leaves, and would fill
+        all voxels above. Such a line is moved aside, twice as far each time, until it leaves as often as it enters.
+        """
+        out: list[tuple[NDArray[np.int64], Array, Array]] = []
+        lines = np.arange(len(x))
+        for attempt in range(_MOST_ATTEMPTS):
+            angle, aside = _GOLDEN_ANGLE_RAD * attempt, _ASIDE_M * (2**attempt - 1)
+            number, z, sign = self._cast(x[lines] + aside * np.cos(angle), y[lines] + aside * np.sin(angle))
+            whole = np.bincount(number, sign, len(lines)) == 0
+            kept = whole[number]
+            out.append((lines[number[kept]], z[kept], sign[kept]))
+            lines = lines[~whole]
+            if len(lines) == 0:
+                break
+        else:
+            raise SimulatorError(
+                f"{len(lines)} rays leave the part {self.name} more or less often than they enter it"
+            )
+        number, z, sign = (np.concatenate(parts) for parts in zip(*out, strict=True))
+        return number, z, sign
+
+    def _cast(self, x: Array, y: Array) -> tuple[NDArray[np.int64], Array, Array]:
+        """The crossings, as `_crossings` gives them, that embree finds; on edges it may miss some."""
+        origins = np.stack([x, y, np.full(len(x), self.low[2] - _BELOW_M)], axis=1).astype(np.float32)
+        up = np.zeros_like(origins)
+        up[:, 2] = 1.0
+        number, left = np.arange(len(x)), np.full(len(x), -1)
+        found: list[tuple[NDArray[np.int64], Array, Array]] = []
+        while len(origins):
+            face = np.asarray(self._scene.run(origins, up[: len(origins)]))
+            hit = face >= 0
+            origins, number, again, face = origins[hit], number[hit], (face == left)[hit], face[hit]
+            z = self._depth(origins, face)
+            found.append((number[~again], z[~again], np.where(self._entering[face[~again]], 1.0, -1.0)))
+            beyond = np.where(again, origins[:, 2] + _PAST_M, z + _RESTART_M)
+            origins[:, 2] = np.maximum(beyond, np.nextafter(origins[:, 2], np.float32(np.inf)))
+            left = face
+        rays, z, sign = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return rays, z, sign
 
     def _depth(self, origins: Array32, face: NDArray[np.int32]) -> Array:
         """Depth z at which vertical rays hit their faces, in double precision."""

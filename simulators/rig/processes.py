@@ -23,6 +23,7 @@ from simulators.rig.world_server import World, WorldServer
 from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
 from simulators.serve import SimulatorError, Termination, announce
 
+CAMERAS = {"Sony ILCE-7RM5": "camera", "Canon EOS R5": "canon"}  # model: its simulator
 _LOAD_KG = 1.6  # camera, lens and mount
 _TAPE_SIGMA_M = 0.003  # accuracy with which a technician measures the scene's centre with a tape
 
@@ -35,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--speed-up", type=float, default=1.0, metavar="N", help="the arm takes 1/N of its time")
     parser.add_argument("--ct-voxel-mm", type=float, default=0.4, help="edge of the CT's voxels")
     parser.add_argument("--arm", choices=ARMS, default=ARMS[0], help="model of the arm; each has its own stations")
+    parser.add_argument("--camera", choices=tuple(CAMERAS), default="Sony ILCE-7RM5", help="model of the camera")
     parser.add_argument("--version", default="5.12", help="of Polyscope")
     parser.add_argument(
         "--arms", type=int, choices=(1, 2), default=1, help="one arm that is moved, or one per station"
@@ -113,7 +115,8 @@ class _Rig:
                 f"--initial-joints={joints}", "--world", world, "--arm", arm, *self._model(),
             )  # fmt: skip
         camera = self._child(
-            "camera", "camera", "--port", "0", "--world", world, "--image-width", str(self.args.image_width),
+            "camera", CAMERAS[self.args.camera], "--port", "0", "--world", world,
+            "--image-width", str(self.args.image_width),
             "--exposures-log", str(self.folder / "truth_exposures.jsonl"),
             *(("--send-to", str(self.folder / "photographs")) if self.args.without_cable else ()),
         )  # fmt: skip

@@ -3,82 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import logging
-import threading
-from pathlib import Path
 
-from simulators.serve import SimulatorError, Termination, announce
-from simulators.sony_camera.body import BodyOptions, CameraBody
+from simulators.serve import Termination
+from simulators.sony_camera.body import SonyBody
 from simulators.sony_camera.properties import Code
-from simulators.sony_camera.scene import ImageSource, PictureFiles, StillLife, WorldSource
-from simulators.sony_camera.server import CameraServer
+from simulators.sony_camera.server import SonyServer
+from simulators.still_camera import add_arguments, body_options, image_source, serve_until_stopped
 
-DEFAULT_WIDTH = 1536
-_LOG = logging.getLogger(__name__)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the camera's options."""
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on")
-    parser.add_argument("--port", type=int, default=15740, help="port of both connections; 0 takes a free one")
-    parser.add_argument("--world", metavar="HOST:PORT", help="take pictures of the rig's world")
-    parser.add_argument(
-        "--image-width", type=int, metavar="W", help=f"image width (up to 9504; default {DEFAULT_WIDTH})"
-    )
-    parser.add_argument("--image", nargs="+", type=Path, metavar="FILE", help="serve these pictures in turn")
-    parser.add_argument("--exposures-log", type=Path, metavar="FILE", help="write one JSON line per exposure")
-    parser.add_argument("--first-counter", type=int, default=1, help="number of the first file")
-    parser.add_argument(
-        "--announce", choices=("event", "property", "both"), default="both", help="how to announce a file"
-    )
-    parser.add_argument("--send-to", type=Path, metavar="DIR", help="no cable: send every file into this folder")
-    parser.add_argument("--battery", type=int, default=87, metavar="PERCENT", help="charge of the battery")
-    parser.add_argument("--fast", action="store_true", help="exposures take no time")
-    parser.add_argument(
-        "--mosaic-jpeg",
-        action="store_true",
-        help="make the JPEG beside a raw file of the same values, as a camera does; "
-        "otherwise it is that of a sensor that measures three colours at every pixel",
-    )
-
-
-def _source(args: argparse.Namespace) -> ImageSource:
-    if args.world:
-        return WorldSource(args.world, args.image_width or DEFAULT_WIDTH)
-    if args.image:
-        return PictureFiles(args.image, args.image_width)
-    return StillLife(args.image_width or DEFAULT_WIDTH)
-
-
-def _attend_button(source: WorldSource, body: CameraBody, stop: threading.Event) -> None:
-    """Release the shutter whenever somebody in the world presses the camera's own button."""
-    presses: int | None = None
-    while not stop.is_set():
-        try:
-            count, iso = source.await_press(-1 if presses is None else presses)
-        except SimulatorError as error:
-            _LOG.debug("the button: %s", error)
-            stop.wait(1.0)
-            continue
-        if presses is not None and count > presses:
-            body.press(iso)
-        presses = count
+__all__ = ["add_arguments", "serve"]
 
 
 def serve(args: argparse.Namespace) -> None:
     """Print the ready line and serve until SIGTERM."""
     termination = Termination()
-    options = BodyOptions(
-        args.fast, args.first_counter, args.exposures_log, args.announce, args.mosaic_jpeg, args.send_to
-    )
-    source, stop = _source(args), threading.Event()
-    body = CameraBody(source, args.faults, options)
+    body = SonyBody(image_source(args), args.faults, body_options(args))
     body.properties.put(Code.BATTERY, args.battery)
-    if isinstance(source, WorldSource):
-        threading.Thread(target=source.warm_up, args=(stop,), name="warm-up", daemon=True).start()
-        threading.Thread(target=_attend_button, args=(source, body, stop), name="button", daemon=True).start()
-    with CameraServer(args.host, args.port, body, args.faults) as server:
-        host, port = server.address
-        announce(simulator="camera", host=host, port=port, gphoto_port=f"ptpip:{host}:{port}:{port}")
-        termination.wait()
-    stop.set()
+    serve_until_stopped(SonyServer(args.host, args.port, body, args.faults), body, termination)

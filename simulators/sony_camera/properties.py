@@ -7,6 +7,9 @@ import threading
 from dataclasses import dataclass, field
 from enum import IntEnum
 
+from simulators.still_camera.exif import ExposureSettings
+from simulators.still_camera.operations import NotWritableError, RefusedValueError
+
 PROTOCOL_VERSION = 300
 _FORMATS = {1: "<b", 2: "<B", 3: "<h", 4: "<H", 5: "<i", 6: "<I"}
 
@@ -50,14 +53,6 @@ class Enabled(IntEnum):
     GREY = 0
     ON = 1
     DISPLAY_ONLY = 2
-
-
-class RefusedValueError(Exception):
-    """The camera does not offer this value."""
-
-
-class NotWritableError(Exception):
-    """The property cannot be set, or does not exist."""
 
 
 @dataclass(slots=True)
@@ -152,20 +147,6 @@ def initial_properties() -> list[CameraProperty]:
     ]
 
 
-@dataclass(frozen=True, slots=True)
-class ExposureSettings:
-    """The settings with which an exposure was taken."""
-
-    aperture_f: float
-    exposure_s: float
-    exposure_fraction: tuple[int, int]
-    iso: int
-    manual_focus: bool
-    file_format: int
-    jpeg_quality: int
-    capture_target: int
-
-
 class PropertyTable:
     """All properties behind one lock; used by the command thread and the exposure thread."""
 
@@ -217,8 +198,8 @@ class PropertyTable:
             exposure_s=numerator / denominator,
             exposure_fraction=(numerator, denominator),
             iso=self.value(Code.ISO) & 0xFFFFFF,
-            manual_focus=self.value(Code.FOCUS_MODE) == MANUAL_FOCUS,
-            file_format=self.value(Code.FILE_FORMAT),
-            jpeg_quality=self.value(Code.JPEG_QUALITY),
-            capture_target=self.value(Code.CAPTURE_TARGET),
+            jpeg=self.value(Code.FILE_FORMAT) != FILE_RAW,
+            raw=self.value(Code.FILE_FORMAT) != FILE_JPEG,
+            jpeg_level=self.value(Code.JPEG_QUALITY),
+            on_card=self.value(Code.CAPTURE_TARGET) != TARGET_COMPUTER,
         )

@@ -3,61 +3,36 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 
-from simulators.faults import Fault, FaultPlan
-from simulators.serve import SimulatorError
-from simulators.sony_camera import codec
-from simulators.sony_camera.body import CARD_BYTES, FORMAT_ARW, FORMAT_JPEG, BusyError, CameraBody, CardFullError
-from simulators.sony_camera.properties import CONTROLS, Code, NotWritableError, RefusedValueError
-from simulators.sony_camera.scene import NotReadyError
+from simulators.faults import FaultPlan
+from simulators.ptpip import codec
+from simulators.ptpip.reply import (
+    INVALID_HANDLE,
+    INVALID_STORAGE,
+    INVALID_VALUE,
+    Reply,
+)
+from simulators.sony_camera.body import FORMAT_ARW, SonyBody
+from simulators.sony_camera.properties import CONTROLS, Code
+from simulators.still_camera.body import CARD_BYTES, FORMAT_JPEG
+from simulators.still_camera.operations import Operation, Operations, accept
 
 STORAGE = 0x00010001
 SHOT_HANDLE, LIVE_VIEW_HANDLE = 0xFFFFC001, 0xFFFFC002
 OBJECT_ADDED = 0xC201
-OK, GENERAL_ERROR, SESSION_NOT_OPEN, NOT_SUPPORTED = 0x2001, 0x2002, 0x2003, 0x2005
-INVALID_STORAGE, INVALID_HANDLE, STORE_FULL, ACCESS_DENIED = 0x2008, 0x2009, 0x200C, 0x200F
-DEVICE_BUSY, INVALID_VALUE = 0x2019, 0x201C
-_REJECTIONS = {
-    "busy": DEVICE_BUSY,
-    "disk_full": STORE_FULL,
-    "reject": ACCESS_DENIED,
-    "error": GENERAL_ERROR,
-    "ignore": OK,
-}
-_CODES: dict[type[Exception], int] = {
-    BusyError: DEVICE_BUSY,
-    CardFullError: STORE_FULL,
-    NotWritableError: ACCESS_DENIED,
-    RefusedValueError: INVALID_VALUE,
-    SimulatorError: GENERAL_ERROR,
-    NotReadyError: DEVICE_BUSY,
-}
 # A real camera takes milliseconds to answer a poll during an exposure; the client polls as fast as it is answered.
 _POLL_WHILE_EXPOSING_S = 0.005
 
 
-@dataclass(frozen=True, slots=True)
-class Reply:
-    """The answer: response code, its parameters, a data phase; the socket carries out `wire_fault`."""
-
-    code: int = OK
-    parameters: tuple[int, ...] = ()
-    data: bytes | None = None
-    wire_fault: Fault | None = None
-
-
-class Responder:
+class SonyResponder(Operations):
     """One session's operations on the camera."""
 
-    def __init__(self, body: CameraBody, faults: FaultPlan) -> None:
+    def __init__(self, body: SonyBody, faults: FaultPlan) -> None:
         self._body = body
-        self._faults = faults
-        self._operations: dict[int, tuple[str, Callable[[codec.Request, bytes], Reply]]] = {
+        operations: dict[int, tuple[str, Operation]] = {
             0x1001: ("get_device_info", self._device_info),
-            0x1002: ("open_session", self._ok),
-            0x1003: ("close_session", self._ok),
+            0x1002: ("open_session", accept),
+            0x1003: ("close_session", accept),
             0x1004: ("get_storage_ids", self._storage_ids),
             0x1005: ("get_storage_info", self._storage_info),
             0x1006: ("get_num_objects", self._object_count),
@@ -70,28 +45,9 @@ class Responder:
             0x9207: ("button", self._button),
             0x9209: ("get_properties", self._all_properties),
         }
+        super().__init__(body, faults, operations)
 
-    def handle(self, request: codec.Request, data: bytes) -> Reply:
-        """Carry out one operation.
-
-        Planned faults of the kinds busy, disk_full, reject, error and ignore take effect here.
-        """
-        known = self._operations.get(request.operation)
-        if known is None:
-            return Reply(NOT_SUPPORTED)
-        name, operation = known
-        fault = self._faults.check("camera", self._message(name, request, data))
-        if fault is not None and fault.kind == "disk_full":
-            self._body.free_bytes = 0
-        if fault is not None and fault.kind in _REJECTIONS:
-            return Reply(_REJECTIONS[fault.kind])
-        try:
-            reply = operation(request, data)
-        except tuple(_CODES) as error:
-            return Reply(_CODES[type(error)])
-        return Reply(reply.code, reply.parameters, reply.data, fault)
-
-    def _message(self, name: str, request: codec.Request, data: bytes) -> str:
+    def message(self, name: str, request: codec.Request, data: bytes) -> str:
         """The name of a message in fault plans: shutter presses and live-view frames have their own names."""
         first = request.parameters[0] if request.parameters else 0
         if name == "button" and first == Code.FULL_PRESS and data[:1] == b"\x02":
@@ -100,10 +56,6 @@ class Responder:
             return "preview"
         return name
 
-    def _ok(self, request: codec.Request, data: bytes) -> Reply:
-        del request, data
-        return Reply()
-
     def _device_info(self, request: codec.Request, data: bytes) -> Reply:
         del request, data
         info = codec.DeviceInfo(
@@ -111,10 +63,12 @@ class Responder:
             model="ILCE-7RM5",
             firmware="3.00",
             serial="00000000000000003282933005318008",
-            operations=tuple(self._operations),
+            operations=tuple(self.operations),
             events=(OBJECT_ADDED, 0xC202, 0xC203),
             properties=(),
             image_formats=(0x3001, FORMAT_JPEG, FORMAT_ARW),
+            vendor_extension=0x11,
+            vendor_description="Sony PTP Extensions",
         )
         return Reply(data=info.encode())
 
@@ -127,7 +81,7 @@ class Responder:
         if request.parameters[:1] != (STORAGE,):
             return Reply(INVALID_STORAGE)
         free = self._body.free_bytes
-        return Reply(data=codec.StorageInfo(CARD_BYTES, free, free // 60_000_000).encode())
+        return Reply(data=codec.StorageInfo(CARD_BYTES, free, free // 60_000_000, "CFexpress Type A").encode())
 
     def _object_count(self, request: codec.Request, data: bytes) -> Reply:
         del request, data

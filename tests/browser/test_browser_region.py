@@ -19,8 +19,7 @@ from tests.support.pages.at_the_table import STANDING
 from tests.support.pages.browser import accessibility_faults, screen, served
 from tests.support.pages.web import password_of, web_site
 from tests.support.runs.attended import attended
-from tests.support.runs.recorded_run import PROTOCOL, record_run
-from tests.web.test_web_region import FUSION
+from tests.support.runs.recorded_run import FUSION, PROTOCOL, record_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

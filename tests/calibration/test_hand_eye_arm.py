@@ -27,13 +27,14 @@ from service.compute.calibration.board_poses.plan import suggest_board_poses
 from service.compute.calibration.board_poses.plan_plot import draw_board_plan
 from service.compute.calibration.hand_eye.answers import HandEyeResult
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.calibration.hand_eye.record import hand_eye_record, read_arm_correction
 from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.poses.files.pose_files import write_poses_csv
 from service.core.arms.known import arm_model
 from service.core.arms.model import ArmModel
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, inverse
+from service.jobs import records
+from service.worker.calibration.records import arm_correction_record, corrected_mounting, hand_eye_record
 from simulators.scene.world import Scene
 from simulators.ur_controller.kinematics import MODELS
 from simulators.ur_controller.kinematics import forward as simulated_forward
@@ -144,8 +145,9 @@ def test_the_arms_own_error_is_found_and_pays_on_viewpoints_it_never_saw() -> No
     reported = np.array([scene.nominal_flange(shot.q) for shot in views])
     errors = {name: scene_error_mm(scene, views, reported @ T) for name, T in result.methods.items()}
     assert result.corrected is not None
-    record = json.loads(json.dumps(hand_eye_record(result, [f"{i}.jpg" for i in range(len(result.held_out_mm))])))
-    corrected = read_arm_correction(record["arm_correction"])
+    record = hand_eye_record(result, [f"{i}.jpg" for i in range(len(result.held_out_mm))]).arm_correction
+    assert record is not None
+    corrected = corrected_mounting(record)
     poses = corrected.T_base_camera(np.array([shot.q for shot in views]), reported)
     error = scene_error_mm(scene, views, poses)
     assert error < 0.1 * min(errors.values())
@@ -153,7 +155,7 @@ def test_the_arms_own_error_is_found_and_pays_on_viewpoints_it_never_saw() -> No
     assert result.corrected.robot_noise_mm == pytest.approx(0.0115, rel=0.4)  # the simulated arm's repeatability
     assert np.median(result.corrected.held_out_mm) < 0.1 * np.median(result.held_out_mm)
     assert result.arm_held_out_mm["geometry+gears"] < result.arm_held_out_mm["geometry"]
-    assert np.all((record["arm_correction"]["observed"] >= np.zeros(6)) & (corrected.correction.observed <= 1))
+    assert np.all((np.array(record.observed) >= 0) & (corrected.correction.observed <= 1))
 
 
 def test_an_arm_that_errs_otherwise_still_gains() -> None:
@@ -177,8 +179,9 @@ def test_an_arm_of_seven_axes_with_errors_of_another_kind_gains_as_well() -> Non
     assert arm.axes == 7
     result = _with_joints(session, arm)
     assert result.corrected is not None
-    record = json.loads(json.dumps(hand_eye_record(result, [f"{i}.jpg" for i in range(len(shots))])))
-    corrected = read_arm_correction(record["arm_correction"])
+    record = hand_eye_record(result, [f"{i}.jpg" for i in range(len(shots))]).arm_correction
+    assert record is not None
+    corrected = corrected_mounting(record)
     assert corrected.correction.dh_deltas.shape == (7, 4)
     assert corrected.correction.observed.shape == (7,)
     views = plan(scene, "exvivo_spine", "viewpoint_capture_1", "viewpoint_capture_2")[::2]
@@ -261,10 +264,13 @@ def test_an_empty_correction_changes_nothing(q: Array) -> None:
     T = forward(UR10E, q[None])[0]
     nothing = ArmCorrection("UR10e", np.zeros((6, 4)), np.zeros((6, 10)), np.zeros((6, 10)), np.zeros(6))
     np.testing.assert_allclose(corrected_T_base_flange(q, T, nothing), T, atol=1e-12)
-    again = ArmCorrection.from_json(json.loads(json.dumps(nothing.as_json())))
-    np.testing.assert_array_equal(again.dh_deltas, nothing.dh_deltas)
-    with pytest.raises(DataError, match="not an arm correction"):
-        ArmCorrection.from_json({"arm": "UR10e"})
+    record = arm_correction_record(nothing, np.eye(4))
+    again = corrected_mounting(records.ArmCorrection.model_validate(json.loads(json.dumps(record.plain()))))
+    np.testing.assert_array_equal(again.correction.dh_deltas, nothing.dh_deltas)
+    np.testing.assert_array_equal(again.T_flange_camera, np.eye(4))
+    for wrong in ({"observed": (1.0,)}, {"dh_deltas": ((0.0,), (0.0, 0.0))}, {"T_flange_camera": ((1.0,),)}):
+        with pytest.raises(DataError, match=r"not an arm correction|not 4 × 4"):
+            corrected_mounting(record.model_copy(update=wrong))
     with pytest.raises(ConfigurationError, match="UR5e"):
         arm_model("R2D2")
 

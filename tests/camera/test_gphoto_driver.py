@@ -5,55 +5,27 @@ from __future__ import annotations
 import hashlib
 import json
 import signal
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from drivers.errors import (
-    DeviceBusyError,
     DeviceError,
     DeviceFaultError,
     DeviceRefusedError,
-    DeviceStorageFullError,
-    DeviceTimeoutError,
     DeviceUnavailableError,
     StaleImageError,
-    UnreadableFileError,
 )
-from drivers.gphoto import DRIVER, GphotoConfig
 from drivers.gphoto.link import check_library_version
-from drivers.gphoto.settings import choose_number, choose_word, number_of, quality_of
-from drivers.host.hosted_device import hosted
+from drivers.gphoto.profile import choose_number, choose_word, number_of, quality_of
+from drivers.gphoto.profiles.sony_ilce import PROFILE
 from drivers.interfaces import Camera, CameraSettings
-from tests.support.rig.camera_simulator import RunningCamera, camera_simulator
+from tests.support.rig.camera_simulator import camera_simulator
+from tests.support.rig.gphoto_rig import PAPER, driver, gphoto_rig
 
-PAPER = CameraSettings(aperture_f=22.0, exposure_s=1 / 15, iso=100, focus_mode="Manual", image_quality="JPEG")
-
-
-def driver(port: str, **config: Any) -> Camera:
-    return hosted(
-        Camera,
-        "drivers.gphoto:DRIVER",
-        GphotoConfig(port=port, **config),
-        call_timeout_s=DRIVER.call_timeout_s,
-        name="camera",
-    )
-
-
-@contextmanager
-def rig(
-    faults: list[dict[str, Any]] | None = None, *options: str, **config: Any
-) -> Generator[tuple[Camera, RunningCamera]]:
-    with camera_simulator(faults or [], *options) as simulator:
-        camera = driver(simulator.gphoto_port, **config)
-        try:
-            camera.open()
-            yield camera, simulator
-        finally:
-            camera.close()
+rig = partial(gphoto_rig, "camera")
 
 
 @pytest.fixture(scope="module")
@@ -117,17 +89,6 @@ def test_raw_alone(tmp_path: Path) -> None:
     assert image.exif.aperture_f == 22.0
 
 
-def test_live_view(camera: Camera) -> None:
-    frame = camera.preview()
-    assert frame[:2] == b"\xff\xd8"
-    assert frame[-2:] == b"\xff\xd9"
-
-
-def test_live_view_waits_for_a_busy_camera() -> None:
-    with rig([{"on": "preview", "kind": "busy", "times": 2}]) as (camera, _):
-        assert camera.preview()[:2] == b"\xff\xd8"
-
-
 def test_stale_image_then_a_new_one(tmp_path: Path) -> None:
     with rig([{"on": "image", "kind": "stale", "nth": 2}]) as (camera, _):
         first = camera.capture(tmp_path)
@@ -136,44 +97,6 @@ def test_stale_image_then_a_new_one(tmp_path: Path) -> None:
         third = camera.capture(tmp_path)
     assert third.counter == 3
     assert hashlib.sha256(first.jpeg.path.read_bytes()).hexdigest() == first.jpeg.sha256
-
-
-def test_stale_image_is_known_by_its_bytes_in_another_folder(tmp_path: Path) -> None:
-    other = tmp_path / "other"
-    other.mkdir()
-    with rig([{"on": "image", "kind": "stale", "nth": 2}]) as (camera, _):
-        camera.capture(tmp_path)
-        with pytest.raises(StaleImageError, match="byte for byte"):
-            camera.capture(other)
-
-
-@pytest.mark.parametrize("on", ["image", "get_object"])
-def test_truncated_jpeg_is_named_and_earlier_files_are_untouched(tmp_path: Path, on: str) -> None:
-    with rig([{"on": on, "kind": "truncate", "nth": 2}]) as (camera, _):
-        first = camera.capture(tmp_path)
-        with pytest.raises(UnreadableFileError, match=r"DSC00002\.JPG.*not affected"):
-            camera.capture(tmp_path)
-        third = camera.capture(tmp_path)
-    assert sorted(path.name for path in tmp_path.glob("*.JPG")) == ["DSC00001.JPG", "DSC00003.JPG"]
-    assert hashlib.sha256(first.jpeg.path.read_bytes()).hexdigest() == first.jpeg.sha256
-    assert third.counter == 3
-
-
-def test_busy_camera_is_asked_again(tmp_path: Path) -> None:
-    with rig([{"on": "shutter", "kind": "busy", "times": 2}]) as (camera, _):
-        assert camera.capture(tmp_path).counter == 1
-
-
-def test_camera_that_stays_busy(tmp_path: Path) -> None:
-    with rig([{"on": "shutter", "kind": "busy", "times": 50}]) as (camera, _), pytest.raises(DeviceBusyError):
-        camera.capture(tmp_path)
-
-
-def test_full_store(tmp_path: Path) -> None:
-    with rig([{"on": "shutter", "kind": "disk_full"}]) as (camera, _):
-        with pytest.raises(DeviceStorageFullError):
-            camera.capture(tmp_path)
-        assert any("free" in problem for problem in camera.report().problems)
 
 
 def test_shutter_refused_by_a_camera_that_answers(tmp_path: Path) -> None:
@@ -192,25 +115,6 @@ def test_setting_refused_for_good_and_for_a_moment() -> None:
         pytest.raises(DeviceRefusedError, match="keeps f-number at f/8 instead of f/22"),
     ):
         camera.apply(CameraSettings(22.0, 1 / 15, 100, "Automatic"))
-
-
-def test_shutter_without_an_image(tmp_path: Path) -> None:
-    with rig([{"on": "image", "kind": "no_image"}], capture_timeout_s=2.0) as (camera, _):
-        with pytest.raises(DeviceTimeoutError, match="none"):
-            camera.capture(tmp_path)
-        assert camera.capture(tmp_path).counter == 2
-
-
-@pytest.mark.parametrize("kind", ["drop", "reset"])
-def test_link_lost_in_mid_download_then_open_again(tmp_path: Path, kind: str) -> None:
-    with rig([{"on": "get_object", "kind": kind, "nth": 2}]) as (camera, _):
-        first = camera.capture(tmp_path)
-        with pytest.raises(DeviceUnavailableError):
-            camera.capture(tmp_path)
-        camera.open()
-        third = camera.capture(tmp_path)
-    assert third.counter == 3
-    assert hashlib.sha256(first.jpeg.path.read_bytes()).hexdigest() == first.jpeg.sha256
 
 
 def test_camera_killed_and_started_again(tmp_path: Path) -> None:
@@ -260,8 +164,8 @@ def test_numbers_in_the_camera_s_words(word: str, number: float | None) -> None:
 
 def test_words_of_another_usb_mode() -> None:
     offered = ("RAW", "RAW+JPEG (Fine)", "Extra Fine", "Fine")
-    assert choose_word("imagequality", "JPEG", offered, "here") == "Extra Fine"
-    assert choose_word("imagequality", "RAW+JPEG", offered, "here") == "RAW+JPEG (Fine)"
+    assert choose_word(PROFILE.quality, "JPEG", offered, "here") == "Extra Fine"
+    assert choose_word(PROFILE.quality, "RAW+JPEG", offered, "here") == "RAW+JPEG (Fine)"
     assert [quality_of(word) for word in offered] == ["RAW", "RAW+JPEG", "JPEG", "JPEG"]
     with pytest.raises(DeviceRefusedError, match="offers no values"):
-        choose_number("f-number", 22.0, ("--",), "here")
+        choose_number(PROFILE.f_number, 22.0, ("--",), "here")

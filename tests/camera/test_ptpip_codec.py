@@ -9,13 +9,15 @@ from pathlib import Path
 import pytest
 
 from simulators.faults import FaultPlan
+from simulators.ptpip import codec
+from simulators.ptpip.codec import PacketType
 from simulators.serve import SimulatorError
-from simulators.sony_camera import codec
-from simulators.sony_camera.body import BodyOptions, CameraBody
-from simulators.sony_camera.codec import PacketType
-from simulators.sony_camera.properties import Code, PropertyTable, RefusedValueError
-from simulators.sony_camera.responder import Responder
-from simulators.sony_camera.scene import PictureFiles, StillLife, exposure_gain
+from simulators.sony_camera.body import SonyBody
+from simulators.sony_camera.properties import Code, PropertyTable
+from simulators.sony_camera.responder import SonyResponder
+from simulators.still_camera.body import BodyOptions
+from simulators.still_camera.operations import RefusedValueError
+from simulators.still_camera.scene import PictureFiles, StillLife, exposure_gain
 
 GUID = bytes(range(16))
 
@@ -25,8 +27,8 @@ def request(operation: int, *parameters: int) -> codec.Request:
 
 
 @pytest.fixture
-def body() -> CameraBody:
-    return CameraBody(StillLife(240), FaultPlan(), BodyOptions(fast=True))
+def body() -> SonyBody:
+    return SonyBody(StillLife(240), FaultPlan(), BodyOptions(fast=True))
 
 
 def test_golden_init_exchange() -> None:
@@ -102,17 +104,17 @@ def test_f_number_comes_in_four_bytes_and_strange_values_are_refused() -> None:
         table.set_from_client(Code.F_NUMBER, b"\x01")
 
 
-def test_extension_info_announces_version_3(body: CameraBody) -> None:
-    reply = Responder(body, FaultPlan()).handle(request(0x9202, 0x12C, 1), b"")
+def test_extension_info_announces_version_3(body: SonyBody) -> None:
+    reply = SonyResponder(body, FaultPlan()).handle(request(0x9202, 0x12C, 1), b"")
     assert reply.data is not None
     assert struct.unpack_from("<H", reply.data)[0] == 300
     assert reply.data.endswith(bytes.fromhex("04000000" + "c1d2" + "c2d2" + "d1d2" + "d2d2"))
 
 
-def test_exposure_through_the_operations(body: CameraBody) -> None:
+def test_exposure_through_the_operations(body: SonyBody) -> None:
     ready: list[int] = []
     body.on_object = lambda: ready.append(1)
-    responder = Responder(body, FaultPlan())
+    responder = SonyResponder(body, FaultPlan())
     assert responder.handle(request(0x1008, 0xFFFFC001), b"").code == 0x2009
     assert responder.handle(request(0x9207, 0xD2C1), b"\x02\x00").code == 0x2001
     assert responder.handle(request(0x9207, 0xD2C2), b"\x02\x00").code == 0x2001
@@ -140,8 +142,8 @@ def test_exposure_through_the_operations(body: CameraBody) -> None:
         (0x9207, (0xD2FF,), b"\x02\x00", 0x201C),
     ],
 )
-def test_refusals(body: CameraBody, operation: int, parameters: tuple[int, ...], data: bytes, code: int) -> None:
-    assert Responder(body, FaultPlan()).handle(request(operation, *parameters), data).code == code
+def test_refusals(body: SonyBody, operation: int, parameters: tuple[int, ...], data: bytes, code: int) -> None:
+    assert SonyResponder(body, FaultPlan()).handle(request(operation, *parameters), data).code == code
 
 
 def test_brightness_follows_aperture_time_and_iso() -> None:

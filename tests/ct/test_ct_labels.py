@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from drivers.dicom_folder import DicomFolder, DicomFolderConfig
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import Array, CtLabels
-from tests.support.scenes.ct_labels import LABELS, LPS_FROM_RAS, write_nifti, write_seg
-from tests.support.scenes.ct_series import SHAPE, hospital, write_series
+from tests.support.ct.ct_labels import LABELS, LPS_FROM_RAS, write_nifti, write_seg
+from tests.support.ct.ct_series import SHAPE, hospital, write_series
 
 OBLIQUE = Rotation.from_euler("xyz", [0.6, -2.1, 2.9]).as_matrix()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -23,14 +22,14 @@ from service.core.records.events import FilesKept
 from service.core.run.state import RunState
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.worker.loop import work
 from simulators.ct_suite.suite import write_series
 from simulators.ct_suite.volume import Grid
 from simulators.faults import FaultPlan
-from tests.ground_truth.test_fuse_command import CENTRES_M, RADIUS_M, T_WORLD_CT
+from tests.support.ct.ct_labels import write_nifti
+from tests.support.ct.fused_scene import CENTRES_M, RADIUS_M, T_WORLD_CT
 from tests.support.rig.bench_rig import BenchRig
-from tests.support.runs.bench_run import Bench, begin_run, say
-from tests.support.scenes.ct_labels import write_nifti
+from tests.support.runs.bench_run import Bench, say
+from tests.support.runs.computing_run import begin_computing_run
 
 pytestmark = pytest.mark.slow
 VOXEL_M = 0.8e-3
@@ -91,13 +90,7 @@ def bench(tmp_path: Path, spheres: tuple[Path, NDArray[np.uint8]]) -> Iterator[B
     for old in spheres[0].glob("*.nii"):
         old.unlink()
     with Store.open(tmp_path / "data") as store:
-        made = replace(begin_run(store, PROTOCOL, tmp_path), rig=rig)
-
-        def compute(_seconds: float) -> None:
-            work(store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _all: None)
-
-        made.on_wait = compute
-        yield made
+        yield begin_computing_run(store, PROTOCOL, tmp_path, rig)
 
 
 def imported(bench: Bench, spheres: tuple[Path, NDArray[np.uint8]], labels: NDArray[np.uint8]) -> RunState:

@@ -17,8 +17,8 @@ from pydicom.uid import UID, ExplicitVRLittleEndian, ImplicitVRLittleEndian, RLE
 from drivers.dicom_folder import DicomFolder, DicomFolderConfig
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import CleanFile
-from tests.support.scenes.ct_labels import LABELS, write_nifti, write_seg
-from tests.support.scenes.ct_series import hospital, pixels, write_series
+from tests.support.ct.ct_labels import LABELS, write_nifti, write_seg
+from tests.support.ct.ct_series import hospital, pixels, write_series
 
 PERSONAL = b"DOE JOHN MRN-4711 19500102 ACC-12 HOUSE SMITH General 20260101 SN-99 secret nickname".split()
 

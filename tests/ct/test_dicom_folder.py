@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from drivers.dicom_folder import DRIVER, DicomFolder, DicomFolderConfig
 from drivers.errors import DeviceUnavailableError, UnreadableFileError
 from drivers.interfaces import Array, CtSeries
-from tests.support.scenes.ct_series import SHAPE, SPACING_MM, Change, pixels, write_series
+from tests.support.ct.ct_series import SHAPE, SPACING_MM, Change, pixels, write_series
 
 # Only files in the package itself; get_testdata_file would look for others on the network.
 SHIPPED = Path(pydicom.data.__file__).parent / "test_files"

@@ -18,8 +18,8 @@ from pydicom.uid import ExplicitVRLittleEndian, RLELossless, generate_uid
 from drivers.dicom_folder import DicomFolder, DicomFolderConfig
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import Array, CtSeries
+from tests.support.ct.ct_series import SHAPE, hospital, pixels, write_series
 from tests.support.rig.rig import REPOSITORY
-from tests.support.scenes.ct_series import SHAPE, hospital, pixels, write_series
 
 SYNTAXES = {
     "RLE": gdcm.TransferSyntax.RLELossless,

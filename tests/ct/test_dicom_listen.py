@@ -23,8 +23,8 @@ from pynetdicom.association import Association
 from drivers.dicom_folder import DicomFolder, DicomFolderConfig
 from drivers.dicom_receiver import Receiver, ReceiverConfig
 from drivers.errors import DeviceRefusedError, DeviceUnavailableError
+from tests.support.ct.ct_series import SHAPE, hospital, pixels, write_series
 from tests.support.rig.rig import REPOSITORY
-from tests.support.scenes.ct_series import SHAPE, hospital, pixels, write_series
 
 LISTEN = [sys.executable, "-m", "service.cli.main", "dicom-listen", "--port", "0", "--json"]
 UID = "1.2.826.0.1.3680043.8.498.1"

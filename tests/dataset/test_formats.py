@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-import json
 import re
 import subprocess
 import sys
@@ -14,19 +13,15 @@ from typing import Any
 import cv2
 import h5py
 import numpy as np
-import pycolmap
 import pytest
 import trimesh
-from numpy.typing import NDArray
-from PIL import Image
 
-from service.core.errors import DataError
-from service.core.geometry import Array, apply, inverse
-from service.dataset.posed.exporter import exporter, exporters, write_data_set
+from service.core.geometry import apply, inverse
+from service.dataset.posed.exporter import exporters
 from service.dataset.posed.of_folder import data_set_of_folder
-from service.dataset.posed.pixels import undistorted_data_set
-from service.dataset.posed.records import DataSet, Mesh, View
-from tests.support.scenes.posed import posed_data_set, scene
+from service.dataset.posed.records import DataSet, Mesh
+from tests.support.scenes.posed import scene
+from tests.support.scenes.read_formats import check_depth, corners, document, picture, truth_px, written
 
 NAMES = {
     "colmap", "colmap-binary", "colmap-pinhole", "sugar", "eth3d", "nerfstudio", "instant-ngp", "neus2", "dtu", "bop",
@@ -35,229 +30,8 @@ NAMES = {
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> DataSet:
-    return posed_data_set(tmp_path_factory.mktemp("photographs"))
-
-
-@pytest.fixture(scope="module")
-def pinholes(dataset: DataSet) -> DataSet:
-    return undistorted_data_set(dataset)
-
-
-def written(dataset: DataSet, name: str, folder: Path) -> Path:
-    write_data_set(dataset, exporter(name), folder / name)
-    return folder / name
-
-
-def document(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def picture(path: Path) -> NDArray[Any]:
-    """The pixels of a file, with all its channels and bits."""
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert pixels is not None
-    return pixels
-
-
-def corners() -> Array:
-    """Points of the solid: corners of the mesh."""
-    return np.asarray(scene().mesh.vertices)
-
-
-def truth_px(view: View) -> Array:
-    """Our own projection of the corners; its first pixel has its centre at 0."""
-    return view.camera.project(apply(inverse(view.T_world_camera), corners()))
-
-
-def check_depth(view: View, depth_m: Array, tolerance_m: float) -> None:
-    """Points at the depth of their pixels lie on the solid."""
-    v, u = (k.ravel() for k in np.mgrid[8:112:9, 8:152:9])
-    z = depth_m[v, u]
-    seen = (z > 0) & np.isfinite(z)
-    rays = np.stack(
-        [(u - view.camera.cx) / view.camera.fx, (v - view.camera.cy) / view.camera.fy, np.ones(len(u))], 1
-    )
-    points = apply(view.T_world_camera, (rays * z[:, None])[seen])
-    assert len(points) > 20
-    assert scene().distance_m(points).max() < tolerance_m
-
-
 def test_every_format_is_found() -> None:
     assert set(exporters()) == NAMES
-
-
-# --- COLMAP -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["colmap", "colmap-binary", "colmap-pinhole", "sugar"])
-def test_pycolmap_projects_points_to_their_pixels(
-    dataset: DataSet, pinholes: DataSet, tmp_path: Path, name: str
-) -> None:
-    folder = written(dataset, name, tmp_path)
-    expected = dataset if name in ("colmap", "colmap-binary") else pinholes
-    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
-    images = {image.name: image for image in model.images.values()}
-    assert set(images) == {view.file for view in dataset.views}
-    for view in expected.views:
-        camera = model.cameras[images[view.file].camera_id]
-        assert camera.model.name == ("OPENCV" if expected is dataset else "PINHOLE")
-        for point, truth in zip(corners(), truth_px(view), strict=True):
-            assert np.abs(images[view.file].project_point(point) - 0.5 - truth).max() < 0.01
-        with Image.open(folder / "images" / view.file) as picture:
-            assert picture.size == (camera.width, camera.height)
-
-
-@pytest.mark.parametrize("name", ["colmap", "colmap-pinhole", "sugar", "eth3d"])
-def test_an_image_name_that_colmaps_text_cannot_hold_is_refused(dataset: DataSet, tmp_path: Path, name: str) -> None:
-    first, *others = dataset.views
-    spaced = dataclasses.replace(dataset, views=(dataclasses.replace(first, name="view 1"), *others))
-    with pytest.raises(DataError, match=r"cannot hold image names with spaces.*view 1\.png"):
-        written(spaced, name, tmp_path)
-
-
-def test_the_undistorted_images_show_the_solid_where_pycolmap_projects_it(dataset: DataSet, tmp_path: Path) -> None:
-    folder, shown = written(dataset, "colmap-pinhole", tmp_path), scene()
-    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
-    points = trimesh.sample.sample_surface(shown.mesh, 4000, seed=5)[0]
-    top = points[np.abs(points[:, 2] - 0.03) < 1e-9]  # nothing hides it from above but the tall part
-    top = top[(top[:, 0] < 0.0) & (np.abs(top[:, 1]) < 0.02) & (top[:, 0] > -0.07)]
-    for image in model.images.values():
-        grey = picture(folder / "images" / image.name)[..., 0].astype(np.float64)
-        pixels = np.array([image.project_point(point) for point in top]) - 0.5
-        u, v = np.rint(pixels).astype(int).T
-        error = grey[v, u] - shown.tone(top)
-        assert np.sqrt(np.mean(error**2)) < 4
-
-
-def test_the_points_of_sugar_are_in_the_scene_and_tell_nothing_of_the_surface(
-    dataset: DataSet, tmp_path: Path
-) -> None:
-    model = pycolmap.Reconstruction(str(written(dataset, "sugar", tmp_path) / "sparse" / "0"))
-    points = np.array([point.xyz for point in model.points3D.values()])
-    low, high = scene().mesh.bounds
-    assert len(points) == 100_000
-    assert (points >= low).all()
-    assert (points <= high).all()
-    assert np.abs(points.mean(axis=0) - (low + high) / 2).max() < 0.01 * (high - low).max()
-
-
-def test_eth3d_has_depth_and_scan(dataset: DataSet, pinholes: DataSet, tmp_path: Path) -> None:
-    folder = written(dataset, "eth3d", tmp_path)
-    model = pycolmap.Reconstruction(str(folder / "dslr_calibration_undistorted"))
-    images = {image.name: image for image in model.images.values()}
-    assert set(images) == {view.file for view in dataset.views}
-    for view in pinholes.views:
-        projected = np.array([images[view.file].project_point(point) for point in corners()])
-        assert np.abs(projected - 0.5 - truth_px(view)).max() < 0.01
-    mesh = trimesh.load_mesh(folder / "dslr_scan_eval" / "scan1.ply")
-    assert np.abs(mesh.bounds - scene().mesh.bounds).max() < 1e-12
-    for view in pinholes.views:
-        raw = np.fromfile(folder / "ground_truth_depth" / "dslr_images_undistorted" / view.file, "<f4")
-        depth = raw.reshape(view.camera.height, view.camera.width)
-        assert np.isinf(depth).any()
-        check_depth(view, depth, 1e-6)
-
-
-# --- radiance fields --------------------------------------------------------------------------------------------
-
-
-def test_nerfstudio_projects_points_to_their_pixels(dataset: DataSet, tmp_path: Path) -> None:
-    folder = written(dataset, "nerfstudio", tmp_path)
-    stated = document(folder / "transforms.json")
-    for frame, view in zip(stated["frames"], dataset.views, strict=True):
-        pose = np.array(frame["transform_matrix"])
-        R, t = OPENCV_FROM_OPENGL @ pose[:3, :3].T, pose[:3, 3]
-        K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]])
-        distortion = np.array([frame[key] for key in ("k1", "k2", "p1", "p2")])
-        pixels = cv2.projectPoints(corners(), cv2.Rodrigues(R)[0], -R @ t, K, distortion)[0].reshape(-1, 2)
-        assert np.abs(pixels - 0.5 - truth_px(view)).max() < 0.01
-        depth = picture(folder / frame["depth_file_path"])
-        exact = dataset.pixels.depth_m(view)
-        assert depth.dtype == np.uint16
-        assert np.abs(depth * stated["depth_unit_scale_factor"] - exact).max() < 0.51e-4
-        mask = picture(folder / frame["mask_path"])
-        assert ((mask == 0) == dataset.pixels.markers(view)).all()
-        assert (mask == 0).any()
-    assert not set(stated["train_filenames"]) & set(stated["test_filenames"])
-
-
-def ngp_matrix(stated: Any, matrix: Array) -> Array:
-    """(3, 4) as Instant-NGP's and NeuS2's nerf_matrix_to_ngp make of a frame."""
-    pose = matrix[:3].copy()
-    pose[:, 1:3] *= -1
-    pose[:, 3] = pose[:, 3] * stated["scale"] + np.array(stated["offset"])
-    return pose if "from_na" in stated else pose[[1, 2, 0]]
-
-
-def ngp_saved(stated: Any, points: Array) -> Array:
-    """What Instant-NGP writes into a mesh file for points of its unit cube."""
-    return (points - np.array(stated["offset"], dtype=np.float64)) / stated["scale"]
-
-
-def test_instant_ngp_sees_the_solid_in_its_cube_and_its_meshes_come_back(dataset: DataSet, tmp_path: Path) -> None:
-    folder = written(dataset, "instant-ngp", tmp_path)
-    stated, box = document(folder / "transforms.json"), document(folder / "unit_box.json")
-    # The solid in the unit cube of Instant-NGP, found from the poses alone: where the rays of its corners meet.
-    cube = np.array([_meeting(dataset, stated, k) for k in range(len(corners()))])
-    assert ((cube > 0.0) & (cube < 1.0)).all()
-    saved = ngp_saved(stated, cube)
-    assert np.abs(saved[:, box["mesh_axes"]] + box["centre_m"] - corners()).max() < 1e-6
-    # The solid has no symmetry: another order of the axes does not fit.
-    assert np.abs(saved + box["centre_m"] - corners()).max() > 0.02
-
-
-def test_neus2_sees_the_solid_in_its_cube_and_its_meshes_come_back(dataset: DataSet, tmp_path: Path) -> None:
-    folder = written(dataset, "neus2", tmp_path)
-    stated, pinholes = document(folder / "transform.json"), undistorted_data_set(dataset)
-    for frame in stated["frames"]:  # with from_na, NeuS2 flips the axes twice
-        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])).tolist()
-    cube = np.array([_meeting(pinholes, stated, k) for k in range(len(corners()))])
-    assert ((cube > 0.0) & (cube < 1.0)).all()
-    box, saved = document(folder / "unit_box.json"), ngp_saved(stated, cube)
-    assert np.abs(saved[:, box["mesh_axes"]] + box["centre_m"] - corners()).max() < 1e-6
-    image = picture(folder / stated["frames"][0]["file_path"])
-    assert image.shape[2] == 4
-    assert set(np.unique(image[..., 3])) == {0, 255}
-
-
-def _meeting(dataset: DataSet, stated: Any, corner: int) -> Array:
-    """Where the rays of a corner's pixels meet, in Instant-NGP's cube."""
-    normal, right = np.zeros((3, 3)), np.zeros(3)
-    for frame, view in zip(stated["frames"], dataset.views, strict=True):
-        pose = ngp_matrix(stated, np.array(frame["transform_matrix"]))
-        x, y = view.camera.normalise(truth_px(view)[corner : corner + 1])[0]
-        ray = pose[:, :3] @ np.array([x, y, 1.0])
-        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
-        normal += across
-        right += across @ pose[:, 3]
-    return np.linalg.solve(normal, right).astype(np.float64)
-
-
-def test_dtu_projections_and_masks(dataset: DataSet, pinholes: DataSet, tmp_path: Path) -> None:
-    folder = written(dataset, "dtu", tmp_path)
-    with np.load(folder / "cameras.npz") as cameras:
-        for k, view in enumerate(pinholes.views):
-            # As IDR loads it: cv2 takes the projection apart.
-            P = cameras[f"world_mat_{k}"] @ cameras[f"scale_mat_{k}"]
-            K, R, place = cv2.decomposeProjectionMatrix(P[:3])[:3]
-            unit = inverse(view.T_world_camera)
-            assert np.abs(R - unit[:3, :3]).max() < 1e-9
-            assert np.abs(K / K[2, 2] - view.camera.matrix).max() < 1e-6
-            scale = cameras[f"scale_mat_{k}"]
-            assert (
-                np.abs(
-                    scale[:3, :3] @ (place[:3] / place[3]).ravel() + scale[:3, 3] - view.T_world_camera[:3, 3]
-                ).max()
-                < 1e-9
-            )
-            sphere = (corners() - scale[:3, 3]) / scale[0, 0]
-            assert np.linalg.norm(sphere, axis=1).max() <= 1 + 1e-12
-            mask = picture(folder / "mask" / f"{k:06d}.png")
-            image = picture(folder / "image" / f"{k:06d}.png")
-            assert mask.shape == image.shape[:2]
-            assert ((mask == 255) <= (pinholes.pixels.depth_m(view) > 0)).all()
 
 
 # --- plain files, BOP, HDF5, glTF -------------------------------------------------------------------------------

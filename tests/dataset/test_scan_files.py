@@ -12,19 +12,14 @@ import pytest
 import trimesh
 from PIL import Image
 
-from drivers.interfaces import Scanner
-from drivers.scan_folder import ScanFolder, ScanFolderConfig
 from service.core.protocol.models import parse_protocol
 from service.dataset.posed.exporter import exporter, write_data_set
 from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.summary import summarise
 from service.steps import params_models
 from service.store.store import Store
-from service.worker.loop import work
-from tests.ground_truth.test_fuse_command import CENTRES_M, with_spheres
-from tests.ground_truth.test_fusion import scan_mesh
-from tests.support.rig.bench_rig import BenchRig
-from tests.support.runs.bench_run import begin_run
+from tests.support.ct.fused_scene import CENTRES_M, scan_mesh, with_spheres
+from tests.support.runs.computing_run import OneScanner, begin_computing_run
 from tests.support.scenes.posed import posed_data_set
 
 PROTOCOL = """\
@@ -40,13 +35,6 @@ steps:
     confirm: false
     params: {spheres: 5, wait_s: 20}
 """
-
-
-class OneScanner(BenchRig):
-    folder: Path
-
-    def scanner(self, name: str | None = None) -> Scanner:
-        return cast(Scanner, ScanFolder(ScanFolderConfig(folder=self.folder, stable_s=0, unit="mm")))
 
 
 def write_textured(folder: Path) -> None:
@@ -74,12 +62,7 @@ def test_a_textured_scan_leaves_as_it_came(tmp_path: Path) -> None:
     rig = OneScanner()
     rig.folder = tmp_path / "scans"
     with Store.open(tmp_path / "data") as store:
-        bench = dataclasses.replace(begin_run(store, PROTOCOL, tmp_path), rig=rig)
-
-        def compute(_seconds: float) -> None:
-            work(store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _all: None)
-
-        bench.on_wait = compute
+        bench = begin_computing_run(store, PROTOCOL, tmp_path, rig)
         state = bench.run()
         assert state.status == "completed", state
         assert state.steps["scan"].measures["scan_textures"] == 1

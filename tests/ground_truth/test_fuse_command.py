@@ -9,28 +9,21 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.ground_truth.surface import Surface
-from service.core.geometry import Array, apply, inverse, transform
-from tests.ground_truth.test_fusion import BIAS_M, HALF_M, ct_mesh, height, scan_mesh
-
-RADIUS_M = 0.006
-CENTRES_M = np.array(
-    [[0.06, 0.0, 0.02], [-0.055, 0.03, 0.035], [-0.05, -0.045, 0.015], [0.03, 0.055, 0.05], [0.025, -0.06, 0.03]]
+from service.core.geometry import Array, apply, inverse
+from tests.support.ct.fused_scene import (
+    BIAS_M,
+    CENTRES_M,
+    HALF_M,
+    RADIUS_M,
+    T_WORLD_CT,
+    ct_mesh,
+    height,
+    scan_mesh,
+    with_spheres,
 )
-T_WORLD_CT = transform(Rotation.from_rotvec([0.4, -0.3, 2.0]), np.array([0.2, -0.1, 0.05]))
-
-
-def with_spheres(mesh: Surface, centres_m: Array) -> Surface:
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS_M)
-    vertices, faces = [mesh.vertices_m], [mesh.faces]
-    for centre in centres_m:
-        faces.append(np.array(ball.faces, dtype=np.int64) + sum(len(v) for v in vertices))
-        vertices.append(np.array(ball.vertices) + centre)
-    return Surface(np.concatenate(vertices), np.concatenate(faces))
 
 
 def run(tmp_path: Path, ct_centres_m: Array, *more: object) -> Result:

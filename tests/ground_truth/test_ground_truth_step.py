@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,12 +28,12 @@ from service.dataset.summary import summarise
 from service.steps import params_models
 from service.store.store import Store
 from service.worker.job import JobContext
-from service.worker.loop import HANDLERS, work
-from tests.ground_truth.test_fuse_command import CENTRES_M, RADIUS_M, T_WORLD_CT, with_spheres
-from tests.ground_truth.test_fusion import ct_mesh, height, scan_mesh
+from service.worker.loop import HANDLERS
+from tests.support.ct.fused_scene import CENTRES_M, RADIUS_M, T_WORLD_CT, ct_mesh, height, scan_mesh, with_spheres
 from tests.support.recorded.registration_record import registration_record
 from tests.support.rig.bench_rig import BenchRig, ScriptedOperator, answer
-from tests.support.runs.bench_run import Bench, begin_run
+from tests.support.runs.bench_run import Bench
+from tests.support.runs.computing_run import begin_computing_run
 
 TAKEN_M = np.array([0.018, 0.012, 0.0360])  # a control sphere on the specimen, which the scan does not show
 PROTOCOL = """\
@@ -111,13 +110,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     in_ct = with_spheres(ct_mesh(), np.vstack([CENTRES_M, TAKEN_M]))
     rig.suite = Shelf(tmp_path / "ct.stl", in_ct.moved(inverse(T_WORLD_CT)))
     with Store.open(tmp_path / "data") as store:
-        made = replace(begin_run(store, PROTOCOL, tmp_path), rig=rig)
-
-        def compute(_seconds: float) -> None:
-            work(store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _all: None)
-
-        made.on_wait = compute
-        yield made
+        yield begin_computing_run(store, PROTOCOL, tmp_path, rig)
 
 
 def fused(bench: Bench) -> tuple[RunState, dict[str, Any], np.ndarray[Any, Any]]:

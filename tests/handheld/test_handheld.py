@@ -3,55 +3,21 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
-from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig
+from tests.support.rig.rig import orthocapture
+from tests.support.runs.run_by_hand import run_by_hand, small_protocol
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
-WIDTH = "1024"
-
-
-def small_protocol(folder: Path) -> Path:
-    """handheld_spine.yaml with fewer images, at the poses that take the least time."""
-    protocol = yaml.safe_load((REPOSITORY / "protocols" / "handheld_spine.yaml").read_text())
-    steps: dict[str, Any] = {step["id"]: step for step in protocol["steps"]}
-    board, hand = steps["board_capture"], steps["handheld_capture"]
-    for ring, count in zip(board["params"]["hemisphere"], (2, 3, 3, 1), strict=True):
-        ring["count"] = count
-    for ring, count in zip(hand["params"]["hemisphere"], (3, 9), strict=True):
-        ring["count"] = count
-    board["params"]["min_images"], hand["params"]["min_images"] = 8, 11
-    for step, images in ((board, 8), (hand, 11)):
-        next(gate for gate in step["gates"] if gate["measure"] == "images_used")["min"] = images
-    calibration = steps["camera_calibration"]
-    next(gate for gate in calibration["gates"] if gate["measure"] == "views")["min"] = 8
-    next(gate for gate in calibration["gates"] if gate["measure"] == "tilt_deg")["min"] = 25
-    registration = steps["registration"]["params"]
-    registration["poses"] = ["spheres", "colmap"]
-    steps["ground_truth"]["params"]["chamfer_spacing_mm"] = 1.0
-    registration["structure_from_motion"] = {"max_image_size": 1600, "max_features": 1500, "neighbours": 8}
-    path = folder / "handheld_small.yaml"
-    path.write_text(yaml.safe_dump(protocol, sort_keys=False))
-    return path
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """One run, shared by the tests of this file."""
     folder = tmp_path_factory.mktemp("handheld")
-    options = ("--scene", "7", "--image-width", WIDTH, "--ct-voxel-mm", "1.0", "--hand", "usual")
-    with simulated_rig(folder, *options, host="127.0.0.9") as rig:
-        assert "robot" not in Path(rig["rig"]).read_text()
-        answer = orthocapture(
-            "run", str(small_protocol(folder)), "--rig", rig["rig"], "--data", str(folder / "data"),
-            "--operator", "Ada", "--auto-confirm", "--json", timeout_s=840,
-        )  # fmt: skip
-    assert answer.returncode == 0, answer.stdout[-3000:] + answer.stderr[-3000:]
-    return {"data": str(folder / "data"), "told": answer.stderr, **json.loads(answer.stdout.splitlines()[-1])}
+    return run_by_hand(folder, small_protocol(folder), "--scene", "7", host="127.0.0.9")
 
 
 def test_the_hand_covers_the_hemisphere_in_spite_of_its_mistakes(run: dict[str, Any]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,8 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.handheld.test_handheld import WIDTH, small_protocol
-from tests.support.rig.rig import orthocapture, simulated_rig
+from tests.support.rig.rig import orthocapture
+from tests.support.runs.run_by_hand import run_by_hand, small_protocol
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -39,14 +38,7 @@ def without_ct(folder: Path) -> Path:
 def run(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """One run, shared by the tests of this file."""
     folder = tmp_path_factory.mktemp("without_ct")
-    options = ("--scene", "21", "--image-width", WIDTH, "--ct-voxel-mm", "1.0", "--hand", "usual", "--without-cable")
-    with simulated_rig(folder, *options, host="127.0.0.12") as rig:
-        answer = orthocapture(
-            "run", str(without_ct(folder)), "--rig", rig["rig"], "--data", str(folder / "data"),
-            "--operator", "Ada", "--auto-confirm", "--json", timeout_s=840,
-        )  # fmt: skip
-    assert answer.returncode == 0, answer.stdout[-3000:] + answer.stderr[-3000:]
-    return {"data": str(folder / "data"), "told": answer.stderr, **json.loads(answer.stdout.splitlines()[-1])}
+    return run_by_hand(folder, without_ct(folder), "--scene", "21", "--without-cable", host="127.0.0.12")
 
 
 def test_the_spheres_are_known_better_with_each_image(run: dict[str, Any]) -> None:

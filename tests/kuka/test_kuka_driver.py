@@ -28,10 +28,10 @@ from service.core.arms.kuka.lbr_med_14 import ARM as LBR_MED_14
 from service.core.geometry import inverse, rotation_angle_rad, transform
 from service.core.seven_axes import forward, nearest_posture, postures
 from simulators.kuka_controller.kinematics import MODELS, frames
+from tests.support.arms.kuka_simulator import Controller, pendant, simulated_kuka
+from tests.support.arms.sunrise import sunrise_engine
+from tests.support.arms.ur_simulator import address
 from tests.support.processes.waiting import until
-from tests.support.rig.kuka_simulator import Controller, pendant, simulated_kuka
-from tests.support.rig.sunrise import sunrise_engine
-from tests.support.rig.ur_simulator import address
 
 both = pytest.mark.parametrize("controller", [simulated_kuka, sunrise_engine])
 PAYLOAD = Payload(1.6, (0.0, 0.0, 0.08))

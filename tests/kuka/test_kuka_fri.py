@@ -25,10 +25,10 @@ from drivers.kuka.fri.sample import unpack
 from drivers.kuka.fri.wire import FriError, Monitoring, decode, reply
 from service.core.arms.known import arm_model
 from service.core.seven_axes import forward
+from tests.support.arms.kuka_simulator import pendant, simulated_kuka, transcript
+from tests.support.arms.ur_simulator import address
 from tests.support.processes.waiting import until
-from tests.support.rig.kuka_simulator import pendant, simulated_kuka, transcript
 from tests.support.rig.rig import orthocapture
-from tests.support.rig.ur_simulator import address
 
 GOLDEN = transcript("fri.jsonl")
 MONITOR = [row for row in GOLDEN if "q" in row]

@@ -15,10 +15,10 @@ from drivers.interfaces import Payload, RobotArm
 from drivers.kuka import DRIVER, KukaConfig
 from drivers.kuka.wire import WireError, from_abc, hello_of, parse, state_of, to_abc
 from service.core.geometry import transform
+from tests.support.arms.kuka_simulator import Controller, agrees, simulated_kuka, transcript
+from tests.support.arms.sunrise import sunrise_engine
+from tests.support.arms.ur_simulator import address
 from tests.support.processes.waiting import until
-from tests.support.rig.kuka_simulator import Controller, agrees, simulated_kuka, transcript
-from tests.support.rig.sunrise import sunrise_engine
-from tests.support.rig.ur_simulator import address
 
 
 @pytest.mark.parametrize("name", ["session.jsonl", "refusals.jsonl"])

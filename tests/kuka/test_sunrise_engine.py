@@ -16,10 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.arms.kuka_simulator import pendant
+from tests.support.arms.sunrise import APPLICATION, TEST_SIDE, compile_java, java_program, sunrise_engine
+from tests.support.arms.ur_simulator import address
 from tests.support.processes.waiting import until
-from tests.support.rig.kuka_simulator import pendant
-from tests.support.rig.sunrise import APPLICATION, TEST_SIDE, compile_java, java_program, sunrise_engine
-from tests.support.rig.ur_simulator import address
 
 HOME = [0.0, 0.5236, 0.0, -1.2217, 0.0, 1.3963, 0.0]
 FAR = [2.5, *HOME[1:]]

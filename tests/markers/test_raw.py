@@ -21,14 +21,13 @@ from service.worker.job import JobContext, RecordedContext, handler_of
 from simulators.rendering.render import REFERENCE, Renderer
 from simulators.rendering.sensor import camera_picture, read_out
 from simulators.scene.world import NOMINAL_LUX, Scene
-from simulators.sony_camera.exif import Shot, encode_jpeg
-from simulators.sony_camera.properties import ExposureSettings
-from simulators.sony_camera.raw_file import encode_raw
+from simulators.sony_camera.exif import PLATE
+from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg
+from simulators.still_camera.raw_file import encode_raw
 from tests.support.scenes.scene_photographs import pose_above
 
 WIDTH = 1200
-SETTINGS = ExposureSettings(22.0, 1 / 15, (1, 15), 100, manual_focus=True, file_format=2, jpeg_quality=2,
-                            capture_target=1)  # fmt: skip
+SETTINGS = ExposureSettings(22.0, 1 / 15, (1, 15), 100)
 
 
 def stored(store: Store, data: bytes, name: str) -> str:
@@ -67,7 +66,7 @@ def test_outlines_found_in_the_jpeg_are_measured_in_the_raw_file(tmp_path: Path)
                 "light_lux": NOMINAL_LUX,
             }
             mosaic = read_out(renderer.light(view, REFERENCE), 100, number)
-            shot = Shot(SETTINGS, number, datetime(2026, 11, 24, tzinfo=UTC))
+            shot = Shot(SETTINGS, number, datetime(2026, 11, 24, tzinfo=UTC), PLATE)
             jpeg = stored(store, encode_jpeg(camera_picture(mosaic), shot), f"{number}.JPG")
             raw = stored(store, encode_raw(mosaic, shot), f"{number}.ARW")
             name = f"view_{number}"

@@ -21,12 +21,11 @@ from service.compute.images.develop import Developed, coded, develop, eight_bits
 from service.compute.images.match import find_shift
 from service.core.errors import ConfigurationError, DataError
 from simulators.rendering.sensor import EXPOSED, bordered, camera_picture, read_out
-from simulators.sony_camera.exif import Shot, encode_jpeg
-from simulators.sony_camera.properties import ExposureSettings
-from simulators.sony_camera.raw_file import encode_raw
+from simulators.sony_camera.exif import PLATE
+from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg
+from simulators.still_camera.raw_file import encode_raw
 
-SETTINGS = ExposureSettings(22.0, 1 / 15, (1, 15), 100, manual_focus=True, file_format=2, jpeg_quality=2,
-                            capture_target=1)  # fmt: skip
+SETTINGS = ExposureSettings(22.0, 1 / 15, (1, 15), 100)
 WIDTH, HEIGHT = 480, 320
 CROP_ORIGIN, CROP_SIZE, UNKNOWN = 50719, 50720, 65000  # tags of DNG, and one of nobody's
 
@@ -45,7 +44,7 @@ def leaves(seed: int = 3) -> NDArray[np.uint8]:
 def exposure(folder: Path, picture: NDArray[np.uint8], name: str = "DSC00001") -> tuple[Path, Path]:
     """The raw file and the JPEG of one exposure."""
     mosaic = read_out(bordered(picture), 100, 1)
-    shot = Shot(SETTINGS, 1, datetime(2026, 11, 24, tzinfo=UTC))
+    shot = Shot(SETTINGS, 1, datetime(2026, 11, 24, tzinfo=UTC), PLATE)
     raw, jpeg = folder / f"{name}.ARW", folder / f"{name}.JPG"
     raw.write_bytes(encode_raw(mosaic, shot))
     jpeg.write_bytes(encode_jpeg(camera_picture(mosaic), shot))

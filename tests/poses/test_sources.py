@@ -30,9 +30,9 @@ from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.record.known_spheres import best_registration as shown_registration
-from service.worker.loop import work
 from tests.support.record.store import enqueue
 from tests.support.recorded.registration_record import registration_record
+from tests.support.runs.computing_run import compute_jobs
 from tests.support.runs.recorded_run import record_run
 
 DEMO = Path(__file__).parents[2] / "protocols" / "demo.yaml"
@@ -289,7 +289,7 @@ def test_a_result_that_arrives_after_the_end_of_a_run_is_recorded_as_late_signed
         assert isinstance(done, JobEnqueued)
         again = NewJob("register", done.step, done.attempt, "later", done.arguments, priority=LATER)
         enqueue(store, run_id, again, actor="worker")
-        assert work(store, until_idle=True, stop=lambda: False, progress=lambda _w, _d, _t: None) == 1
+        assert compute_jobs(store) == 1
         end = store.events(run_id)[-1].payload
         assert isinstance(end, JobFinished)
         assert end.late_s is not None

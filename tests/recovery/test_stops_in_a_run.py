@@ -26,10 +26,10 @@ from service.runner.loop import Runner
 from service.station import Station
 from service.steps import params_models
 from service.store.store import Store
+from tests.support.arms.arm_watch import ArmWatch, watched_arm
+from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.processes.waiting import until
-from tests.support.rig.arm_watch import ArmWatch, watched_arm
 from tests.support.rig.bench_rig import BenchCamera, ScriptedOperator, answer, numbered
-from tests.support.rig.ur_simulator import address, simulated_ur
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]

@@ -13,10 +13,10 @@ from pydantic import BaseModel
 
 from drivers.grbl import GrblConfig
 from drivers.kuka import KukaConfig
-from tests.support.rig.grbl_simulator import TURN, mount, table
-from tests.support.rig.kuka_simulator import simulated_kuka
-from tests.support.rig.stubborn import WATCHED_S, Program
-from tests.support.rig.ur_simulator import address
+from tests.support.arms.grbl_simulator import TURN, mount, table
+from tests.support.arms.kuka_simulator import simulated_kuka
+from tests.support.arms.stubborn import WATCHED_S, Program
+from tests.support.arms.ur_simulator import address
 from tests.support.rig.world_watch import WorldWatch, watched_world
 
 pytestmark = pytest.mark.slow

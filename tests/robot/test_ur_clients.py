@@ -18,7 +18,7 @@ import pytest
 from simulators.ur_controller import rtde_codec as codec
 from simulators.ur_controller.kinematics import MODELS, forward, from_pose, inverse, to_pose
 from simulators.ur_controller.motion import MoveJ, MoveL, Stop
-from tests.support.rig.ur_simulator import address, simulated_ur
+from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 DATA = Path(__file__).parents[1] / "data"

@@ -10,10 +10,10 @@ from collections.abc import Generator
 import pytest
 
 from drivers.ur import UrConfig
+from tests.support.arms.arm_watch import ArmWatch, watched_arm
+from tests.support.arms.stubborn import WATCHED_S, Program
+from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.processes.waiting import until
-from tests.support.rig.arm_watch import ArmWatch, watched_arm
-from tests.support.rig.stubborn import WATCHED_S, Program
-from tests.support.rig.ur_simulator import address, simulated_ur
 
 pytestmark = pytest.mark.slow
 AT_REST_WITHIN_S = 0.5

@@ -20,7 +20,7 @@ from drivers.scan_folder import ScanFolder, ScanFolderConfig
 from service.compute.surfaces.isosurface import surface
 from service.core.geometry import apply, inverse
 from simulators.ct_suite.suite import true_frames, write_series
-from simulators.ct_suite.volume import Grid
+from simulators.ct_suite.volume import Grid, voxelise
 from simulators.faults import FaultPlan
 from simulators.scene.world import Scene
 from tests.support.rig.simulator_process import simulator
@@ -214,6 +214,16 @@ def test_ct_surface_lies_on_the_specimen(ct: Ct) -> None:
     ]
     assert len(gaps) > 100
     assert abs(np.median(gaps)) < 0.05e-3
+
+
+@pytest.mark.parametrize("corner_m", [(-0.1162, 0.001, 0.0832), (-0.1042, -0.0082, 0.0832)])
+def test_ct_has_only_air_above_the_specimen_also_where_a_ray_meets_an_edge(
+    corner_m: tuple[float, float, float],
+) -> None:
+    T = np.eye(4)
+    T[:3, 3] = corner_m
+    volume = voxelise(Scene.generate(296), Grid(T, 4e-4, (32, 15, 16)), control_spheres=False)
+    assert volume.max() < -850  # such a ray filled half a voxel all the way up: -450
 
 
 def test_ct_materials_and_noise(ct: Ct) -> None:

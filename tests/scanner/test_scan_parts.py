@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pytest
@@ -14,15 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from drivers.interfaces import Scanner
-from drivers.scan_folder import ScanFolder, ScanFolderConfig
 from service.compute.surfaces.part_merging import merge_parts
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
 from service.store.store import Store
-from service.worker.loop import work
-from tests.support.rig.bench_rig import BenchRig
-from tests.support.runs.bench_run import begin_run
+from tests.support.runs.computing_run import OneScanner, begin_computing_run
 
 RADIUS_M = 0.006
 SPHERES_M = np.array(
@@ -90,13 +84,6 @@ def test_a_part_that_shares_too_little_or_is_mirrored_is_named() -> None:
         merge_parts(mirrored)
 
 
-class OneScanner(BenchRig):
-    folder: Path
-
-    def scanner(self, name: str | None = None) -> Scanner:
-        return cast(Scanner, ScanFolder(ScanFolderConfig(folder=self.folder, stable_s=0, unit="mm")))
-
-
 @pytest.mark.slow
 def test_a_run_waits_for_all_parts_and_makes_one_mesh(tmp_path: Path) -> None:
     T_world_part = poses(3)
@@ -110,12 +97,7 @@ def test_a_run_waits_for_all_parts_and_makes_one_mesh(tmp_path: Path) -> None:
         ]
         trimesh.util.concatenate(balls).export(rig.folder / f"part{number}.ply")
     with Store.open(tmp_path / "data") as store:
-        bench = dataclasses.replace(begin_run(store, PROTOCOL, tmp_path), rig=rig)
-
-        def compute(_seconds: float) -> None:
-            work(store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _all: None)
-
-        bench.on_wait = compute
+        bench = begin_computing_run(store, PROTOCOL, tmp_path, rig)
         state = bench.run()
         assert state.status == "completed", state
         scan = state.steps["scan"]

@@ -27,11 +27,13 @@ from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import GatesEvaluated, StepNote
 from service.jobs.capture import live_view
 from service.store.store import Store
+from service.worker.calibration.records import arm_correction_record
 from service.worker.job import JobAnswer, JobContext, RecordedContext
-from service.worker.loop import HANDLERS, work
+from service.worker.loop import HANDLERS
 from service.worker.poses.robot_poses import robot_camera_poses
 from tests.support.rig.bench_rig import answer, other_settings
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
+from tests.support.runs.computing_run import compute_jobs
 from tests.support.runs.measuring_rig import CENTRE_M, MEASURED, SPHERES_M, BenchCt, MeasuringRig, hill
 from tests.support.scenes.sphere_images import (
     RADIUS_M,
@@ -121,11 +123,8 @@ def erring_arm(made: Scene) -> tuple[Array, list[dict[str, Any]], dict[str, Any]
         gap = inverse(flange) @ corrected_T_base_flange(joints, flange, correction)
         reported.append({"T_base_flange": (flange @ inverse(gap)).tolist(), "joints_rad": joints.tolist()})
     mounted = {"T_flange_camera": T_flange_camera.tolist()}
-    return (
-        T_base_world,
-        reported,
-        mounted | {"arm_correction": correction.as_json() | mounted | {"stations": [STATION]}},
-    )
+    record = arm_correction_record(correction, T_flange_camera).plain()
+    return T_base_world, reported, mounted | {"arm_correction": record | {"stations": [STATION]}}
 
 
 def test_jobs_go_from_images_to_a_gate_and_a_suggestion(
@@ -275,7 +274,7 @@ def measured_run(
         job = bench.store.claim_job("test", 30, kinds=list(known))
         if job is not None:
             bench.store.finish_job(job, measures={}, duration_s=0.1, result=known[job.kind])
-        work(bench.store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _total: None)
+        compute_jobs(bench.store)
 
     monkeypatch.setitem(HANDLERS, "live_view", look)
     monkeypatch.setattr("service.worker.capture.live_view.find_spheres", exactly)

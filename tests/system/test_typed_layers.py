@@ -38,8 +38,6 @@ EDGES = {
     "service/store/verification/signature_checks.py": "checks rows that may be altered and no longer records",
     "service/audit/verify/bundle_verifier.py": "stands alone in a bundle, with nothing but the standard library",
     # files
-    "service/compute/arm/correction.py": "part of hand_eye.json",
-    "service/compute/calibration/hand_eye/record.py": "writes hand_eye.json",
     "service/compute/capture/hand_bundle.py": "writes and reads the file of a hand-held image",
     "service/compute/markers/archive.py": "writes and reads files of outlines",
     "service/compute/pipeline.py": "writes the result of `orthocapture register`",

@@ -22,14 +22,8 @@ from service.run_record import RunRecord, read_log
 from service.run_start import recorded_run
 from service.web.scene.data import scene_of
 from tests.support.pages.web import Browser, WebSite, web_site
-from tests.support.runs.recorded_run import PROTOCOL, record_run
+from tests.support.runs.recorded_run import FUSION, PROTOCOL, record_run
 
-FUSION = """\
-  - id: ground_truth
-    kind: ground_truth
-    title: Fuse
-    params: {ct: first_scan, scan: second_scan}
-"""
 CORNERS = [[0.01, 0.0, 0.02], [0.03, 0.0, 0.02], [0.02, 0.02, 0.025]]
 FORM = {"source": "ct", "corners": json.dumps(CORNERS), "along": "[0, 0, 1]"}
 

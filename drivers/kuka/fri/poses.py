@@ -89,7 +89,7 @@ class FriPoses:
         return found if found and float(np.max(np.diff(times))) <= LONGEST_GAP_S else ()
 
     def details(self) -> dict[str, str]:
-        """How FRI fares, for the report."""
+        """The state of FRI, for the report."""
         last = self._last
         if last is None:
             return {"FRI": "no message yet"}

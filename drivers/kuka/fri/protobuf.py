@@ -19,7 +19,7 @@ class ProtobufError(ValueError):
 def fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
     """The fields of a message in their order: number and value.
 
-    A varint is an int; what has a length, and numbers of fixed width, are bytes. Raises ProtobufError.
+    Varints are ints; fields with a length, and numbers of fixed width, are bytes. Raises ProtobufError.
     """
     at = 0
     while at < len(message):

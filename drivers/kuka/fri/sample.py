@@ -13,7 +13,7 @@ SIZE = _RECORD.size
 
 @dataclass(frozen=True, slots=True)
 class FriSample:
-    """The arm at one moment, and how the connection fares.
+    """The arm at one moment, and the state of the connection.
 
     Attributes:
         monotonic_s: host time.monotonic() when the datagram arrived.

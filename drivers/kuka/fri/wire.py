@@ -13,7 +13,6 @@ from enum import IntEnum
 
 from drivers.kuka.fri.protobuf import ProtobufError, doubles, fields, message_field, number_field
 
-LONGEST_MESSAGE = 1500
 JOINTS = 7
 _MONITORING, _REPLY = 0x245142, 0x34001  # identifiers of the messages of an LBR
 _FRAME = struct.Struct("<I")
@@ -24,7 +23,7 @@ class FriError(ValueError):
 
 
 class Session(IntEnum):
-    """State of the session. Only in the last two could a client command; this one does not then answer."""
+    """State of the session. A client could command only in the last two; this one does not answer in them."""
 
     IDLE = 0
     MONITORING_WAIT = 1

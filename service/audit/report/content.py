@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
 from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Cell, Paragraph, Report, Section
 from service.audit.report.sections.accuracy import accuracy_section, budget_section, later_section, result_sentence
 from service.audit.report.sections.certificates import certificate_sections
-from service.audit.report.sections.course import deviations, deviations_section, people_section, steps_section
+from service.audit.report.sections.course import (
+    NotableEvent,
+    deviations,
+    deviations_section,
+    people_section,
+    steps_section,
+)
 from service.audit.report.sections.facts import facts
 from service.audit.report.sections.notes import notes_section
 from service.audit.report.sections.origin import devices_section, software_section
@@ -39,33 +45,14 @@ def report_content(
         with_scene: include the scene that can be turned, which only HTML can show; its drawing is always included.
         with_pictures: False leaves out everything that shows photographs.
     """
-    summary = run.summary()
     listed = deviations(run)
-    result = result_sentence(summary)
-    sections = [
-        deviations_section(run, listed),
-        accuracy_section(summary, true_error_mm),
-        later_section(summary),
-        budget_section(summary),
-        steps_section(run),
-        people_section(run),
-        notes_section(run, with_pictures=with_pictures),
-        *certificate_sections(run),
-        devices_section(run),
-        pictures_section(run, turning=with_scene)
-        if with_pictures
-        else Section(
-            "Pictures", (Paragraph("They were left out, because this report belongs to a bundle without files."),)
-        ),
-        verification_section(run, audit),
-        software_section(run),
-    ]
+    sections = _sections(run, audit, listed, true_error_mm, with_scene=with_scene, with_pictures=with_pictures)
     return Report(
         title=run.protocol.title,
         simulated=run.root.simulated,
         origin=_origin(run),
         verification=_verification(audit),
-        result=result,
+        result=result_sentence(run.summary()),
         deviations=Cell(f"{counted(len(listed), 'deviation')}, listed first", "attention")
         if listed
         else Cell("No deviation: every step was done as the protocol says", "ok"),
@@ -76,6 +63,34 @@ def report_content(
         head_sha256=run.events[-1].sha256,
         made_at=(made_at or datetime.now(UTC)).astimezone(UTC).replace(microsecond=0),
     )
+
+
+def _sections(
+    run: RecordedRun,
+    audit: AuditReport,
+    listed: Sequence[NotableEvent],
+    true_error_mm: Mapping[str, float] | None,
+    *,
+    with_scene: bool,
+    with_pictures: bool,
+) -> list[Section | None]:
+    """In the order of the report; None for a section that this run does not have."""
+    omitted = Paragraph("They were left out, because this report belongs to a bundle without files.")
+    summary = run.summary()
+    return [
+        deviations_section(run, listed),
+        accuracy_section(summary, true_error_mm),
+        later_section(summary),
+        budget_section(summary),
+        steps_section(run),
+        people_section(run),
+        notes_section(run, with_pictures=with_pictures),
+        *certificate_sections(run),
+        devices_section(run),
+        pictures_section(run, turning=with_scene) if with_pictures else Section("Pictures", (omitted,)),
+        verification_section(run, audit),
+        software_section(run),
+    ]
 
 
 def _verification(audit: AuditReport) -> Cell:

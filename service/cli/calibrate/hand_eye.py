@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import json as json_module
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -21,6 +22,7 @@ from service.cli.calibrate.board_options import (
     described_board,
     searched,
 )
+from service.cli.calibrate.hand_eye_file import HandEyeFile, SuggestedBoardPose
 from service.cli.common import (
     JsonOption,
     StrictOption,
@@ -31,15 +33,18 @@ from service.cli.common import (
 )
 from service.compute.arm.joint_file import read_joints_csv
 from service.compute.arm.kinematics import matching_arm, solve_joints
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.board.images import UsableViews
 from service.compute.calibration.board_poses.plan import SuggestedPose, suggest_board_poses
 from service.compute.calibration.board_poses.plan_plot import draw_board_plan
 from service.compute.calibration.hand_eye.answers import HandEyeResult
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.fit import Method
-from service.compute.calibration.hand_eye.record import board_corners, hand_eye_record
+from service.compute.calibration.hand_eye.reprojection import BoardCorners, board_corners
 from service.compute.calibration.hand_eye.setup import Setup
 from service.compute.calibration.intrinsics.estimate import locate_view
 from service.compute.camera_covariance import read_camera_covariance
+from service.compute.camera_model import CameraModel
 from service.compute.images.folder import image_folder
 from service.compute.poses.files.camera_files import read_camera_json
 from service.compute.poses.files.pose_files import posed_images
@@ -49,6 +54,8 @@ from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform
 from service.core.text.counts import counted
 from service.core.units import mm
+from service.jobs.records import matrix
+from service.worker.calibration.records import hand_eye_record
 
 
 def hand_eye_command(
@@ -95,44 +102,60 @@ def hand_eye_command(
         for file in filter(None, (out, preview)):
             require_writable(file)
         usable = searched(files, target, quiet=json)
-        names = [files[k].name for k in usable.indices]
-        T_base_flange = np.array([known[name] for name in names])
-        T_camera_board = np.array([locate_view(view, target, model)[0] for view in usable.views])
-        joints_rad, kinematics = _arm(joints, arm, names, T_base_flange)
-        corners = board_corners(usable.views, target, model)
+        session = _session(usable, [files[k].name for k in usable.indices], known, target, model)
+        joints_rad, kinematics = _arm(joints, arm, session)
         result = calibrate_hand_eye(
-            HandEyeViews(T_base_flange, T_camera_board, corners=corners, joints_rad=joints_rad, arm=kinematics),
+            HandEyeViews(
+                session.T_base_flange,
+                session.T_camera_board,
+                corners=session.corners,
+                joints_rad=joints_rad,
+                arm=kinematics,
+            ),
             method=method,
             T_board_turned=target.half_turn(),
             setup=setup,
             camera_covariance=read_camera_covariance(camera),
         )
-        best = result if result.corrected is None else result.corrected
-        suggested = suggest_board_poses(
-            best,
-            T_base_flange,
-            corners.points_m,
-            model,
-            corner_sigma_px=result.corner_sigma_px or 0.0,
-            count=suggest if setup == "eye-in-hand" else 0,  # a camera that stands still has no poses to suggest
-            reachable=_reachability(kinematics, joints_rad, T_base_flange),
+        reach = None if kinematics is None or joints_rad is None else _Reach(kinematics, joints_rad, session)
+        # A camera that stands still has no poses to suggest.
+        suggested = _suggested(result, session, reach, suggest if setup == "eye-in-hand" else 0)
+        record = HandEyeFile(
+            **hand_eye_record(result, session.names, setup).set_fields(),
+            left_out=dict(folder.left_out),
+            images_without_board={files[k].name: reason for k, reason in sorted(usable.excluded.items())},
+            suggested_poses=tuple(_as_recorded(pose) for pose in suggested),
+            suggestions_reachable=kinematics is not None,
         )
-        without_board = {files[k].name: reason for k, reason in sorted(usable.excluded.items())}
-        record = hand_eye_record(result, names, setup) | {
-            "left_out": folder.left_out,
-            "images_without_board": without_board,
-            "suggested_poses": [_suggestion(pose) for pose in suggested],
-            "suggestions_reachable": kinematics is not None,
-        }
-        out.write_text(json_module.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        out.write_text(record.text(), encoding="utf-8")
         if preview is not None:
-            cameras = T_base_flange @ best.T_flange_camera
-            preview.write_bytes(draw_board_plan(cameras, suggested, best.T_base_board, corners.points_m, model))
+            preview.write_bytes(_drawn(result, session, suggested))
         if json:
-            print_json(record)
+            print_json(record.printed())
             return
-        _tell(result, record, setup)
+        _tell(result, record)
         console.print(f"written: {out}")
+
+
+@dataclass(frozen=True, slots=True)
+class _Session:
+    """The N images in which the board was found: their names, corners, and poses (N, 4, 4)."""
+
+    names: list[str]
+    corners: BoardCorners
+    T_base_flange: Array
+    T_camera_board: Array
+
+
+def _session(
+    usable: UsableViews, names: list[str], poses: Mapping[str, Transform], board: Board, camera: CameraModel
+) -> _Session:
+    return _Session(
+        names,
+        board_corners(usable.views, board, camera),
+        np.array([poses[name] for name in names]),
+        np.array([locate_view(view, board, camera)[0] for view in usable.views]),
+    )
 
 
 def _require_possible(setup: Setup, joints: Path | None, arm: str | None, preview: Path | None) -> None:
@@ -145,11 +168,11 @@ def _require_possible(setup: Setup, joints: Path | None, arm: str | None, previe
         arm_model(arm)
 
 
-class _Reachability:
+class _Reach:
     """Whether an arm can reach a pose from the joint positions of the nearest recorded pose."""
 
-    def __init__(self, arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
-        self._arm, self._joints, self._poses = arm, joints_rad, T_base_flange
+    def __init__(self, arm: ArmModel, joints_rad: Array, session: _Session) -> None:
+        self._arm, self._joints, self._poses = arm, joints_rad, session.T_base_flange
 
     def __call__(self, T_base_flange: Transform) -> bool:
         turn = np.trace(np.swapaxes(self._poses[:, :3, :3], 1, 2) @ T_base_flange[:3, :3], axis1=1, axis2=2)
@@ -158,22 +181,17 @@ class _Reachability:
         return solve_joints(self._arm, T_base_flange, self._joints[nearest]) is not None
 
 
-def _reachability(arm: ArmModel | None, joints_rad: Array | None, T_base_flange: Array) -> _Reachability | None:
-    return None if arm is None or joints_rad is None else _Reachability(arm, joints_rad, T_base_flange)
-
-
-def _arm(
-    joints: Path | None, arm: str | None, names: list[str], T_base_flange: Array
-) -> tuple[Array | None, ArmModel | None]:
+def _arm(joints: Path | None, arm: str | None, session: _Session) -> tuple[Array | None, ArmModel | None]:
+    """The joints of each image, and the arm's model; None where no joints are given."""
     if joints is None:
         if arm is not None:
             raise typer.BadParameter("--arm needs --joints")
         return None, None
-    rows = read_joints_csv(joints, names)
-    values = np.array([rows[name] for name in names])
+    rows = read_joints_csv(joints, session.names)
+    values = np.array([rows[name] for name in session.names])
     if arm is not None:
         return values, arm_model(arm)
-    found = matching_arm(values, T_base_flange)
+    found = matching_arm(values, session.T_base_flange)
     if found is None:
         raise ConfigurationError(
             "no known arm has these poses at these joint angles",
@@ -183,18 +201,39 @@ def _arm(
     return values, found
 
 
-def _suggestion(pose: SuggestedPose) -> dict[str, Any]:
-    return {
-        "T_base_flange": pose.T_base_flange.tolist(),
-        "T_base_camera": pose.T_base_camera.tolist(),
-        "predicted_sigma_mm": pose.sigma_mm,
-        "predicted_sigma_deg": pose.sigma_deg,
-    }
+def _suggested(
+    result: HandEyeResult, session: _Session, reach: _Reach | None, count: int
+) -> tuple[SuggestedPose, ...]:
+    corners = session.corners
+    return suggest_board_poses(
+        result.corrected or result,
+        session.T_base_flange,
+        corners.points_m,
+        corners.camera,
+        corner_sigma_px=result.corner_sigma_px or 0.0,
+        count=count,
+        reachable=reach,
+    )
 
 
-def _tell(result: HandEyeResult, record: dict[str, Any], setup: Setup) -> None:
+def _as_recorded(pose: SuggestedPose) -> SuggestedBoardPose:
+    return SuggestedBoardPose(
+        T_base_flange=matrix(pose.T_base_flange),
+        T_base_camera=matrix(pose.T_base_camera),
+        predicted_sigma_mm=pose.sigma_mm,
+        predicted_sigma_deg=pose.sigma_deg,
+    )
+
+
+def _drawn(result: HandEyeResult, session: _Session, suggested: Sequence[SuggestedPose]) -> bytes:
+    best, corners = result.corrected or result, session.corners
+    cameras = session.T_base_flange @ best.T_flange_camera
+    return draw_board_plan(cameras, suggested, best.T_base_board, corners.points_m, corners.camera)
+
+
+def _tell(result: HandEyeResult, record: HandEyeFile) -> None:
     x, y, z = mm(result.T_flange_camera[:3, 3])
-    frame = "flange" if setup == "eye-in-hand" else "robot's base"
+    frame = "flange" if record.setup == "eye-in-hand" else "robot's base"
     console.print(
         f"{counted(len(result.held_out_mm), 'image')}: camera at {x:.2f}, {y:.2f}, {z:.2f} mm in the {frame} frame "
         f"± {result.sigma_mm:.3f} mm, ± {result.sigma_deg:.4f}° ({result.method})"
@@ -204,8 +243,8 @@ def _tell(result: HandEyeResult, record: dict[str, Any], setup: Setup) -> None:
         f"held-out images: {held_mm:.3f} mm, {held_deg:.4f}° (median); "
         f"other methods up to {result.spread_mm:.3f} mm away; condition {result.condition:.1f}"
     )
-    camera_mm, camera_deg = record["sigma"]["camera_mm"], record["sigma"]["camera_deg"]
-    if camera_mm:
+    camera_mm, camera_deg = record.sigma.camera_mm, record.sigma.camera_deg
+    if camera_mm and camera_deg is not None:
         console.print(f"of that ± {camera_mm:.3f} mm, ± {camera_deg:.4f}° from the uncertainty of the camera")
     else:
         console.print("camera.json states no covariance: the camera is taken as exactly known")
@@ -218,12 +257,11 @@ def _tell(result: HandEyeResult, record: dict[str, Any], setup: Setup) -> None:
         )
     elif len(result.arm_held_out_mm) > 1:
         console.print("estimating the arm's own error does not improve held-out images: not used")
-    for name, reason in {**record["left_out"], **record["excluded"], **record["images_without_board"]}.items():
+    for name, reason in record.not_used.items():
         console.print(f"not used: {escape(name)}: {escape(reason)}")
-    suggested = record["suggested_poses"]
-    if suggested:
-        checked = "" if record["suggestions_reachable"] else " (reach not checked: no joints)"
+    if record.suggested_poses:
+        checked = "" if record.suggestions_reachable else " (reach not checked: no joints)"
         console.print(
-            f"{len(suggested)} more board poses{checked} would bring the fit's own sigma to "
-            f"{suggested[-1]['predicted_sigma_mm']:.3f} mm"
+            f"{len(record.suggested_poses)} more board poses{checked} would bring the fit's own sigma to "
+            f"{record.suggested_poses[-1].predicted_sigma_mm:.3f} mm"
         )

@@ -102,14 +102,7 @@ def import_ros_command(
                 "base": base,
                 "flange": body,
                 "written": written,
-                "poses": {
-                    name: {
-                        "stamp_ns": taken.stamps_ns[name],
-                        "away_ns": one.away_ns,
-                        "interpolated": one.interpolated,
-                    }
-                    for name, one in poses.items()
-                },
+                "poses": _how_found(taken, poses),
                 "left_out": left_out,
                 "not_read": found.other,
             }
@@ -234,6 +227,14 @@ def _mount(tree: FrameTree, flange: str, camera_frame: str) -> Transform:
             remedy="Name the frame of a camera on the flange",
         )
     return tree.pose(flange, camera_frame, 0, Timing()).T_a_b
+
+
+def _how_found(taken: _Images, poses: dict[str, FoundPose]) -> dict[str, dict[str, int | bool]]:
+    """Of each image with a pose its stamp, and how the pose was found."""
+    return {
+        name: {"stamp_ns": taken.stamps_ns[name], "away_ns": one.away_ns, "interpolated": one.interpolated}
+        for name, one in poses.items()
+    }
 
 
 def _nothing(left_out: dict[str, str], file: Path) -> DataError:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -12,12 +10,10 @@ from service.compute.arm.kinematics import chain, dh_jacobian, pose_gap
 from service.core.arms.known import arm_model
 from service.core.arms.model import ArmModel
 from service.core.errors import DataError
-from service.core.geometry import Array
+from service.core.geometry import Array, Transform
 from service.core.units import mm
 
 _MODEL_GAP_M, _MODEL_GAP_RAD = 0.02, np.radians(3.0)
-
-
 _PLACE = "arm_correction of the hand-eye calibration"
 _REMEDY = "Calibrate hand and eye again"
 
@@ -33,6 +29,9 @@ class ArmCorrection:
         gear_sin_rad: (N, H) amplitudes of sin(k q).
         observed: (N,) share of each joint's error that the images determine, 0 … 1: 1 - posterior / prior variance,
             over the terms in use.
+
+    Raises:
+        DataError: the arrays' shapes are inconsistent.
     """
 
     arm: str
@@ -41,44 +40,32 @@ class ArmCorrection:
     gear_sin_rad: Array
     observed: Array
 
-    def as_json(self) -> dict[str, Any]:
-        """Plain data for a file or an event."""
-        return {
-            "model": "dh_deltas + gear harmonics" if self.gear_cos_rad.any() else "dh_deltas",
-            "arm": self.arm,
-            "dh_deltas": self.dh_deltas.tolist(),
-            "gear_cos_rad": self.gear_cos_rad.tolist(),
-            "gear_sin_rad": self.gear_sin_rad.tolist(),
-            "observed": self.observed.tolist(),
-        }
-
-    @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> ArmCorrection:
-        """Read a record written by `as_json`.
-
-        Raises:
-            DataError: a field is missing or has another shape.
-        """
-        try:
-            found = cls(
-                str(record["arm"]),
-                np.array(record["dh_deltas"], dtype=np.float64),
-                np.array(record["gear_cos_rad"], dtype=np.float64),
-                np.array(record["gear_sin_rad"], dtype=np.float64),
-                np.array(record["observed"], dtype=np.float64),
-            )
-        except (KeyError, ValueError, TypeError, OverflowError) as error:
-            raise DataError(f"not an arm correction: {error!r}", where=_PLACE, remedy=_REMEDY) from error
-        axes = len(found.observed) if found.observed.ndim == 1 else 0
+    def __post_init__(self) -> None:
+        axes = len(self.observed) if self.observed.ndim == 1 else 0
         if (
             axes == 0
-            or found.dh_deltas.shape != (axes, 4)
-            or found.gear_cos_rad.ndim != 2
-            or len(found.gear_cos_rad) != axes
-            or found.gear_cos_rad.shape != found.gear_sin_rad.shape
+            or self.dh_deltas.shape != (axes, 4)
+            or self.gear_cos_rad.ndim != 2
+            or len(self.gear_cos_rad) != axes
+            or self.gear_cos_rad.shape != self.gear_sin_rad.shape
         ):
             raise DataError("not an arm correction: the shapes are inconsistent", where=_PLACE, remedy=_REMEDY)
-        return found
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectedMounting:
+    """An arm's correction, and the camera's pose on the flange that belongs to corrected poses."""
+
+    correction: ArmCorrection
+    T_flange_camera: Transform
+
+    def T_base_camera(self, joints_rad: Array, T_base_flange: Array) -> Array:
+        """(N, 4, 4) camera poses from joints (N, J) and reported poses (N, 4, 4).
+
+        Raises:
+            DataError: joints and poses of another arm.
+        """
+        return corrected_T_base_flange(joints_rad, T_base_flange, self.correction) @ self.T_flange_camera
 
 
 def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction: ArmCorrection) -> Array:

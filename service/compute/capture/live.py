@@ -60,7 +60,7 @@ class ProvisionalRegistration:
     used: tuple[str, ...]  # images with spheres assigned, in the order of the registration
 
     def predicted_error_m(self, point_scan_m: Array) -> float:
-        """Predicted standard deviation (3D) of a point (3,) of the scan in this station's images, metres."""
+        """Predicted standard deviation (3D, metres) with which this station's images place a scan point (3,)."""
         return self.registration.sigma_at_m(point_scan_m)
 
 

@@ -172,6 +172,17 @@ def fit_ellipse(mask: NDArray[np.bool_], box: Box) -> EllipseEstimate:
     )  # fmt: skip
 
 
+def middle_colour(image_bgr: NDArray[np.uint8], ellipse: EllipseEstimate) -> tuple[float, float, float]:
+    """The median colour (blue, green, red; 0..255) of an ellipse's middle; black if that is outside the image."""
+    reach = max(2, round(0.4 * min(ellipse.a, ellipse.b)))
+    u, v = round(ellipse.x), round(ellipse.y)
+    middle = image_bgr[max(0, v - reach) : max(0, v + reach), max(0, u - reach) : max(0, u + reach)]
+    if middle.size == 0:
+        return 0.0, 0.0, 0.0
+    b, g, r = (float(value) for value in np.median(middle.reshape(-1, 3), axis=0))
+    return b, g, r
+
+
 def _outline(
     image_bgr: NDArray[np.uint8], camera: CameraModel, estimate: EllipseEstimate, options: DetectionOptions
 ) -> SphereOutline | None:
@@ -226,10 +237,6 @@ def _evidence(
     off_px = angles_to(cone, rays) * camera.fx
     sigma_px = max(_LEAST_SIGMA_PX, 1.4826 * float(np.median(np.abs(off_px))))
     variance = (sigma_px / camera.fx) ** 2 / (_INDEPENDENT * coverage)
-    u, v = round(estimate.x), round(estimate.y)
-    reach = max(2, round(0.4 * estimate.b))
-    colour = np.median(image_bgr[max(0, v - reach) : v + reach, max(0, u - reach) : u + reach].reshape(-1, 3), axis=0)
-    b, g, r = (float(value) for value in colour)
     return Evidence(
         coverage=coverage,
         rms_px=float(np.sqrt(np.mean(off_px**2))),
@@ -237,7 +244,7 @@ def _evidence(
         n_edges=len(rays),
         systematic_px=_LEAST_SIGMA_PX,
         contrast=0.0,  # not measured by this chain
-        colour_bgr=(b, g, r),
+        colour_bgr=middle_colour(image_bgr, estimate),
         score=coverage * (1 - estimate.loss),
         # A direction is determined by half of each point's information, the radius by all of it.
         cone_covariance=np.diag([2 * variance, 2 * variance, variance]),

@@ -67,7 +67,7 @@ def depth_of_pair(pair: Rectified, distance_m: float) -> DepthMap | None:
 
 
 def depth_map(pair: Rectified, disparity_px: Disparity, distance_m: float) -> DepthMap:
-    """The depth of disparities (H, W) of a pair's left image that looks at an object at this distance."""
+    """The depth map of a pair's left image from its disparities (H, W); `distance_m` is that of the object."""
     depth = pair.depth_m(_without_edges(disparity_px))
     slope = pair.f_px * pair.baseline_m / distance_m**2
     return DepthMap(depth, pair.left_camera, pair.T_world_left, slope**2)

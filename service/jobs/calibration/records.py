@@ -1,7 +1,6 @@
 """Records of a camera calibration and of a hand-eye calibration, as the worker writes them into its answer.
 
-Written by service/worker/calibration/records.py and service/compute/calibration/hand_eye/record.py. Parts that are
-None here are not in the records of early versions.
+service/worker/calibration/records.py makes them. Parts that are None here are not in the records of early versions.
 """
 
 from __future__ import annotations
@@ -153,11 +152,16 @@ class Spread(JobRecord):
         covariance: (6, 6), translation in m, then rotation in rad.
         mm: standard deviation of the position, 3D.
         deg: standard deviation of the rotation, about all axes.
+        camera_mm, camera_deg: the part that is due to the uncertainty of the camera's calibration.
+        formal_covariance: (6, 6) that the fit's noise model predicts; None unless the method is weighted.
     """
 
     covariance: Matrix
     mm: float | None = None
     deg: float | None = None
+    camera_mm: float | None = None
+    camera_deg: float | None = None
+    formal_covariance: Matrix | None = None
 
 
 class Residuals(JobRecord):
@@ -191,6 +195,27 @@ class Method(JobRecord):
     distance_deg: float
 
 
+class MethodSpread(JobRecord):
+    """The largest distance between the method in use and another."""
+
+    mm: float
+    deg: float
+
+
+class Motion(JobRecord):
+    """Whether the arm's rotations determine the transform.
+
+    Attributes:
+        rotation_spread_deg: largest rotation between two images.
+        second_axis_deg: root mean square rotation about the second best axis.
+        condition: condition number of the translation's linear system.
+    """
+
+    rotation_spread_deg: float
+    second_axis_deg: float
+    condition: float
+
+
 class ArmAnswer(ArmCorrection):
     """The hand-eye answer with the arm's errors corrected; `terms`: of the arm's model, such as geometry+gears."""
 
@@ -202,18 +227,40 @@ class ArmAnswer(ArmCorrection):
 
 
 class HandEye(JobRecord):
-    """The hand-eye calibration. `T_flange_camera` belongs to the poses that the arm reports, without correction."""
+    """The hand-eye calibration.
+
+    Attributes:
+        T_flange_camera: for the poses that the arm reports, without correction.
+        T_base_board: the board's pose.
+        sigma: of T_flange_camera.
+        residuals: by image.
+        robot_noise: of the arm's poses.
+        setup: eye-in-hand for a camera on the flange, eye-to-hand for one beside the robot.
+        method: that gave T_flange_camera.
+        methods: the transform by every method that gave an answer.
+        spread: between the methods.
+        corner_sigma_px: standard deviation of a board corner.
+        motion: of the arm between the images.
+        excluded: reason, by image that no fit used.
+        turned: images in which the board was seen turned by 180°.
+        arm_held_out_rms_mm: error of held-out images, by terms of the arm's model; "none": poses as reported.
+        arm_correction: the answer with the arm's errors corrected; None if that does not improve held-out images.
+    """
 
     T_flange_camera: Matrix
     T_base_board: Matrix | None = None
     sigma: Spread
     residuals: Residuals
     robot_noise: RobotNoise = RobotNoise()
+    setup: str = ""
     method: str = ""
     methods: dict[str, Method] = Field(default_factory=dict[str, Method])
-    corner_sigma_px: float | None = None  # of a board corner, 1σ
-    excluded: dict[str, str] = Field(default_factory=dict[str, str])  # reasons, by image
-    arm_held_out_rms_mm: dict[str, float] = Field(default_factory=dict[str, float])  # by terms of the arm's model
+    spread: MethodSpread | None = None
+    corner_sigma_px: float | None = None
+    motion: Motion | None = None
+    excluded: dict[str, str] = Field(default_factory=dict[str, str])
+    turned: tuple[str, ...] = ()
+    arm_held_out_rms_mm: dict[str, float] = Field(default_factory=dict[str, float])
     arm_correction: ArmAnswer | None = None
 
     @property

@@ -164,10 +164,7 @@ def _verify(
     orphans, foreign = unlisted_files(folder, evidence.every_sha256) if with_files else ([], [])
     if not with_files:
         notes.append("the files were not read again: only records and signatures were checked")
-    public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
-    of_log, said_of_log = log_findings(
-        read_log(data_dir / LOG_NAME), evidence.checkpoints, public_keys, awaited=bool(site.key_changes)
-    )
+    of_log, said_of_log = _log_findings(data_dir, evidence, site, keys)
     every_run = run_id is None
     ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]
     faults = [
@@ -181,6 +178,16 @@ def _verify(
     ]
     counted = _counted(data_dir, evidence, chains, files or {})
     return replace(counted, key_ids=tuple(keys.periods), faults=tuple(faults), notes=(*notes, *said_of_log, *orphans))
+
+
+def _log_findings(
+    data_dir: Path, evidence: EvidenceRows, site: ChainFacts, keys: signatures.Keys
+) -> tuple[list[Fault], list[str]]:
+    """Faults and notes of the log of signatures that is kept beside the database."""
+    public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
+    return log_findings(
+        read_log(data_dir / LOG_NAME), evidence.checkpoints, public_keys, awaited=bool(site.key_changes)
+    )
 
 
 def _check_chains(

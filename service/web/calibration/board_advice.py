@@ -15,7 +15,6 @@ from service.compute.arm.inverse_kinematics import nearest_posture
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.board_poses.plan import SuggestedPose, suggest_board_poses
 from service.compute.calibration.hand_eye.answers import HandEyeAnswer
-from service.compute.calibration.hand_eye.record import read_arm_correction
 from service.compute.camera_model import CameraModel
 from service.core.arms.known import known_arm
 from service.core.errors import OrthocaptureError
@@ -26,6 +25,7 @@ from service.core.units import deg, metres, mm
 from service.jobs.calibration.records import ArmAnswer, HandEye
 from service.jobs.records import Camera
 from service.web.record.pictures import cached
+from service.worker.calibration.records import corrected_mounting
 
 POSES = 6
 _USUAL_CORNER_PX = 0.1  # 1σ of a board corner, for records that do not state it
@@ -58,7 +58,7 @@ _KEPT = TypeAdapter(tuple[PoseAdvice, ...])
 
 
 def empty_regions(corners: Sequence[Sequence[int]]) -> list[tuple[str, int, int]]:
-    """Ninths of the image that have cells without corners: name, empty cells, all its cells; worst first."""
+    """The ninths of the image in which cells hold no corner, worst first: name, such cells, all cells."""
     grid = np.array(corners)
     out: list[tuple[str, int, int]] = []
     for r, rows in enumerate(np.array_split(np.arange(grid.shape[0]), 3)):
@@ -112,7 +112,7 @@ def _advise(
     T_base_flange = np.array([capture.T_base_flange for capture in captures])
     joints = np.array([capture.joints_rad for capture in captures])
     if correction is not None:
-        arm_errors = read_arm_correction(correction.plain()).correction
+        arm_errors = corrected_mounting(correction).correction
         T_base_flange = corrected_T_base_flange(joints, T_base_flange, arm_errors)
     sigma_px = hand_eye.corner_sigma_px or _USUAL_CORNER_PX
     model = known_arm(arm) if arm else None

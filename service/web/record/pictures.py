@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from service.core.errors import DataError
-from service.core.picture_files import check_picture, picture_size
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,7 +23,6 @@ IMAGE_WIDTHS = (*WIDTHS[3:], 960, 1280, 1920)
 #: Drawn on the screen's copy, so that every screen shows the same; version of all that follows.
 _VERSION = "1"
 _DECODING = threading.BoundedSemaphore(2)  # the capture and its worker need the processor more
-_MOST_PIXELS = 250_000_000
 _SAFE_NAME = re.compile(r"[^\w.+() -]+")
 
 MarkKind = Literal["registration", "control", "sphere", "unassigned"]
@@ -90,46 +88,19 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[DrawnOutline] = (), *, 
         DataError: it is no picture that can be decoded.
     """
     import cv2  # noqa: PLC0415 - a web process starts without it
-    import numpy as np  # noqa: PLC0415
 
-    data = np.fromfile(path, np.uint8)
-    content = data.tobytes()
-    full = picture_size(content)
-    if full[0] * full[1] > _MOST_PIXELS:
-        raise DataError(
-            f"the picture has {full[0]} × {full[1]} pixels, which is too many to show",
-            where=path.name,
-            remedy=_REMEDY,
-        )
-    check_picture(content, path.name, partly=True)
+    from service.compute.images.shown import decode_reduced  # noqa: PLC0415 - the same
+
+    content = path.read_bytes()
     with _DECODING:
-        picture = _decoded(data, full[0], width, path.name, upright=upright)
+        picture, stored_px = decode_reduced(content, width, path.name, upright=upright)
         if marks:
-            draw_marks(picture, marks, picture.shape[1] / full[0])
+            draw_marks(picture, marks, picture.shape[1] / stored_px)
         quality = 80 if width <= WIDTHS[-1] else 88
         done, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise DataError("the picture cannot be encoded", where=path.name, remedy=_REMEDY)
     return encoded.tobytes()
-
-
-def _decoded(data: NDArray[np.uint8], full: int, width: int, name: str, *, upright: bool) -> NDArray[np.uint8]:
-    """Decode a picture of the width `full` at the smallest scale that suffices, and reduce it to `width`."""
-    import cv2  # noqa: PLC0415 - a web process starts without it
-    import numpy as np  # noqa: PLC0415
-
-    scales = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
-    how = next((flag for k, flag in scales.items() if full // k >= width), cv2.IMREAD_COLOR)
-    try:
-        image = cv2.imdecode(data, how if upright else how | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise DataError("the picture cannot be decoded", where=name, remedy=_REMEDY) from error
-    if image is None:
-        raise DataError("the file is not a picture that can be decoded", where=name, remedy=_REMEDY)
-    height, present = image.shape[:2]
-    if present > width:
-        image = cv2.resize(image, (width, max(1, round(height * width / present))), interpolation=cv2.INTER_AREA)
-    return np.asarray(image, dtype=np.uint8)
 
 
 def draw_marks(picture: NDArray[np.uint8], marks: Sequence[DrawnOutline], scale: float) -> None:

@@ -27,7 +27,7 @@ class Listener(socket.socket):
         self._exhausted = False
 
     def listen(self, backlog: int = _BACKLOG, /) -> None:
-        """Listen with a queue of at least _BACKLOG; asyncio's own number is only how many it accepts at once."""
+        """Listen with a queue of at least _BACKLOG; asyncio's smaller number is how many it accepts at once."""
         super().listen(max(backlog, _BACKLOG))
 
     def accept(self) -> tuple[socket.socket, Any]:

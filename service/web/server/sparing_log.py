@@ -30,7 +30,7 @@ class _Repeats:
 
 
 class SparingHandler(logging.StreamHandler[TextIO]):
-    """Writes a kind of message, which is a line of code and the error's own, once a minute at most."""
+    """Writes messages of one kind at most once a minute. A kind is a line of code and an error's place."""
 
     def __init__(self, stream: TextIO, *, every_s: float = EVERY_S) -> None:
         super().__init__(stream)

@@ -11,7 +11,7 @@ from service.compute.calibration.board.board import Board
 from service.compute.calibration.board.images import UsableViews, usable_views
 from service.compute.calibration.hand_eye.answers import HandEyeResult
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.calibration.hand_eye.record import board_corners, hand_eye_record
+from service.compute.calibration.hand_eye.reprojection import board_corners
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
 from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.calibration.intrinsics.validation import (
@@ -25,7 +25,7 @@ from service.jobs.calibration import calibrate as job
 from service.jobs.calibration.records import HandEye, Intrinsics
 from service.jobs.records import Photograph
 from service.worker.calibration.board_view import board_of, boards_of
-from service.worker.calibration.records import intrinsics_record
+from service.worker.calibration.records import hand_eye_record, intrinsics_record
 from service.worker.camera import camera_of, camera_record
 from service.worker.job import JobAnswer, JobContext
 
@@ -92,8 +92,7 @@ def _hand_eye(
         ),
         T_board_turned=board.half_turn(),
     )
-    record = hand_eye_record(solved, [image.viewpoint for image in used])
-    return HandEye.model_validate(record), _hand_eye_measures(solved)
+    return hand_eye_record(solved, [image.viewpoint for image in used]), _hand_eye_measures(solved)
 
 
 def _hand_eye_measures(solved: HandEyeResult) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""A camera calibration as the record of a job, which is also written into camera.json."""
+"""Calibrations as the records of jobs, which are also written into camera.json and hand_eye.json, and read back."""
 
 from __future__ import annotations
 
@@ -6,14 +6,22 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from service.compute.arm.correction import ArmCorrection, CorrectedMounting
 from service.compute.calibration.board.board import Board
+from service.compute.calibration.hand_eye.answers import CorrectedHandEye, HandEyeAnswer, HandEyeResult
+from service.compute.calibration.hand_eye.closed_form import distance
+from service.compute.calibration.hand_eye.setup import Setup
 from service.compute.calibration.intrinsics.estimate import COVERAGE_GRID, IntrinsicsResult
 from service.compute.calibration.intrinsics.uncertainty import ProjectionUncertainty
 from service.compute.calibration.intrinsics.validation import CrossValidation, residual_field
-from service.core.geometry import Array
-from service.core.units import mm
+from service.core.errors import DataError
+from service.core.geometry import Array, Transform
+from service.core.units import deg, mm
+from service.jobs import records as shared
 from service.jobs.calibration import records
 from service.jobs.records import Matrix, ParameterCovariance, matrix
+
+_CORRECTION, _CALIBRATE_AGAIN = "arm_correction of the hand-eye calibration", "Calibrate hand and eye again"
 
 
 def intrinsics_record(
@@ -54,6 +62,107 @@ def intrinsics_record(
         cross_validation=None if validation is None else _cross_validation(validation),
         uncertainty=_uncertainty(uncertainty),
         warnings=tuple(warnings),
+    )
+
+
+def hand_eye_record(result: HandEyeResult, images: Sequence[str], setup: Setup = "eye-in-hand") -> records.HandEye:
+    """The whole result of a hand-eye calibration; `images` are the names of its views."""
+    chosen = result.T_flange_camera
+    methods: dict[str, records.Method] = {}
+    for name, T in result.methods.items():
+        away_mm, away_deg = distance(T, chosen)
+        methods[name] = records.Method(T_flange_camera=matrix(T), distance_mm=away_mm, distance_deg=away_deg)
+    corrected = result.corrected
+    return records.HandEye(
+        T_flange_camera=matrix(chosen),
+        T_base_board=matrix(result.T_base_board),
+        sigma=_spread(result),
+        residuals=_residuals_of(result, images),
+        robot_noise=records.RobotNoise(mm=result.robot_noise_mm, deg=result.robot_noise_deg),
+        setup=setup,
+        method=result.method,
+        methods=methods,
+        spread=records.MethodSpread(mm=result.spread_mm, deg=result.spread_deg),
+        corner_sigma_px=result.corner_sigma_px,
+        motion=records.Motion(
+            rotation_spread_deg=result.rotation_spread_deg,
+            second_axis_deg=result.second_axis_deg,
+            condition=result.condition,
+        ),
+        excluded={images[i]: reason for i, reason in result.excluded.items()},
+        turned=tuple(name for name, turned in zip(images, result.turned, strict=True) if turned),
+        arm_held_out_rms_mm={str(terms): error_mm for terms, error_mm in result.arm_held_out_mm.items()},
+        arm_correction=None if corrected is None else _arm_answer(corrected, images),
+    )
+
+
+def arm_correction_record(correction: ArmCorrection, T_flange_camera: Transform) -> shared.ArmCorrection:
+    """A correction, and the camera's pose on the flange (4, 4) for corrected poses."""
+    return shared.ArmCorrection(
+        T_flange_camera=matrix(T_flange_camera),
+        arm=correction.arm,
+        model="dh_deltas + gear harmonics" if correction.gear_cos_rad.any() else "dh_deltas",
+        dh_deltas=matrix(correction.dh_deltas),
+        gear_cos_rad=matrix(correction.gear_cos_rad),
+        gear_sin_rad=matrix(correction.gear_sin_rad),
+        observed=_row(correction.observed),
+    )
+
+
+def corrected_mounting(record: shared.ArmCorrection) -> CorrectedMounting:
+    """The correction of a record as arrays.
+
+    Raises:
+        DataError: a matrix has another shape.
+    """
+    try:
+        T_flange_camera = np.array(record.T_flange_camera, dtype=np.float64)
+        correction = ArmCorrection(
+            record.arm,
+            np.array(record.dh_deltas, dtype=np.float64),
+            np.array(record.gear_cos_rad, dtype=np.float64),
+            np.array(record.gear_sin_rad, dtype=np.float64),
+            np.array(record.observed, dtype=np.float64),
+        )
+    except ValueError as error:  # rows of different lengths
+        raise DataError(f"not an arm correction: {error}", where=_CORRECTION, remedy=_CALIBRATE_AGAIN) from error
+    if T_flange_camera.shape != (4, 4):
+        raise DataError("T_flange_camera is not 4 × 4", where=_CORRECTION, remedy=_CALIBRATE_AGAIN)
+    return CorrectedMounting(correction, T_flange_camera)
+
+
+def _arm_answer(corrected: CorrectedHandEye, images: Sequence[str]) -> records.ArmAnswer:
+    return records.ArmAnswer(
+        **arm_correction_record(corrected.correction, corrected.T_flange_camera).set_fields(),
+        T_base_board=matrix(corrected.T_base_board),
+        sigma=_spread(corrected),
+        residuals=_residuals_of(corrected, images),
+        robot_noise=records.RobotNoise(mm=corrected.robot_noise_mm, deg=corrected.robot_noise_deg),
+        terms=corrected.terms,
+    )
+
+
+def _spread(answer: HandEyeAnswer) -> records.Spread:
+    formal, camera = answer.formal_covariance, answer.camera_share
+    return records.Spread(
+        covariance=matrix(answer.covariance),
+        mm=answer.sigma_mm,
+        deg=answer.sigma_deg,
+        camera_mm=mm(float(np.sqrt(np.trace(camera[:3, :3])))),
+        camera_deg=deg(np.sqrt(np.trace(camera[3:, 3:]))),
+        formal_covariance=None if formal is None else matrix(formal),
+    )
+
+
+def _residuals_of(answer: HandEyeAnswer, images: Sequence[str]) -> records.Residuals:
+    def by_image(values: Array) -> dict[str, float]:
+        return dict(zip(images, _row(values), strict=True))
+
+    return records.Residuals(
+        mm=by_image(answer.residual_mm),
+        deg=by_image(answer.residual_deg),
+        held_out_mm=by_image(answer.held_out_mm),
+        held_out_deg=by_image(answer.held_out_deg),
     )
 
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.compute.calibration.hand_eye.record import read_arm_correction
 from service.core.geometry import Array
 from service.jobs.records import Mounting, Photograph
+from service.worker.calibration.records import corrected_mounting
 
 
 def robot_camera_poses(mounting: Mounting, images: Sequence[Photograph]) -> Array:
@@ -33,5 +33,5 @@ def robot_camera_poses(mounting: Mounting, images: Sequence[Photograph]) -> Arra
     mine = np.array([image.station in stations for image in images])
     if mine.any():
         joints = np.array([image.joints_rad for image, own in zip(images, mine, strict=True) if own])
-        poses[mine] = read_arm_correction(correction.plain()).T_base_camera(joints, flange[mine])
+        poses[mine] = corrected_mounting(correction).T_base_camera(joints, flange[mine])
     return poses

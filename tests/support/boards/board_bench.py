@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from service.compute.calibration.board.board import Board
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Transform, apply, inverse, transform
-from service.worker.loop import work
 from tests.support.boards.board_images import checkerboard, photograph
 from tests.support.rig.bench_rig import BenchRig
 from tests.support.runs.bench_run import Bench
+from tests.support.runs.computing_run import compute_jobs
 
 BOARD = Board(7, 10, 0.030)
 LENS = CameraModel(900, 600, 1272.0, 1272.5, 452.0, 297.0, -0.05, 0.02, 2e-4, -2e-4)
@@ -67,7 +67,7 @@ def board_room(bench: Bench) -> BoardRoom:
 
 
 def _serve(bench: Bench) -> None:
-    work(bench.store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _total: None)
+    compute_jobs(bench.store)
 
 
 PROTOCOL = """

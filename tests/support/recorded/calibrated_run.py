@@ -12,7 +12,6 @@ import numpy as np
 
 from service.compute.calibration.board.board import BoardView
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
-from service.compute.calibration.hand_eye.record import hand_eye_record
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics
 from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.calibration.intrinsics.validation import calibration_warnings, cross_validate
@@ -32,7 +31,7 @@ from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact
 from service.store.signatures.signing import checkpoint
-from service.worker.calibration.records import intrinsics_record
+from service.worker.calibration.records import hand_eye_record, intrinsics_record
 from tests.support.boards.board_sessions import BOARD, Session, noisy_session
 from tests.support.pages.web import WebSite
 
@@ -129,7 +128,7 @@ def _calibrated() -> tuple[Session, dict[str, Any], dict[str, float]]:
     hands = calibrate_hand_eye(
         HandEyeViews(session.T_base_flange, session.T_camera_board, corners=session.corners), bootstrap=10
     )
-    hand_eye = hand_eye_record(hands, _NAMES)
+    hand_eye = hand_eye_record(hands, _NAMES).plain()
     result: dict[str, Any] = {
         "camera": solved.camera.record(),
         "T_flange_camera": hand_eye["T_flange_camera"],

@@ -24,9 +24,9 @@ class RunningCamera:
 
 @contextmanager
 def camera_simulator(
-    faults: Sequence[dict[str, Any]] = (), *options: str, port: int = 0, width: int = 480
+    faults: Sequence[dict[str, Any]] = (), *options: str, port: int = 0, width: int = 480, name: str = "camera"
 ) -> Generator[RunningCamera]:
-    command = [sys.executable, "-m", "simulators", "camera", "--port", str(port), "--image-width", str(width)]
+    command = [sys.executable, "-m", "simulators", name, "--port", str(port), "--image-width", str(width)]
     command += [
         "--parent",
         str(os.getpid()),

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from simulators.rendering.sensor import bordered, read_out
-from simulators.sony_camera.exif import Shot, encode_jpeg
-from simulators.sony_camera.properties import ExposureSettings
-from simulators.sony_camera.raw_file import encode_raw
+from simulators.sony_camera.exif import PLATE
+from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg
+from simulators.still_camera.raw_file import encode_raw
 
 BEGAN = datetime(2026, 11, 21, 10, 0, tzinfo=UTC)
 _COPY = """\
@@ -32,11 +32,10 @@ with open(target, "wb") as stream:
 
 def photograph(number: int, taken: datetime, *, iso: int = 100, raw: bool = False) -> bytes:
     """A small image file, different for each number."""
-    settings = ExposureSettings(22.0, 1 / 50, (1, 50), iso, manual_focus=True, file_format=2, jpeg_quality=2,
-                                capture_target=16)  # fmt: skip
+    settings = ExposureSettings(22.0, 1 / 50, (1, 50), iso, on_card=True)
     picture = np.full((64, 96, 3), 40 + number, dtype=np.uint8)
     picture[number % 64] = 255
-    shot = Shot(settings, number, taken)
+    shot = Shot(settings, number, taken, PLATE)
     return encode_raw(read_out(bordered(picture), iso, number), shot) if raw else encode_jpeg(picture, shot)
 
 

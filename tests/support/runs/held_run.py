@@ -17,10 +17,10 @@ from service.compute.capture.hand_view import HandView
 from service.compute.planning.information import ViewInformation
 from service.core.errors import ComputeError
 from service.core.geometry import Array
-from service.worker.loop import work
 from simulators.hand.technician import Grip, follow
 from tests.support.rig.bench_rig import BenchRig, ScriptedOperator
 from tests.support.runs.bench_run import PROTOCOL, Bench
+from tests.support.runs.computing_run import compute_jobs
 from tests.support.runs.measuring_rig import MEASURED, SPHERES_M, BenchCt, MeasuringRig
 from tests.support.scenes.sphere_images import camera
 
@@ -121,7 +121,7 @@ def held_run(
         job = bench.store.claim_job("test", 30, kinds=list(known))
         if job is not None:
             bench.store.finish_job(job, measures={}, duration_s=0.1, result=known[job.kind])
-        work(bench.store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _total: None)
+        compute_jobs(bench.store)
 
     monkeypatch.setattr("service.worker.capture.hand_view.look_at_image", look)
     bench.operator.on_show = serve

@@ -18,9 +18,9 @@ from simulators.rendering.sensor import camera_picture, read_out
 from simulators.scan_station.formats import encode
 from simulators.scan_station.station import scan_scene
 from simulators.scene.world import NOMINAL_LUX, SCENE_CENTRE_M, Scene
-from simulators.sony_camera.exif import Shot, encode_jpeg
-from simulators.sony_camera.properties import ExposureSettings
-from simulators.sony_camera.raw_file import encode_raw
+from simulators.sony_camera.exif import PLATE
+from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg
+from simulators.still_camera.raw_file import encode_raw
 
 SEED = 7
 SETTINGS = ExposureSettings(
@@ -28,10 +28,7 @@ SETTINGS = ExposureSettings(
     exposure_s=1 / 15,
     exposure_fraction=(1, 15),
     iso=100,
-    manual_focus=True,
-    file_format=2,
-    jpeg_quality=1,
-    capture_target=1,
+    jpeg_level=1,
 )
 _BEGAN = datetime(2024, 3, 1, 10, 0, 0, tzinfo=UTC)
 
@@ -73,7 +70,7 @@ class Photographer:
             whole = self.renderer.render(view, REFERENCE, self.counter) if mosaic is None else camera_picture(mosaic)
             taken = _BEGAN + timedelta(minutes=self.counter)
             name = f"DSC{self.counter:05d}"
-            shot = Shot(SETTINGS, self.counter, taken)
+            shot = Shot(SETTINGS, self.counter, taken, PLATE)
             (self.folder / part / f"{name}.JPG").write_bytes(encode_jpeg(whole, shot))
             if mosaic is not None:
                 (self.folder / part / f"{name}.ARW").write_bytes(encode_raw(mosaic, shot))

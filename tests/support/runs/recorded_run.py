@@ -29,8 +29,8 @@ from service.steps import params_models
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
-from service.worker.loop import work
 from tests.support.record.store import enqueue
+from tests.support.runs.computing_run import compute_jobs
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, exact_outlines, scene
 from tests.support.scenes.sphere_meshes import MeshBuilder, cap
 
@@ -62,6 +62,13 @@ steps:
     params: {images_of: [first_scan], calibration: first_scan, hand_eye: first_scan, scan: second_scan}
     gates:
       - {measure: colmap_rms_px, max: 1.0, unit: px}
+"""
+# A step to follow those of PROTOCOL.
+FUSION = """\
+  - id: ground_truth
+    kind: ground_truth
+    title: Fuse
+    params: {ct: first_scan, scan: second_scan}
 """
 
 
@@ -161,7 +168,7 @@ class _Recorder:
     ) -> tuple[dict[str, float], dict[str, Any], tuple[ArtefactRef, ...]]:
         job = NewJob(kind, step, attempt, f"{step}/{attempt}/{kind}", arguments, version=self.version)
         enqueue(self.store, self.run_id, job, actor="runner")
-        assert work(self.store, until_idle=True, stop=lambda: False, progress=lambda _w, _d, _t: None) == 1
+        assert compute_jobs(self.store) == 1
         end: Any = self.store.events(self.run_id)[-1].payload
         assert end.kind == "job_finished", end
         self.last_job = end.job

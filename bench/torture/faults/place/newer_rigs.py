@@ -17,7 +17,7 @@ import numpy as np
 
 from bench.torture.faults.place.person import PlaceEye
 from bench.torture.faults.wire.proxy import Wire
-from tests.support.rig.grbl_simulator import CENTRE_M, TURN, mount
+from tests.support.arms.grbl_simulator import CENTRE_M, TURN, mount
 
 if TYPE_CHECKING:
     from bench.torture.faults.trial import Trial

@@ -8,7 +8,8 @@ from typing import cast
 from bench.torture.fuzz.targets.target import Target
 
 _MODULES = (  # each has a tuple TARGETS
-    "written", "delivered", "labelled", "viewed", "exported", "streams", "records", "wires", "movers", "hostile",
+    "files.written", "files.delivered", "files.labelled", "files.viewed", "files.exported",
+    "records", "wires.streams", "wires.devices", "wires.movers", "wires.hostile",
 )  # fmt: skip
 GROUPS = tuple(f"bench.torture.fuzz.targets.{name}" for name in _MODULES)
 

@@ -301,7 +301,7 @@ class AutomaticOperator(_Operator):
         self.hands.read(message)
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction:
-        """Say yes, recorded as automatic. Raises OrthocaptureError if there is no advice left to follow."""
+        """Confirm the step, recorded as automatic. Raises OrthocaptureError if there is no advice left to follow."""
         if question.for_ == "recovery":
             mends = self._mends.get(question.step, 0)
             if state.step.mend and "confirm" in question.options and mends < _MOST_MENDS:

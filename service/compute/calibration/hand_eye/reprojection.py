@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compute.calibration.board.board import Board, BoardView
 from service.compute.calibration.hand_eye.weighted import linearise
 from service.compute.camera_model import CameraModel
 from service.compute.descent import halved_gauss_newton, largest
@@ -38,6 +40,15 @@ class BoardCorners:
     def take(self, which: NDArray[np.bool_]) -> BoardCorners:
         """Select these views."""
         return BoardCorners(self.points_m, self.corners_px[which], self.camera)
+
+
+def board_corners(views: Sequence[BoardView], board: Board, camera: CameraModel) -> BoardCorners:
+    """The corners of a board's views, which may be partial, as one array."""
+    points = board.points()
+    pixels = np.full((len(views), len(points), 2), np.nan)
+    for row, view in zip(pixels, views, strict=True):
+        row[view.indices] = view.corners
+    return BoardCorners(points, pixels, camera)
 
 
 def projection_jacobian(points_m: Array, T_camera_board: Array, camera: CameraModel) -> tuple[Array, Array]:

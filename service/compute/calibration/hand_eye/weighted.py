@@ -175,7 +175,7 @@ def solve(views: Views, noise: Noise, X: Transform, B: Transform, *, iterations:
     prior = _prior(noise, views.kind)
 
     def minimum_at(fit: Fit) -> tuple[Array, Array]:
-        """Increments of the transforms and of the arm's parameters, and their covariance."""
+        """The step from `fit` to the minimum of the linearised problem, and the covariance of all parameters."""
         grams, _ = _grams(views, noise, fit.T_flange_camera, fit.T_base_board)
         step, covariance, _ = _minimum(grams.sum(axis=0), prior)
         return np.concatenate([step[:12], step[12:] - fit.arm]), covariance

@@ -275,7 +275,7 @@ def _inverse_root(normal: Array) -> Array:
     if values[0] < _MIN_EIGENVALUE:
         raise ComputeError(
             "the views do not determine all terms of the distortion",
-            remedy="take a model with fewer terms, or show the board in the corners of the image",
+            remedy="Choose a model with fewer terms, or show the board in the corners of the image",
         )
     return vectors / np.sqrt(values) / scale[:, None]
 

@@ -18,7 +18,7 @@ from service.compute.markers.grounded.masks import sphere_masks
 from service.compute.markers.grounded.networks import Networks, load_networks
 from service.compute.markers.grounded.weights import Weights
 from service.compute.markers.outlines.rough import RoughSphere, apart_rad
-from service.compute.markers.paper_chain import MARGIN, MOST_LOSS, Box, EllipseEstimate, fit_ellipse
+from service.compute.markers.paper_chain import MARGIN, MOST_LOSS, Box, EllipseEstimate, fit_ellipse, middle_colour
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 
 _POINTS = 48  # of an ellipse, through which its cone is fitted
@@ -106,15 +106,4 @@ def _rough(image_bgr: NDArray[np.uint8], camera: CameraModel, ellipse: EllipseEs
     if not np.isfinite(half[0]):
         return None
     cone = fit_cone(rays, np.ones(_POINTS), Cone(axis[0], float(half[0])))
-    return RoughSphere(cone, 1.0, 0.0, ellipse.loss, _colour(image_bgr, ellipse), plain=True)
-
-
-def _colour(image_bgr: NDArray[np.uint8], ellipse: EllipseEstimate) -> tuple[float, float, float]:
-    """The median colour of the ellipse's middle, 0..255."""
-    reach = max(2, round(0.4 * min(ellipse.a, ellipse.b)))
-    u, v = round(ellipse.x), round(ellipse.y)
-    middle = image_bgr[max(0, v - reach) : max(1, v + reach), max(0, u - reach) : max(1, u + reach)]
-    if middle.size == 0:
-        return 0.0, 0.0, 0.0
-    b, g, r = (float(value) for value in np.median(middle.reshape(-1, 3), axis=0))
-    return b, g, r
+    return RoughSphere(cone, 1.0, 0.0, ellipse.loss, middle_colour(image_bgr, ellipse), plain=True)

@@ -131,4 +131,4 @@ def _size(path: Path) -> tuple[int, int]:
         size = json.loads(path.read_text("utf-8")).get("size", {})
         return int(size.get("shortest_edge", _SIZE[0])), int(size.get("longest_edge", _SIZE[1]))
     except (OSError, ValueError, AttributeError, TypeError) as error:
-        raise DataError("this is no configuration of an image processor", where=str(path)) from error
+        raise DataError("the file is not the configuration of an image processor", where=str(path)) from error

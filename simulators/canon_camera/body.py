@@ -1,0 +1,102 @@
+"""The Canon body: its buttons, the files on its card, and those that wait in its memory."""
+
+from __future__ import annotations
+
+import threading
+
+from simulators.canon_camera import events
+from simulators.canon_camera.properties import (
+    APERTURE_PRIORITY,
+    ISO,
+    MEMORY,
+    ONE_SHOT,
+    Code,
+    Properties,
+)
+from simulators.faults import FaultPlan
+from simulators.still_camera.body import BodyOptions, CameraBody, CameraFile, FileNames
+from simulators.still_camera.exif import ExposureSettings, Nameplate
+from simulators.still_camera.scene import ImageSource
+
+MODEL, SERIAL, LENS = "Canon EOS R5", "042021006092", "RF24-70mm F2.8 L IS USM"
+PLATE = Nameplate("Canon", MODEL, LENS, SERIAL, "Firmware Version 1.8.2", sub_second_digits=2)
+FORMAT_CR3 = 0xB108
+STORAGE, FOLDER_DCIM, FOLDER_PICTURES = 0x00010001, 0x30000000, 0x30100000
+FOLDERS = {FOLDER_DCIM: ("DCIM", 0), FOLDER_PICTURES: ("100EOSR5", FOLDER_DCIM)}
+PICTURE_BYTES = 30_000_000  # by which the remaining pictures are counted
+_IN_MEMORY = 0x40000000
+_PROTOCOL_ISO = 100
+
+
+class CanonBody(CameraBody):
+    """An EOS R5, whose files stay on its card."""
+
+    def __init__(self, source: ImageSource, faults: FaultPlan, options: BodyOptions) -> None:
+        super().__init__(source, faults, options, PLATE, FileNames("IMG_{:04d}", ".CR3", FORMAT_CR3))
+        self.properties = Properties(SERIAL, LENS)
+        self.count_shots()
+        self.has_card = True
+        self._files: dict[int, CameraFile] = {}
+        self._lock = threading.Lock()
+
+    def set_by_hand(self, *, autofocus: bool, aperture_priority: bool) -> None:
+        """Turn the switch on the lens, and the mode dial."""
+        if autofocus:
+            self.properties.put(Code.FOCUS, ONE_SHOT)
+        if aperture_priority:
+            self.properties.put(Code.EXPOSURE_MODE, APERTURE_PRIORITY)
+
+    def take_card_out(self) -> None:
+        """From now on, files go to the memory only."""
+        self.has_card = False
+        self.properties.offer(Code.DESTINATION, (MEMORY,))
+
+    def count_shots(self) -> None:
+        """Say how many pictures the card still holds."""
+        self.properties.put(Code.AVAILABLE_SHOTS, self.free_bytes // PICTURE_BYTES)
+
+    def exposure_settings(self) -> ExposureSettings:
+        """The settings with which the next exposure will be taken."""
+        return self.properties.exposure_settings()
+
+    def dial_iso(self, iso: int) -> None:
+        """Turn the ISO dial by hand."""
+        wanted = iso or _PROTOCOL_ISO
+        self.properties.put(Code.ISO, next(code for code, known in ISO.items() if known == wanted))
+
+    def begun(self) -> None:
+        """Say that an exposure has begun."""
+        self.properties.announce(events.status(busy=True))
+
+    def done(self) -> None:
+        """Say that the exposure has ended."""
+        self.properties.announce(events.status(busy=False))
+
+    def keep(self, files: list[CameraFile], settings: ExposureSettings) -> None:
+        """Put finished files on the card, or into the memory, and announce them."""
+        with self._lock:
+            for file in files:
+                base = FOLDER_PICTURES if settings.on_card else _IN_MEMORY
+                handle = base + 1 + len(self._files)
+                self._files[handle] = file
+                if settings.on_card:
+                    self.properties.announce(events.object_added(handle, STORAGE, FOLDER_PICTURES, file))
+                else:
+                    self.properties.announce(events.transfer_wanted(handle, file))
+        self.count_shots()
+
+    def file(self, handle: int) -> CameraFile | None:
+        """A file on the card or in the memory."""
+        with self._lock:
+            return self._files.get(handle)
+
+    def on_card(self) -> tuple[int, ...]:
+        """The handles of the files on the card."""
+        with self._lock:
+            return tuple(handle for handle in self._files if handle < _IN_MEMORY)
+
+    def fetched(self, handle: int) -> None:
+        """Drop a file from the memory, once the client has it."""
+        with self._lock:
+            if handle >= _IN_MEMORY:
+                self._files.pop(handle, None)

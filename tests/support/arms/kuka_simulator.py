@@ -1,0 +1,42 @@
+"""Runs simulated KUKA controllers for tests, presses what is on their pendant, and reads the golden transcripts."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import Any
+
+from tests.support.rig.simulator_process import simulator
+
+#: Starts what answers at the ports of a controller on an address.
+Controller = Callable[[str], contextlib.AbstractContextManager[dict[str, Any]]]
+TRANSCRIPTS = Path(__file__).parents[2] / "data" / "kuka"
+
+
+@contextlib.contextmanager
+def simulated_kuka(host: str, *options: str) -> Generator[dict[str, Any]]:
+    """Run `python -m simulators kuka`; yields its ready line."""
+    with simulator("kuka", "--host", host, "--parent", str(os.getpid()), *options) as running:
+        yield running.ready
+
+
+def pendant(host: str, order: str) -> None:
+    """Do what a person does at the smartPAD."""
+    with socket.create_connection((host, 30011), timeout=30) as connection, connection.makefile("rw") as lines:
+        lines.write(order + "\n")
+        lines.flush()
+        assert lines.readline().strip() == "ok", order
+
+
+def transcript(name: str) -> list[dict[str, Any]]:
+    """The rows of a golden transcript."""
+    return [json.loads(row) for row in (TRANSCRIPTS / name).read_text().splitlines()]
+
+
+def agrees(line: dict[str, Any], golden: dict[str, Any]) -> bool:
+    """Whether a line has the fields of the golden one, and its values where that is not `*`."""
+    return line.keys() == golden.keys() and all(value in ("*", line[name]) for name, value in golden.items())

@@ -1,0 +1,22 @@
+"""Runs simulated Universal Robots controllers for tests, each on its own address."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Generator
+
+from tests.support.rig.simulator_process import simulator
+
+
+def address(number: int) -> str:
+    """A loopback address that no other test worker uses, because the controller's ports are fixed."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")
+    return f"127.7.{10 + int(worker)}.{number}"
+
+
+@contextlib.contextmanager
+def simulated_ur(host: str, *options: str) -> Generator[dict[str, str]]:
+    """Run `python -m simulators ur`; yields its ready line."""
+    with simulator("ur", "--host", host, "--parent", str(os.getpid()), *options) as running:
+        yield running.ready
