@@ -92,6 +92,23 @@ class LensSection(Record):
         return self.focal_length_mm * extended / self.sensor_width_mm * width_px
 
 
+class FurtherCameraSection(Record):
+    """A further camera, which exposes after the first one at the viewpoints of a data set."""
+
+    mounted: Literal["fixed", "rigid"]  # fixed: on a stand in the room; rigid: beside the first camera on its mount
+    calibration: str  # camera.json from `calibrate intrinsics` for this camera, relative to the rig file
+    every: Literal["viewpoint", "station"] = "viewpoint"  # exposes at each viewpoint, or once at each station
+    aperture_f: Annotated[float, Field(gt=0)] | None = None  # None: that of the protocol, as the next two
+    exposure_s: Annotated[float, Field(gt=0)] | None = None  # exposure time
+    iso: Annotated[int, Field(gt=0)] | None = None  # sensitivity
+
+    @model_validator(mode="after")
+    def _seen_once(self) -> Self:
+        if self.mounted == "rigid" and self.every == "station":
+            raise ValueError("a rigid camera exposes at every viewpoint: leave `every` out")
+        return self
+
+
 class TimestampSection(Record):
     """A time-stamp authority (RFC 3161) that is asked at the end of every run; the run ends even if it fails."""
 
@@ -148,6 +165,7 @@ class RigSection(Record):
     simulated: bool = False  # devices are simulators: everything recorded is marked so
     hands: str | None = None  # HOST:PORT of a simulated technician (simulated rigs only)
     devices: dict[str, dict[str, Any]]  # by a name of your choice: robot, camera, scanner and so on; see Devices
+    cameras: dict[str, FurtherCameraSection] = Field(default_factory=dict)  # further cameras, by their device's name
     stations: dict[str, StationSection] = Field(default_factory=dict)  # by the name that protocols use
     # The camera mount's drawing: a rigid 4×4 matrix, metres; the calibration replaces it.
     T_flange_camera_nominal: tuple[tuple[float, float, float, float], ...] | None = None
@@ -249,8 +267,13 @@ def parse_recorded_rig(source: bytes, path: Path) -> Rig:
 
 def _violations(data: Plain) -> Iterator[tuple[FieldPath, str]]:
     """Yield (field, what is wrong) beyond the types of the fields; the data may be malformed in any way."""
-    devices, stations = (data.get(name) if isinstance(data, dict) else None for name in ("devices", "stations"))
+    devices, stations, cameras = (
+        data.get(name) if isinstance(data, dict) else None for name in ("devices", "stations", "cameras")
+    )
     known: list[str] = list(devices) if isinstance(devices, dict) else []
+    for name in cameras if isinstance(cameras, dict) else ():
+        if name not in known:
+            yield ("cameras", name), f"{name!r} is not among the devices: {', '.join(known) or 'there are none'}"
     for name, station in stations.items() if isinstance(stations, dict) else ():
         if not isinstance(station, dict):
             continue

@@ -31,8 +31,8 @@ from drivers.plugin import DriverConfig, DriverSpec
 from service.core.errors import ConfigurationError
 from service.core.records.import_list import ImportList
 from service.core.text.checked_yaml import problem_of, refuse
-from service.rig import CollisionSection, LensSection, OpticsSection, Rig
-from service.steps.context import LeaveToMove, StationLayout
+from service.rig import CollisionSection, FurtherCameraSection, LensSection, OpticsSection, Rig
+from service.steps.context import FurtherCamera, LeaveToMove, StationLayout
 
 GROUP = "orthocapture.drivers"
 INTERFACES: Mapping[str, type[Any]] = {
@@ -134,8 +134,24 @@ class Station:
         self._leave = leave
 
     def camera(self) -> Camera:
-        """The rig's only camera. Raises ConfigurationError unless there is exactly one, DeviceError."""
+        """The rig's first camera. Raises ConfigurationError unless there is exactly one, DeviceError."""
         return cast(Camera, self.device(self._only("camera")))
+
+    def further_cameras(self) -> tuple[FurtherCamera, ...]:
+        """The rig's further cameras. Raises ConfigurationError if one is no camera, uncalibrated; DeviceError."""
+        return tuple(self._further(name, section) for name, section in self.rig.section.cameras.items())
+
+    def _further(self, name: str, section: FurtherCameraSection) -> FurtherCamera:
+        calibration, where = self.rig.folder / section.calibration, f"{self.rig.path}, camera {name}"
+        if self.kind_of(name) != "camera":
+            raise ConfigurationError(f"the device {name} is not a camera", where=where, remedy="Correct `cameras`")
+        if not calibration.is_file():
+            raise ConfigurationError(
+                f"there is no file {calibration}",
+                where=where,
+                remedy="Calibrate this camera: orthocapture calibrate intrinsics … --out camera.json",
+            )
+        return FurtherCamera(name, cast(Camera, self.device(name)), section, calibration)
 
     def scanner(self, name: str | None = None) -> Scanner:
         """The scanner of this name, or the rig's only one. Raises ConfigurationError or DeviceError."""
@@ -205,7 +221,7 @@ class Station:
         return [name for name in self.names() if self.kind_of(name) == kind]
 
     def _only(self, kind: str) -> str:
-        names = self._of_kind(kind)
+        names = [name for name in self._of_kind(kind) if name not in self.rig.section.cameras]
         if len(names) != 1:
             raise ConfigurationError(
                 f"this step needs exactly one {kind}, the rig has {len(names)}", where=str(self.rig.path)

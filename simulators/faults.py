@@ -70,6 +70,11 @@ class FaultPlan:
         """Return the plan as JSON that parse() reads; counters are not included."""
         return _FAULTS.dump_json(self.faults).decode()
 
+    def of(self, device: str, called: str) -> FaultPlan:
+        """The faults of a device, for its simulator, which calls itself by another name."""
+        mine = (fault for fault in self.faults if fault.device == device)
+        return FaultPlan(tuple(fault.model_copy(update={"device": called}) for fault in mine))
+
     def check(self, device: str, message: str) -> Fault | None:
         """Count this message and return the fault that is due for it, or None."""
         with self._lock:

@@ -16,6 +16,9 @@ from service.core.geometry import Array
 from service.core.text.file_text import file_text
 from service.core.text.json_text import parse_json
 
+#: Parameters of the lens, in the order of the registration's solver.
+LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+
 
 @dataclass(frozen=True, slots=True)
 class CameraCovariance:
@@ -23,6 +26,16 @@ class CameraCovariance:
 
     parameters: tuple[str, ...]
     matrix: Array
+
+    def of_lens(self) -> Array | None:
+        """(8, 8) covariance of the parameters LENS; None if the covariance is of another lens model."""
+        if not set(self.parameters) <= set(LENS):
+            return None
+        # Parameters that the model holds fixed are exact, but the solver needs a positive variance.
+        out = 1e-18 * np.eye(len(LENS))
+        places = [LENS.index(name) for name in self.parameters]
+        out[np.ix_(places, places)] = self.matrix
+        return out
 
     def deviations(self, camera: CameraModel) -> Iterator[CameraModel]:
         """Cameras displaced by one standard deviation along each principal axis of the covariance.

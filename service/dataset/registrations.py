@@ -20,7 +20,7 @@ from service.core.protocol.step_params import Gives
 from service.core.results.arrival import late_words
 from service.core.run.state import JobState, RunState
 from service.jobs.kind import JobRecord
-from service.jobs.registration import evaluate, register
+from service.jobs.registration import evaluate, further_camera, register
 from service.jobs.registration.evaluate import ErrorBudget, Row
 from service.jobs.registration.register import Registration, Registrations
 
@@ -63,6 +63,12 @@ def registrations(protocol: Protocol, state: RunState) -> dict[str, Registration
         answer = register.KIND.read_answer(job.result)
         found.setdefault(registration_name(answer), answer)
     return found
+
+
+def further_cameras(protocol: Protocol, state: RunState) -> dict[str, further_camera.Answer]:
+    """The further cameras of the rig by their names, as the registration step located them."""
+    result = last_result(protocol, state, "registrations", Registrations)
+    return {} if result is None else dict(result.cameras)
 
 
 def evaluated(protocol: Protocol, state: RunState) -> list[Row]:

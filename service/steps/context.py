@@ -19,7 +19,7 @@ from service.core.records.import_list import ImportList
 from service.core.run.decide import RunState, StepState
 from service.core.run.state import JobState
 from service.jobs.kind import JobKind, JobRecord
-from service.rig import CollisionSection, LensSection, ObstacleSection, OpticsSection
+from service.rig import CollisionSection, FurtherCameraSection, LensSection, ObstacleSection, OpticsSection
 from service.steps.measures import MeasureRecord
 from service.store.records import NewArtefact
 
@@ -55,6 +55,16 @@ class LeaveToMove:
     not_before_monotonic_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class FurtherCamera:
+    """An open camera beside the first one, and its section in rig.yaml with the file of its intrinsics."""
+
+    name: str  # device name in rig.yaml
+    camera: Camera
+    section: FurtherCameraSection
+    calibration: Path
+
+
 class Devices(Protocol):
     """The open devices of a rig, by role; opened on first use. Raises ConfigurationError if the rig has none."""
 
@@ -66,7 +76,11 @@ class Devices(Protocol):
         ...
 
     def camera(self) -> Camera:
-        """The camera."""
+        """The first camera: the one on the arm, or the only one."""
+        ...
+
+    def further_cameras(self) -> tuple[FurtherCamera, ...]:
+        """The further cameras of the rig, in the order of the rig file; mostly none."""
         ...
 
     def scanner(self, name: str | None = None) -> Scanner:

@@ -26,6 +26,7 @@ FOLDERS = {FOLDER_DCIM: ("DCIM", 0), FOLDER_PICTURES: ("100EOSR5", FOLDER_DCIM)}
 PICTURE_BYTES = 30_000_000  # by which the remaining pictures are counted
 _IN_MEMORY = 0x40000000
 _PROTOCOL_ISO = 100
+DIALLED = {Code.APERTURE: 0x50, Code.SHUTTER: 0x58, Code.ISO: 0x48}
 
 
 class CanonBody(CameraBody):
@@ -38,6 +39,10 @@ class CanonBody(CameraBody):
         self.has_card = True
         self._files: dict[int, CameraFile] = {}
         self._lock = threading.Lock()
+        if options.send_to is not None:
+            # Nobody can set this camera remotely: a technician has dialled in what a protocol asks for.
+            for code, value in DIALLED.items():
+                self.properties.put(code, value)
 
     def set_by_hand(self, *, autofocus: bool, aperture_priority: bool) -> None:
         """Turn the switch on the lens, and the mode dial."""

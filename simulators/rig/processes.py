@@ -20,6 +20,8 @@ from simulators.faults import FaultPlan
 from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand.technician import MISHAP_EVERY, Hand
 from simulators.rig.world_server import World, WorldServer
+from simulators.scene.second_camera import NAME as SECOND
+from simulators.scene.second_camera import PLACES, SecondCamera
 from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
 from simulators.serve import SimulatorError, Termination, announce
 
@@ -48,6 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="no arm: a technician holds the camera, and makes this many mistakes",
     )
     parser.add_argument(
+        "--second-camera", choices=PLACES, help="on a stand in the room, or beside the first one on the arm"
+    )
+    parser.add_argument(
         "--without-cable", action="store_true", help="with --hand: the camera sends its photographs into a folder"
     )
     parser.add_argument(
@@ -62,6 +67,8 @@ def serve(args: argparse.Namespace) -> None:
     """Start everything, print the ready line and serve until SIGTERM."""
     if args.without_cable and not args.hand:
         raise SimulatorError("--without-cable is for a camera that a person holds: add --hand")
+    if args.second_camera and args.hand:
+        raise SimulatorError("--second-camera needs an arm: leave --hand out")
     termination = Termination()
     rig = _Rig(args, termination)
     try:
@@ -82,7 +89,10 @@ class _Rig:
         self.children: dict[str, subprocess.Popen[str]] = {}
         self._words: dict[str, tuple[str, ...]] = {}  # command line with which each was started
         self._ready: dict[str, dict[str, Any]] = {}  # ready line of each
-        self.world = World(scene, args.image_width, self.arms, _start_joints(scene), camera_held=bool(args.hand))
+        self.second = SecondCamera.place(scene, args.second_camera) if args.second_camera else None
+        self.world = World(
+            scene, args.image_width, self.arms, _start_joints(scene), second=self.second, camera_held=bool(args.hand)
+        )
         self.hand = args.hand and Hand(
             args.hand, args.scene, self.world.hold, self.world.press_shutter, SCENE_CENTRE_M.copy()
         )
@@ -117,9 +127,11 @@ class _Rig:
         camera = self._child(
             "camera", CAMERAS[self.args.camera], "--port", "0", "--world", world,
             "--image-width", str(self.args.image_width),
-            "--exposures-log", str(self.folder / "truth_exposures.jsonl"),
+            "--exposures-log", str(self._exposures_log("camera")),
             *(("--send-to", str(self.folder / "photographs")) if self.args.without_cable else ()),
         )  # fmt: skip
+        if self.second is not None:
+            self._start_second(self.second)
         self._child("lightbox", "lightbox", "--link", str(self.folder / "lightbox"), "--world", world)
         self._write_truth()
         rig = self.folder / "rig.yaml"
@@ -132,6 +144,19 @@ class _Rig:
             scan_folder=str(self.folder / "scans"),
         )
         threading.Thread(target=self._watch, daemon=True).start()
+
+    def _start_second(self, second: SecondCamera) -> None:
+        """Start the second camera's simulator, and write its calibration, which is exact."""
+        self._child(
+            SECOND, CAMERAS[self.args.camera], "--port", "0", "--world", self.server.address, "--camera", SECOND,
+            "--image-width", str(self.args.image_width), "--clock-ahead-s", str(second.clock_ahead_s),
+            "--exposures-log", str(self._exposures_log(SECOND)),
+        )  # fmt: skip
+        calibration = second.lens.scaled(self.args.image_width).to_json()
+        (self.folder / f"{SECOND}.json").write_text(json.dumps(calibration, indent=1))
+
+    def _exposures_log(self, camera: str) -> Path:
+        return self.folder / ("truth_exposures.jsonl" if camera == "camera" else f"truth_exposures_{camera}.jsonl")
 
     def stop(self) -> None:
         processes = [*self.children.values(), *([self._delivery] if self._delivery is not None else [])]
@@ -167,8 +192,8 @@ class _Rig:
         if name in self.arms:
             joints = ",".join(f"{q:.6f}" for q in self.world.joints_rad(name))
             words = [f"--initial-joints={joints}" if w.startswith("--initial-joints") else w for w in words]
-        if name == "camera":
-            log = self.folder / "truth_exposures.jsonl"
+        if name in ("camera", SECOND):
+            log = self._exposures_log(name)
             taken = len(log.read_text().splitlines()) if log.exists() else 0
             port = self._ready[name]["gphoto_port"].rpartition(":")[2]
             words += ["--port", port, "--first-counter", str(taken + 1)]  # these override the first ones
@@ -179,7 +204,7 @@ class _Rig:
         """Start a simulator and wait for its ready line."""
         command = [
             sys.executable, "-m", "simulators", *words, "--parent", str(os.getpid()),
-            "--faults", self.faults.to_json(),
+            "--faults", (self.faults.of(SECOND, "camera") if name == SECOND else self.faults).to_json(),
         ]  # fmt: skip
         with (self.folder / "logs" / f"{name}.log").open("w") as log:
             process = subprocess.Popen(
@@ -213,11 +238,15 @@ class _Rig:
             "devices": {
                 **robots,
                 "camera": self._camera(gphoto_port),
+                **({SECOND: self._camera(self._ready[SECOND]["gphoto_port"])} if self.second else {}),
                 "scanner": {"driver": "scan_folder", "folder": "scans", "unit": "mm", "stable_s": 1.0},
                 "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
                 "lightbox": {"driver": "lightbox", "port": "lightbox"},
             },
         }
+        if self.second is not None:
+            mounted = "fixed" if self.second.fixed else "rigid"
+            rig["cameras"] = {SECOND: {"mounted": mounted, "calibration": f"{SECOND}.json"}}
         if not robots:
             return rig
         return {
@@ -269,6 +298,11 @@ class _Rig:
                 "scans": [],
                 "ct": [],
             }
+            if self.second is not None:
+                self._truth["second_camera"] = {
+                    "T_outer_camera": self.second.T_outer_camera.tolist(),
+                    "clock_ahead_s": self.second.clock_ahead_s,
+                }
         self._truth |= {"registration_m": self.scene.registration_m.tolist(), "moved": self.scene.moved}
         (self.folder / "truth.json").write_text(json.dumps(self._truth, indent=1))
 

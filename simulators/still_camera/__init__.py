@@ -32,6 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--send-to", type=Path, metavar="DIR", help="no cable: send every file into this folder")
     parser.add_argument("--battery", type=int, default=87, metavar="PERCENT", help="charge of the battery")
+    parser.add_argument("--camera", default="", metavar="NAME", help="which camera of the world; default: the first")
+    parser.add_argument("--clock-ahead-s", type=float, default=0.0, metavar="S", help="how far its clock is ahead")
     parser.add_argument("--fast", action="store_true", help="exposures take no time")
     parser.add_argument(
         "--mosaic-jpeg",
@@ -44,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def image_source(args: argparse.Namespace) -> ImageSource:
     """Where the pictures come from."""
     if args.world:
-        return WorldSource(args.world, args.image_width or DEFAULT_WIDTH)
+        return WorldSource(args.world, args.image_width or DEFAULT_WIDTH, camera=args.camera)
     if args.image:
         return PictureFiles(args.image, args.image_width)
     return StillLife(args.image_width or DEFAULT_WIDTH)
@@ -68,7 +70,13 @@ def _attend_button(source: WorldSource, body: CameraBody, stop: threading.Event)
 def body_options(args: argparse.Namespace) -> BodyOptions:
     """The options of the body."""
     return BodyOptions(
-        args.fast, args.first_counter, args.exposures_log, args.announce, args.mosaic_jpeg, args.send_to
+        args.fast,
+        args.first_counter,
+        args.exposures_log,
+        args.announce,
+        args.mosaic_jpeg,
+        args.send_to,
+        args.clock_ahead_s,
     )
 
 

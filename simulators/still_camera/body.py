@@ -10,7 +10,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import cv2
@@ -61,6 +61,7 @@ class BodyOptions:
     announce: str = "both"  # event, property or both: how the client learns of a new file
     mosaic_jpeg: bool = False  # beside a raw file: whether the JPEG is made of the same values, as a camera's is
     send_to: Path | None = None  # wireless transfer: files are written into this folder instead of being downloaded
+    clock_ahead_s: float = 0.0  # of this machine's
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +140,7 @@ class CameraBody(ABC):
         started = time.monotonic()
         try:
             moment = self.source.freeze(counter)
-            taken = datetime.now().astimezone()
+            taken = datetime.now().astimezone() + timedelta(seconds=self.options.clock_ahead_s)
             files = self._develop(moment, settings, Shot(settings, counter, taken, self._plate), fault)
             if not self.options.fast:
                 time.sleep(max(0.0, settings.exposure_s + HANDLING_S - (time.monotonic() - started)))

@@ -188,13 +188,15 @@ class _Renderer(Protocol):
 class WorldSource:
     """Pictures of the rig's world, rendered for the camera pose at the moment of exposure."""
 
-    def __init__(self, address: str, image_width: int, timeout_s: float = 10.0) -> None:
+    def __init__(self, address: str, image_width: int, timeout_s: float = 10.0, camera: str = "") -> None:
+        """Take the world's address and the name of the camera there; "": the first."""
         host, _, port = address.rpartition(":")
         if not host or not port.isdigit():
             raise SimulatorError(f"--world takes HOST:PORT, not {address}")
         self._address = (host, int(port))
         self._width = image_width
         self._timeout_s = timeout_s
+        self._camera = camera
         self._built: _Renderer | None = None
         self._rendering = threading.Lock()  # live view and exposures use different threads
 
@@ -207,7 +209,7 @@ class WorldSource:
         return self._built
 
     def _view(self) -> dict[str, Any]:
-        answer = self._ask({"op": "view"})
+        answer = self._ask({"op": "view", "camera": self._camera})
         if "T_world_camera" not in answer:
             raise SimulatorError(f"the world refused a view: {answer.get('error', answer)}")
         return answer

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 
 import pytest
 
 from simulators.canon_camera import events
+from simulators.canon_camera.body import CanonBody
 from simulators.canon_camera.properties import APERTURE_F, FORMATS, ISO, SHUTTER, Code, Properties
-from simulators.still_camera.body import CameraFile
+from simulators.faults import FaultPlan
+from simulators.still_camera.body import BodyOptions, CameraFile
 from simulators.still_camera.operations import NotWritableError, RefusedValueError
+from simulators.still_camera.scene import StillLife
 
 
 @pytest.mark.parametrize(
@@ -54,6 +58,12 @@ def test_codes_are_thirds_of_a_stop() -> None:
         assert iso == pytest.approx(100 * 2 ** ((code - 0x48) / 8), rel=0.04)
     for code, (numerator, denominator) in SHUTTER.items():
         assert numerator / denominator == pytest.approx(2 ** ((0x38 - code) / 8), rel=0.08)
+
+
+def test_a_camera_without_a_cable_was_set_by_hand(tmp_path: Path) -> None:
+    body = CanonBody(StillLife(240), FaultPlan(), BodyOptions(send_to=tmp_path))
+    settings = body.exposure_settings()
+    assert (settings.aperture_f, settings.exposure_fraction, settings.iso) == (22, (1, 15), 100)
 
 
 def written(code: Code, value: int) -> bytes:

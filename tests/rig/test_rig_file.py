@@ -43,6 +43,14 @@ stations:
             STATION.replace("-90}", "-90,\n    scene_up: [0, 0, -1]}"),
             r"upright.* \[rig.yaml:7 stations.left.scene_up\]",
         ),
+        (
+            RIG + "cameras: {side: {mounted: fixed, calibration: side.json}}\n",
+            r"'side' is not among the devices: scanner \[rig.yaml:4 cameras.side\]",
+        ),
+        (
+            RIG + "cameras: {scanner: {mounted: rigid, calibration: s.json, every: station}}\n",
+            r"exposes at every viewpoint: leave `every` out",
+        ),
         (RIG + "signing: {pin: yes}\n", r"valid boolean \(it is \"yes\"\) \[rig.yaml:4 signing.pin\]"),
         ('{"name": "a", "simulated": false, "simulated": true}', "'simulated' is given twice"),
         ('{"import": ' + "[" * 100_000, "nested more than 100 deep"),

@@ -191,6 +191,9 @@ RUN_ELSEWHERE = {
     "orthocapture import FOLDER --data runs": (
         "tests/poses/test_import.py::test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere"
     ),
+    "orthocapture simulate rig --scene 7 --dir rig --second-camera stereo": (
+        "tests/further/test_second_camera_whole_run.py::test_the_extrinsics_are_true_within_their_covariance"
+    ),
     "orthocapture simulate rig --scene 7 --dir rig --hand usual": (
         "tests/handheld/test_handheld.py::test_the_evidence_verifies"
     ),

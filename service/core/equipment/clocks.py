@@ -8,16 +8,19 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Literal
 
+from service.core.equipment.camera_clocks import clock_offset
 from service.core.equipment.recorded_devices import RecordedReport, recorded_optics, recorded_report
 from service.core.records.events import DeviceOpened, Event, SessionStarted, ViewpointCaptured
+from service.core.text.counts import counted
 
 #: Limits. EXIF times may be whole seconds, and a release takes part of one. A host synchronised over the network is a
 #: few ms off. Two good crystals drift apart by up to 0.1 ms per second, and robot messages jitter by a few ms.
 DEVICE_LIMIT_S = 5.0
 HOST_LIMIT_S = 1.0
+_COMPARED = 100  # newest pairs of photographs by which two cameras' clocks are compared
 _DRIFT_LIMIT_S, _DRIFT_LIMIT_RATE = 0.02, 2e-4
 
-Against = Literal["host UTC", "host since it was opened", "NTP"]
+Against = Literal["host UTC", "host since it was opened", "NTP", "first camera"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +57,8 @@ class ClockReading:
     @property
     def other(self) -> str:
         """What it was compared with, in words."""
-        return {"host UTC": "this machine", "NTP": "the network's time"}.get(self.against, "this machine, its change")
+        others = {"host UTC": "this machine", "NTP": "the network's time", "first camera": "the first camera"}
+        return others.get(self.against, "this machine, its change")
 
     @property
     def difference(self) -> str:
@@ -68,6 +72,8 @@ class ClockReading:
         """What the offset means and what depends on it, for the auditor of a run."""
         if self.against == "NTP":
             return "Every time in the record is from this machine's clock and is as true as this clock"
+        if self.against == "first camera":
+            return "With it, the times in the files of both cameras can be compared. The poses do not depend on it"
         if self.against == "host UTC":
             return "It sets the times in the device's own files. Order and times of the record do not depend on it"
         return (
@@ -79,7 +85,7 @@ class ClockReading:
     def words(self) -> str:
         """A sentence for people on a clock beyond its limit, with what to do."""
         ahead = "ahead of" if (self.offset_s or 0.0) > 0 else "behind"
-        other = "the network's" if self.against == "NTP" else "this machine's"
+        other = {"NTP": "the network's", "first camera": "the first camera's"}.get(self.against, "this machine's")
         what = f"The clock of {self.name} is {abs(self.offset_s or 0.0):.2f} s {ahead} {other}"
         if self.against == "host since it was opened":
             return f"{what}, counted from the first image: more than {self.limit_s:.2f} s. Check its controller"
@@ -102,10 +108,13 @@ def clock_readings(events: Sequence[Event]) -> tuple[ClockReading, ...]:
     # Only the first image since a device was last opened, and the newest: a run may have ten thousand.
     first: dict[str, Event] = {}
     newest: Event | None = None
+    both: list[ViewpointCaptured] = []  # the newest with images of further cameras
     for event in events:
         payload = event.payload
         if isinstance(payload, ViewpointCaptured):
             newest = event
+            if payload.further:
+                both = [*both[1 - _COMPARED :], payload]
             for name in opened:
                 first.setdefault(name, event)
         elif isinstance(payload, DeviceOpened):
@@ -118,12 +127,24 @@ def clock_readings(events: Sequence[Event]) -> tuple[ClockReading, ...]:
     reports = {name: _report(event) for name, event in opened.items()}
     kinds = Counter(report.identity.kind for report in reports.values())
     # A capture does not say which of several cameras or arms it came from.
+    further = {exposure.device for capture in both for exposure in capture.further}
     of_captures = {name for name, report in reports.items() if kinds[report.identity.kind] == 1}
     found: list[ClockReading] = []
     for name, event in opened.items():
         since = (first[name], newest) if name in first and newest is not None and name in of_captures else None
         found += _readings(name, event, reports[name], since)
+        if name in further and newest is not None:
+            found += _against_the_first(name, both, newest.at_utc)
     return (*host, *found)
+
+
+def _against_the_first(device: str, captures: Sequence[ViewpointCaptured], at_utc: str) -> list[ClockReading]:
+    """How far a further camera's clock is ahead of the first camera's, by the newest photographs."""
+    found = clock_offset(captures, device)
+    if found is None:
+        return []
+    note = f"± {found.sigma_s:.3f} s, by {counted(found.photographs, 'pair')} of photographs"
+    return [ClockReading(device, "first camera", found.offset_s, DEVICE_LIMIT_S, at_utc, note)]
 
 
 def _report(opened: Event) -> RecordedReport:

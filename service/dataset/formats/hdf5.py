@@ -20,7 +20,8 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
 
     A view has image (H, W, 3) RGB, depth_m (H, W) z in metres, normal (H, W, 3) in the camera frame, valid and
     markers (H, W), K (3, 3) for pixel centres at integers, distortion (8,) k1 k2 p1 p2 k3 k4 k5 k6, T_world_camera
-    (4, 4) and covariance (6, 6). Each view is a file of its own, so that an interrupted export goes on.
+    (4, 4) and covariance (6, 6); its attribute `camera` names the further camera that took it. Each view is a file of
+    its own, so that an interrupted export goes on.
     The mesh has vertices_m and faces; if CT and scan were fused, source (0: CT, 1: scan, 2: blend) and sigma_m along
     the normal of each vertex.
     """
@@ -53,6 +54,7 @@ def _view(path: Path, dataset: DataSet, view: View) -> None:
         file["distortion"] = np.array(terms)
         file["T_world_camera"] = view.T_world_camera
         file["covariance"] = view.covariance
+        file.attrs["camera"] = view.device
 
 
 def _index(path: Path, dataset: DataSet) -> None:

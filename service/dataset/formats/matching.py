@@ -169,5 +169,9 @@ def _json(document: object) -> bytes:
 
 
 KIND = Exporter(
-    "matching", "feature matching: image pairs with depth, relative poses and difficulties", write, pinhole=True
+    "matching",
+    "feature matching: image pairs with depth, relative poses and difficulties",
+    write,
+    pinhole=True,
+    one_camera=True,
 )

@@ -163,4 +163,6 @@ def _metadata(stamps: dict[str, int]) -> str:
     return yaml.safe_dump({"rosbag2_bagfile_information": described}, sort_keys=False)
 
 
-KIND = Exporter("mcap", "rosbag2/MCAP: images, camera, poses and frames for ROS 2, which is not needed", write)
+KIND = Exporter(
+    "mcap", "rosbag2/MCAP: images, camera, poses and frames for ROS 2, which is not needed", write, one_camera=True
+)

@@ -27,6 +27,7 @@ def columns(parts: Parts) -> dict[str, str]:
         "split": "train or test",
         "sparse": "whether the view is one of the sparse split",
         "simulated": "whether the view was made by a simulated rig",
+        "camera": "name of the further camera that took it; empty: the first camera",
         "width": "of the picture, px",
         "height": "of the picture, px",
         "fx": "focal length along x, px",
@@ -49,7 +50,7 @@ def views_csv(dataset: DataSet, parts: Parts) -> bytes:
     for view in dataset.views:
         files = [files.get(view.name, "") for files in parts.values()]
         split = "test" if view.name in test else "train"
-        about = [split, _flag(view.name in sparse), _flag(dataset.simulated)]
+        about = [split, _flag(view.name in sparse), _flag(dataset.simulated), view.device]
         writer.writerow([view.name, *files, *about, *_numbers(view)])
     return text.getvalue().encode()
 

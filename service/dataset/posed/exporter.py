@@ -25,12 +25,14 @@ class Exporter:
         words: what it is, and who reads it.
         write: puts the files of a data set into a folder; units and frames are stated in its docstring.
         pinhole: the format has no distortion, so it gets undistorted images.
+        one_camera: the format has one camera, so it gets only the images of the rig's first one.
     """
 
     name: str
     words: str
     write: Callable[[DataSet, ExportFolder], None]
     pinhole: bool = False
+    one_camera: bool = False
 
 
 def exporters() -> dict[str, Exporter]:
@@ -74,7 +76,8 @@ def write_data_set(
         DataError: the target exists, the data set does not fit into the format, or a picture cannot be read.
         ConfigurationError: another process is writing the same export.
     """
-    ready = undistorted_data_set(dataset, personal=personal) if how.pinhole else dataset
+    fitting = dataset.of_first_camera if how.one_camera else dataset
+    ready = undistorted_data_set(fitting, personal=personal) if how.pinhole else fitting
     identity = f"{how.name} 2 {ready.identity} {'with' if personal else 'without'} personal data"
     with export_folder(target, identity, leaving, _told(ready, how, progress)) as folder:
         _write(ready, how, folder)

@@ -170,4 +170,5 @@ def _view(folder: Path, name: str) -> View:
             k1, k2, p1, p2, k3, k4, k5, k6,
         )  # fmt: skip
         pose, covariance = np.array(file["T_world_camera"]), np.array(file["covariance"])
-    return View(name, ".png", camera, pose, covariance)
+        device = str(file.attrs.get("camera", ""))
+    return View(name, ".png", camera, pose, covariance, device=device)

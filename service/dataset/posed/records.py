@@ -30,6 +30,7 @@ class View:
         T_world_camera: (4, 4) m; x right, y down, z forward.
         covariance: (6, 6) of (d, w): exp([w]x) R, t + d in the axes of the world, m and rad.
         taken: time that the photograph states, as EXIF has it; "" if it states none.
+        device: name in rig.yaml of the further camera that took it; "": the first camera.
     """
 
     name: str
@@ -38,6 +39,7 @@ class View:
     T_world_camera: Transform
     covariance: Array
     taken: str = ""
+    device: str = ""
 
     @property
     def file(self) -> str:
@@ -146,6 +148,16 @@ class DataSet:
         kept = [k for k, view in enumerate(self.views) if view.name in chosen]
         views = tuple(self.views[k] for k in kept)
         return dataclasses.replace(self, views=views, splits=Splits(**cut), pose_errors=self.errors_of(kept))
+
+    @property
+    def of_first_camera(self) -> DataSet:
+        """This data set without the images of further cameras."""
+        if not any(view.device for view in self.views):
+            return self
+        kept = self.keeping(tuple(view.name for view in self.views if not view.device))
+        hashes = self.statement.get("image_sha256", {})
+        named = {view.file: hashes[view.file] for view in kept.views if view.file in hashes}
+        return dataclasses.replace(kept, statement={**self.statement, "image_sha256": named})
 
 
 def only_camera(dataset: DataSet, of: str) -> CameraModel:

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from service.jobs.kind import JobKind, JobRecord
 from service.jobs.records import Camera, Hash, Matrix
+from service.jobs.registration import further_camera
 from service.jobs.registration.detect_spheres import SceneArguments
 
 
@@ -65,9 +66,10 @@ class Registration(JobRecord):
 
 
 class Registrations(JobRecord):
-    """The registrations in the result of a registration step, by name."""
+    """The registrations in the result of a registration step, by name, and the further cameras of the rig."""
 
     registrations: dict[str, Registration] = Field(default_factory=dict[str, Registration])
+    cameras: dict[str, further_camera.Answer] = Field(default_factory=dict[str, further_camera.Answer])
 
 
 KIND = JobKind(

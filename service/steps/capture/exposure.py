@@ -17,9 +17,10 @@ from drivers.stillness import PoseSpread, pose_spread
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, Transform
 from service.core.records.events import ArtefactRef, Matrix4, ViewpointCaptured
+from service.steps.capture.further_cameras import FurtherImage, expose_further, files_of, keep_further
 from service.steps.capture.motion import settle_criteria
 from service.steps.capture.plan.viewpoints import Viewpoint
-from service.steps.context import StepContext
+from service.steps.context import FurtherCamera, StepContext
 from service.store.records import NewArtefact
 
 #: Pauses between tries while the camera is busy; nearly a minute in all.
@@ -40,6 +41,7 @@ class Shot:
     verdicts: dict[str, bool]
     image_kind: str
     ringing_s: float
+    further: tuple[FurtherImage, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +56,7 @@ class Exposure:
         environment: light and temperature before the exposure.
         wanted: settings of the protocol.
         image_kind: artefact kind of the photograph.
+        further: cameras that expose after it, while the arm stands.
     """
 
     camera: Camera
@@ -63,26 +66,36 @@ class Exposure:
     environment: dict[str, float]
     wanted: CameraSettings
     image_kind: str
+    further: Sequence[FurtherCamera] = ()
 
 
 def expose(context: StepContext, exposure: Exposure, *, was_busy: bool = False) -> Shot:
-    """Take the image and judge it. `record_shot` records it, while the arm moves on.
+    """Take the images of all cameras and judge them. `record_shot` records them, while the arm moves on.
 
-    Raises DeviceError, DeviceUnavailableError if no pose of the arm is known for the exposure.
+    Raises DeviceError of any camera, DeviceUnavailableError if no pose of the arm is known for the exposure.
     """
     wanted = exposure.wanted
     folder = tempfile.TemporaryDirectory(prefix="orthocapture-")
     try:
         image = expose_when_free(context, exposure.camera, Path(folder.name), was_busy=was_busy)
-        began_s = image.trigger_monotonic_s
-        window = exposure.robot.samples(began_s, began_s + wanted.exposure_s + 0.3)
+        window = _during(exposure.robot, image, wanted)
+        further = expose_further(
+            exposure.further,
+            wanted,
+            Path(folder.name),
+            lambda camera, inside: expose_when_free(context, camera, inside, was_busy=was_busy),
+        )
+        for one in further:
+            if one.rigid:  # it moved if the arm did
+                window += _during(exposure.robot, one.image, one.wanted)
         pose = exposure_pose(window)
     except BaseException:
         folder.cleanup()
         raise
     verdicts = {
         "still": pose.spread.within(settle_criteria(context)),
-        "settings": settings_agree(image.exif, wanted),
+        "settings": settings_agree(image.exif, wanted)
+        and all(settings_agree(one.image.exif, one.wanted) for one in further),
     }
     return Shot(
         viewpoint=exposure.viewpoint,
@@ -94,7 +107,14 @@ def expose(context: StepContext, exposure: Exposure, *, was_busy: bool = False) 
         verdicts=verdicts,
         image_kind=exposure.image_kind,
         ringing_s=exposure.settled.ringing_s,
+        further=further,
     )
+
+
+def _during(robot: RobotArm, image: CapturedImage, wanted: CameraSettings) -> tuple[RobotSample, ...]:
+    """The pose stream during an exposure."""
+    began_s = image.trigger_monotonic_s
+    return robot.samples(began_s, began_s + wanted.exposure_s + 0.3)
 
 
 def record_shot(context: StepContext, shot: Shot) -> None:
@@ -110,20 +130,27 @@ def record_shot(context: StepContext, shot: Shot) -> None:
             )
             for file in image.files
         ]
+        further = tuple(keep_further(context, one, camera_record) for one in shot.further)
     refs.append(_pose_log(context, viewpoint, shot.window))
-    rows = tuple(
-        NewArtefact(
-            ref=ref,
-            device="robot" if ref.kind == "pose_log" else "camera",
-            step=context.step.id,
-            attempt=context.attempt,
-            viewpoint=viewpoint.name,
-            who=context.operator,
-            monotonic_s=image.trigger_monotonic_s,
-        )
-        for ref in refs
+    rows = [_row(context, shot, ref, "robot" if ref.kind == "pose_log" else "camera") for ref in refs]
+    rows += [_row(context, shot, ref, one.device) for one in further for ref in files_of(context, one)]
+    captured = _captured(context, shot, refs).model_copy(update={"further": further})
+    context.evidence.record(captured, artefacts=tuple(rows))
+
+
+def _row(context: StepContext, shot: Shot, ref: ArtefactRef, device: str) -> NewArtefact:
+    return NewArtefact(
+        ref=ref,
+        device=device,
+        step=context.step.id,
+        attempt=context.attempt,
+        viewpoint=shot.viewpoint.name,
+        who=context.operator,
+        monotonic_s=next(
+            (one.image.trigger_monotonic_s for one in shot.further if one.taken_by.name == device),
+            shot.image.trigger_monotonic_s,
+        ),
     )
-    context.evidence.record(_captured(context, shot, refs), artefacts=rows)
 
 
 def _captured(context: StepContext, shot: Shot, refs: Sequence[ArtefactRef]) -> ViewpointCaptured:

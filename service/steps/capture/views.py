@@ -30,9 +30,10 @@ from service.steps.capture.exposure import (
     record_shot,
     wanted_settings,
 )
+from service.steps.capture.further_cameras import exposing_at, settings_of
 from service.steps.capture.motion import MotionLimits, move_and_settle, settle_criteria
 from service.steps.capture.plan.viewpoints import Viewpoint, flange_target
-from service.steps.context import StepContext
+from service.steps.context import FurtherCamera, StepContext
 
 #: Errors after which a viewpoint is tried again with the device reopened.
 WORTH_ANOTHER_TRY = (
@@ -78,6 +79,7 @@ class CaptureTask:
         on_captured: called after each image is recorded; must return at once.
         stop: called before each viewpoint; if it returns True, the rest is not captured.
         again: SHA-256 of images to take again.
+        all_cameras: whether the rig's further cameras expose as well.
     """
 
     viewpoints: Sequence[Viewpoint]
@@ -87,6 +89,7 @@ class CaptureTask:
     on_captured: Callable[[], None] = lambda: None
     stop: Callable[[], bool] = lambda: False
     again: Collection[str] = ()
+    all_cameras: bool = False
 
 
 def capture_viewpoints(context: StepContext, task: CaptureTask) -> CaptureTotals:
@@ -97,7 +100,10 @@ def capture_viewpoints(context: StepContext, task: CaptureTask) -> CaptureTotals
     camera = context.devices.camera()
     wanted = wanted_settings(context)
     _apply(context, camera, wanted)
-    loop = _CaptureLoop(context, camera, wanted, task)
+    further = context.devices.further_cameras() if task.all_cameras else ()
+    for one in further:
+        _apply(context, one.camera, settings_of(one, wanted))
+    loop = _CaptureLoop(context, camera, wanted, task, further)
     try:
         loop.run()
     finally:
@@ -126,6 +132,7 @@ class _CaptureLoop:
     camera: Camera
     wanted: CameraSettings
     task: CaptureTask
+    further: Sequence[FurtherCamera] = ()
     given_up: set[str] = field(init=False)
     _tried: set[str] = field(init=False, default_factory=set[str])  # in this execution, successful or not
     _held: Shot | None = field(init=False, default=None)
@@ -202,8 +209,9 @@ class _CaptureLoop:
                 arrived = True
                 environment = self._dwell(robot, later)
                 context.busy(f"taking {viewpoint.name} and fetching it from the camera{self._size}")
+                further = exposing_at(context, viewpoint, self.further)
                 exposure = Exposure(
-                    self.camera, robot, viewpoint, settled, environment, self.wanted, self.task.image_kind
+                    self.camera, robot, viewpoint, settled, environment, self.wanted, self.task.image_kind, further
                 )
                 return expose(context, exposure, was_busy=was_busy)
             except WORTH_ANOTHER_TRY as error:
@@ -214,12 +222,18 @@ class _CaptureLoop:
                     raise
                 context.checkpoint()
                 if arrived:
-                    context.devices.reopen(self.camera)
-                    context.busy("setting the camera")
-                    self.camera.apply(self.wanted)
+                    self._reopen_cameras()
                 if not arrived or not _streams(robot):
                     context.devices.reopen(robot)
         raise AssertionError
+
+    def _reopen_cameras(self) -> None:
+        """Open all cameras again, because an error does not say which of them it came from."""
+        cameras = [(self.camera, self.wanted), *((one.camera, settings_of(one, self.wanted)) for one in self.further)]
+        for camera, wanted in cameras:
+            self.context.devices.reopen(camera)
+            self.context.busy("setting the camera")
+            camera.apply(wanted)
 
     def _go_to(self, robot: RobotArm, viewpoint: Viewpoint) -> SettleReport:
         context = self.context

@@ -73,6 +73,12 @@ def decisive(protocol: Protocol, step: Step) -> tuple[str, ...]:
     return tuple(name for name in names if name in waited)
 
 
+def most_preferred(registrations: Iterable[str]) -> str:
+    """Of several registrations the one to build on; with corrected poses of the arm if there is one."""
+    names = tuple(registrations)
+    return next((name for name in _BY_PREFERENCE if name in names), names[0])
+
+
 class _EvaluationParams(BaseModel):
     """The parameter of an evaluation step that names what it evaluates."""
 

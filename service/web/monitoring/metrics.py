@@ -129,18 +129,22 @@ def _devices(figures: Figures) -> Iterable[Metric]:
 
 
 def _clocks(clocks: Mapping[str, Sequence[ClockReading]]) -> Iterable[Metric]:
-    known = {(run_id, clock.device): clock for run_id, found in clocks.items() for clock in found}
+    known = {(run_id, clock.device, clock.against): clock for run_id, found in clocks.items() for clock in found}
+    within: dict[tuple[str, ...], bool] = {}
+    for (run_id, device, _), clock in known.items():
+        if clock.within is not None:
+            within[run_id, device] = within.get((run_id, device), True) and clock.within
     yield _gauge(
         "clock_offset_seconds",
         "Offset of a clock: a device's minus the host's, or the host's minus the network's.",
         ("run", "device", "against"),
-        {(*of, clock.against): clock.offset_s for of, clock in known.items() if clock.offset_s is not None},
+        {of: clock.offset_s for of, clock in known.items() if clock.offset_s is not None},
     )
     yield _gauge(
         "clock_within_limit",
         "0 for a clock beyond its limit.",
         ("run", "device"),
-        {of: clock.within for of, clock in known.items() if clock.within is not None},
+        within,
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import leave_one_out
 from service.compute.evaluation.closure import Alignment
@@ -28,8 +29,6 @@ from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.models import joint_pose_covariance
 from service.worker.poses.robot_poses import robot_camera_poses
 from service.worker.registration.outlines import read_outlines
-
-_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")  # of the lens, in the order of the solver
 
 
 def register(context: JobContext[job.Arguments]) -> JobAnswer:
@@ -242,14 +241,7 @@ def _intrinsics_covariance(arguments: job.Arguments) -> Array | None:
         return None
     if not isinstance(record, ParameterCovariance):
         return np.array(record)
-    known = record.parameters
-    if not set(known) <= set(_PARAMETERS):
-        return None
-    # Parameters that the model holds fixed are exact, but the solver needs a positive variance.
-    out = 1e-18 * np.eye(len(_PARAMETERS))
-    places = [_PARAMETERS.index(name) for name in known]
-    out[np.ix_(places, places)] = np.array(record.matrix)
-    return out
+    return CameraCovariance(record.parameters, np.array(record.matrix)).of_lens()
 
 
 def _residuals(answer: RegistrationResult, names: Sequence[str]) -> dict[str, object]:

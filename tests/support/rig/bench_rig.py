@@ -44,7 +44,7 @@ from service.core.run.state import RunState
 from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, LensSection, OpticsSection
 from service.runner.operator import AnswerBy
-from service.steps.context import LeaveToMove, StationLayout
+from service.steps.context import FurtherCamera, LeaveToMove, StationLayout
 
 TRAVEL_S = 0.02
 _RATE_HZ = 500.0
@@ -269,6 +269,7 @@ class BenchRig:
     shutter: BenchCamera = field(default_factory=BenchCamera)
     card: Camera | None = None  # instead of it: a camera without a cable
     box: BenchLightbox | None = field(default_factory=BenchLightbox)
+    further: tuple[FurtherCamera, ...] = ()
     _on_open: Callable[[str, DeviceReport], None] | None = None
 
     def robot(self, station: str) -> RobotArm:
@@ -280,6 +281,13 @@ class BenchRig:
             return self.card
         self._open("camera", self.shutter, opened=self.shutter.opened > 0)
         return self.shutter
+
+    def further_cameras(self) -> tuple[FurtherCamera, ...]:
+        for one in self.further:
+            shutter = one.camera
+            assert isinstance(shutter, BenchCamera)
+            self._open(one.name, shutter, opened=shutter.opened > 0)
+        return self.further
 
     def imported(self) -> ImportList | None:
         """No imported files."""

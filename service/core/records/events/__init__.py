@@ -55,6 +55,7 @@ from service.core.records.events.steps import (
 )
 from service.core.records.events.views import (
     CaptureAsked,
+    FurtherExposure,
     Matrix4,
     View,
     ViewHeld,
@@ -78,6 +79,7 @@ __all__ = [
     "Event",
     "EvidenceExported",
     "FilesKept",
+    "FurtherExposure",
     "GateVerdict",
     "GatesEvaluated",
     "HostClock",

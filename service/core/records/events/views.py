@@ -24,6 +24,18 @@ class View(Record):
     verdicts: dict[str, bool] = Field(default_factory=dict)  # still, settings, sharp …
 
 
+class FurtherExposure(Record):
+    """What a further camera exposed at the same viewpoint, after the first one."""
+
+    device: str  # name in rig.yaml
+    mounted: Literal["fixed", "rigid"]  # in the room, or beside the first camera
+    artefacts: tuple[ArtefactRef, ...]  # the photograph first
+    calibration: ArtefactRef  # file with the intrinsics of this camera
+    camera: dict[str, Any]  # EXIF settings, counter, time, lens
+    trigger_monotonic_s: float
+    arrival_monotonic_s: float
+
+
 class ViewpointCaptured(View):
     """One complete exposure of a camera carried by a robot: files, pose, settings, environment."""
 
@@ -37,6 +49,7 @@ class ViewpointCaptured(View):
     arrival_monotonic_s: float
     controller_time_s: float
     clock_offset_s: float  # controller time minus host monotonic
+    further: tuple[FurtherExposure, ...] = ()  # of the rig's further cameras that exposed here
     ringing_s: float = 0.0  # how long the arm swung after the commanded motion; a loose mount shows here
 
 

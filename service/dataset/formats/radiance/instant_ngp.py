@@ -47,4 +47,4 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     write_images(dataset, folder, "images")
 
 
-KIND = Exporter("instant-ngp", "Instant-NGP's transforms.json, the scene in the unit box", write)
+KIND = Exporter("instant-ngp", "Instant-NGP's transforms.json, the scene in the unit box", write, one_camera=True)

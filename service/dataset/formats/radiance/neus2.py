@@ -58,4 +58,6 @@ def _with_alpha(dataset: DataSet, view: View) -> bytes:
     return png(np.dstack([pixels.colours(view), np.where(shown, np.uint8(255), np.uint8(0))]), dataset.mark)
 
 
-KIND = Exporter("neus2", "NeuS2: RGBA images with masks, the scene in the unit box", write, pinhole=True)
+KIND = Exporter(
+    "neus2", "NeuS2: RGBA images with masks, the scene in the unit box", write, pinhole=True, one_camera=True
+)

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from service.core.records.data_set import FIRST_VERSION, DataSetStatement
 from service.core.units import metres
 from service.dataset.control_spheres import control_centres
 from service.dataset.posed.of_run.about_run import about_run
+from service.dataset.posed.of_run.further_views import FurtherView, further_views
 from service.dataset.posed.of_run.pose_errors import own_pose_errors
 from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.posed.of_run.statement import described_run
@@ -70,10 +72,16 @@ def data_set_of(
     joint = own_pose_errors(summary, registered, sorted(files))
     stated_errors = view_covariances(summary, own, registered, sorted(files), joint)
     taken = {capture.viewpoint: str(capture.camera.get("exif_time") or "") for capture in summary.captures()}
-    views = tuple(
+    first = [
         _view(name, path, registered, stated_errors.covariance[name], taken[name])
         for name, (path, _) in sorted(files.items())
-    )
+    ]
+    further = further_views(summary, {view.name: view.T_world_camera for view in first})
+    if joint is not None:
+        joint = further.joint(joint, sorted(files))
+    covariances = further.covariances(stated_errors.covariance)
+    files |= {one.name: (one.path, one.sha256) for one in further.views}
+    views = _in_order([*first, *(_further_view(one, covariances[one.name]) for one in further.views)])
     pixels, masks = _pixels(summary, files, views, mesh, personal=personal)
     hashes = {view.file: files[view.name][1] for view in views}
     about = about_run(summary, own, not_in_yet, stated=stated, version=version, personal=personal)
@@ -86,11 +94,12 @@ def data_set_of(
             "mesh_sha256": truth.sha256,
             "masks": masks,
             "image_sha256": hashes,
+            "further_cameras": further.statement,
         },
         views=views,
         pixels=pixels,
         mesh=mesh,
-        splits=splits({view.name: _sees(view, mesh) for view in views}),
+        splits=further.with_them(splits({view.name: _sees(view, mesh) for view in first})),
         about=dataclasses.replace(
             about, masks=masks, mesh=f"{truth.words}, in the frame of the scan", covariance=stated_errors.words
         ),
@@ -149,9 +158,27 @@ def _photographs(summary: RunSummary, registered: Registration) -> dict[str, tup
     return found
 
 
+def _further_view(one: FurtherView, covariance: Array) -> View:
+    suffix = _suffix(one.path)
+    return View(one.name, suffix, one.camera, one.T_scan_camera, covariance, one.taken, one.device)
+
+
+def _in_order(views: Sequence[View]) -> tuple[View, ...]:
+    """The views in order of their names. Raises DataError if two have the same name."""
+    ordered = tuple(sorted(views, key=lambda view: view.name))
+    for one, other in pairwise(ordered):
+        if one.name == other.name:
+            raise DataError("two images of the data set have the same name", where=one.name)
+    return ordered
+
+
+def _suffix(photograph: Path) -> str:
+    with photograph.open("rb") as file:
+        return ".png" if file.read(len(PNG_BEGINS)) == PNG_BEGINS else ".jpg"
+
+
 def _view(name: str, path: Path, registered: Registration, covariance: Array, taken: str) -> View:
-    with path.open("rb") as file:
-        suffix = ".png" if file.read(len(PNG_BEGINS)) == PNG_BEGINS else ".jpg"
+    suffix = _suffix(path)
     camera = CameraModel.from_record((registered.full_camera or registered.camera).model_dump())
     T_scan_camera = np.array(registered.T_scan_camera[name])
     return View(name, suffix, camera, T_scan_camera, covariance, taken)

@@ -114,6 +114,7 @@ class _Capture:
             on_captured=self._look,
             stop=lambda: self.live is not None and bool(self.live.spoilt_in_a_row()),
             again=again,
+            all_cameras=self._purpose == "dataset",
         )
         return capture_viewpoints(self._context, task)
 

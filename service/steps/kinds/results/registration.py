@@ -7,10 +7,11 @@ seconds. The others are computed while the run goes on (service/steps/poses/regi
 from __future__ import annotations
 
 import re
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import field_validator
+from pydantic import Field, field_validator
 
 from service.compute.images.develop import PARAMETERS
 from service.core.errors import ComputeError, ConfigurationError
@@ -20,11 +21,11 @@ from service.core.records.events import ComputedBy, Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
 from service.jobs.records import Mounting, Photograph
-from service.jobs.registration import detect_spheres, develop, register
+from service.jobs.registration import detect_spheres, develop, further_camera, register
 from service.jobs.registration.register import Registration
 from service.jobs.surfaces import locate_spheres
 from service.jobs.words import term
-from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
+from service.steps.context import JobRequest, JobResult, StepContext, StepKind, StepOutcome
 from service.steps.inputs import (
     CameraMounting,
     captured_images,
@@ -33,7 +34,8 @@ from service.steps.inputs import (
     mounting_of,
     raw_files,
 )
-from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures
+from service.steps.measures import Count, ErrorMm, Measure, MeasureRecord, Px, Ratio, RegistrationMeasures
+from service.steps.poses.further_cameras import locate_further_cameras
 from service.steps.poses.registration_jobs import RegistrationJobs, registration_jobs
 from service.steps.poses.sources import DEFAULT_SOURCES, PLANNED, Source, WantedRegistrations, decisive, posed
 
@@ -103,8 +105,15 @@ class Measures(RegistrationMeasures[OneRegistration]):
     images_searched_whole: Annotated[Count, "images that were searched whole because no pose said where to look"] = (
         None
     )
-
     outlines_not_in_raw: Annotated[Count, "outlines of the JPEGs that the developed raw files do not show"] = None
+    further_views: Annotated[Count, "images that locate a further camera, for the one that has fewest"] = None
+    further_excluded: Annotated[
+        Count, "images of further cameras without four spheres, or that contradict the rest"
+    ] = None
+    further_consistency_mm: Annotated[
+        ErrorMm, "rms distance between the poses of a further camera by single images and by all, for the worst one"
+    ] = None
+    further_consistency_mrad: Annotated[float | None, Measure("mrad", 1e-3, 100), "the same for the rotation"] = None
 
 
 class Result(Record):
@@ -112,6 +121,9 @@ class Result(Record):
 
     outlines_sha256: str
     registrations: dict[str, Registration]
+    cameras: dict[str, further_camera.Answer] = Field(
+        default_factory=dict[str, further_camera.Answer]
+    )  # further ones
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
@@ -139,7 +151,9 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
                 )
         context.progress(_words(found), len(found.arrived.keys() & set(waited)), len(waited))
         if all(name in found.arrived for name in waited):
-            return _outcome(found)
+            return _with_further_cameras(
+                _outcome(found), locate_further_cameras(context, params.images_of, outlines, found.arrived)
+            )
         for task in found.due:
             context.evidence.enqueue(task.request, task.name)
 
@@ -224,6 +238,29 @@ def _outcome(found: RegistrationJobs) -> StepOutcome:
     sources = (ComputedBy(job=job.job, prefix=f"{name}_") for name, job in found.arrived.items())
     return StepOutcome(measures, artefacts, result, computed_by=(ComputedBy(job=outlines.job), *sources))
 
+
+def _with_further_cameras(outcome: StepOutcome, located: Mapping[str, JobResult]) -> StepOutcome:
+    """The outcome with the poses of the further cameras, and the measures of the worst of them."""
+    if not located:
+        return outcome
+    measured = [job.measures for job in located.values()]
+    off = {f"further_{name}": [m[name] for m in measured if name in m] for name in _CONSISTENCY}
+    worst = {name: max(values) for name, values in off.items() if values}
+    worst |= {
+        "further_views": min(m["views"] for m in measured),
+        "further_excluded": sum(m["excluded"] for m in measured),
+    }
+    cameras = {name: further_camera.KIND.read_answer(job.result) for name, job in located.items()}
+    assert isinstance(outcome.result, Result)
+    return replace(
+        outcome,
+        measures=outcome.measures.model_copy(update=worst),
+        artefacts=(*outcome.artefacts, *(ref for job in located.values() for ref in job.artefacts)),
+        result=outcome.result.model_copy(update={"cameras": cameras}),
+    )
+
+
+_CONSISTENCY = ("consistency_mm", "consistency_mrad")
 
 KIND = StepKind(
     "registration",

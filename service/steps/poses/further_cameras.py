@@ -1,0 +1,72 @@
+"""The jobs that locate the rig's further cameras, once the first camera's images are registered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
+
+from service.core.jobs.references import Reference
+from service.core.records.events import FurtherExposure, ViewpointCaptured
+from service.core.run.state import JobState
+from service.jobs.records import ImageFile
+from service.jobs.registration import further_camera
+from service.steps.context import JobRequest, JobResult, StepContext
+from service.steps.poses.sources import most_preferred
+
+_SHARED = ("spheres_m", "sphere_covariance_m2", "radius_m", "colour")  # arguments of the search for outlines
+
+_OF_REGISTRATION = ("T_world_scan", "covariance", "T_scan_camera", "camera", "outlines")  # parts of its answer
+_OF_LENS = ("intrinsics_covariance",)
+
+
+def locate_further_cameras(
+    context: StepContext, images_of: Iterable[str], outlines: JobRequest, registered: Mapping[str, JobState]
+) -> Mapping[str, JobResult]:
+    """Locate each further camera that exposed in these capture steps; the worker's answers, by the camera's name.
+
+    Args:
+        context: of the registration step.
+        images_of: capture steps.
+        outlines: the search for spheres in the first camera's images, which has the arguments on the spheres.
+        registered: the finished job of each registration of those images.
+    """
+    exposures = sorted(_exposures(context, images_of), key=lambda exposure: exposure[1].device)
+    requests = {
+        device: _request([*group], outlines, registered)
+        for device, group in groupby(exposures, lambda exposure: exposure[1].device)
+    }
+    return dict(zip(requests, context.evidence.run_jobs(*requests.values()), strict=True)) if requests else {}
+
+
+def _exposures(context: StepContext, images_of: Iterable[str]) -> list[tuple[str, FurtherExposure]]:
+    """(viewpoint, exposure) of every usable view."""
+    return [
+        (capture.viewpoint, exposure)
+        for step in images_of
+        for capture in context.evidence.captures(step)
+        if isinstance(capture, ViewpointCaptured) and all(capture.verdicts.values())
+        for exposure in capture.further
+    ]
+
+
+def _request(
+    exposures: Sequence[tuple[str, FurtherExposure]], outlines: JobRequest, registered: Mapping[str, JobState]
+) -> JobRequest:
+    """The job for one camera; its newest calibration counts."""
+    last = exposures[-1][1]
+    recorded = outlines.arguments
+    arguments = {
+        "device": last.device,
+        "mounted": last.mounted,
+        "images": [
+            ImageFile(viewpoint=viewpoint, sha256=exposure.artefacts[0].sha256).plain()
+            for viewpoint, exposure in exposures
+        ],
+        "calibration": last.calibration.sha256,
+        **{name: recorded[name] for name in _SHARED if name in recorded},
+    }
+    if last.mounted == "rigid":
+        job = registered[most_preferred(registered)]
+        first = {name: Reference(job.job, f"result/{name}").record() for name in _OF_REGISTRATION}
+        arguments["first"] = first | {name: recorded[name] for name in _OF_LENS if name in recorded}
+    return JobRequest(further_camera.KIND.name, arguments, version=further_camera.KIND.version)
