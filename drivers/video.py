@@ -28,11 +28,10 @@ from drivers.errors import (
     DeviceRefusedError,
     DeviceTimeoutError,
     DeviceUnavailableError,
-    StaleImageError,
     UnreadableFileError,
 )
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
-from drivers.photos.photo_file import check_jpeg_complete, sha256_of
+from drivers.photos.frames import FrameFiles
 from drivers.plugin import DriverConfig, DriverSpec
 
 _LOG = logging.getLogger(__name__)
@@ -104,8 +103,7 @@ class VideoCamera:
         self._ended = False
         self._unused: _Frame | None = None  # of a recording: read ahead for a preview
         self._received = 0
-        self._size: tuple[int, int] | None = None
-        self._hashes: set[str] = set()
+        self._files = FrameFiles("source", self._where)
 
     # --- every device -----------------------------------------------------------------------------------
 
@@ -119,7 +117,8 @@ class VideoCamera:
             raise self._unavailable("The last connection still waits for an image")
         source = self._opened()
         self._prepare(source)
-        self._source, self._newest, self._unused, self._ended, self._size = source, None, None, False, None
+        self._source, self._newest, self._unused, self._ended = source, None, None, False
+        self._files.reopened()
         self._stop.clear()
         if not self._is_recording():
             self._reader = threading.Thread(target=self._read_on, args=(source,), name="video", daemon=True)
@@ -206,8 +205,7 @@ class VideoCamera:
         delay_s = self._config.latency_s + self._config.exposure_s
         frame = self._next() if self._is_recording() else self._live_after(called_s + delay_s)
         file, size = self._written(frame, folder)
-        self._check_new(file, size)
-        self._hashes.add(file.sha256)
+        self._files.accept(file, size)
         return CapturedImage(
             files=(file,),
             counter=frame.number,
@@ -333,32 +331,15 @@ class VideoCamera:
 
     def _written(self, frame: _Frame, folder: Path) -> tuple[CapturedFile, tuple[int, int]]:
         """Write an image; returns its file and its size (width, height) in px."""
-        target = folder / f"FRAME{frame.number:06d}.JPG"
         data = frame.jpeg(self._where)
-        partial = target.with_name(target.name + ".part")
-        partial.write_bytes(data)
-        check_jpeg_complete(partial)
+        file = self._files.write(frame.number, data, folder)
         picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
         if picture is None:  # pyright: ignore[reportUnnecessaryComparison] - wrong in OpenCV's types
-            raise UnreadableFileError("The image cannot be decoded", where=str(partial), remedy="Repeat the exposure")
-        partial.rename(target)
-        file = CapturedFile(target, target.name, sha256_of(target), len(data), "image/jpeg")
-        return file, (int(picture.shape[1]), int(picture.shape[0]))
-
-    def _check_new(self, file: CapturedFile, size: tuple[int, int]) -> None:
-        if file.sha256 in self._hashes:
-            raise StaleImageError(
-                f"{file.camera_name} is byte for byte the same as an earlier image",
-                where=self._where,
-                remedy="The source is frozen: open it again and repeat the exposure",
-            )
-        if self._size not in (None, size):
+            file.path.unlink()
             raise UnreadableFileError(
-                f"{file.camera_name} has {size[0]} × {size[1]} px, those before it another size",
-                where=self._where,
-                remedy="Calibration holds for one size: set the source back and repeat the exposure",
+                "The image cannot be decoded", where=str(file.path), remedy="Repeat the exposure"
             )
-        self._size = size
+        return file, (int(picture.shape[1]), int(picture.shape[0]))
 
     def _connected(self) -> cv2.VideoCapture:
         if self._source is None:

@@ -83,6 +83,10 @@ _COMMANDS = {
         "service.cli.compute.import_ros:import_ros_command",
         "Take images, robot poses, camera and mount from a ROS 2 recording; the files fit the other commands.",
     ),
+    "develop": _Command(
+        "service.cli.compute.develop:develop_command",
+        "Develop raw files to linear TIFFs of 16 bits, always in the same way; needs the extra `raw`.",
+    ),
     "sfm": _Command(
         "service.cli.compute.sfm:sfm_command",
         "Estimate camera poses with fixed, calibrated intrinsics; use the model with register --estimate-scale.",

@@ -13,6 +13,7 @@ from service.core.jobs.references import Each, Reference
 from service.core.records.events import ArtefactRef, View, ViewHeld, ViewpointCaptured
 from service.core.run.computed import answered_by
 from service.core.run.state import JobState
+from service.core.text.counts import counted
 from service.jobs.calibration import calibrate
 from service.jobs.capture import hand_board, hand_view
 from service.jobs.kind import JobKind, JobRecord
@@ -112,6 +113,30 @@ def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[Photo
             remedy="Take the images again",
         )
     return images
+
+
+def raw_files(context: StepContext, images: Iterable[Photograph]) -> dict[str, str]:
+    """SHA-256 of the raw file of each photograph, by viewpoint.
+
+    Raises:
+        ConfigurationError: a photograph has none.
+    """
+    wanted = {image.sha256: image for image in images}
+    found: dict[str, str] = {}
+    for step_id in dict.fromkeys(image.step for image in wanted.values()):
+        for capture in context.evidence.captures(step_id):
+            image = wanted.get(capture.artefacts[0].sha256)
+            raw = next((ref.sha256 for ref in capture.artefacts if ref.kind == "raw"), None)
+            if image is not None and raw is not None:
+                found[image.viewpoint] = raw
+    missing = [image.viewpoint for image in wanted.values() if image.viewpoint not in found]
+    if missing:
+        raise ConfigurationError(
+            f"{counted(len(missing), 'image')} of {len(wanted)} without a raw file, the first is {missing[0]}",
+            where=f"step {context.step.id}",
+            remedy="Set `image_quality` of the camera to RAW+JPEG and take the images again, or `measure_on` to jpeg",
+        )
+    return found
 
 
 def _photograph(capture: View, step_id: str, look: hand_view.Answer | None) -> Photograph:

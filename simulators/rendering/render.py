@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -11,6 +11,7 @@ import numpy as np
 
 from simulators.geometry import Array, Array32, Bools, Bytes, Ints, inverse
 from simulators.rendering.overlays import Frame, draw_calibration_board, draw_sphere
+from simulators.rendering.sensor import EXPOSED, FULL_WELL_E, READ_NOISE_E, Light, light_of
 from simulators.rendering.surfaces import Surfaces
 from simulators.scene.intrinsics import Intrinsics
 from simulators.scene.world import NOMINAL_LUX, RADIUS_M, Moved, Scene
@@ -20,7 +21,6 @@ MOST_KEPT_RAYS = 16_000_000  # 24 bytes each
 HALO = 4  # additional rows of a tile, so that edge detection and lens blur do not see its border
 _TEXTURES = ((800, 512), (1400, 1024), (2601, 2048))  # texture size that suffices below this image width
 PREVIEW_WIDTH = 640
-FULL_WELL_E, READ_NOISE_E = 40_000.0, 4.0
 BLUR_PX = 0.42
 WHITE = 1.12  # linear colour that saturates at the reference exposure
 REFERENCE = {"exposure_s": 1 / 15, "iso": 100.0, "aperture_f": 22.0}
@@ -73,6 +73,16 @@ class Renderer:
         """
         return self._rendered(View.from_json(view, self.image_width), camera_settings, seed)
 
+    def light(self, view: Mapping[str, Any], camera_settings: Mapping[str, float]) -> Light:
+        """The light on the sensor, without noise: linear RGB (H, W, 3) of the picture and the border around it."""
+        seen = View.from_json(view, self.image_width)
+        seen = replace(seen, intrinsics=_with_border(seen.intrinsics))
+        scale = _electrons(seen, camera_settings) * _amplification(camera_settings)
+        out = np.empty((seen.intrinsics.height, seen.intrinsics.width, 3), dtype=np.uint16)
+        for first, rows in self._blurred_tiles(seen):
+            out[first : first + len(rows)] = light_of(rows * np.float32(scale))
+        return out
+
     def preview(self, view: Mapping[str, Any]) -> Bytes:
         """Render a small RGB frame at the reference exposure, for live view."""
         return self._rendered(View.from_json(view, min(PREVIEW_WIDTH, self.image_width)), REFERENCE, 0)
@@ -85,25 +95,25 @@ class Renderer:
         return self._surfaces
 
     def _rendered(self, view: View, settings: Mapping[str, float], seed: int) -> Bytes:
-        surfaces = self.surfaces(view.seed, view.moved)
         lens = view.intrinsics
-        gain = view.light_lux / NOMINAL_LUX / WHITE
-        gain *= (
-            settings["exposure_s"] / REFERENCE["exposure_s"] * (REFERENCE["aperture_f"] / settings["aperture_f"]) ** 2
-        )
-        electrons = gain * FULL_WELL_E  # per unit of linear colour, before ISO amplification
-        amplification = settings["iso"] / REFERENCE["iso"] / FULL_WELL_E
+        electrons, amplification = _electrons(view, settings), _amplification(settings)
         rng = np.random.default_rng([view.seed, seed])
         image = np.empty((lens.height, lens.width, 3), dtype=np.uint8)
+        for first, rows in self._blurred_tiles(view):
+            signal = rows * np.float32(electrons)
+            noise = rng.standard_normal(signal.shape, dtype=np.float32)
+            signal += noise * np.sqrt(signal + np.float32(READ_NOISE_E**2))
+            image[first : first + len(rows)] = _srgb(signal * np.float32(amplification))
+        return image
+
+    def _blurred_tiles(self, view: View) -> Iterator[tuple[int, Array32]]:
+        """First row and linear colour (rows, W, 3) of the parts of the image, blurred by the lens."""
+        surfaces, lens = self.surfaces(view.seed, view.moved), view.intrinsics
         for first, last in _tiles(lens):
             top, bottom = max(0, first - HALO), min(lens.height, last + HALO)
             linear = self._linear(surfaces, view, top, bottom)
             linear = np.asarray(cv2.GaussianBlur(linear, (0, 0), BLUR_PX, borderType=cv2.BORDER_REPLICATE))
-            signal = np.maximum(linear[first - top : last - top], 0.0) * np.float32(electrons)
-            noise = rng.standard_normal(signal.shape, dtype=np.float32)
-            signal += noise * np.sqrt(signal + np.float32(READ_NOISE_E**2))
-            image[first:last] = _srgb(signal * np.float32(amplification))
-        return image
+            yield first, np.maximum(linear[first - top : last - top], 0.0)
 
     def _linear(self, surfaces: Surfaces, view: View, top: int, bottom: int) -> Array32:
         """Linear colour (rows, W, 3) of the image rows top…bottom."""
@@ -156,6 +166,25 @@ class Renderer:
         if self._rays is None or self._rays[0] != lens:
             self._rays = (lens, _pixel_rays(lens, 0, lens.height))
         return self._rays[1][top:bottom]
+
+
+def _electrons(view: View, settings: Mapping[str, float]) -> float:
+    """Electrons per unit of linear colour, before ISO amplification."""
+    gain = view.light_lux / NOMINAL_LUX / WHITE
+    gain *= settings["exposure_s"] / REFERENCE["exposure_s"] * (REFERENCE["aperture_f"] / settings["aperture_f"]) ** 2
+    return gain * FULL_WELL_E
+
+
+def _amplification(settings: Mapping[str, float]) -> float:
+    """The share of saturation of one electron."""
+    return settings["iso"] / REFERENCE["iso"] / FULL_WELL_E
+
+
+def _with_border(lens: Intrinsics) -> Intrinsics:
+    """The same lens on all exposed photosites, of which the picture is a part."""
+    b = EXPOSED
+    width, height = lens.width + b.left + b.right, lens.height + b.top + b.bottom
+    return replace(lens, width=width, height=height, cx=lens.cx + b.left, cy=lens.cy + b.top)
 
 
 def _tiles(lens: Intrinsics) -> Iterator[tuple[int, int]]:

@@ -35,6 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--camera", default="", metavar="NAME", help="which camera of the world; default: the first")
     parser.add_argument("--clock-ahead-s", type=float, default=0.0, metavar="S", help="how far its clock is ahead")
     parser.add_argument("--fast", action="store_true", help="exposures take no time")
+    parser.add_argument(
+        "--mosaic-jpeg",
+        action="store_true",
+        help="make the JPEG beside a raw file of the same values, as a camera does; "
+        "otherwise it is that of a sensor that measures three colours at every pixel",
+    )
 
 
 def image_source(args: argparse.Namespace) -> ImageSource:
@@ -64,7 +70,13 @@ def _attend_button(source: WorldSource, body: CameraBody, stop: threading.Event)
 def body_options(args: argparse.Namespace) -> BodyOptions:
     """The options of the body."""
     return BodyOptions(
-        args.fast, args.first_counter, args.exposures_log, args.announce, args.send_to, args.clock_ahead_s
+        args.fast,
+        args.first_counter,
+        args.exposures_log,
+        args.announce,
+        args.mosaic_jpeg,
+        args.send_to,
+        args.clock_ahead_s,
     )
 
 

@@ -17,8 +17,10 @@ import cv2
 
 from simulators.faults import Fault, FaultPlan
 from simulators.rendering.picture_faults import Lens
+from simulators.rendering.sensor import camera_picture, picture_without_filters, read_out
 from simulators.serve import SimulatorError
-from simulators.still_camera.exif import ExposureSettings, Nameplate, Shot, encode_jpeg, encode_raw
+from simulators.still_camera.exif import ExposureSettings, Nameplate, Shot, encode_jpeg
+from simulators.still_camera.raw_file import encode_raw
 from simulators.still_camera.scene import ImageSource, Moment
 
 FORMAT_JPEG = 0x3801
@@ -57,6 +59,7 @@ class BodyOptions:
     first_counter: int = 1
     exposures_log: Path | None = None
     announce: str = "both"  # event, property or both: how the client learns of a new file
+    mosaic_jpeg: bool = False  # beside a raw file: whether the JPEG is made of the same values, as a camera's is
     send_to: Path | None = None  # wireless transfer: files are written into this folder instead of being downloaded
     clock_ahead_s: float = 0.0  # of this machine's
 
@@ -152,7 +155,16 @@ class CameraBody(ABC):
     def _develop(
         self, moment: Moment, settings: ExposureSettings, shot: Shot, fault: Fault | None
     ) -> list[CameraFile]:
-        picture = self._lens.picture(self.source.develop(moment, settings), fault, moment.view)
+        mosaic = None
+        if not settings.raw:
+            picture = self._lens.picture(self.source.develop(moment, settings), fault, moment.view)
+        else:
+            light = self._lens.picture(self.source.light(moment, settings), fault, moment.view)
+            mosaic = read_out(light, settings.iso, moment.counter)
+            if self.options.mosaic_jpeg:
+                picture = camera_picture(mosaic)
+            else:
+                picture = picture_without_filters(light, settings.iso, moment.counter)
         if fault is not None and fault.kind == "wrong_exif":  # somebody turned a dial at the last moment
             shot = replace(shot, settings=replace(settings, iso=2 * settings.iso))
         captured = f"{shot.taken:%Y%m%dT%H%M%S}"
@@ -162,9 +174,9 @@ class CameraBody(ABC):
         if settings.jpeg and not (fault is not None and fault.kind == "raw_only"):
             jpeg = encode_jpeg(picture, shot)
             files.append(CameraFile(f"{stem}.JPG", FORMAT_JPEG, jpeg, width, height, captured))
-        if settings.raw:
+        if mosaic is not None:
             name = stem + self._names.raw_suffix
-            files.append(CameraFile(name, self._names.raw_format, encode_raw(picture, shot), width, height, captured))
+            files.append(CameraFile(name, self._names.raw_format, encode_raw(mosaic, shot), width, height, captured))
         return files
 
     def _finish(

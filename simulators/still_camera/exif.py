@@ -1,10 +1,8 @@
-"""Encodes a camera's files: a JPEG with EXIF, and a small raw file."""
+"""Encodes a camera's JPEG, and writes EXIF into its files."""
 
 from __future__ import annotations
 
 import importlib
-import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -69,10 +67,11 @@ def encode_jpeg(picture: NDArray[np.uint8], shot: Shot) -> bytes:
     done, encoded = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)
     if not done:
         raise SimulatorError("the picture could not be encoded as JPEG")
-    return _with_exif(encoded.tobytes(), picture.shape[1], picture.shape[0], shot)
+    return with_exif(encoded.tobytes(), picture.shape[1], picture.shape[0], shot)
 
 
-def _with_exif(file: bytes, width: int, height: int, shot: Shot) -> bytes:
+def with_exif(file: bytes, width: int, height: int, shot: Shot) -> bytes:
+    """The file with the EXIF of the shot, for a picture of this size in pixels."""
     image = exiv2.ImageFactory.open(file)
     image.readMetadata()
     exif = image.exifData()
@@ -109,85 +108,3 @@ def _with_exif(file: bytes, width: int, height: int, shot: Shot) -> bytes:
     exif["Exif.Photo.PixelYDimension"] = exiv2.ULongValue(height)
     image.writeMetadata()
     return bytes(image.io().data())
-
-
-def encode_raw(picture: NDArray[np.uint8], shot: Shot) -> bytes:
-    """Encode what stands for a raw file: a TIFF with camera tags and a 14-bit RGGB mosaic, a quarter as wide.
-
-    It is no maker's real format: it has no maker notes, no tiled lossless compression, no embedded preview, no black
-    level or white-balance tags, and a sixteenth of the pixels. It is a valid TIFF with the CFA tags of TIFF/EP, which
-    is enough for a capture to pair, hash and recognise it.
-    """
-    mosaic = _mosaic(picture)
-    height, width = mosaic.shape
-    pixels = mosaic.tobytes()
-    entries = [
-        _number(254, _LONG, 0),
-        _number(256, _LONG, width),
-        _number(257, _LONG, height),
-        _number(258, _SHORT, 16),
-        _number(259, _SHORT, 1),
-        _number(262, _SHORT, 32803),
-        _text(271, shot.body.make),
-        _text(272, shot.body.model),
-        _number(_STRIP_OFFSETS, _LONG, 0),
-        _number(274, _SHORT, 1),
-        _number(277, _SHORT, 1),
-        _number(278, _LONG, height),
-        _number(279, _LONG, len(pixels)),
-        _text(305, shot.body.firmware),
-        _text(306, shot.taken.strftime("%Y:%m:%d %H:%M:%S")),
-        _Entry(33421, _SHORT, 2, struct.pack("<HH", 2, 2)),
-        _Entry(33422, _BYTE, 4, bytes([0, 1, 1, 2])),
-    ]
-    return _with_exif(_tiff(entries, pixels), width, height, shot)
-
-
-def _mosaic(picture: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """The 14-bit RGGB mosaic of a picture, a quarter as wide."""
-    small = cv2.resize(picture, (picture.shape[1] // 8 * 2, picture.shape[0] // 8 * 2), interpolation=cv2.INTER_AREA)
-    linear = ((small / 255.0) ** 2.2 * 16383.0).astype("<u2")
-    mosaic = linear[..., 1].copy()
-    mosaic[0::2, 0::2] = linear[0::2, 0::2, 0]
-    mosaic[1::2, 1::2] = linear[1::2, 1::2, 2]
-    return mosaic
-
-
-@dataclass(frozen=True, slots=True)
-class _Entry:
-    """An entry of a TIFF directory."""
-
-    tag: int
-    kind: int
-    count: int
-    data: bytes
-
-
-_BYTE, _ASCII, _SHORT, _LONG = 1, 2, 3, 4  # kinds of TIFF values
-_STRIP_OFFSETS = 273
-
-
-def _number(tag: int, kind: int, value: int) -> _Entry:
-    return _Entry(tag, kind, 1, struct.pack("<H" if kind == _SHORT else "<I", value))
-
-
-def _text(tag: int, value: str) -> _Entry:
-    data = value.encode("ascii") + b"\0"
-    return _Entry(tag, _ASCII, len(data), data)
-
-
-def _tiff(entries: Sequence[_Entry], pixels: bytes) -> bytes:
-    """A little-endian TIFF with one directory and one strip of pixels, whose place is filled in."""
-    directory_bytes = 2 + 12 * len(entries) + 4
-    extra_at = 8 + directory_bytes
-    pixels_at = extra_at + sum(len(e.data) + len(e.data) % 2 for e in entries if len(e.data) > 4)
-    directory, extra = struct.pack("<H", len(entries)), b""
-    for entry in entries:
-        data = struct.pack("<I", pixels_at) if entry.tag == _STRIP_OFFSETS else entry.data
-        if len(data) > 4:
-            field = struct.pack("<I", extra_at + len(extra))
-            extra += data + b"\0" * (len(data) % 2)
-        else:
-            field = data.ljust(4, b"\0")
-        directory += struct.pack("<HHI", entry.tag, entry.kind, entry.count) + field
-    return b"II*\0" + struct.pack("<I", 8) + directory + struct.pack("<I", 0) + extra + pixels

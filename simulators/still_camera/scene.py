@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.hand.effects import hand_in_picture
+from simulators.rendering.sensor import Light, bordered
 from simulators.serve import SimulatorError
 from simulators.still_camera.exif import ExposureSettings
 
@@ -50,6 +51,13 @@ class ImageSource(Protocol):
 
     def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
         """Render the picture of that moment as (H, W, 3) RGB."""
+        ...
+
+    def light(self, moment: Moment, settings: ExposureSettings) -> Light:
+        """The light on the sensor at that moment, for a raw file.
+
+        Linear RGB (H, W, 3) of the picture and its border.
+        """
         ...
 
     def preview(self) -> Rgb:
@@ -122,6 +130,10 @@ class StillLife:
         cv2.putText(picture, f"{moment.counter:05d}", corner, 0, height / 300, (255, 255, 255), thickness)
         return picture
 
+    def light(self, moment: Moment, settings: ExposureSettings) -> Light:
+        """Return the light of that picture; its edge pixels are repeated in the border."""
+        return bordered(self.develop(moment, settings))
+
     def preview(self) -> Rgb:
         """Return a frame of 640 × 424."""
         return self._picture(640, 424)
@@ -155,6 +167,10 @@ class PictureFiles:
         """Return the counter's file with the settings' brightness."""
         return expose(self._load(moment.counter), exposure_gain(settings))
 
+    def light(self, moment: Moment, settings: ExposureSettings) -> Light:
+        """Return the light of that picture; its edge pixels are repeated in the border."""
+        return bordered(self.develop(moment, settings))
+
     def preview(self) -> Rgb:
         """Return the first file at a small size."""
         picture = self._load(1)
@@ -163,6 +179,8 @@ class PictureFiles:
 
 class _Renderer(Protocol):
     def render(self, view: Mapping[str, Any], camera_settings: Mapping[str, float], seed: int) -> Rgb: ...
+
+    def light(self, view: Mapping[str, Any], camera_settings: Mapping[str, float]) -> Light: ...
 
     def preview(self, view: Mapping[str, Any]) -> Rgb: ...
 
@@ -221,10 +239,15 @@ class WorldSource:
 
     def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
         """Render the recorded view."""
-        lens = {"aperture_f": settings.aperture_f, "exposure_s": settings.exposure_s, "iso": float(settings.iso)}
         with self._rendering:
-            picture = self._renderer.render(moment.view, lens, moment.counter)
+            picture = self._renderer.render(moment.view, _lens(settings), moment.counter)
         return hand_in_picture(picture, moment.view)
+
+    def light(self, moment: Moment, settings: ExposureSettings) -> Light:
+        """Render the light of the recorded view."""
+        with self._rendering:
+            light = self._renderer.light(moment.view, _lens(settings))
+        return hand_in_picture(light, moment.view)
 
     def preview(self) -> Rgb:
         """Render a small frame of the current view."""
@@ -264,3 +287,7 @@ class WorldSource:
                         self._renderer.preview(view)
                     built = moved
             stop.wait(interval_s)
+
+
+def _lens(settings: ExposureSettings) -> dict[str, float]:
+    return {"aperture_f": settings.aperture_f, "exposure_s": settings.exposure_s, "iso": float(settings.iso)}

@@ -27,8 +27,8 @@ ROOT = Path(__file__).parents[2]
 COMMAND = Path(sys.executable).with_name("orthocapture")
 COMMANDS = (
     "demo", "serve", "run", "resume", "import", "act", "note", "status", "runs", "compare", "history", "worker",
-    "doctor", "dicom-listen", "calibrate", "import-ros", "sfm", "register", "spheres", "layout", "fuse", "evaluate",
-    "benchmark", "simulate", "audit", "store", "replay", "export", "protocol", "plan",
+    "doctor", "dicom-listen", "calibrate", "import-ros", "develop", "sfm", "register", "spheres", "layout", "fuse",
+    "evaluate", "benchmark", "simulate", "audit", "store", "replay", "export", "protocol", "plan",
 )  # fmt: skip
 
 

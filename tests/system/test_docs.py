@@ -256,6 +256,9 @@ RUN_ELSEWHERE = {
     "orthocapture import-ros bag --out files --base base_link --flange tool0 --camera-frame camera_optical": (
         "tests/poses/test_import_ros.py::test_a_recording_calibrates_a_hand_eye_as_its_files_would"
     ),
+    "orthocapture develop DSC00001.ARW --out developed": (
+        "tests/photos/test_develop.py::test_the_command_writes_a_tiff_and_its_record"
+    ),
     'orthocapture simulate rig --scene 7 --dir rig --arm "LBR Med 14"': (
         "tests/kuka/test_kuka_run.py::test_it_comes_to_its_end_with_every_view"
     ),

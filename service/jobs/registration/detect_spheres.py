@@ -31,6 +31,9 @@ class SceneArguments(ImagesCamera, Mounting):
 class Arguments(SceneArguments):
     """How outlines are searched; `model` holds the poses if neither a robot nor spheres provide them.
 
+    `developed` holds the file of the job `develop` by viewpoint: outlines found in the photographs are then measured
+    in these; None: in the photographs.
+
     The detectors `grounded` and `vote` need the weights of their networks on the worker's machine; the job's file
     `weights.json` has the hashes of these.
     """
@@ -38,6 +41,7 @@ class Arguments(SceneArguments):
     model: Hash | None = None
     colour: str | None = None
     detector: DetectorName = "classical"
+    developed: dict[str, Hash] | None = None
 
 
 KIND = JobKind(

@@ -29,6 +29,7 @@ from service.steps.poses.front_end import IMAGES_A_JOB, PAIRS_A_JOB, EarlyJobs, 
 from service.steps.poses.sources import PLANNED, QUICK, WantedRegistrations, decisive, posed
 
 _REDUCED = ("reduced_to", "full_camera")  # arguments of jobs on reduced images; the second one in old runs only
+_SEARCH_ONLY = ("detector", "colour", "developed")  # arguments of the search for outlines alone
 _MAPPERS = {"colmap": "incremental", "glomap": "global", "triangulated": "triangulated"}
 
 
@@ -137,7 +138,7 @@ class _Plan:
 
     def _registered(self, source: str, size: str) -> JobState | None:
         search = self._arguments(size)
-        shared = {key: value for key, value in search.items() if key not in ("detector", "colour")}
+        shared = {key: value for key, value in search.items() if key not in _SEARCH_ONLY}
         if not posed(read_part(_Images, search).images):
             first = self._model(self._mapper(""), size, shared)  # spheres are searched where poses predict them
             if first is None:
@@ -234,6 +235,7 @@ class _Plan:
             return arguments
         width, height = _pixels(size)
         arguments.pop("intrinsics_covariance", None)  # it belongs to the full size
+        arguments.pop("developed", None)  # so do the developed raw files
         return arguments | {"reduced_to": [width, height]}
 
     def _need(self, kind: str, what: str, size: str, arguments: Mapping[str, Any]) -> JobState | None:

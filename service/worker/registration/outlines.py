@@ -11,6 +11,7 @@ import numpy as np
 from service.compute.camera_model import CameraModel
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.detectors import options_for
+from service.compute.markers.developed import remeasure_file
 from service.compute.markers.grounded.detector import GroundedDetector
 from service.compute.markers.grounded.weights import Weights, weights_in
 from service.compute.markers.records import SphereOutline
@@ -37,7 +38,8 @@ def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:
     images, poses = _posed(context)
     weights = weights_in() if arguments.detector in ("grounded", "vote") else None
     located = _located(context, images, poses, weights)
-    records = [[outline_record(outline) for outline in found] for found in located.outlines]
+    measured, lost = _measured(context, images, located.outlines)
+    records = [[outline_record(outline) for outline in found] for found in measured]
     found = {image.viewpoint: [] for image in arguments.images}
     found |= dict(zip((image.viewpoint for image in images), records, strict=True))
     total = sum(map(len, records))
@@ -46,7 +48,7 @@ def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:
         "outlines": float(total),
         "outlines_an_image": total / len(images),
         "images_searched_whole": float(located.count("searched")),
-    }
+    } | lost
     if weights is None:
         return JobAnswer(measures, (ref,))
     used = {"detector": arguments.detector, "sha256": dict(weights.sha256())}
@@ -69,6 +71,25 @@ def _posed(context: JobContext[job.Arguments]) -> tuple[Sequence[Photograph], Ar
     model = ModelFile.model_validate(context.input_json(arguments.model)).T_world_camera
     images = tuple(image for image in arguments.images if image.viewpoint in model)
     return images, np.array([model[image.viewpoint] for image in images])
+
+
+def _measured(
+    context: JobContext[job.Arguments],
+    images: Sequence[Photograph],
+    outlines: Sequence[tuple[SphereOutline, ...]],
+) -> tuple[Sequence[tuple[SphereOutline, ...]], dict[str, float]]:
+    """The outlines measured in the developed raw files, where there are any, and how many these do not show."""
+    arguments = context.arguments
+    if arguments.developed is None:
+        return outlines, {}
+    camera, options = camera_used(arguments), options_for(arguments.colour)
+    out: list[tuple[SphereOutline, ...]] = []
+    for done, (image, found) in enumerate(zip(images, outlines, strict=True), 1):
+        again = remeasure_file(context.input(arguments.developed[image.viewpoint]), camera, found, options)
+        out.append(tuple(outline for outline in again if outline is not None))
+        context.progress("spheres in developed raw files", done, len(images))
+    lost = sum(map(len, outlines)) - sum(map(len, out))
+    return out, {"outlines_not_in_raw": float(lost)}
 
 
 def _located(

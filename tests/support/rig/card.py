@@ -11,8 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from simulators.rendering.sensor import bordered, read_out
 from simulators.sony_camera.exif import PLATE
-from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg, encode_raw
+from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg
+from simulators.still_camera.raw_file import encode_raw
 
 BEGAN = datetime(2026, 11, 21, 10, 0, tzinfo=UTC)
 _COPY = """\
@@ -33,7 +35,8 @@ def photograph(number: int, taken: datetime, *, iso: int = 100, raw: bool = Fals
     settings = ExposureSettings(22.0, 1 / 50, (1, 50), iso, on_card=True)
     picture = np.full((64, 96, 3), 40 + number, dtype=np.uint8)
     picture[number % 64] = 255
-    return (encode_raw if raw else encode_jpeg)(picture, Shot(settings, number, taken, PLATE))
+    shot = Shot(settings, number, taken, PLATE)
+    return encode_raw(read_out(bordered(picture), iso, number), shot) if raw else encode_jpeg(picture, shot)
 
 
 def after(seconds: float) -> datetime:

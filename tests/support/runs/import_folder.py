@@ -14,11 +14,13 @@ from simulators.ct_suite.volume import grid_around
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, from_euler, look_at
 from simulators.rendering.render import REFERENCE, Renderer
+from simulators.rendering.sensor import camera_picture, read_out
 from simulators.scan_station.formats import encode
 from simulators.scan_station.station import scan_scene
 from simulators.scene.world import NOMINAL_LUX, SCENE_CENTRE_M, Scene
 from simulators.sony_camera.exif import PLATE
 from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg
+from simulators.still_camera.raw_file import encode_raw
 
 SEED = 7
 SETTINGS = ExposureSettings(
@@ -40,6 +42,7 @@ class Photographer:
     control_spheres: bool = True
     seed: int = SEED
     counter: int = 0
+    raw: bool = False  # a raw file beside each photograph, of the same exposure
 
     def __post_init__(self) -> None:
         self.scene = Scene.generate(self.seed)
@@ -63,11 +66,14 @@ class Photographer:
                 },
                 "light_lux": NOMINAL_LUX,
             }
-            picture = self.renderer.render(view, REFERENCE, self.counter)
+            mosaic = read_out(self.renderer.light(view, REFERENCE), SETTINGS.iso, self.counter) if self.raw else None
+            whole = self.renderer.render(view, REFERENCE, self.counter) if mosaic is None else camera_picture(mosaic)
             taken = _BEGAN + timedelta(minutes=self.counter)
             name = f"DSC{self.counter:05d}"
-            jpeg = encode_jpeg(picture, Shot(SETTINGS, self.counter, taken, PLATE))
-            (self.folder / part / f"{name}.JPG").write_bytes(jpeg)
+            shot = Shot(SETTINGS, self.counter, taken, PLATE)
+            (self.folder / part / f"{name}.JPG").write_bytes(encode_jpeg(whole, shot))
+            if mosaic is not None:
+                (self.folder / part / f"{name}.ARW").write_bytes(encode_raw(mosaic, shot))
             self.T_world_camera[name] = pose
 
     def scan(self, part: str, *, control_spheres: bool, nth: int) -> None:

@@ -13,6 +13,9 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone
 from service.core.geometry import Array
 
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]  # 16 bits of a developed raw file: sRGB coded, 257 times as fine
+FINER = 257  # values of 16 bits for each of 8 bits
+
 
 @dataclass(frozen=True, slots=True)
 class Profiles:
@@ -69,26 +72,32 @@ def sample(image: NDArray[np.float32] | NDArray[np.uint8], pixels: Array) -> NDA
     return np.asarray(top * (1 - fy) + bottom * fy, dtype=np.float32)
 
 
-def sample_sharp(image: NDArray[np.uint8], pixels: Array) -> NDArray[np.uint8]:
+def sample_sharp(image: Pixels, pixels: Array) -> NDArray[np.uint8] | NDArray[np.float32]:
     """Values (..., J, 3) at pixels (..., J, 2) by Lanczos interpolation, which does not blur.
 
     Bilinear interpolation averages coded values, which blurs after the transfer curve and moves high-contrast edges
-    by a tenth of a pixel. Positions are rounded to 1/32 px, without bias.
+    by a tenth of a pixel. Positions are rounded to 1/32 px, without bias. Values of 16 bits are given in units of
+    those of 8 bits, not rounded.
     """
-    return _remapped(image, pixels, cv2.INTER_LANCZOS4)
+    values = _remapped(image, pixels, cv2.INTER_LANCZOS4)
+    if values.dtype == np.uint8:
+        return values.astype(np.uint8, copy=False)
+    return (values / np.float32(FINER)).astype(np.float32)
 
 
-def sample_averaged(image: NDArray[np.uint8], pixels: Array, count: int) -> NDArray[np.uint8]:
+def sample_averaged(image: Pixels, pixels: Array, count: int) -> NDArray[np.uint8] | NDArray[np.float32]:
     """Means (..., J, 3) of every `count` neighbouring values along profiles (..., J * count, 2)."""
     values = _remapped(image, pixels, cv2.INTER_LINEAR)
     means = values.reshape(*values.shape[:-2], -1, count, 3).mean(axis=-2, dtype=np.float32)
+    if values.dtype != np.uint8:
+        return (means / np.float32(FINER)).astype(np.float32)
     return np.rint(means).astype(np.uint8)
 
 
-def _remapped(image: NDArray[np.uint8], pixels: Array, how: int) -> NDArray[np.uint8]:
+def _remapped(image: Pixels, pixels: Array, how: int) -> Pixels:
     at = pixels.reshape(-1, *pixels.shape[-2:]).astype(np.float32)
     values = cv2.remap(image, at[..., 0], at[..., 1], how, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(values, dtype=np.uint8).reshape(*pixels.shape[:-1], 3)
+    return values.reshape(*pixels.shape[:-1], 3)  # pyright: ignore[reportReturnType] - cv2 keeps the image's type
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from service.compute.markers.outlines.limb_model import (
     ALL,
@@ -27,7 +26,7 @@ from service.compute.markers.outlines.limb_model import (
     LimbProfiles,
     Mask,
     evaluate,
-    light_of,
+    to_light,
 )
 from service.core.geometry import Array
 
@@ -75,9 +74,8 @@ def fit_limb(
     """
     inside = profiles.inside
     usable = np.where(inside.any(axis=1, keepdims=True), inside, True)
-    light = light_of(srgb=profiles.srgb)
-    p = _start(profiles.coded_bgr, light, profiles.offsets)
-    model = LimbModel.of(profiles, _albedo(profiles.coded_bgr, light, usable, profiles.offsets))
+    p = _start(profiles)
+    model = LimbModel.of(profiles, _albedo(profiles, usable))
     G, K, J = profiles.coded_bgr.shape[:3]
     blur, chroma_blur = blur.astype(np.float64), chroma_blur.astype(np.float64)
     shading = _Shading(np.zeros((G, K)), np.full((G, 1), 1.0), np.zeros((G, K)), np.full((G, 1), 5.0))
@@ -201,19 +199,21 @@ def _around(values: Array, good: Mask, least: float) -> tuple[Array, Array]:
     return smooth, np.maximum(least, 0.5 * spread)[:, None]
 
 
-def _albedo(coded_bgr: NDArray[np.uint8], light: Array32, usable: Mask, t: Array) -> Array32:
+def _albedo(profiles: LimbProfiles, usable: Mask) -> Array32:
     """(G, 3) the spheres' colour in linear light, of unit luma, measured away from the edges."""
-    inner = np.moveaxis(coded_bgr[:, :, t < t[0] + 2.1], 3, 1)  # (G, 3, K, n)
+    t = profiles.offsets
+    inner = np.moveaxis(profiles.coded_bgr[:, :, t < t[0] + 2.1], 3, 1)  # (G, 3, K, n)
     mask = np.broadcast_to(usable[:, None, :, None], inner.shape)
     flat = (*inner.shape[:2], -1)
-    colour = masked_median(light[inner].reshape(flat), mask.reshape(flat))
+    colour = masked_median(to_light(inner, srgb=profiles.srgb).reshape(flat), mask.reshape(flat))
     return (colour / np.maximum(colour @ TO_YCC[0], 1e-4)[:, None]).astype(np.float32)
 
 
-def _start(coded_bgr: NDArray[np.uint8], light: Array32, t: Array) -> Array:
-    p = np.zeros((*coded_bgr.shape[:2], OWN))
+def _start(profiles: LimbProfiles) -> Array:
+    coded, t = profiles.coded_bgr, profiles.offsets
+    p = np.zeros((*coded.shape[:2], OWN))
     for first, side in ((0, (t < -1.2) & (t > -4)), (5, (t > 1.2) & (t < 4))):
-        p[..., first : first + 3] = np.maximum(light[coded_bgr[:, :, side]].mean(axis=2), 1e-4)
+        p[..., first : first + 3] = np.maximum(to_light(coded[:, :, side], srgb=profiles.srgb).mean(axis=2), 1e-4)
     return p
 
 

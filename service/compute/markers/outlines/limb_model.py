@@ -17,6 +17,7 @@ from service.core.geometry import Array
 
 Array32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Coded = NDArray[np.uint8] | Array32  # 0 … 255; of a developed raw file not rounded
 
 # Rows: Y, Cb, Cr of B, G, R (ITU-R BT.601, which JPEG uses).
 TO_YCC = np.array([[0.114, 0.587, 0.299], [0.5, -0.331264, -0.168736], [-0.081312, -0.418688, 0.5]])
@@ -39,7 +40,7 @@ class LimbProfiles:
         srgb: whether values are sRGB coded.
     """
 
-    coded_bgr: NDArray[np.uint8]
+    coded_bgr: Coded
     offsets: Array
     inside: Mask
     radius: Array
@@ -93,6 +94,15 @@ def _limb_table() -> tuple[Array32, Array32]:
 def light_of(*, srgb: bool) -> Array32:
     """(256,) linear light of each coded value."""
     x = np.arange(256) / 255
+    linear = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4) if srgb else x
+    return linear.astype(np.float32)
+
+
+def to_light(coded: Coded, *, srgb: bool) -> Array32:
+    """Linear light of coded values."""
+    if coded.dtype == np.uint8:
+        return light_of(srgb=srgb)[coded.astype(np.uint8, copy=False)]
+    x = coded / np.float32(255)
     linear = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4) if srgb else x
     return linear.astype(np.float32)
 

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, distance_gradient, ransac_cone
 from service.compute.markers.outlines.edges import (
+    FINER,
+    Pixels,
     envelope_edges,
     profiles,
     profiles_of,
@@ -121,7 +123,7 @@ def approach_outlines(
 
 
 def measure_outlines(
-    image_bgr: NDArray[np.uint8],
+    image_bgr: Pixels,
     camera: CameraModel,
     starts: Sequence[AveragedCone],
     options: DetectionOptions = DEFAULTS,
@@ -131,7 +133,7 @@ def measure_outlines(
     """Outlines at full resolution from cones that are good to about a pixel; None as in `refine_outline`.
 
     The larger an outline, the more edge it has and the better it determines the sphere's position, so the number of
-    profiles decreases with its size.
+    profiles decreases with its size. An image of 16 bits is a developed raw file, sRGB coded.
     """
     if not starts:
         return []
@@ -152,7 +154,7 @@ def measure_outlines(
 
 
 def _outline(
-    image: NDArray[np.uint8], camera: CameraModel, best: _SubpixelCone, options: DetectionOptions, score: float
+    image: Pixels, camera: CameraModel, best: _SubpixelCone, options: DetectionOptions, score: float
 ) -> SphereOutline | None:
     if (
         best.coverage < options.min_coverage
@@ -225,7 +227,7 @@ class _Sampling:
 
 
 def _measure(
-    image: NDArray[np.uint8],
+    image: Pixels,
     camera: CameraModel,
     starts: Sequence[AveragedCone],
     sampling: _Sampling,
@@ -365,10 +367,11 @@ def _covariances(azimuth: Array, fit: _ConeFits) -> Array:
     return noise * np.maximum(1.0, factor)[:, None, None]
 
 
-def _median_colour(image: NDArray[np.uint8], middle: Array, reach: float) -> tuple[float, float, float]:
+def _median_colour(image: Pixels, middle: Array, reach: float) -> tuple[float, float, float]:
     h, w = image.shape[:2]
     x0, x1 = (int(np.clip(middle[0] + s * reach, 0, w - 1)) for s in (-1, 1))
     y0, y1 = (int(np.clip(middle[1] + s * reach, 0, h - 1)) for s in (-1, 1))
     step = max(1, (x1 - x0) // 32)
     b, g, r = np.median(image[y0 : y1 + 1 : step, x0 : x1 + 1 : step].reshape(-1, 3), axis=0)
-    return float(b), float(g), float(r)
+    unit = 1 if image.dtype == np.uint8 else FINER
+    return float(b) / unit, float(g) / unit, float(r) / unit

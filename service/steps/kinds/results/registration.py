@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
+from service.compute.images.develop import PARAMETERS
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.jobs.keys import arguments_name
 from service.core.protocol.step_params import RepeatedStep, StepParams
@@ -20,7 +21,7 @@ from service.core.records.events import ComputedBy, Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
 from service.jobs.records import Mounting, Photograph
-from service.jobs.registration import detect_spheres, further_camera, register
+from service.jobs.registration import detect_spheres, develop, further_camera, register
 from service.jobs.registration.register import Registration
 from service.jobs.surfaces import locate_spheres
 from service.jobs.words import term
@@ -31,6 +32,7 @@ from service.steps.inputs import (
     earlier_answer,
     intrinsics_covariance_of,
     mounting_of,
+    raw_files,
 )
 from service.steps.measures import Count, ErrorMm, Measure, MeasureRecord, Px, Ratio, RegistrationMeasures
 from service.steps.poses.further_cameras import locate_further_cameras
@@ -64,6 +66,9 @@ class Params(StepParams):
     # The others search every image whole: "paper" is the published method without its networks, "grounded" has
     # Grounding DINO and SAM 2, and in "vote" it and the classical one must agree.
     detector: detect_spheres.DetectorName = "classical"
+    # Where outlines are measured once they are found. "raw" develops the raw file of each image first, which needs
+    # the extra `raw` on the worker, and RAW+JPEG as the camera's `image_quality`.
+    measure_on: Literal["jpeg", "raw"] = "jpeg"
     reduced: tuple[str, ...] = ()  # such as 1920x1080: lower resolutions, for the paper's comparison
     reduced_poses: tuple[Literal["colmap", "glomap"], ...] = ("colmap",)  # sources of poses for the reduced images
 
@@ -100,6 +105,7 @@ class Measures(RegistrationMeasures[OneRegistration]):
     images_searched_whole: Annotated[Count, "images that were searched whole because no pose said where to look"] = (
         None
     )
+    outlines_not_in_raw: Annotated[Count, "outlines of the JPEGs that the developed raw files do not show"] = None
     further_views: Annotated[Count, "images that locate a further camera, for the one that has fewest"] = None
     further_excluded: Annotated[
         Count, "images of further cameras without four spheres, or that contradict the rest"
@@ -176,6 +182,8 @@ def _search(context: StepContext, params: Params) -> JobRequest:
         radius_m=metres(context.protocol.spheres.radius_mm),
         detector=params.detector,
     ).model_copy(update={**mounted.mounting.set_fields(), **known})
+    if params.measure_on == "raw":
+        arguments = arguments.model_copy(update={"developed": _developed(context, images)})
     references = {
         **mounted.references,
         "camera": calibration.reference("camera"),
@@ -185,6 +193,23 @@ def _search(context: StepContext, params: Params) -> JobRequest:
     if lens is not None:
         references["intrinsics_covariance"] = calibration.reference("details/intrinsics/covariance")
     return JobRequest.of(detect_spheres.KIND, arguments, references)
+
+
+def _developed(context: StepContext, images: list[Photograph]) -> dict[str, str]:
+    """The developed raw file of each image, by viewpoint."""
+    raws = raw_files(context, images)
+    parameters = develop.Parameters.model_validate(asdict(PARAMETERS))
+    requests = [
+        JobRequest.of(
+            develop.KIND,
+            develop.Arguments(
+                viewpoint=image.viewpoint, raw=raws[image.viewpoint], jpeg=image.sha256, parameters=parameters
+            ),
+        )
+        for image in images
+    ]
+    results = context.evidence.run_jobs(*requests)
+    return {image.viewpoint: result.artefacts[0].sha256 for image, result in zip(images, results, strict=True)}
 
 
 def _mounting(context: StepContext, params: Params, images: list[Photograph]) -> CameraMounting:

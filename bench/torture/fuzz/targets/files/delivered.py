@@ -26,9 +26,11 @@ from service.web.record.pictures import reduced_jpeg
 from simulators.ct_suite.suite import write_series
 from simulators.ct_suite.volume import Grid
 from simulators.faults import FaultPlan
+from simulators.rendering.sensor import bordered, read_out
 from simulators.scan_station.formats import encode
 from simulators.sony_camera.exif import PLATE
-from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg, encode_raw
+from simulators.still_camera.exif import ExposureSettings, Shot, encode_jpeg
+from simulators.still_camera.raw_file import encode_raw
 
 SLICES, ROWS = 3, 6
 _SETTINGS = ExposureSettings(22.0, 1 / 50, (1, 50), 100)
@@ -53,7 +55,8 @@ def _jpegs(_: Path) -> list[bytes]:
 
 
 def _photographs(_: Path) -> list[bytes]:
-    return [encode_jpeg(*_shot()), encode_raw(*_shot())]
+    picture, shot = _shot()
+    return [encode_jpeg(picture, shot), encode_raw(read_out(bordered(picture), 100, 7), shot)]
 
 
 def _pictures(_: Path) -> list[bytes]:

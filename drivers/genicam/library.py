@@ -1,0 +1,161 @@
+"""The calls of Aravis (libaravis 0.8) that the driver needs: GenICam over GigE Vision and USB3 Vision.
+
+Aravis is called by ctypes: the library comes with the operating system, and its Python package would have to be
+compiled. Every call that can fail raises AravisError with the library's message.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+from dataclasses import dataclass
+from typing import Any
+
+LIBRARIES = ("aravis-0.8", "gobject-2.0", "glib-2.0")
+_SUCCESS = 0  # of ArvBufferStatus
+_POINTER, _TEXT, _REAL = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_double
+_US = 1e6  # microseconds in a second: Aravis' unit of times
+
+
+class AravisError(Exception):
+    """A call failed; the message is the library's."""
+
+
+class LibraryMissingError(Exception):
+    """A library of Aravis is not installed."""
+
+
+class NoImageError(Exception):
+    """No whole image came in time."""
+
+
+class _Error(ctypes.Structure):
+    """GError."""
+
+    _fields_ = (("domain", ctypes.c_uint32), ("code", ctypes.c_int), ("message", _TEXT))
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One image as the camera sent it: its number, size in px, pixel format by its GenICam code, and bytes."""
+
+    number: int
+    width: int
+    height: int
+    code: int
+    data: bytes
+
+
+class AravisCamera:
+    """A connected camera. Not thread-safe; calls may block, and a fault of the library ends the process."""
+
+    def __init__(self, name: str) -> None:
+        """Connect to a camera by IP address or by the name that `arv-tool-0.8` lists.
+
+        Raises LibraryMissingError or AravisError.
+        """
+        self._aravis, self._gobject, self._glib = (_library(name) for name in LIBRARIES)
+        self._camera: int | None = self._call("arv_camera_new", _POINTER, name.encode(), of=(_TEXT,))
+
+    def close(self) -> None:
+        """Disconnect."""
+        camera, self._camera = self._camera, None
+        if camera is not None:
+            self._unref(camera)
+
+    def text(self, what: str) -> str:
+        """The text that `arv_camera_get_…` gives, such as `model_name`."""
+        value = self._of_camera(f"arv_camera_get_{what}", _TEXT)
+        return value.decode("utf-8", "replace") if value else ""
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure time that the camera reports."""
+        return float(self._of_camera("arv_camera_get_exposure_time", _REAL)) / _US
+
+    @property
+    def gain(self) -> float:
+        """Gain that the camera reports, in its own unit, usually dB."""
+        return float(self._of_camera("arv_camera_get_gain", _REAL))
+
+    def set_exposure_s(self, exposure_s: float) -> None:
+        """Set the exposure time; the camera may round it."""
+        self._of_camera("arv_camera_set_exposure_time", None, exposure_s * _US, of=(_REAL,))
+
+    def set_gain(self, gain: float) -> None:
+        """Set the gain, in the camera's own unit."""
+        self._of_camera("arv_camera_set_gain", None, gain, of=(_REAL,))
+
+    def set_pixel_format(self, name: str) -> None:
+        """Set the pixel format by its GenICam name, such as BayerRG8."""
+        self._of_camera("arv_camera_set_pixel_format_from_string", None, name.encode(), of=(_TEXT,))
+
+    def acquire(self, timeout_s: float) -> Frame:
+        """Expose and receive one image. Raises NoImageError or AravisError."""
+        timeout_us = ctypes.c_uint64(round(timeout_s * _US))
+        buffer = self._of_camera("arv_camera_acquisition", _POINTER, timeout_us, of=(ctypes.c_uint64,))
+        if not buffer:
+            raise NoImageError("no image came")
+        try:
+            status = self._of_buffer(buffer, "status", ctypes.c_int)
+            if status != _SUCCESS:
+                raise NoImageError(f"an image is incomplete (Aravis' status {status})")
+            return self._frame(buffer)
+        finally:
+            self._unref(buffer)
+
+    def _frame(self, buffer: int) -> Frame:
+        size = ctypes.c_size_t()
+        read = self._aravis.arv_buffer_get_data
+        read.restype, read.argtypes = _POINTER, (_POINTER, ctypes.POINTER(ctypes.c_size_t))
+        place = read(buffer, ctypes.byref(size))
+        return Frame(
+            number=self._of_buffer(buffer, "frame_id", ctypes.c_uint64),
+            width=self._of_buffer(buffer, "image_width", ctypes.c_int),
+            height=self._of_buffer(buffer, "image_height", ctypes.c_int),
+            code=self._of_buffer(buffer, "image_pixel_format", ctypes.c_uint32),
+            data=ctypes.string_at(place, size.value),
+        )
+
+    def _of_buffer(self, buffer: int, what: str, gives: Any) -> int:
+        function = getattr(self._aravis, f"arv_buffer_get_{what}")
+        function.restype, function.argtypes = gives, (_POINTER,)
+        return int(function(buffer))
+
+    def _of_camera(self, name: str, gives: Any, *arguments: Any, of: tuple[Any, ...] = ()) -> Any:
+        if self._camera is None:
+            raise AravisError("the camera is not connected")
+        return self._call(name, gives, self._camera, *arguments, of=(_POINTER, *of))
+
+    def _call(self, name: str, gives: Any, *arguments: Any, of: tuple[Any, ...]) -> Any:
+        """Call a function whose last argument is a GError."""
+        function = getattr(self._aravis, name)
+        function.restype, function.argtypes = gives, (*of, ctypes.POINTER(ctypes.POINTER(_Error)))
+        error = ctypes.POINTER(_Error)()
+        value = function(*arguments, ctypes.byref(error))
+        if error:
+            message = (error.contents.message or b"").decode("utf-8", "replace")
+            free = self._glib.g_error_free
+            free.restype, free.argtypes = None, (ctypes.POINTER(_Error),)
+            free(error)
+            raise AravisError(message)
+        return value
+
+    def _unref(self, thing: int) -> None:
+        release = self._gobject.g_object_unref
+        release.restype, release.argtypes = None, (_POINTER,)
+        release(thing)
+
+
+def version() -> str:
+    """The library's version. Raises LibraryMissingError."""
+    library = _library(LIBRARIES[0])
+    return ".".join(str(getattr(library, f"arv_get_{part}_version")()) for part in ("major", "minor", "micro"))
+
+
+def _library(name: str) -> ctypes.CDLL:
+    found = ctypes.util.find_library(name)
+    try:
+        return ctypes.CDLL(found or f"lib{name}.so.0")
+    except OSError as error:
+        raise LibraryMissingError(f"lib{name}") from error

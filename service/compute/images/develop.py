@@ -1,0 +1,286 @@
+"""Develops raw files with fixed parameters to linear 16-bit pictures that match the JPEG of the same exposure.
+
+LibRaw (through rawpy, the extra `raw`) does the developing. Nothing in it looks at the picture's content: there is no
+automatic brightness, white level or white balance, no noise reduction, no rotation. What differs from file to file,
+such as the white balance that the camera recorded, is returned and goes into the record.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.images.match import find_shift
+from service.core.errors import ConfigurationError, DataError
+
+Pixels16 = NDArray[np.uint16]
+_P = TypeVar("_P", NDArray[np.uint8], Pixels16)
+INSTALL = 'pip install "orthocapture[raw]"'
+MOST_SHIFT_PX = 0.25  # of the developed picture against the JPEG; half a pixel would be another convention
+_MOST_ROOM_PX = 160  # around the JPEG in the exposed area; cameras leave out some tens of pixels
+_TIFF = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE,
+         cv2.IMWRITE_TIFF_PREDICTOR, cv2.IMWRITE_TIFF_PREDICTOR_HORIZONTAL]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class DevelopParameters:
+    """How every raw file is developed; recorded with each picture, and the same for all.
+
+    Attributes:
+        demosaic: LibRaw's algorithm, by rawpy's name of it; chosen by bench/markers/raw_gain.py.
+        white_balance: `camera`: the gains that the camera recorded for the exposure.
+        primaries: of the picture's colours; the colour matrix is the file's or, without one, LibRaw's for the model.
+        gamma: power and slope of the transfer curve; 1, 1 is linear.
+        highlights: what becomes of saturated channels.
+        auto_brightness: whether the content decides the brightness.
+        noise_reduction: of any kind.
+        orientation: 0: as the sensor read it out.
+        bits: of a channel.
+    """
+
+    demosaic: str = "VNG"
+    white_balance: str = "camera"
+    primaries: str = "sRGB"
+    gamma: tuple[float, float] = (1.0, 1.0)
+    highlights: str = "Clip"
+    auto_brightness: bool = False
+    noise_reduction: bool = False
+    orientation: int = 0
+    bits: int = 16
+
+
+PARAMETERS = DevelopParameters()
+
+
+@dataclass(frozen=True, slots=True)
+class Crop:
+    """The part of the developed area that the JPEG shows, in pixels of that area.
+
+    `found` says where it comes from: `file`: the raw file names it; `moved`: the file names another, and the JPEG
+    shows this one; `matched`: the file names none of the JPEG's size, so it was found by comparison with the JPEG.
+    """
+
+    left: int
+    top: int
+    width: int
+    height: int
+    found: str
+
+
+@dataclass(frozen=True, slots=True)
+class Development:
+    """What is recorded of a development.
+
+    Attributes:
+        parameters: fixed ones.
+        white_balance: gains of red, green, blue and second green that the camera recorded (0: as the first green).
+        black_level: of the four photosites of the pattern.
+        white_level: of the sensor's values.
+        area: width and height of the exposed area.
+        crop: of the picture in it.
+        shift_px: median shift of the picture against the JPEG in x and y; None without a JPEG.
+        largest_shift_px: of a part of the picture; None without a JPEG.
+        rawpy: its version.
+        libraw: its version.
+    """
+
+    parameters: DevelopParameters
+    white_balance: tuple[float, ...]
+    black_level: tuple[int, ...]
+    white_level: int
+    area: tuple[int, int]
+    crop: Crop
+    shift_px: tuple[float, float] | None
+    largest_shift_px: float | None
+    rawpy: str
+    libraw: str
+
+
+@dataclass(frozen=True, slots=True)
+class Developed:
+    """A picture (H, W, 3) BGR, linear, 65535 at saturation, of the size of the JPEG; and how it was made."""
+
+    image_bgr: Pixels16
+    how: Development
+
+
+def develop(path: Path, jpeg_bgr: NDArray[np.uint8] | None, parameters: DevelopParameters = PARAMETERS) -> Developed:
+    """Develop a raw file.
+
+    Args:
+        path: any raw format that LibRaw reads, such as ARW, CR3, NEF or DNG.
+        jpeg_bgr: (H, W, 3) the JPEG of the same exposure, as stored. The picture gets its size, and its place is
+            checked. None: the crop that the file names, unchecked.
+        parameters: fixed for a series of pictures.
+
+    Raises:
+        ConfigurationError: rawpy is not installed, or it does not know the demosaic algorithm.
+        DataError: the file cannot be developed, has no part that matches the JPEG, or the JPEG was corrected for
+            distortion by the camera.
+    """
+    rawpy = _rawpy()
+    options = _options(rawpy, parameters)
+    try:
+        with rawpy.imread(str(path)) as raw:
+            area = np.ascontiguousarray(raw.postprocess(**options)[..., ::-1], dtype=np.uint16)
+            sizes = raw.sizes
+            white_balance = tuple(float(gain) for gain in raw.camera_whitebalance)
+            black_level = tuple(int(level) for level in raw.black_level_per_channel)
+            white_level = int(raw.white_level)
+    except rawpy.LibRawError as error:
+        raise DataError(
+            f"the raw file cannot be developed: {_words(error)}",
+            where=str(path),
+            remedy="Copy the file from the camera again; if it is whole, LibRaw does not know the model yet",
+        ) from error
+    named = _named_crop(sizes)
+    crop, shift, largest = (named, None, None) if jpeg_bgr is None else _matched(area, jpeg_bgr, named, path)
+    how = Development(
+        parameters=parameters,
+        white_balance=white_balance,
+        black_level=black_level,
+        white_level=white_level,
+        area=(area.shape[1], area.shape[0]),
+        crop=crop,
+        shift_px=shift,
+        largest_shift_px=largest,
+        rawpy=str(rawpy.__version__),
+        libraw=".".join(map(str, rawpy.libraw_version)),
+    )
+    return Developed(np.ascontiguousarray(_part(area, crop)), how)
+
+
+def encode_tiff(image_bgr: Pixels16) -> bytes:
+    """A picture (H, W, 3) BGR as a TIFF with 16 bits a channel, compressed without loss."""
+    return cv2.imencode(".tif", image_bgr, _TIFF)[1].tobytes()
+
+
+def read_developed(path: Path) -> Pixels16:
+    """(H, W, 3) BGR of a TIFF that `encode_tiff` wrote. Raises DataError if it is not such a file."""
+    data = np.fromfile(path, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if image is None or image.dtype != np.uint16 or image.ndim != 3:
+        raise DataError(
+            "this is not a developed picture with 16 bits a channel",
+            where=str(path),
+            remedy="Develop the raw file with `orthocapture develop`",
+        )
+    return np.asarray(image, dtype=np.uint16)
+
+
+def coded(linear: Pixels16) -> Pixels16:
+    """Linear values as sRGB-coded ones with 16 bits (IEC 61966-2-1)."""
+    return _CODE[linear]
+
+
+def eight_bits(coded_bgr: Pixels16) -> NDArray[np.uint8]:
+    """sRGB-coded values with 16 bits, rounded to 8."""
+    return ((coded_bgr.astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def _code_table() -> Pixels16:
+    x = np.arange(65536) / 65535
+    y = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.rint(65535 * y).astype(np.uint16)
+
+
+_CODE = _code_table()
+
+
+def _rawpy() -> Any:
+    try:
+        return importlib.import_module("rawpy")
+    except ImportError as error:
+        raise ConfigurationError(
+            "raw files cannot be developed: rawpy is not installed", where="extra raw", remedy=f"Run: {INSTALL}"
+        ) from error
+
+
+def _options(rawpy: Any, parameters: DevelopParameters) -> dict[str, Any]:
+    """The parameters as rawpy takes them; those that it would otherwise choose by the content are set too."""
+    names = [algorithm.name for algorithm in rawpy.DemosaicAlgorithm]
+    if parameters.demosaic not in names:
+        raise ConfigurationError(
+            f"there is no demosaic algorithm {parameters.demosaic}",
+            where="demosaic",
+            remedy=f"Use {', '.join(names)}",
+        )
+    return {
+        "demosaic_algorithm": rawpy.DemosaicAlgorithm[parameters.demosaic],
+        "use_camera_wb": parameters.white_balance == "camera",
+        "output_color": rawpy.ColorSpace[parameters.primaries],
+        "gamma": parameters.gamma,
+        "highlight_mode": rawpy.HighlightMode[parameters.highlights],
+        "no_auto_bright": not parameters.auto_brightness,
+        "fbdd_noise_reduction": rawpy.FBDDNoiseReductionMode.Off,
+        "median_filter_passes": 0,
+        "user_flip": parameters.orientation,
+        "output_bps": parameters.bits,
+        "adjust_maximum_thr": 0.0,  # otherwise the brightest pixel may lower the white level
+        "bright": 1.0,
+    }
+
+
+def _named_crop(sizes: Any) -> Crop:
+    """The crop that the file names, in pixels of the developed area; all of the area if it names none."""
+    left, top = sizes.crop_left_margin - sizes.left_margin, sizes.crop_top_margin - sizes.top_margin
+    inside = left >= 0 and top >= 0 and left + sizes.crop_width <= sizes.width
+    if sizes.crop_width and inside and top + sizes.crop_height <= sizes.height:
+        return Crop(left, top, sizes.crop_width, sizes.crop_height, "file")
+    return Crop(0, 0, sizes.width, sizes.height, "file")
+
+
+def _matched(
+    area: Pixels16, jpeg_bgr: NDArray[np.uint8], named: Crop, path: Path
+) -> tuple[Crop, tuple[float, float], float]:
+    """The crop whose pixels are the JPEG's, its shift against the JPEG, and the largest shift of a part."""
+    height, width = jpeg_bgr.shape[:2]
+    room = area.shape[1] - width, area.shape[0] - height
+    if min(room) < 0 or max(room) > _MOST_ROOM_PX:
+        raise DataError(
+            f"the raw file has {area.shape[1]} × {area.shape[0]} pixels and the JPEG {width} × {height}: "
+            "they are not two pictures of one size",
+            where=str(path),
+            remedy="Set the camera to JPEGs of full size (L), and give the JPEG of the same exposure",
+        )
+    crop = named
+    if (named.width, named.height) != (width, height):
+        crop = Crop(room[0] // 2, room[1] // 2, width, height, "matched")
+    grey = np.asarray(cv2.cvtColor(jpeg_bgr, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+    whole = np.asarray(cv2.cvtColor(eight_bits(coded(area)), cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+    shift = find_shift(grey, _part(whole, crop))
+    dx, dy = (round(s) for s in shift.median_px)
+    if (dx, dy) != (0, 0):
+        left, top = int(np.clip(crop.left + dx, 0, room[0])), int(np.clip(crop.top + dy, 0, room[1]))
+        crop = Crop(left, top, width, height, "matched" if crop.found == "matched" else "moved")
+        shift = find_shift(grey, _part(whole, crop))
+    if not shift.certain:
+        raise DataError(
+            "the raw file and the JPEG do not show the same picture",
+            where=str(path),
+            remedy="Give the JPEG of the same exposure",
+        )
+    if shift.largest_px > MOST_SHIFT_PX:
+        raise DataError(
+            f"parts of the developed picture lie up to {shift.largest_px:.2f} px from where the JPEG shows them; "
+            f"poses and calibration are of the JPEG, so {MOST_SHIFT_PX} px is the most",
+            where=str(path),
+            remedy="Turn the distortion compensation of the camera off, for all images of the calibration too",
+        )
+    return crop, shift.median_px, shift.largest_px
+
+
+def _part(picture: _P, crop: Crop) -> _P:
+    return picture[crop.top : crop.top + crop.height, crop.left : crop.left + crop.width]
+
+
+def _words(error: Exception) -> str:
+    """LibRaw's message."""
+    first = error.args[0] if error.args else ""
+    return first.decode("utf-8", "replace") if isinstance(first, bytes) else str(first or type(error).__name__)

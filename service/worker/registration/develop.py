@@ -1,0 +1,27 @@
+"""Job `develop`: a raw file, developed to a linear TIFF with 16 bits, of the size and in the place of its JPEG."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import cv2
+
+from service.compute.images.develop import DevelopParameters, develop, encode_tiff
+from service.compute.images.files import read_image
+from service.jobs.registration import develop as job
+from service.worker.job import JobAnswer, JobContext
+
+
+def develop_raw(context: JobContext[job.Arguments]) -> JobAnswer:
+    """Develop the raw file with the recorded parameters."""
+    cv2.setNumThreads(1)
+    arguments = context.arguments
+    parameters = DevelopParameters(**arguments.parameters.model_dump())
+    jpeg = read_image(context.input(arguments.jpeg))
+    made = develop(context.input(arguments.raw), jpeg, parameters)
+    tiff = context.keep_bytes(
+        encode_tiff(made.image_bgr), kind="developed", media_type="image/tiff", name=f"{arguments.viewpoint}.tif"
+    )
+    answer = job.Answer.model_validate({**asdict(made.how), "raw": arguments.raw})
+    largest = 0.0 if made.how.largest_shift_px is None else made.how.largest_shift_px
+    return JobAnswer({"largest_shift_px": largest}, (tiff,), answer)
