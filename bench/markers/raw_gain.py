@@ -27,7 +27,8 @@ from bench.machine import RESULTS, commit, machine
 from bench.scenes import SETTINGS, plan_shots
 from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import true_error_m
-from service.compute.images.develop import PARAMETERS, DevelopParameters, coded, develop
+from service.compute.images.develop import coded, develop
+from service.compute.images.develop_parameters import PARAMETERS, DevelopParameters
 from service.compute.images.files import read_image
 from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.detect import detect_spheres

@@ -50,7 +50,7 @@ _COMMANDS = {
     ),
     "note": _Command(
         "service.cli.run.act:note_command",
-        "Write a note on a step of a run, with or without a photograph. It is recorded and has no other effect.",
+        "Write a note on a step of a run, with or without a photograph; the run goes on as it was.",
     ),
     "status": _Command("service.cli.run.status:status_command", "Show the state of a run: steps, gates, deviations."),
     "runs": _Command(

@@ -12,7 +12,8 @@ import typer
 from rich.markup import escape
 
 from service.cli.common import JsonOption, console, print_json, reporting_errors
-from service.compute.images.develop import PARAMETERS, Developed, develop, encode_tiff
+from service.compute.images.develop import Developed, develop, encode_tiff
+from service.compute.images.develop_parameters import PARAMETERS
 from service.compute.images.files import read_image
 from service.core.errors import ConfigurationError, DataError
 

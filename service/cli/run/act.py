@@ -130,7 +130,7 @@ def note_command(
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:
-    """Write a note on a step of a run, with or without a photograph. It is recorded and has no other effect."""
+    """Write a note on a step of a run, with or without a photograph; the run goes on as it was."""
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         protocol, _ = recorded_run(store, run_id)

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compute.images.develop_parameters import PARAMETERS, DevelopParameters
 from service.compute.images.match import find_shift
 from service.core.errors import ConfigurationError, DataError
 
@@ -26,36 +27,6 @@ MOST_SHIFT_PX = 0.25  # of the developed picture against the JPEG; half a pixel 
 _MOST_ROOM_PX = 160  # around the JPEG in the exposed area; cameras leave out some tens of pixels
 _TIFF = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE,
          cv2.IMWRITE_TIFF_PREDICTOR, cv2.IMWRITE_TIFF_PREDICTOR_HORIZONTAL]  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class DevelopParameters:
-    """How every raw file is developed; recorded with each picture, and the same for all.
-
-    Attributes:
-        demosaic: LibRaw's algorithm, by rawpy's name of it; chosen by bench/markers/raw_gain.py.
-        white_balance: `camera`: the gains that the camera recorded for the exposure.
-        primaries: of the picture's colours; the colour matrix is the file's or, without one, LibRaw's for the model.
-        gamma: power and slope of the transfer curve; 1, 1 is linear.
-        highlights: what becomes of saturated channels.
-        auto_brightness: whether the content decides the brightness.
-        noise_reduction: of any kind.
-        orientation: 0: as the sensor read it out.
-        bits: of a channel.
-    """
-
-    demosaic: str = "VNG"
-    white_balance: str = "camera"
-    primaries: str = "sRGB"
-    gamma: tuple[float, float] = (1.0, 1.0)
-    highlights: str = "Clip"
-    auto_brightness: bool = False
-    noise_reduction: bool = False
-    orientation: int = 0
-    bits: int = 16
-
-
-PARAMETERS = DevelopParameters()
 
 
 @dataclass(frozen=True, slots=True)

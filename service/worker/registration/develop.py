@@ -6,7 +6,8 @@ from dataclasses import asdict
 
 import cv2
 
-from service.compute.images.develop import DevelopParameters, develop, encode_tiff
+from service.compute.images.develop import develop, encode_tiff
+from service.compute.images.develop_parameters import DevelopParameters
 from service.compute.images.files import read_image
 from service.jobs.registration import develop as job
 from service.worker.job import JobAnswer, JobContext

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
-from service.compute.images.develop import PARAMETERS
+from service.compute.images.develop_parameters import PARAMETERS
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.jobs.keys import arguments_name
 from service.core.protocol.step_params import RepeatedStep, StepParams
