@@ -10,18 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.poses.files.camera_files import read_camera_json
 from service.compute.poses.files.pose_files import read_poses_csv
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad
-from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig
+from tests.support.protocols.small_demo import SLICE_MM, VIEWS, small_demo
+from tests.support.rig.rig import orthocapture, simulated_rig
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
-SECOND, VIEWS, SLICE_MM = "camera_2", 6, 1.0
-_NEEDS_TIME = ("ground_truth", "specimen_release", "layout_check")
+SECOND = "camera_2"
 
 
 @dataclass(frozen=True)
@@ -41,31 +40,11 @@ class Ended:
         return said
 
 
-def protocol(folder: Path) -> Path:
-    """The demonstration with the arm's poses alone, and three views at each station for each purpose."""
-    document = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text(encoding="utf-8"))
-    steps = [step for step in document["steps"] if step["id"] not in _NEEDS_TIME]
-    for step in steps:
-        for gate in step.get("gates", []):
-            if gate["measure"] == "slice_spacing_mm":
-                gate["max"] = SLICE_MM
-            if gate["measure"] == "specimen_coverage":
-                gate["min"] = 0.3
-        if step["id"].startswith("viewpoint_capture"):
-            step["params"]["viewpoints"][0]["arcs"] = [
-                {"tilt_deg": 28, "azimuth_from_deg": -50, "azimuth_to_deg": 50, "count": 3, "distance_m": 0.66}
-            ]
-            step["gates"][0]["min"] = 3
-        if step["id"] == "registration":
-            step["params"]["poses"] = ["robot", "robot_corrected"]
-            step["gates"] += [
-                {"measure": "further_views", "min": VIEWS, "unit": "images"},
-                {"measure": "further_consistency_mm", "max": 1.5, "unit": "mm"},
-                {"measure": "further_consistency_mrad", "max": 2.0, "unit": "mrad"},
-            ]
-    path = folder / "two_cameras.yaml"
-    path.write_text(yaml.safe_dump({**document, "steps": steps}, sort_keys=False, allow_unicode=True), "utf-8")
-    return path
+FURTHER_GATES = (
+    {"measure": "further_views", "min": VIEWS, "unit": "images"},
+    {"measure": "further_consistency_mm", "max": 1.5, "unit": "mm"},
+    {"measure": "further_consistency_mrad", "max": 2.0, "unit": "mrad"},
+)
 
 
 @pytest.fixture(scope="module", params=["fixed", "stereo"])
@@ -75,8 +54,8 @@ def ended(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     options = ("--scene", "7", "--image-width", "960", "--ct-voxel-mm", str(SLICE_MM), "--speed-up", "10")
     with simulated_rig(folder, *options, "--second-camera", place, host="127.0.0.61") as rig:
         answer = orthocapture(
-            "run", str(protocol(folder)), "--rig", rig["rig"], "--data", str(data), "--operator", "Ada",
-            "--auto-confirm", timeout_s=1400,
+            "run", str(small_demo(folder / "two_cameras.yaml", *FURTHER_GATES)), "--rig", rig["rig"],
+            "--data", str(data), "--operator", "Ada", "--auto-confirm", timeout_s=1400,
         )  # fmt: skip
         assert answer.returncode == 0, answer.stdout[-2000:] + answer.stderr[-3000:]
         truth = json.loads(Path(rig["truth"]).read_text())

@@ -1,0 +1,35 @@
+"""The demonstration with the arm's poses alone and three views at each station, for whole runs with other devices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tests.support.rig.rig import REPOSITORY
+
+SLICE_MM = 1.0  # of the CT, which a simulator makes in seconds
+VIEWS = 6  # at both stations
+_NEEDS_TIME = ("ground_truth", "specimen_release", "layout_check")
+_ARC = {"tilt_deg": 28, "azimuth_from_deg": -50, "azimuth_to_deg": 50, "count": VIEWS // 2, "distance_m": 0.66}
+
+
+def small_demo(path: Path, *registration_gates: dict[str, Any]) -> Path:
+    """Write the protocol to a file; the registration is also judged by these gates."""
+    document = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text(encoding="utf-8"))
+    steps = [step for step in document["steps"] if step["id"] not in _NEEDS_TIME]
+    for step in steps:
+        for gate in step.get("gates", []):
+            if gate["measure"] == "slice_spacing_mm":
+                gate["max"] = SLICE_MM
+            if gate["measure"] == "specimen_coverage":
+                gate["min"] = 0.3
+        if step["id"].startswith("viewpoint_capture"):
+            step["params"]["viewpoints"][0]["arcs"] = [_ARC]
+            step["gates"][0]["min"] = VIEWS // 2
+        if step["id"] == "registration":
+            step["params"]["poses"] = ["robot", "robot_corrected"]
+            step["gates"] += registration_gates
+    path.write_text(yaml.safe_dump({**document, "steps": steps}, sort_keys=False, allow_unicode=True), "utf-8")
+    return path
