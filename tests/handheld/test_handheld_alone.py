@@ -23,9 +23,6 @@ def without_ct(folder: Path) -> Path:
     for step in protocol["steps"]:
         step["gates"] = [gate for gate in step["gates"] if gate.get("unless_skipped") != "ct_import"]
         params = step.get("params", {})
-        if step["kind"] == "registration":
-            params["poses"] = ["spheres"]  # structure from motion is the same with and without a CT
-            step["gates"] = [{"measure": "spheres_markers", "min": 10, "unit": "spheres"}]
         if params.get("compare_with") == "ct_import":
             del params["compare_with"]
         if "spheres_of" in params:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from service.compute.descent import gauss_newton
 from service.core.geometry import Array
 
 _TILES, _TILE_PX = (5, 4), 256
@@ -76,24 +77,35 @@ def _refined(a: NDArray[np.float32], b: NDArray[np.float32], start: Array) -> tu
     a, b = (np.asarray(cv2.GaussianBlur(part, (0, 0), _SMOOTH_PX), dtype=np.float32) for part in (a, b))
     inner = slice(_MARGIN_PX, -_MARGIN_PX)
     aim = a[inner, inner].astype(np.float64).ravel()
-    shift = start
-    for _ in range(_MOST_STEPS):
+
+    def linearised(shift: Array) -> tuple[Array, Array, Array]:
+        """Rows of the equations, their normal matrix, and their solution: gain, offset, gain times the step."""
         # Splines: cv2.warpAffine rounds positions to 1/32 px, and the steps would never end.
         moved = ndimage.shift(b, (-shift[1], -shift[0]), order=3, mode="reflect")[inner, inner]
         dy, dx = np.gradient(moved.astype(np.float64))
         rows = np.stack([moved.ravel(), np.ones(moved.size), dx.ravel(), dy.ravel()], axis=1)
         normal = rows.T @ rows
-        values = np.linalg.solve(normal, rows.T @ aim)
-        step = values[2:] / values[0]
-        shift = shift + step
-        if not np.all(np.abs(shift - start) < _MOST_MOVED_PX):
-            return None
-        if np.abs(step).max() < _DONE_PX:
-            rest = aim - rows @ values
-            sigma_px = np.sqrt(np.diag(np.linalg.inv(normal))[2:] * (rest @ rest) / rest.size) / abs(values[0])
-            # An edge in one direction does not show the shift along it.
-            return (float(shift[0]), float(shift[1])) if sigma_px.max() < _MOST_SIGMA_PX else None
-    return None
+        return rows, normal, np.linalg.solve(normal, rows.T @ aim)
+
+    def near(shift: Array) -> bool:
+        return bool(np.all(np.abs(shift - start) < _MOST_MOVED_PX))
+
+    def step_at(shift: Array) -> Array:
+        if not near(shift):
+            return np.zeros(2)  # lost: there is nothing to follow
+        values = linearised(shift)[2]
+        return np.asarray(values[2:] / values[0], dtype=np.float64)
+
+    shift = gauss_newton(start, step_at, lambda at, step: at + step, most=_MOST_STEPS, settled=_DONE_PX)
+    if not near(shift):
+        return None
+    rows, normal, values = linearised(shift)
+    if np.abs(values[2:] / values[0]).max() >= _DONE_PX:
+        return None
+    rest = aim - rows @ values
+    sigma_px = np.sqrt(np.diag(np.linalg.inv(normal))[2:] * (rest @ rest) / rest.size) / abs(values[0])
+    # An edge in one direction does not show the shift along it.
+    return (float(shift[0]), float(shift[1])) if sigma_px.max() < _MOST_SIGMA_PX else None
 
 
 def _parts(height: int, width: int) -> Iterator[tuple[slice, slice]]:
