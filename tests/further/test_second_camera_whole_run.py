@@ -52,7 +52,7 @@ def ended(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     place, folder = str(request.param), tmp_path_factory.mktemp("second")
     data = folder / "data"
     options = ("--scene", "7", "--image-width", "960", "--ct-voxel-mm", str(SLICE_MM), "--speed-up", "10")
-    with simulated_rig(folder, *options, "--second-camera", place, host="127.0.0.61") as rig:
+    with simulated_rig(folder, *options, "--second-camera", place, host="127.0.0.49") as rig:
         answer = orthocapture(
             "run", str(small_demo(folder / "two_cameras.yaml", *FURTHER_GATES)), "--rig", rig["rig"],
             "--data", str(data), "--operator", "Ada", "--auto-confirm", timeout_s=1400,

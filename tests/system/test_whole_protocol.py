@@ -37,7 +37,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Generator[Whole]:
     protocol = REPOSITORY / "protocols" / "exvivo_spine.yaml"
     short = shortened(protocol, 6, folder / "short.yaml", slice_mm=SLICE_MM, settle_s=1.0, chamfer_spacing_mm=0.4)
     options = ("--scene", "7", "--image-width", WIDTH, "--ct-voxel-mm", str(SLICE_MM), "--speed-up", "10")
-    with simulated_rig(folder, *options, host="127.0.0.41") as rig:
+    with simulated_rig(folder, *options, host="127.0.0.52") as rig:
         answer = orthocapture(
             "run", str(short), "--rig", rig["rig"], "--data", str(data), "--operator", "Ada", "--auto-confirm",
             "--json", timeout_s=1400,

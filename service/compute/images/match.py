@@ -83,9 +83,9 @@ def _refined(a: NDArray[np.float32], b: NDArray[np.float32], start: Array) -> tu
         # Splines: cv2.warpAffine rounds positions to 1/32 px, and the steps would never end.
         moved = ndimage.shift(b, (-shift[1], -shift[0]), order=3, mode="reflect")[inner, inner]
         dy, dx = np.gradient(moved.astype(np.float64))
-        rows = np.stack([moved.ravel(), np.ones(moved.size), dx.ravel(), dy.ravel()], axis=1)
+        rows = np.stack([moved.ravel(), np.ones(moved.size), dx.ravel(), dy.ravel()], axis=1).astype(np.float64)
         normal = rows.T @ rows
-        return rows, normal, np.linalg.solve(normal, rows.T @ aim)
+        return rows, normal, np.linalg.solve(normal, rows.T @ aim).astype(np.float64)
 
     def near(shift: Array) -> bool:
         return bool(np.all(np.abs(shift - start) < _MOST_MOVED_PX))

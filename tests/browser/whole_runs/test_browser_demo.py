@@ -34,7 +34,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     rig_folder = folder / "rig"
     rig_folder.mkdir()
     with (
-        simulated_rig(rig_folder, *options, host="127.0.0.9") as ready,
+        simulated_rig(rig_folder, *options, host="127.0.0.48") as ready,
         served(Path(ready["rig"]), folder / "data", "--protocols", str(_protocols(folder))) as running,
     ):
         add_people(folder / "data", [("tina", "technician"), ("sam", "supervisor"), ("otto", "auditor")])

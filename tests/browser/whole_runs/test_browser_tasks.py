@@ -106,7 +106,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     options = ("--scene", "7", "--image-width", "780", "--speed-up", "10")
     (folder / "rig").mkdir()
     with (
-        simulated_rig(folder / "rig", *options, host="127.0.0.61") as ready,
+        simulated_rig(folder / "rig", *options, host="127.0.0.50") as ready,
         served(Path(ready["rig"]), folder / "data", "--protocols", str(_protocols(folder))) as running,
     ):
         add_people(folder / "data", [("tina", "technician"), ("sam", "supervisor")])
