@@ -52,7 +52,7 @@ def test_the_code_of_the_wheel_is_what_runs(package: Package, tmp_path: Path) ->
 
 
 def test_the_shell_completes_commands_and_options(package: Package, tmp_path: Path) -> None:
-    for typed, offered in (("orthocapture de", ["demo"]), ("orthocapture store gc --rem", ["--remove"])):
+    for typed, offered in (("orthocapture dem", ["demo"]), ("orthocapture store gc --rem", ["--remove"])):
         answer = package.run(
             cwd=tmp_path, _ORTHOCAPTURE_COMPLETE="complete_bash", COMP_WORDS=typed, COMP_CWORD=str(typed.count(" "))
         )
