@@ -96,4 +96,7 @@ def _read(model: type[_T], data: Mapping[str, Any], what: str) -> _T:
     except ValidationError as error:
         first = error.errors()[0]
         path = "/".join(map(str, first["loc"]))
-        raise IntegrityError(f"{what}: {path}: {first['msg']}") from error
+        remedy = (
+            "Verify the record with `orthocapture audit verify`; it should hold what this version or an earlier wrote"
+        )
+        raise IntegrityError(f"{what}: {path}: {first['msg']}", where=path or what, remedy=remedy) from error
