@@ -19,7 +19,7 @@ import numpy as np
 
 from bench.torture.fuzz.mutations import BYTES, JSON, TEXT
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
-from bench.torture.fuzz.targets.wires.peers import threads_watched
+from bench.torture.fuzz.targets.wires.peers import Listener, threads_watched
 from drivers.lightbox import LightboxConfig, SerialLightbox
 from drivers.ur.link import read_facts
 from service.cli.run.terminal.hands import SimulatedHands
@@ -246,33 +246,18 @@ def _fault_plan(data: bytes, _: Path) -> None:
 # --- what drivers read --------------------------------------------------------------------------------------------
 
 
-class _Answering:
+class _Answering(Listener):
     """A server that answers every line, or each connection, with the next part of the input."""
 
     def __init__(self, host: str, port: int, parts: list[bytes]) -> None:
+        super().__init__(host, port)
         self._parts = itertools.cycle(parts or [b""])
-        self._listener = socket.create_server((host, port))
-        self._thread = threading.Thread(target=self._serve, daemon=True)
 
-    def __enter__(self) -> int:
-        self._thread.start()
-        return int(self._listener.getsockname()[1])
-
-    def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(OSError):
-            self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-        self._thread.join(5.0)
-
-    def _serve(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                link, _ = self._listener.accept()
-                with link, contextlib.suppress(OSError):
-                    link.settimeout(1.0)
-                    link.sendall(next(self._parts) + b"\n")
-                    while link.recv(4096):
-                        link.sendall(next(self._parts) + b"\n")
+    def converse(self, link: socket.socket) -> None:
+        link.settimeout(1.0)
+        link.sendall(next(self._parts) + b"\n")
+        while link.recv(4096):
+            link.sendall(next(self._parts) + b"\n")
 
 
 class _Dashboard:
@@ -324,8 +309,8 @@ def _box_answers(_: Path) -> list[bytes]:
 
 def _box_driver(data: bytes, _: Path) -> None:
     """Query a box that answers everything with the input."""
-    with _Answering("127.0.0.1", 0, [data[: 1 << 16]]) as port:
-        box = SerialLightbox(LightboxConfig(port=f"socket://127.0.0.1:{port}", timeout_s=0.05))
+    with _Answering("127.0.0.1", 0, [data[: 1 << 16]]) as peer:
+        box = SerialLightbox(LightboxConfig(port=f"socket://127.0.0.1:{peer.port}", timeout_s=0.05))
         try:
             identity = box.open()
             canonical(dataclasses.asdict(identity))  # as a run records it
@@ -341,8 +326,8 @@ def _hands_answers(_: Path) -> list[bytes]:
 
 
 def _hands(data: bytes, _: Path) -> None:
-    with _Answering("127.0.0.1", 0, [data]) as port:
-        SimulatedHands(f"127.0.0.1:{port}").act("fixation", 1, [HandWork(action="spray")])
+    with _Answering("127.0.0.1", 0, [data]) as peer:
+        SimulatedHands(f"127.0.0.1:{peer.port}").act("fixation", 1, [HandWork(action="spray")])
 
 
 _SIMULATOR: dict[str, Any] = {"errors": (SimulatorError,), "says_place": False}

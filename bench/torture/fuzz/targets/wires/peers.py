@@ -6,6 +6,7 @@ import contextlib
 import socket
 import threading
 from collections.abc import Callable, Generator
+from typing import Self
 
 _PERIOD_S = 0.01
 
@@ -29,22 +30,15 @@ def threads_watched() -> Generator[list[BaseException]]:
         raise died[0]
 
 
-class Peer:
-    """A server on a free port of this machine for one client after another.
+class Listener:
+    """A server for one client after another, which serves for the time of a `with` block."""
 
-    Args:
-        greets: said to each client at once.
-        answers: what is said after each piece that a client sends.
-        goes_on: said again and again while the client is silent.
-    """
-
-    def __init__(self, greets: bytes, answers: Callable[[bytes], bytes], goes_on: bytes = b"") -> None:
-        self._greets, self._answers, self._goes_on = greets, answers, goes_on
-        self._listener = socket.create_server(("127.0.0.1", 0))
+    def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._listener = socket.create_server((host, port))
         self.port = int(self._listener.getsockname()[1])
         self._thread = threading.Thread(target=self._serve, daemon=True)
 
-    def __enter__(self) -> Peer:
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 
@@ -59,11 +53,30 @@ class Peer:
             while True:
                 link, _ = self._listener.accept()
                 with link, contextlib.suppress(OSError):
-                    link.settimeout(_PERIOD_S if self._goes_on else 5.0)
-                    link.sendall(self._greets)
-                    self._converse(link)
+                    self.converse(link)
 
-    def _converse(self, link: socket.socket) -> None:
+    def converse(self, link: socket.socket) -> None:
+        """Talk to a client until it, or this, has nothing more to say."""
+        raise NotImplementedError
+
+
+class Peer(Listener):
+    """A listener on a free port of this machine, which says what it is told to say.
+
+    Args:
+        greets: said to each client at once.
+        answers: what is said after each piece that a client sends.
+        goes_on: said again and again while the client is silent.
+    """
+
+    def __init__(self, greets: bytes, answers: Callable[[bytes], bytes], goes_on: bytes = b"") -> None:
+        super().__init__()
+        self._greets, self._answers, self._goes_on = greets, answers, goes_on
+
+    def converse(self, link: socket.socket) -> None:
+        """Greet, then answer."""
+        link.settimeout(_PERIOD_S if self._goes_on else 5.0)
+        link.sendall(self._greets)
         while True:
             try:
                 heard = link.recv(4096)
