@@ -18,6 +18,7 @@ from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, Transform
 from service.core.records.events import ArtefactRef, FurtherExposure, Matrix4, ViewpointCaptured
 from service.steps.capture.further_cameras import FurtherImage, expose_further, files_of, keep_further
+from service.steps.capture.image_files import put_image
 from service.steps.capture.motion import settle_criteria
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import FurtherCamera, StepContext
@@ -119,19 +120,10 @@ def _during(robot: RobotArm, image: CapturedImage, wanted: CameraSettings) -> tu
 
 def record_shot(context: StepContext, shot: Shot) -> None:
     """Record an image: first its files, then its rows and its event in one transaction."""
-    viewpoint, image = shot.viewpoint, shot.image
     with shot.folder:
-        refs = [
-            context.evidence.put_file(
-                file.path,
-                kind=shot.image_kind if file.media_type == "image/jpeg" else "raw",
-                media_type=file.media_type,
-                original_name=file.camera_name,
-            )
-            for file in image.files
-        ]
+        files = put_image(context, shot.image, shot.image_kind)
         further = tuple(_further_exposure(context, one) for one in shot.further)
-    refs.append(_pose_log(context, viewpoint, shot.window))
+    refs = [*files, _pose_log(context, shot.viewpoint, shot.window)]
     rows = [_row(context, shot, ref, "robot" if ref.kind == "pose_log" else "camera") for ref in refs]
     rows += [_row(context, shot, ref, one.device) for one in further for ref in files_of(context, one)]
     captured = _captured(context, shot, refs).model_copy(update={"further": further})

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from drivers.interfaces import Camera, CameraSettings, CapturedImage
 from service.core.records.events import ArtefactRef, FurtherExposure, ViewpointCaptured
+from service.steps.capture.image_files import put_image
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import FurtherCamera, StepContext
 
@@ -70,15 +71,7 @@ def expose_further(
 def keep_further(context: StepContext, further: FurtherImage) -> tuple[tuple[ArtefactRef, ...], ArtefactRef]:
     """Put the files of a further camera's image into the store, and its calibration; returns both."""
     taken_by = further.taken_by
-    images = tuple(
-        context.evidence.put_file(
-            file.path,
-            kind=IMAGE_KIND if file.media_type == "image/jpeg" else "raw",
-            media_type=file.media_type,
-            original_name=file.camera_name,
-        )
-        for file in further.image.files
-    )
+    images = put_image(context, further.image, IMAGE_KIND)
     calibration = context.evidence.put_file(
         taken_by.calibration,
         kind=CALIBRATION_KIND,

@@ -19,6 +19,7 @@ from drivers.interfaces import Camera, CapturedImage
 from service.core.records.events import ViewHeld, ViewpointFailed
 from service.core.run.state import WAITING_FOR_HAND
 from service.steps.capture.exposure import camera_record, environment_now, settings_agree, wanted_settings
+from service.steps.capture.image_files import put_image
 from service.steps.capture.views import WORTH_ANOTHER_TRY, photograph
 from service.steps.context import StepContext
 from service.store.records import NewArtefact
@@ -110,15 +111,7 @@ class HeldCamera:
         context = self.context
         number = len(context.evidence.captures(context.step.id)) + 1
         name = f"{self.prefix}{number:03d}"
-        refs = tuple(
-            context.evidence.put_file(
-                file.path,
-                kind=self.image_kind if file.media_type == "image/jpeg" else "raw",
-                media_type=file.media_type,
-                original_name=file.camera_name,
-            )
-            for file in image.files
-        )
+        refs = put_image(context, image, self.image_kind)
         view = ViewHeld(
             step=context.step.id,
             attempt=context.attempt,
