@@ -31,7 +31,7 @@ from drivers.errors import (
     UnreadableFileError,
 )
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
-from drivers.photos.frames import FrameFiles
+from drivers.photos.frames import FrameFiles, frame_jpeg
 from drivers.plugin import DriverConfig, DriverSpec
 
 _LOG = logging.getLogger(__name__)
@@ -77,12 +77,7 @@ class _Frame:
         """The image as a file. Raises UnreadableFileError if it cannot be encoded."""
         if self.pixels.shape[0] == 1:
             return self.pixels.tobytes()
-        options = (cv2.IMWRITE_JPEG_QUALITY, 100)
-        sampling = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
-        done, encoded = cv2.imencode(".jpg", self.pixels, [*options, *sampling])
-        if not done:
-            raise UnreadableFileError("An image cannot be encoded", where=where, remedy="Repeat the exposure")
-        return encoded.tobytes()
+        return frame_jpeg(self.pixels, where)
 
 
 class VideoCamera:

@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -27,11 +26,10 @@ from drivers.errors import (
 from drivers.genicam.library import AravisCamera, AravisError, LibraryMissingError, NoImageError, version
 from drivers.genicam.pixels import picture
 from drivers.interfaces import CameraSettings, CapturedImage, DeviceIdentity, DeviceReport
-from drivers.photos.frames import FrameFiles
+from drivers.photos.frames import FrameFiles, frame_jpeg
 from drivers.plugin import DriverConfig, DriverSpec
 
 _TOLERANCE = 0.02  # of aperture and exposure time, as for photographs
-_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 
 
 class GenicamConfig(DriverConfig):
@@ -186,7 +184,7 @@ class GenicamCamera:
         pixels = self._acquired(settings.exposure_s)
         arrived_s = time.monotonic()
         self._taken += 1
-        file = self._files.write(self._taken, self._jpeg(pixels), folder)
+        file = self._files.write(self._taken, frame_jpeg(pixels, self._where), folder)
         size = int(pixels.shape[1]), int(pixels.shape[0])
         self._files.accept(file, size)
         return CapturedImage(
@@ -211,7 +209,7 @@ class GenicamCamera:
 
     def preview(self) -> bytes:
         """Take an image and return it as JPEG bytes."""
-        return self._jpeg(self._acquired(self.settings().exposure_s))
+        return frame_jpeg(self._acquired(self.settings().exposure_s), self._where)
 
     def _acquired(self, exposure_s: float) -> NDArray[np.uint8]:
         try:
@@ -232,12 +230,6 @@ class GenicamCamera:
                 remedy="Close other programs that use the camera, and open it again",
             )
         return pixels
-
-    def _jpeg(self, pixels: NDArray[np.uint8]) -> bytes:
-        done, encoded = cv2.imencode(".jpg", pixels, _JPEG)
-        if not done:
-            raise UnreadableFileError("An image cannot be encoded", where=self._where, remedy="Repeat the exposure")
-        return encoded.tobytes()
 
     # --- the link ---------------------------------------------------------------------------------------------
 

@@ -94,7 +94,7 @@ class GphotoCamera:
         maker, model = self._link.value("manufacturer"), self._link.value("cameramodel")
         self._profile_name, profile = profile_for(maker, model, self._config.profile, self._link.where)
         self._opened = profile, Dials(self._link, profile, self._config.white_balance)
-        self._dials.set(profile.target.name, self._target_word(profile))
+        self._dials.set(profile.target.name, self._target_word())
         self._identity = DeviceIdentity(
             kind="camera",
             model=model,
@@ -106,8 +106,13 @@ class GphotoCamera:
         )
         return self._identity
 
-    def _target_word(self, profile: Profile) -> str:
-        wanted = self._config.capture_target or next(iter(profile.targets))
+    @property
+    def _target(self) -> str:
+        """What the camera keeps the image on: as configured, else what the profile prefers."""
+        return self._config.capture_target or next(iter(self._profile.targets))
+
+    def _target_word(self) -> str:
+        wanted, profile = self._target, self._profile
         if wanted not in profile.targets:
             raise DeviceRefusedError(
                 f"capture_target {wanted} is not possible with the profile {self._profile_name}",
@@ -272,8 +277,7 @@ class GphotoCamera:
 
     def _check_space(self) -> None:
         free = self._link.free_bytes()
-        target = self._config.capture_target or next(iter(self._profile.targets))
-        if free is not None and (free == 0 or (target != "computer" and free < LEAST_FREE_BYTES)):
+        if free is not None and (free == 0 or (self._target != "computer" and free < LEAST_FREE_BYTES)):
             raise DeviceStorageFullError(
                 f"{free / 1e6:.0f} MB free in the camera", where=self._link.where, remedy="Empty or change the card"
             )

@@ -4,9 +4,26 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from drivers.errors import StaleImageError, UnreadableFileError
 from drivers.interfaces import CapturedFile
 from drivers.photos.photo_file import check_jpeg_complete, sha256_of
+
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+
+
+def frame_jpeg(pixels: NDArray[np.uint8], where: str) -> bytes:
+    """Pixels (H, W, 3) BGR or (H, W) grey as JPEG of quality 100 without chroma subsampling.
+
+    Raises UnreadableFileError if they cannot be encoded.
+    """
+    done, encoded = cv2.imencode(".jpg", pixels, _JPEG)
+    if not done:
+        raise UnreadableFileError("An image cannot be encoded", where=where, remedy="Repeat the exposure")
+    return encoded.tobytes()
 
 
 class FrameFiles:
