@@ -12,6 +12,7 @@ import numpy as np
 from simulators.geometry import Array, Array32, Bools, Bytes, Ints, inverse
 from simulators.rendering.overlays import Frame, draw_calibration_board, draw_sphere
 from simulators.rendering.sensor import EXPOSED, FULL_WELL_E, READ_NOISE_E, Light, light_of
+from simulators.rendering.srgb import coded_table
 from simulators.rendering.surfaces import Surfaces
 from simulators.scene.intrinsics import Intrinsics
 from simulators.scene.world import NOMINAL_LUX, RADIUS_M, Moved, Scene
@@ -206,15 +207,7 @@ def _edges(depth: Array32, material: Bytes) -> Bools:
 
 
 _SRGB_STEPS = 4095
-
-
-def _srgb_table() -> Bytes:
-    x = np.arange(_SRGB_STEPS + 1) / _SRGB_STEPS
-    y = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-9), 1 / 2.4) - 0.055)
-    return np.round(255.0 * y).astype(np.uint8)
-
-
-_SRGB = _srgb_table()
+_SRGB = coded_table(_SRGB_STEPS)
 
 
 def _srgb(linear: Array32) -> Bytes:

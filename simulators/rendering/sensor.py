@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.geometry import Array32, Bytes
+from simulators.rendering.srgb import coded_table
 
 FULL_WELL_E, READ_NOISE_E = 40_000.0, 4.0
 BLACK, WHITE = 512, 16_383  # of 14 bits
@@ -111,17 +112,10 @@ def _sites() -> Iterator[tuple[tuple[int, int], int]]:
     yield from (((0, 0), 0), ((0, 1), 1), ((1, 0), 1), ((1, 1), 2))
 
 
-def _coded_table() -> Bytes:
-    """sRGB values of all values of light (IEC 61966-2-1)."""
-    x = np.arange(_FULL + 1) / _FULL
-    value = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-9), 1 / 2.4) - 0.055)
-    return np.rint(255.0 * value).astype(np.uint8)
-
-
 def _light_table() -> Light:
     """Light of all sRGB values."""
     x = np.arange(256) / 255
     return np.rint(_FULL * np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)).astype(np.uint16)
 
 
-_CODED, _LIGHT = _coded_table(), _light_table()
+_CODED, _LIGHT = coded_table(_FULL), _light_table()
