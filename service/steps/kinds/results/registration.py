@@ -97,6 +97,9 @@ class OneRegistration(MeasureRecord):
     )
 
 
+_CONSISTENCY = ("consistency_mm", "consistency_mrad")  # measures of the job that locates a further camera
+
+
 class Measures(RegistrationMeasures[OneRegistration]):
     """Of the outlines, and of every registration."""
 
@@ -259,8 +262,6 @@ def _with_further_cameras(outcome: StepOutcome, located: Mapping[str, JobResult]
         result=outcome.result.model_copy(update={"cameras": cameras}),
     )
 
-
-_CONSISTENCY = ("consistency_mm", "consistency_mrad")
 
 KIND = StepKind(
     "registration",
