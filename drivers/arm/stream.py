@@ -66,11 +66,11 @@ class PoseStream:
         return self.newest() is not None
 
     def newest(self) -> RobotSample | None:
-        """Return the newest sample, or None if it is stale; does not wait."""
+        """Return the newest sample, or None if it is stale or the stream has ended; does not wait."""
         with self._lock:
             newest = self._samples[-1] if self._samples else None
         fresh = newest is not None and time.monotonic() - newest.monotonic_s <= self._stale_after_s
-        return newest if fresh else None
+        return newest if fresh and not self._death else None
 
     def await_first(self, timeout_s: float) -> None:
         """Wait for the first sample, which on a busy machine comes later than any other may."""
@@ -79,13 +79,13 @@ class PoseStream:
             time.sleep(POLL_S)
 
     def latest(self) -> RobotSample:
-        """Return the newest sample. Raises DeviceUnavailableError if it is stale."""
+        """Return the newest sample. Raises DeviceUnavailableError if it is stale or the stream has ended."""
         deadline_s = time.monotonic() + self._stale_after_s
         while True:
             with self._lock:
                 newest = self._samples[-1] if self._samples else None
             now_s = time.monotonic()
-            if newest is not None and now_s - newest.monotonic_s <= self._stale_after_s:
+            if newest is not None and now_s - newest.monotonic_s <= self._stale_after_s and not self._death:
                 return newest
             waits = newest is None or self._not_looking(now_s)
             if self._death or now_s > deadline_s or not waits:

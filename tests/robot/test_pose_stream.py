@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 
 import numpy as np
+import pytest
 
 from drivers.arm.stream import PoseStream
+from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import RobotSample, SafetyState
 
 
@@ -26,3 +29,21 @@ def test_all_that_arrived_meanwhile_is_taken_at_once_and_in_order() -> None:
     finally:
         stream.close()
     assert [s.monotonic_s for s in taken] == [0.01 * i for i in range(20_000)]
+
+
+def test_a_stream_that_has_ended_brings_nothing_however_young_its_last_sample() -> None:
+    arrived = deque([sample(time.monotonic())])
+
+    def read() -> RobotSample:
+        if not arrived:
+            raise ConnectionError("the controller hung up")
+        return arrived.popleft()
+
+    stream = PoseStream(read, stale_after_s=600.0, where="a test", vendor_errors=(ConnectionError,))
+    try:
+        stream.catch_up()
+        assert stream.newest() is None
+        with pytest.raises(DeviceUnavailableError, match="the controller hung up"):
+            stream.latest()
+    finally:
+        stream.close()
