@@ -11,7 +11,6 @@ import numpy as np
 from service.compute.ground_truth.surface import Surface
 from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.stereo.closed import closed
-from service.compute.stereo.filling import FillLimits, filled
 from service.compute.stereo.fusion import fused
 from service.compute.stereo.guided import guided_depth
 from service.compute.stereo.matching import DepthMap, depth_of_pair
@@ -23,7 +22,6 @@ from service.core.geometry import Array
 
 COARSE_PX, FINE_PX = 960, 1920  # width of the images that are matched at first and then; larger ones are made smaller
 VOXEL_PX = 1.5  # size of a voxel in pixels at the object
-NEAR_VOXELS, FAR_VOXELS, BEHIND_VOXELS = 3.0, 60.0, 6.0  # when holes are filled
 _MANY = 24  # depth maps; a surface that so many could see must be seen by several
 _FEWEST_AT_FIRST, _FEWEST = 3, 2  # then
 
@@ -34,8 +32,7 @@ def reconstruct(views: Sequence[StereoView], progress: Progress) -> Surface:
     """The surface that posed images of pinhole cameras show, in the frame and unit of the poses.
 
     A first surface from small images, closed where nothing was matched, is the guess around which larger images are
-    matched. The depth of both is fused: the first holds more of what is steep, the second is finer. Its holes are
-    filled by the closed surface, where views see it and no depth maps see through it.
+    matched. The depth of both is fused: the first holds more of what is steep, the second is finer.
 
     Raises:
         ComputeError: no two images can be matched, or no surface comes out.
@@ -61,11 +58,7 @@ def reconstruct(views: Sequence[StereoView], progress: Progress) -> Surface:
         found = guided_depth(rectified(large[one], large[two], centre), near, _distance_m(large, one, two, centre))
         fine += [] if found is None else [found]
     progress("fusing all depth maps", 0, 0)
-    voxel_m = VOXEL_PX * _footprint_m(large, centre)
-    found = _surface([*coarse, *fine], voxel_m, _FEWEST if many else 1)
-    progress("filling holes", 0, 0)
-    limits = FillLimits(NEAR_VOXELS * voxel_m, FAR_VOXELS * voxel_m, BEHIND_VOXELS * voxel_m)
-    return filled(found, closed(found), [*coarse, *fine], small, limits)
+    return _surface([*coarse, *fine], VOXEL_PX * _footprint_m(large, centre), _FEWEST if many else 1)
 
 
 def _surface(maps: Sequence[DepthMap], voxel_m: float, least: int) -> Surface:
