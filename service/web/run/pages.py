@@ -28,7 +28,7 @@ from service.steps import step_kinds
 from service.store.files.space_used import forecast_of
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
-from service.web.run.notes import Note, notes_of
+from service.web.run.notes import PageNote, notes_of
 from service.web.run.view import run_view
 from service.web.run.view_records import RunView, Viewer
 from service.web.security.guards import SignedInPerson, requires
@@ -68,7 +68,7 @@ class RunPage:
     acceptors: list[Account]
     looking_back: bool
     dialog: str
-    notes: tuple[Note, ...]
+    notes: tuple[PageNote, ...]
     about: list[tuple[str, str]]
     reasons: Reasons
     signing: SigningSection

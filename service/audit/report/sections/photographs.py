@@ -7,10 +7,10 @@ their hashes, which are their names in the evidence.
 from __future__ import annotations
 
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Pictures, Section, Table
+from service.audit.report.blocks import Block, Column, Heading, Paragraph, Pictures, Section, Table, TableCell
 from service.audit.report.drawings.pictures import LARGE_PX, THUMBNAIL_PX, picture
 from service.audit.report.drawings.scene import report_scene
-from service.core.records.events import View
+from service.core.records.events import RecordedView
 
 
 def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
@@ -32,11 +32,11 @@ def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
     scene = report_scene(run.summary(), turning=turning)
     if scene is not None:
         blocks += [Heading(scene.drawing.title), scene]
-    originals: list[tuple[Cell | str, ...]] = []
+    originals: list[tuple[TableCell | str, ...]] = []
     for step in run.protocol.steps:
         seqs = sorted(run.state.steps[step.id].captured.values())
         captures = [(seq, run.events[seq - 1].payload) for seq in seqs]
-        views = [(seq, capture) for seq, capture in captures if isinstance(capture, View)]
+        views = [(seq, capture) for seq, capture in captures if isinstance(capture, RecordedView)]
         if views:
             sheet = tuple(picture(run, view.artefacts[0].sha256, _caption(view), THUMBNAIL_PX) for _, view in views)
             blocks += [Heading(f"Contact sheet: {step.title}"), Pictures(sheet, 5)]
@@ -59,6 +59,6 @@ def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
     return Section("Pictures", tuple(blocks) or (Paragraph("No photograph was taken."),))
 
 
-def _caption(capture: View) -> str:
+def _caption(capture: RecordedView) -> str:
     failed = [name for name, passed in capture.verdicts.items() if not passed]
     return capture.viewpoint + (f" ✗ {', '.join(failed)}" if failed else "")

@@ -20,7 +20,7 @@ from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import ComputedBy, Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
-from service.jobs.records import Mounting, Photograph
+from service.jobs.records import Mounting, PosedPhotograph
 from service.jobs.registration import detect_spheres, develop, further_camera, register
 from service.jobs.registration.register import Registration
 from service.jobs.surfaces import locate_spheres
@@ -198,7 +198,7 @@ def _search(context: StepContext, params: Params) -> JobRequest:
     return JobRequest.of(detect_spheres.KIND, arguments, references)
 
 
-def _developed(context: StepContext, images: list[Photograph]) -> dict[str, str]:
+def _developed(context: StepContext, images: list[PosedPhotograph]) -> dict[str, str]:
     """The developed raw file of each image, by viewpoint."""
     raws = raw_files(context, images)
     parameters = develop.Parameters.model_validate(asdict(PARAMETERS))
@@ -215,7 +215,7 @@ def _developed(context: StepContext, images: list[Photograph]) -> dict[str, str]
     return {image.viewpoint: result.artefacts[0].sha256 for image, result in zip(images, results, strict=True)}
 
 
-def _mounting(context: StepContext, params: Params, images: list[Photograph]) -> CameraMounting:
+def _mounting(context: StepContext, params: Params, images: list[PosedPhotograph]) -> CameraMounting:
     """How the camera was mounted on the arm; empty where a person held it."""
     if params.hand_eye is None:
         return CameraMounting(Mounting(), {})
