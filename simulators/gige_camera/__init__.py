@@ -1,4 +1,4 @@
-"""A simulated industrial camera: GenICam registers and images over GigE Vision. Command-line options and main loop."""
+"""A simulated industrial camera: GenICam registers and images over GigE Vision. Options and main loop."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the camera's options."""
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on; its port is always 3956")
     parser.add_argument("--world", metavar="HOST:PORT", help="take images of the rig's world")
-    parser.add_argument("--image-width", type=int, default=_WIDTH, metavar="W", help=f"image width (default {_WIDTH})")
+    parser.add_argument(
+        "--image-width", type=int, default=_WIDTH, metavar="W", help=f"image width (default {_WIDTH})"
+    )
     parser.add_argument("--aperture-f", type=float, default=22.0, metavar="F", help="as the lens is set by hand")
     parser.add_argument("--exposures-log", type=Path, metavar="FILE", help="write one JSON line per exposure")
     parser.add_argument("--first-counter", type=int, default=1, help="number of the first image")

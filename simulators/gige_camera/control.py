@@ -1,4 +1,4 @@
-"""GigE Vision's control protocol (GVCP) on UDP: discovery, registers, memory, resend requests; one client controls."""
+"""GigE Vision's control protocol (GVCP) on UDP: discovery, registers, memory, resends; one client controls."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from simulators.gige_camera.registers import (
     DISCOVERY_BYTES,
     HEARTBEAT_MS,
     INVALID_PARAMETER,
-    Registers,
     RefusedError,
+    Registers,
 )
 from simulators.serve import SimulatorError
 

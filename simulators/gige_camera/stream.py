@@ -1,4 +1,4 @@
-"""GigE Vision's stream protocol (GVSP) on UDP: an image as leader, payload packets and trailer; packets sent again."""
+"""GigE Vision's stream protocol (GVSP) on UDP: an image as leader, payload and trailer; packets sent again."""
 
 from __future__ import annotations
 
