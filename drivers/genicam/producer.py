@@ -120,15 +120,16 @@ class ProducerCamera:
 
     def set_exposure_s(self, exposure_s: float) -> None:
         """Set the exposure time; the camera may round it."""
-        self._set(exposure_s * _US, *_EXPOSURE)
+        self._set_number(exposure_s * _US, *_EXPOSURE)
 
     def set_gain(self, gain: float) -> None:
         """Set the gain, in the camera's own unit."""
-        self._set(gain, *_GAIN)
+        self._set_number(gain, *_GAIN)
 
     def set_pixel_format(self, name: str) -> None:
         """Set the pixel format by its GenICam name, such as BayerRG8."""
-        self._set(name, "PixelFormat")
+        with self._told():
+            self._feature("PixelFormat").value = name
 
     def acquire(self, timeout_s: float) -> Frame:
         """Expose and receive one image. Raises NoImageError or LinkError."""
@@ -153,9 +154,12 @@ class ProducerCamera:
         with self._told():
             return self._feature(*names).value
 
-    def _set(self, value: float | str, *names: str) -> None:
+    def _set_number(self, value: float, *names: str) -> None:
+        """Set a real or whole number, within the camera's limits."""
         with self._told():
-            self._feature(*names).value = value
+            feature = self._feature(*names)
+            within = min(feature.max, max(feature.min, value))
+            feature.value = type(feature.value)(within)
 
     def _feature(self, *names: str) -> Any:
         """The first of these features that the camera has. Raises LinkError."""

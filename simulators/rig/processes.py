@@ -19,13 +19,13 @@ import yaml
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand.technician import MISHAP_EVERY, Hand
+from simulators.rig.cameras import CAMERAS, again, is_still, place, section
 from simulators.rig.world_server import World, WorldServer
 from simulators.scene.second_camera import NAME as SECOND
 from simulators.scene.second_camera import PLACES, SecondCamera
 from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
 from simulators.serve import SimulatorError, Termination, announce
 
-CAMERAS = {"Sony ILCE-7RM5": "camera", "Canon EOS R5": "canon"}  # model: its simulator
 _LOAD_KG = 1.6  # camera, lens and mount
 _TAPE_SIGMA_M = 0.003  # accuracy with which a technician measures the scene's centre with a tape
 
@@ -69,6 +69,8 @@ def serve(args: argparse.Namespace) -> None:
         raise SimulatorError("--without-cable is for a camera that a person holds: add --hand")
     if args.second_camera and args.hand:
         raise SimulatorError("--second-camera needs an arm: leave --hand out")
+    if not is_still(args.camera) and (args.hand or args.second_camera):
+        raise SimulatorError("--hand and --second-camera are for still cameras, not for --camera " + args.camera)
     termination = Termination()
     rig = _Rig(args, termination)
     try:
@@ -125,8 +127,8 @@ class _Rig:
                 f"--initial-joints={joints}", "--world", world, "--arm", arm, *self._model(),
             )  # fmt: skip
         camera = self._child(
-            "camera", CAMERAS[self.args.camera], "--port", "0", "--world", world,
-            "--image-width", str(self.args.image_width),
+            "camera", CAMERAS[self.args.camera], *place(self.args.camera, self.args.host, self.folder),
+            "--world", world, "--image-width", str(self.args.image_width),
             "--exposures-log", str(self._exposures_log("camera")),
             *(("--send-to", str(self.folder / "photographs")) if self.args.without_cable else ()),
         )  # fmt: skip
@@ -135,7 +137,7 @@ class _Rig:
         self._child("lightbox", "lightbox", "--link", str(self.folder / "lightbox"), "--world", world)
         self._write_truth()
         rig = self.folder / "rig.yaml"
-        rig.write_text(yaml.safe_dump(self._rig_file(camera["gphoto_port"], hosts), sort_keys=False))
+        rig.write_text(yaml.safe_dump(self._rig_file(camera, hosts), sort_keys=False))
         announce(
             rig=str(rig),
             world=world,
@@ -195,8 +197,7 @@ class _Rig:
         if name in ("camera", SECOND):
             log = self._exposures_log(name)
             taken = len(log.read_text().splitlines()) if log.exists() else 0
-            port = self._ready[name]["gphoto_port"].rpartition(":")[2]
-            words += ["--port", port, "--first-counter", str(taken + 1)]  # these override the first ones
+            words += again(self._ready[name], taken)  # these override the first ones
         with suppress(SimulatorError):  # it is retried
             self._child(name, *words)
 
@@ -228,7 +229,7 @@ class _Rig:
         stem, _, last = first.rpartition(".")
         return [first, f"{stem}.{int(last) + 1}"][: len(self.arms)]
 
-    def _rig_file(self, gphoto_port: str, hosts: list[str]) -> dict[str, Any]:
+    def _rig_file(self, camera: dict[str, Any], hosts: list[str]) -> dict[str, Any]:
         driver = {"ur": "ur", "kuka": "kuka_sunrise"}[self.scene.arm.simulator]
         robots = {arm: {"driver": driver, "host": host} for arm, host in zip(self.arms, hosts, strict=True)}
         rig: dict[str, Any] = {
@@ -237,8 +238,8 @@ class _Rig:
             "hands": self.server.address,
             "devices": {
                 **robots,
-                "camera": self._camera(gphoto_port),
-                **({SECOND: self._camera(self._ready[SECOND]["gphoto_port"])} if self.second else {}),
+                "camera": self._camera(camera),
+                **({SECOND: self._camera(self._ready[SECOND])} if self.second else {}),
                 "scanner": {"driver": "scan_folder", "folder": "scans", "unit": "mm", "stable_s": 1.0},
                 "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
                 "lightbox": {"driver": "lightbox", "port": "lightbox"},
@@ -258,10 +259,10 @@ class _Rig:
             "lens": self._lens(),
         }
 
-    def _camera(self, gphoto_port: str) -> dict[str, Any]:
+    def _camera(self, ready: dict[str, Any]) -> dict[str, Any]:
         if self.args.without_cable:
             return {"driver": "photo_folder", "folder": "photographs", "stable_s": 1.0}
-        return {"driver": "gphoto", "port": gphoto_port, "capture_timeout_s": self._exposure_s()}
+        return section(self.args.camera, ready, self._exposure_s())
 
     def _exposure_s(self) -> float:
         """Longest time that one picture may take, since this camera renders it: up to some seconds per megapixel."""
