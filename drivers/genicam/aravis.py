@@ -14,6 +14,7 @@ from drivers.genicam.link import Frame, LibraryMissingError, LinkError, NoImageE
 
 LIBRARIES = ("aravis-0.8", "gobject-2.0", "glib-2.0")
 _SUCCESS = 0  # of ArvBufferStatus
+_NO_PACKET_SOCKET = 1  # of ArvGvStreamOption
 _POINTER, _TEXT, _REAL = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_double
 _US = 1e6  # microseconds in a second: Aravis' unit of times
 
@@ -34,6 +35,7 @@ class AravisCamera:
         """
         self._aravis, self._gobject, self._glib = (_library(name) for name in LIBRARIES)
         self._camera: int | None = self._call("arv_camera_new", _POINTER, name.encode(), of=(_TEXT,))
+        self._use_udp_sockets()
 
     def close(self) -> None:
         """Disconnect."""
@@ -101,6 +103,19 @@ class AravisCamera:
             return self._frame(buffer)
         finally:
             self._unref(buffer)
+
+    def _use_udp_sockets(self) -> None:
+        """Images over GigE Vision come by an UDP socket, as from any program.
+
+        Where a process may open packet sockets, Aravis would read one that for a moment, until its filter is set, sees
+        all traffic of the machine, and takes what it sees for an image.
+        """
+        is_gige = self._aravis.arv_camera_is_gv_device
+        is_gige.restype, is_gige.argtypes = ctypes.c_int, (_POINTER,)
+        if is_gige(self._camera):
+            choose = self._aravis.arv_camera_gv_set_stream_options
+            choose.restype, choose.argtypes = None, (_POINTER, ctypes.c_int)
+            choose(self._camera, _NO_PACKET_SOCKET)
 
     def _text(self, what: str) -> str:
         """The text that `arv_camera_get_…` gives."""

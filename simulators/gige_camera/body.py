@@ -56,28 +56,28 @@ class IndustrialBody:
         self._counter = first_counter
         self._lens = Lens()
         self._previous = b""
-        self._wanted = threading.Event()  # acquisition is on
+        self._acquisition: threading.Event | None = None  # the one that is on; set: to be stopped
         self._going = threading.Lock()
 
     def written(self, address: int) -> None:
         """Act on a register that a client has written."""
-        if address == STOP:
-            self._wanted.clear()
-        elif address == START and not self._wanted.is_set():
-            self._wanted.set()
-            threading.Thread(target=self._acquire, name="acquisition", daemon=True).start()
+        if address == STOP and self._acquisition is not None:
+            self._acquisition.set()
+        elif address == START and (self._acquisition is None or self._acquisition.is_set()):
+            self._acquisition = stop = threading.Event()
+            threading.Thread(target=self._acquire, args=(stop,), name="acquisition", daemon=True).start()
 
-    def _acquire(self) -> None:
+    def _acquire(self, stop: threading.Event) -> None:
         with self._going:  # an exposure that was stopped may still be rendered
-            while self._wanted.is_set():
+            while not stop.is_set():
                 try:
-                    self._expose()
+                    self._expose(stop)
                 except SimulatorError:
                     _LOG.exception("exposure %d gave no image", self._counter)
                 if self._registers.get(ACQUISITION_MODE) == SINGLE_FRAME:
-                    self._wanted.clear()
+                    stop.set()
 
-    def _expose(self) -> None:
+    def _expose(self, stop: threading.Event) -> None:
         began_ns = time.monotonic_ns()
         counter, self._counter = self._counter, self._counter + 1
         settings = self._settings()
@@ -91,8 +91,7 @@ class IndustrialBody:
             pixels = self._previous
         self._previous = pixels
         left_s = settings.exposure_s - (time.monotonic_ns() - began_ns) / 1e9
-        time.sleep(max(0.0, left_s))
-        if not self._wanted.is_set() or kind == "no_image":
+        if stop.wait(max(0.0, left_s)) or kind == "no_image":
             return
         self._write_log(moment, settings)
         lost = 3 if kind in ("lost_packets", "truncate") else 0

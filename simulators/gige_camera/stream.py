@@ -37,6 +37,8 @@ class Stream:
         self._lock = threading.Lock()
         self._block = 0
         self._packets: list[bytes] = []  # of the last image
+        self._sent = 0  # of these
+        self._to = ("", 0)
         self._lost_for_good: frozenset[int] = frozenset()
 
     def send(
@@ -47,24 +49,28 @@ class Stream:
         middle = len(packets) // 2
         missing = frozenset(range(middle, middle + lost))
         with self._lock:
-            self._block, self._packets = block, packets
+            self._block, self._packets, self._sent = block, packets, 0
+            address = socket.inet_ntoa(self._registers.read(STREAM_ADDRESS, 4))
+            self._to = address, self._registers.get(STREAM_PORT) & 0xFFFF
             self._lost_for_good = missing if for_good else frozenset()
         pause_s = self._registers.get(PACKET_DELAY) / TICKS_PER_S * _AT_ONCE
         for number, packet in enumerate(packets):
-            if number not in missing:
-                self._put(packet)
+            with self._lock:
+                if number not in missing:
+                    self._put(packet)
+                self._sent = number + 1
             if number % _AT_ONCE == 0:
                 time.sleep(pause_s)
 
     def resend(self, block: int, first: int, last: int) -> None:
-        """Send packets of the last image again; what is not there any more is said to be unavailable."""
+        """Send packets of the last image again; what is lost for good is said to be unavailable.
+
+        Packets that were not sent yet, and those of other images, are not sent.
+        """
         with self._lock:
-            packets = self._packets if block == self._block else []
-            for number in range(first, min(last, first + len(self._packets)) + 1):
-                if number < len(packets) and number not in self._lost_for_good:
-                    self._put(packets[number])
-                else:
-                    self._put(_header(block, _PAYLOAD, number, _UNAVAILABLE))
+            for number in range(first, min(last + 1, self._sent) if block == self._block else first):
+                lost = number in self._lost_for_good
+                self._put(_header(block, _PAYLOAD, number, _UNAVAILABLE) if lost else self._packets[number])
 
     def _packed(self, block: int, code: int, pixels: bytes, exposed_ns: int) -> list[bytes]:
         size = (self._registers.get(WIDTH), self._registers.get(HEIGHT))
@@ -77,10 +83,8 @@ class Stream:
         return packets
 
     def _put(self, packet: bytes) -> None:
-        address = socket.inet_ntoa(self._registers.read(STREAM_ADDRESS, 4))
-        port = self._registers.get(STREAM_PORT) & 0xFFFF
-        if port:
-            self._socket.sendto(packet, (address, port))
+        if self._to[1]:
+            self._socket.sendto(packet, self._to)
 
 
 def _header(block: int, kind: int, number: int, status: int = 0) -> bytes:
