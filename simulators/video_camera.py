@@ -18,6 +18,11 @@ from simulators.still_camera.exif import ExposureSettings
 from simulators.still_camera.scene import ImageSource, Moment, StillLife, WorldSource
 
 _WIDTH, _QUALITY = 960, 95
+# With this comment every image begins. It goes out behind the image before, which for FFmpeg is whole when another
+# one begins; and FFmpeg reads blocks of this size.
+_BLOCK = 4096
+_START = b"\xff\xd8"
+_HEAD = _START + b"\xff\xfe" + (_BLOCK + 2).to_bytes(2, "big") + bytes(_BLOCK)
 _STALE_S = 1.0  # a frame that took longer is dropped, as a camera's program does that cannot follow
 _SETTINGS = ExposureSettings(22.0, 1 / 15, (1, 15), 100)  # as they are dialled in by hand
 
@@ -27,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pipe", type=Path, required=True, help="named pipe; it is made if there is none")
     parser.add_argument("--world", metavar="HOST:PORT", help="film the rig's world")
     parser.add_argument("--image-width", type=int, default=_WIDTH, metavar="W", help="width of its images")
-    parser.add_argument("--frame-rate", type=float, default=4.0, metavar="HZ", help="images a second")
+    parser.add_argument("--frame-rate", type=float, default=2.0, metavar="HZ", help="images a second")
     parser.add_argument("--exposures-log", type=Path, metavar="FILE", help="write one JSON line per image")
     parser.add_argument("--first-counter", type=int, default=1, help="number of the first image")
 
@@ -58,15 +63,20 @@ def serve(args: argparse.Namespace) -> None:
 
 def _write_on(pipe: int, film: _Film, interval_s: float, termination: Termination) -> None:
     """Write images until the end, or until nobody reads any more (BrokenPipeError)."""
+    _write(pipe, _HEAD, termination)
     while not termination.is_set():
         began_s = time.monotonic()
         data = film.next_image()
         if time.monotonic() - began_s < _STALE_S:
             film.note(data)
-            while data and not termination.is_set():
-                if select.select([], [pipe], [], 0.2)[1]:
-                    data = data[os.write(pipe, data) :]
+            _write(pipe, data.removeprefix(_HEAD) + _HEAD, termination)
         time.sleep(max(0.0, began_s + interval_s - time.monotonic()))
+
+
+def _write(pipe: int, data: bytes, termination: Termination) -> None:
+    while data and not termination.is_set():
+        if select.select([], [pipe], [], 0.2)[1]:
+            data = data[os.write(pipe, data) :]
 
 
 class _Film:
@@ -92,7 +102,7 @@ class _Film:
         )
         if not done:
             raise SimulatorError("the picture could not be encoded as JPEG")
-        return encoded.tobytes()
+        return _HEAD + encoded.tobytes().removeprefix(_START)
 
     def note(self, data: bytes) -> None:
         """Write the truth about an image that goes out."""
