@@ -107,8 +107,8 @@ class AravisCamera:
     def _use_udp_sockets(self) -> None:
         """Images over GigE Vision come by a UDP socket, as from any program.
 
-        Where a process may open packet sockets, Aravis would read one. Until its filter is set, it sees all traffic of
-        the machine, and takes it for an image.
+        Where a process may open packet sockets, Aravis would read one. Until its filter is set, that sees all traffic
+        of the machine, which is taken for an image.
         """
         is_gige = self._aravis.arv_camera_is_gv_device
         is_gige.restype, is_gige.argtypes = ctypes.c_int, (_POINTER,)
