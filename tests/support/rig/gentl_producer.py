@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Generator
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def compiled_producer(folder: Path) -> Path:
 
 
 @contextmanager
-def industrial_camera(host: str, *words: str, faults: tuple[dict[str, object], ...] = ()) -> Generator[None]:
+def industrial_camera(host: str, *words: str, faults: Sequence[Mapping[str, object]] = ()) -> Generator[None]:
     """The simulated camera at an address of the loopback; its images have 480 × 320 px."""
     plan = json.dumps([{"device": "camera", "on": "image", **fault} for fault in faults])
     with simulator("gige", "--host", host, "--image-width", "480", "--faults", plan, *words):
