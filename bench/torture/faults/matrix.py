@@ -49,6 +49,17 @@ _CAMERA: dict[str, tuple[str, int, int, int]] = {
     "ptpip/file": ("a packet of a file", 1, 2, 1),
     "ptpip/request": ("a request to the camera", 1, 6, 1),
 }
+# What Sony's bodies do not have, and the files: an EOS tells everything as an answer to the polling of its events.
+_CANON: dict[str, tuple[str, int, int, int]] = {
+    "ptpip/remote_mode": ("the answer to the remote mode", -1, 1, 1),
+    "ptpip/event_mode": ("the answer to the event mode", -1, 1, 1),
+    "ptpip/events": ("a packet of the camera's events", 1, 4, 1),
+    "ptpip/eos_set": ("the answer to a setting", -1, 2, 1),
+    "ptpip/press": ("the answer to the full press of the shutter", 1, 2, 1),
+    "ptpip/let_go": ("the answer to its release", 1, 1, 1),
+    "ptpip/file_info": ("the description of a file", 1, 1, 1),
+    "ptpip/file": ("a packet of a file", 1, 2, 1),
+}
 _TABLE: dict[str, tuple[str, int, int, int]] = {
     "grbl/welcome": ("the controller's welcome", -1, 1, 1),
     "grbl/setting": ("a setting", -1, 20, 1),
@@ -56,6 +67,8 @@ _TABLE: dict[str, tuple[str, int, int, int]] = {
     "grbl/answer": ("the answer to a piece of a motion", 1, 3, 1),
     "grbl/query": ("a request for a report", 1, 20, 1),
     "grbl/jog": ("a piece of a motion", 1, 3, 1),
+    "grbl/home": ("the command to home", -1, 1, 1),
+    "grbl/homed": ("the answer to homing", -1, 1, 1),
 }
 _KUKA: dict[str, tuple[str, int, int, int]] = {
     "lines/hello": ("the application's greeting", -1, 1, 1),
@@ -64,6 +77,11 @@ _KUKA: dict[str, tuple[str, int, int, int]] = {
     "lines/done": ("the end of a motion", 1, 1, 1),
     "lines/request": ("a request to the application", 1, 1, 1),
     "lines/beat": ("a sign of life", 1, 20, 1),
+}
+# Datagrams, a hundred a second; forty of them are spoilt, of those that nobody waits for.
+_FRI: dict[str, tuple[str, int, int, int]] = {
+    "fri/message": ("each of 40 messages of FRI", 1, 20, 40),
+    "fri/reply": ("each of 40 replies to FRI", 1, 20, 40),
 }
 _LIGHTBOX: dict[str, tuple[str, int, int, int]] = {
     "serial/identity": ("the box's identity", -1, 1, 1),
@@ -75,7 +93,7 @@ _LIGHTBOX: dict[str, tuple[str, int, int, int]] = {
 # Messages that the protocol cannot refuse, or that cannot be reordered because the sender waits for the answer.
 _NO_REFUSAL = {"rtde/controller", "rtde/stream", "rtde/command", "dashboard/welcome", "script/script"} | {
     "ptpip/event", "ptpip/request", "serial/request", "grbl/welcome", "grbl/status", "grbl/query", "grbl/jog",
-    "lines/state", "lines/done", "lines/request", "lines/beat",
+    "lines/state", "lines/done", "lines/request", "lines/beat", "grbl/home", "fri/message", "fri/reply",
 }  # fmt: skip
 
 
@@ -279,11 +297,13 @@ def cases() -> dict[str, Case]:
         *_more_of_the_robot(),
         *_wires("camera", "camera", _CAMERA),
         *_camera_itself(),
+        *_wires("canon", "canon", _CANON),
         *_wires("lightbox", "lightbox", _LIGHTBOX),
         Case("lightbox/itself/unplugged", "lightbox", "the serial cable is unplugged", after=1, act="unplug"),
         *_wires("table", "table", _TABLE),
         *_table_itself(),
         *_wires("kuka", "kuka", _KUKA),
+        *_wires("kuka", "fri", _FRI),
         *_kuka_itself(),
         *_video_itself(),
         *_files(),

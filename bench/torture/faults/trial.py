@@ -49,6 +49,7 @@ from tests.support.rig.bench_rig import BenchArm, BenchCamera
 STATIONS: dict[str, dict[str, Any]] = {
     "table": {"station": TABLE_STATION, "camera_m": 0.0},
     "kuka": {"station": KUKA_STATION},
+    "fri": {"station": KUKA_STATION},
 }
 _UNSIGNED = "the record could not be signed"
 _SESSIONS = 3  # programs that drive the run in turn, if an error ends them
@@ -111,18 +112,20 @@ class Trial:
     def _laboratory(self) -> Laboratory:
         devices = {
             "arm": self._arm_devices,
-            "camera": self._camera_devices,
+            "camera": lambda: self._camera_devices("camera"),
+            "canon": lambda: self._camera_devices("canon"),
             "lightbox": self._lightbox_devices,
             "scan": self._scan_devices,
             "ct": self._ct_devices,
             "table": lambda: {"robot": table_rig(self, self._plan())},
             "kuka": lambda: {"robot": kuka_rig(self, self._plan())},
+            "fri": lambda: {"robot": kuka_rig(self, self._plan(), fri=True)},
             "video": lambda: {"camera": video_rig(self)},
         }
         scene = self.case.scene
         rig = write_rig(self.folder, devices[scene]() if scene in devices else {}, **STATIONS.get(scene, {}))
-        self.arm = arm = None if scene in ("arm", "table", "kuka") else BenchArm()
-        self.shutter = shutter = None if scene in ("camera", "video") else BenchCamera(picture=exposed)
+        self.arm = arm = None if scene in ("arm", "table", "kuka", "fri") else BenchArm()
+        self.shutter = shutter = None if scene in ("camera", "canon", "video") else BenchCamera(picture=exposed)
         if arm is not None:
             arm.on_move = self._eye.began
         elif scene == "arm":
@@ -148,8 +151,8 @@ class Trial:
         limits = {"connect_timeout_s": 2.0, "watchdog_s": 1.0, "stale_after_s": 2.0}
         return {"robot": {"driver": "ur", "host": host, **limits}}
 
-    def _camera_devices(self) -> dict[str, Any]:
-        words = ("camera", "--port", "0", "--fast", "--image-width", "96", *self._plan(), *self.case.options)
+    def _camera_devices(self, body: str) -> dict[str, Any]:
+        words = (body, "--port", "0", "--fast", "--image-width", "96", *self._plan(), *self.case.options)
         ready = self.simulators.start(*words)
         port, near_port = int(ready["port"]), 15740
         self.wired(Wire("camera", "ptpip", (self._near_host, near_port), ("127.0.0.1", port)))
