@@ -83,6 +83,15 @@ _FRI: dict[str, tuple[str, int, int, int]] = {
     "fri/message": ("each of 40 messages of FRI", 1, 20, 40),
     "fri/reply": ("each of 40 replies to FRI", 1, 20, 40),
 }
+_LISTEN: dict[str, tuple[str, int, int, int]] = {
+    "dicom/associate": ("the request of an association", -1, 1, 1),
+    "dicom/accept": ("the answer to it", -1, 1, 1),
+    "dicom/command": ("the head of a slice", -1, 30, 1),
+    "dicom/slice": ("a slice", -1, 30, 1),
+    "dicom/stored": ("the answer to a slice", -1, 30, 1),
+    "dicom/release": ("the end of an association", -1, 1, 1),
+    "dicom/released": ("the answer to its end", -1, 1, 1),
+}
 _LIGHTBOX: dict[str, tuple[str, int, int, int]] = {
     "serial/identity": ("the box's identity", -1, 1, 1),
     "serial/light": ("a reading of the light", 1, 1, 1),
@@ -94,17 +103,29 @@ _LIGHTBOX: dict[str, tuple[str, int, int, int]] = {
 _NO_REFUSAL = {"rtde/controller", "rtde/stream", "rtde/command", "dashboard/welcome", "script/script"} | {
     "ptpip/event", "ptpip/request", "serial/request", "grbl/welcome", "grbl/status", "grbl/query", "grbl/jog",
     "lines/state", "lines/done", "lines/request", "lines/beat", "grbl/home", "fri/message", "fri/reply",
+    "dicom/associate", "dicom/command", "dicom/slice", "dicom/release", "dicom/released",
 }  # fmt: skip
 
 
-def _wires(device: str, scene: Scene, kinds: dict[str, tuple[str, int, int, int]]) -> Iterator[Case]:
+def _wires(device: str, scene: Scene, kinds: dict[str, tuple[str, int, int, int]], act: str = "") -> Iterator[Case]:
     for place, (what, after, nth, times) in kinds.items():
         kind = place.split("/")[1]
         for column, happens in COLUMNS.items():
             if column == "reject" and place in _NO_REFUSAL:
                 continue
-            spoil = Spoil(kind, column, nth, times)
-            yield Case(f"{device}/{place}/{column}", scene, f"{what} {happens}", spoil, after)
+            spoil = Spoil(kind, column, nth, 1 if column.startswith("away_") else times)
+            # With noise libgphoto2 hangs at an EOS until its process is killed, a minute for each attempt.
+            patience = 1 if scene == "canon" and column == "noise" else 3
+            yield Case(
+                f"{device}/{place}/{column}",
+                scene,
+                f"{what} {happens}",
+                spoil,
+                after,
+                act=act,
+                mend=act,
+                patience=patience,
+            )
 
 
 def _robot_itself() -> Iterator[Case]:
@@ -256,6 +277,19 @@ def _files() -> Iterator[Case]:
     yield Case("ct/series/none", "ct", "there is no series", act="no_export", mend="ct")
 
 
+def _listen_itself() -> Iterator[Case]:
+    def case(name: str, what: str, act: str, mend: str, **value: object) -> Case:
+        return Case(f"listen/itself/{name}", "listen", what, act=act, mend=mend, value=value)
+
+    yield case("sender_killed", "the sender dies in the middle of a series", "send_cut", "send")
+    yield case("sender_killed_on", "the same, and nobody sends again", "send_cut", "")
+    yield case("receiver_killed", "the receiver is killed in the middle of a series", "receiver_killed", "listen")
+    yield case("disk_full", "the disk is full", "send", "listen", full=True)
+    yield case("slice_missing", "a slice is missing in what is sent", "send_spoilt", "send_afresh", kind="drop")
+    yield case("slice_cut", "a slice that is sent ends early", "send_spoilt", "send_afresh", kind="truncate")
+    yield case("two_series", "two series are sent at once", "send_two", "send_afresh")
+
+
 # Calls of each kind that a capture makes after its first image is recorded: the disk fails at each of them.
 _CALLS = {"write": 6, "sync_file": 6, "rename": 5, "make_read_only": 4, "sync_directory": 8, "commit": 6, "append": 1}
 
@@ -307,6 +341,8 @@ def cases() -> dict[str, Case]:
         *_kuka_itself(),
         *_video_itself(),
         *_files(),
+        *_wires("listen", "listen", _LISTEN, act="send"),
+        *_listen_itself(),
         *_store(),
     ]
     return {case.name: case for case in found}

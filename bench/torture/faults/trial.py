@@ -18,6 +18,7 @@ from bench.torture.faults.acts import ACTS, MENDS, SEAMS
 from bench.torture.faults.case import Case
 from bench.torture.faults.judgement import rules
 from bench.torture.faults.judgement.verdict import Verdict, errors_of, first_words, listed, masked, policy_of
+from bench.torture.faults.place.ct_suite import Suite
 from bench.torture.faults.place.disk import FaultyDisk, JumpingClock
 from bench.torture.faults.place.laboratory import (
     CT,
@@ -52,6 +53,7 @@ STATIONS: dict[str, dict[str, Any]] = {
     "fri": {"station": KUKA_STATION},
 }
 _UNSIGNED = "the record could not be signed"
+_IMPORTS = ("scan", "ct", "listen")  # scenes without views, whose jobs are worked on here
 _SESSIONS = 3  # programs that drive the run in turn, if an error ends them
 
 
@@ -87,6 +89,7 @@ class Trial:
         self.words: list[str] = []
         self.verdict = Verdict(case.name)
         self.film: Film | None = None
+        self.suite: Suite | None = None
         self._eye: Motions = Motions()
 
     # --- the rig ------------------------------------------------------------------------------------------
@@ -117,6 +120,7 @@ class Trial:
             "lightbox": self._lightbox_devices,
             "scan": self._scan_devices,
             "ct": self._ct_devices,
+            "listen": self._listen_devices,
             "table": lambda: {"robot": table_rig(self, self._plan())},
             "kuka": lambda: {"robot": kuka_rig(self, self._plan())},
             "fri": lambda: {"robot": kuka_rig(self, self._plan(), fri=True)},
@@ -178,6 +182,10 @@ class Trial:
             "ct": {"driver": "dicom_folder", "folder": str(self.scene_folder), "stable_s": 0.5},
         }
 
+    def _listen_devices(self) -> dict[str, Any]:
+        self.suite = Suite(self)
+        return self.suite.rig(full=bool(self.case.value.get("full")))
+
     # --- the run ------------------------------------------------------------------------------------------
 
     def run(self) -> None:
@@ -204,7 +212,7 @@ class Trial:
             logging.getLogger(chatty).setLevel(logging.WARNING)
 
     def _begin(self, store: Store, station: Laboratory) -> str:
-        text = {"scan": SCAN, "ct": CT, "table": TABLE}.get(self.case.scene, PROTOCOL)
+        text = {"scan": SCAN, "ct": CT, "listen": CT, "table": TABLE}.get(self.case.scene, PROTOCOL)
         distance_m = self.case.value.get("distance_m", 0.5 if self.case.scene == "arm" else 0.6)
         source = text.replace("DISTANCE", str(distance_m)).encode()
         loaded = parse_protocol(source, params_models(), name="faults.yaml")
@@ -290,7 +298,9 @@ class Trial:
 
     def _look(self, state: RunState) -> None:
         self._arm_now(len(state.steps["capture"].captured) if "capture" in state.steps else 0)
-        if state.current and self.case.scene in ("scan", "ct"):
+        if self.suite is not None:
+            self.suite.look()
+        if state.current and self.case.scene in _IMPORTS:
             self._work()
 
     def _arm_now(self, captured: int) -> None:
@@ -307,7 +317,7 @@ class Trial:
 
     def _prepare(self, step: str) -> None:
         """Prepare a step, as a technician does."""
-        if self.case.scene == "ct" and step == "scan":
+        if self.case.scene in ("ct", "listen") and step == "scan":
             scan_folder(self.folder / "scans", self.material, FIVE)
 
     def _mend(self) -> None:
@@ -315,9 +325,9 @@ class Trial:
         if mend is not None:
             mend(self)
         elif self.proxy is not None and self.case.spoil is not None and self.case.spoil.column.startswith("away_"):
-            self._await_return()
+            self.await_return()
 
-    def _await_return(self) -> None:
+    def await_return(self) -> None:
         """Wait until the device is back, unless it never comes back."""
         assert self.proxy is not None
         assert self.case.spoil is not None
@@ -332,7 +342,7 @@ class Trial:
 
     def _work(self) -> None:
         """Work on jobs in this process, as a worker process does."""
-        if self.case.scene not in ("scan", "ct"):
+        if self.case.scene not in _IMPORTS:
             return
         if not database_path(self.data).exists():
             return
@@ -360,8 +370,12 @@ class Trial:
         if not verdict.end:
             verdict.end = f"the run is {status or 'stopped'}"
             verdict.broken.append(f"{verdict.end}, but no way on is listed")
-        views = VIEWS if self.case.scene not in ("scan", "ct") else ()
-        logs = (self.folder / "program.log", self.folder / "said.log")
+        views = VIEWS if self.case.scene not in _IMPORTS else ()
+        logs = (self.folder / "program.log", self.folder / "said.log", self.folder / "received.log")
+        if self.suite is not None:
+            column = self.case.spoil.column if self.case.spoil else ""
+            self.suite.check(content=column not in ("corrupt", "mutated"))
+            verdict.broken += self.suite.faults
         verdict.broken += rules.broken(events, self._eye, self.data, views, status, logs)
 
 

@@ -213,6 +213,36 @@ class PtpIp(_Buffered):
         return {2: "connect", 4: "event_connect", EVENT: "event"}.get(kind, "")
 
 
+_PDUS = {1: "associate", 2: "accept", 5: "release", 6: "released"}
+
+
+class Dicom(_Buffered):
+    """PDUs of DICOM's upper layer: type, a byte, length (big-endian u32), content; data are named by their kind."""
+
+    def __init__(self, *, answers: bool) -> None:
+        super().__init__()
+        self._answers = answers
+
+    def feed(self, data: bytes) -> list[Message]:
+        """Add bytes; returns the PDUs that are now complete."""
+        self._buffer += data
+        found: list[Message] = []
+        while len(self._buffer) >= 6:
+            size = 6 + int.from_bytes(self._buffer[2:6], "big")
+            if len(self._buffer) < size:
+                break
+            message, self._buffer = self._buffer[:size], self._buffer[size:]
+            found.append((self._kind(message), message))
+        return found
+
+    def _kind(self, message: bytes) -> str:
+        if message[0] != 4 or len(message) < 12:
+            return _PDUS.get(message[0], "")
+        if self._answers:
+            return "stored"
+        return "command" if message[11] & 1 else "slice"
+
+
 # --- saying no ------------------------------------------------------------------------------------------------
 
 _ACCESS_DENIED = 0x200F
@@ -226,6 +256,12 @@ def refused(device: str, kind: str, message: bytes) -> bytes:  # noqa: PLR0911 -
         if struct.unpack_from("<I", message, 4)[0] == RESPONSE:
             return message[:8] + struct.pack("<H", _ACCESS_DENIED) + message[10:14] + bytes(len(message) - 14)
         raise KeyError(kind)
+    if device == "ct":
+        if kind == "accept":
+            return bytes([3, 0, 0, 0, 0, 4, 0, 1, 1, 1])
+        status = bytes.fromhex("0000000902000000")  # (0000,0900), two bytes
+        at = message.index(status) + len(status)
+        return message[:at] + b"\x00\xa7" + message[at + 2 :]
     if device == "lightbox":
         return b"ERR 2 refused\r\n"
     if device == "table":

@@ -20,6 +20,7 @@ from typing import Any, Literal
 from bench.torture.faults.wire.framing import (
     RESPONSE,
     START_DATA,
+    Dicom,
     Framer,
     Grbl,
     JsonLines,
@@ -61,8 +62,8 @@ class Wire:
     `rewrite` is replaced in requests, as by a router that translates addresses.
     """
 
-    device: Literal["robot", "camera", "lightbox", "table", "kuka"]
-    protocol: Literal["rtde", "dashboard", "script", "ptpip", "serial", "grbl", "kuka", "fri"]
+    device: Literal["robot", "camera", "lightbox", "table", "kuka", "ct"]
+    protocol: Literal["rtde", "dashboard", "script", "ptpip", "serial", "grbl", "kuka", "fri", "dicom"]
     listen: tuple[str, int] | str
     upstream: tuple[str, int] | str
     rewrite: tuple[bytes, bytes] = (b"", b"")
@@ -349,6 +350,8 @@ def _framer(wire: Wire, link: _Link, *, answers: bool) -> Framer:  # noqa: PLR09
             return Grbl(link.talk, answers=answers)
         case "kuka":
             return JsonLines(answers=answers)
+        case "dicom":
+            return Dicom(answers=answers)
         case _:  # the light box
             words = {"*idn": "identity", "light": "light", "temp": "temperature", "shutter": "shutter"}
             return Lines({**words, "pedal": "pedal", "#": "banner"}) if answers else Lines({}, "request")
