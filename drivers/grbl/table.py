@@ -142,7 +142,7 @@ class GrblTable:
         """Permit motion after a person's confirmation, and home the axes if their position is not known.
 
         Raises SafetyStopError or LeaveNeededError for a stop that is active or was seen after that time, and for
-        homing that failed.
+        homing that failed; DeviceUnavailableError if the line is dead.
         """
         link, mover = self._linked(), self._mover
         mover.refuse_while_door_is_open()
@@ -162,6 +162,8 @@ class GrblTable:
                 with contextlib.suppress(DeviceError):
                     link.reset(self._config.connect_timeout_s)
                 mover.latch.end(f"homing failed ({error.what})")
+            if isinstance(error, DeviceUnavailableError):  # a confirmation alone would not bring the line back
+                raise
             raise (mover.latch.stop or error) from error
         finally:
             mover.resetting = False

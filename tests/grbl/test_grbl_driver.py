@@ -223,6 +223,19 @@ def losing(answers: int, after: bytes) -> Callable[[bytes, bool], bytes]:
     return spoil
 
 
+def test_a_cable_that_is_pulled_while_it_homes_is_unavailable_and_not_a_question_of_leave(tmp_path: Path) -> None:
+    """With a question alone a person could confirm for ever: only opening it again brings the line back."""
+    with table(tmp_path, *fault(on="$H", kind="unplug", value=0.5)) as port, opened(port) as arm:
+        with pytest.raises(DeviceUnavailableError, match="connection is lost"):
+            let_move(arm)
+        wait_for(port.exists)
+        arm.open()
+        with pytest.raises(LeaveNeededError):
+            move(arm, -10)
+        let_move(arm)
+        travel(arm, -10)
+
+
 @pytest.mark.parametrize("lost", ["answer", "command"])
 def test_homing_without_an_answer_is_noticed_long_before_its_longest_time(tmp_path: Path, lost: str) -> None:
     plan = fault(on="$H", kind="drop") if lost == "command" else ()
