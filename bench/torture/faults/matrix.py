@@ -115,7 +115,7 @@ def _wires(device: str, scene: Scene, kinds: dict[str, tuple[str, int, int, int]
                 continue
             spoil = Spoil(kind, column, nth, 1 if column.startswith("away_") else times)
             # With noise libgphoto2 hangs at an EOS until its process is killed, a minute for each attempt.
-            patience = 1 if scene == "canon" and column == "noise" else 3
+            patience = 1 if scene == "canon" and column in ("noise", "mutated") else 3
             yield Case(
                 f"{device}/{place}/{column}",
                 scene,
