@@ -310,6 +310,7 @@ def camera_record(image: CapturedImage) -> dict[str, object]:
         "height": image.height,
         "lens_serial": image.lens_serial,
         "body_serial": image.body_serial,
+        "model": image.model,
         "focus_distance_m": image.focus_distance_m,
         "focus_position": image.focus_position,
     }
