@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,11 +10,13 @@ import numpy as np
 
 from service.core.equipment.camera_clocks import ClockOffset, clock_offset
 from service.core.equipment.recorded_devices import RecordedOptics, recorded_optics
+from service.core.geometry import Transform
 from service.core.protocol.models import Protocol
 from service.core.records.events import ArtefactRef, FurtherExposure, View, ViewpointCaptured
 from service.core.run.state import RunState
 from service.core.units import mm, mrad
 from service.dataset.registrations import further_cameras
+from service.jobs.records import Matrix
 from service.jobs.registration.further_camera import Answer
 
 
@@ -66,6 +68,28 @@ def pose_sigmas(located: Answer) -> tuple[float, float]:
     """Standard deviations of a located camera's position (m) and rotation (rad): roots of the traces."""
     variances = np.diag(np.array(located.covariance))
     return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:].sum()))
+
+
+def further_pose(located: Answer, T_scan_first: Matrix | None) -> Transform | None:
+    """T_scan_camera (4, 4) of a further camera while the first one was at this pose; None where it is not known."""
+    if located.T_outer_camera is None or (located.mounted == "rigid" and T_scan_first is None):
+        return None
+    T_outer_camera = np.array(located.T_outer_camera)
+    return T_outer_camera if located.mounted == "fixed" else np.array(T_scan_first) @ T_outer_camera
+
+
+def further_poses(
+    protocol: Protocol, state: RunState, views: Iterable[View], T_scan_first: Mapping[str, Matrix]
+) -> dict[str, dict[str, Transform]]:
+    """T_scan_camera of every further camera by its name: by viewpoint if it is rigid, once if it is fixed."""
+    found: dict[str, dict[str, Transform]] = {}
+    for camera in known_further_cameras(protocol, state, views):
+        for viewpoint in camera.images:
+            pose = None if camera.located is None else further_pose(camera.located, T_scan_first.get(viewpoint))
+            if pose is not None:
+                shown = camera.name if camera.mounted == "fixed" else f"{viewpoint}, {camera.name}"
+                found.setdefault(camera.name, {})[shown] = pose
+    return found
 
 
 def known_further_cameras(

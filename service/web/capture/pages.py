@@ -25,6 +25,7 @@ from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
 if TYPE_CHECKING:
+    from service.web.capture.cameras import CameraImage, SheetImage
     from service.web.capture.plan_drawing import PlanDrawing
     from service.web.capture.view import Redo, Verdict, View, ViewState
 
@@ -46,6 +47,7 @@ class CaptureQuery(BaseModel):
     views: int = Field(0, ge=0, le=100_000)  # page of the table; 0: the one that shows where the run is
     replaced: bool = False  # list replaced images too
     plain: bool = False  # without the outlines of spheres
+    device: str = Field("", max_length=64)  # a further camera, whose images are shown; "": the first one
 
 
 Wanted = Annotated[CaptureQuery, Query()]
@@ -66,8 +68,8 @@ class ViewTable:
 class ContactSheet:
     """A page of the contact sheet."""
 
-    captures: list[Capture]  # on this page
-    uses: Mapping[str, BoardUse]  # of board images, by SHA-256
+    images: list[SheetImage]  # on this page
+    devices: list[str]  # further cameras that took images in this step
     replaced: int  # images of the step that no longer count
     page: int
     pages: int
@@ -78,7 +80,8 @@ class ChosenImage:
     """The large image; `capture` is None where the step has none to show."""
 
     capture: Capture | None
-    verdicts: list[Verdict]
+    camera: CameraImage | None  # the camera whose image is large
+    cameras: list[CameraImage]  # all that exposed at this viewpoint
     sums: list[Verdict]  # of all images up to this one
     registered: bool  # the spheres have the numbers of the registration
 
@@ -184,7 +187,7 @@ def _of_step(site: Site, person: Person, log: RunRecord, step: Step, wanted: Cap
         step=step,
         table=_table(views, view, wanted.views),
         sheet=_sheet(log, step, captures, wanted),
-        image=_image(log, step, chosen, captures),
+        image=_image(log, step, chosen, captures, wanted.device),
         drawings=_drawings(log, views, name),
         view=view,
         redo=None if view is None else capture_view.redo_of(log, step, view, person.account),
@@ -230,31 +233,43 @@ def _table(views: list[View], view: View | None, page: int) -> ViewTable:
 
 def _sheet(log: RunRecord, step: Step, captures: Sequence[Capture], wanted: CaptureQuery) -> ContactSheet:
     """A page of the contact sheet: images with something wrong first, then newest first."""
+    from service.web.capture.cameras import devices_in, sheet_image  # noqa: PLC0415
+
     valid = [c for c in captures if c.replaced is None]
     uses = board_uses(log.state, log.events, step.id)
     listed = sorted(
         captures if wanted.replaced else valid, key=lambda c: _is_problem(c, uses.get(c.sha256))
     )  # stable
-    pages = max(1, -(-len(listed) // SHEET))
+    devices = devices_in(log, captures)
+    device = wanted.device if wanted.device in devices else ""
+    images = [image for c in listed[::-1] if (image := sheet_image(log, c, uses, device)) is not None]
+    pages = max(1, -(-len(images) // SHEET))
     page = min(wanted.page, pages)
     return ContactSheet(
-        captures=listed[::-1][(page - 1) * SHEET : page * SHEET],
-        uses=uses,
+        images=images[(page - 1) * SHEET : page * SHEET],
+        devices=devices,
         replaced=len(captures) - len(valid),
         page=page,
         pages=pages,
     )
 
 
-def _image(log: RunRecord, step: Step, chosen: Capture | None, captures: Sequence[Capture]) -> ChosenImage:
+def _image(
+    log: RunRecord, step: Step, chosen: Capture | None, captures: Sequence[Capture], device: str
+) -> ChosenImage:
     """The large image, with what is known about it."""
     from service.web.capture import view as capture_view  # noqa: PLC0415
+    from service.web.capture.cameras import camera_images  # noqa: PLC0415
     from service.web.record.known_spheres import best_registration  # noqa: PLC0415
 
     valid = [c for c in captures if c.replaced is None]
+    cameras: list[CameraImage] = []
+    if chosen is not None:
+        cameras = camera_images(log, chosen, capture_view.verdicts_of(log, step, chosen, valid), valid)
     return ChosenImage(
         capture=chosen,
-        verdicts=[] if chosen is None else capture_view.verdicts_of(log, step, chosen, valid),
+        camera=next((one for one in cameras if one.device == device), cameras[0] if cameras else None),
+        cameras=cameras,
         sums=[] if chosen is None else capture_view.summary_of(step, chosen),
         registered=best_registration(log) is not None and (chosen is None or chosen.replaced is None),
     )
