@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from service.compute.poses.files.pose_files import read_poses_csv
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad
 from service.core.records.events import JobFinished, ViewpointCaptured
 from service.store.store import Store
+from tests.support.pages.web import web_site
 from tests.support.protocols.small_demo import SLICE_MM, VIEWS, small_demo
 from tests.support.rig.rig import orthocapture, simulated_rig
 
@@ -192,6 +194,55 @@ def test_its_images_show_the_spheres_where_its_pose_says(ended: Ended, name: str
 
 def _seen(points_m: Array, T_world_camera: Transform) -> Array:
     return (points_m - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+
+
+def test_pages_show_every_camera(ended: Ended, tmp_path: Path) -> None:
+    shutil.copytree(ended.data, tmp_path / "data")
+    with web_site(tmp_path) as site:
+        browser, run = site.browser("auditor"), site.store.find_run("latest")
+        capture = f"/runs/{run}/capture?step=viewpoint_capture_1"
+        first, fixed = (browser.get(f"{capture}&viewpoint=v1_002{more}").text for more in ("", f"&device={FIXED}"))
+        assert first.count("thumbnail=320") == fixed.count("thumbnail=320") == 3
+        assert "This image, camera_2" in fixed
+        assert "13 seen" in fixed
+        picture = f"/runs/{run}/images/v1_002?device={FIXED}&width=960"
+        plain, marked = (browser.get(picture + more).content for more in ("", "&marked=1"))
+        assert marked.startswith(b"\xff\xd8")
+        assert marked != plain, "the outlines of the spheres"
+        scene = browser.get(f"/runs/{run}/scene/frame").text
+        assert all(f'"name":"{name}"' in scene for name in (FIXED, STEREO))
+        pages = (
+            f"/audit/runs/{run}/devices",
+            f"/runs/{run}/scene",
+            f"/runs/{run}/dataset",
+            f"/runs/{run}/calibration",
+        )
+        for page in pages:
+            text = browser.get(page).text
+            for name in (FIXED, STEREO):
+                said = ended.said_of(name)
+                for figure in (
+                    f"{said['sigma_mm']:.3f} mm",
+                    f"± {said['clock_offset_sigma_s']:.3f} s",
+                    f"{name}.json",
+                ):
+                    assert figure in text, (page, name, figure)
+
+
+def test_the_report_states_every_camera(ended: Ended) -> None:
+    html = ended.data.parent / "report.html"
+    made = orthocapture("audit", "report", "latest", "--html", str(html), "--data", str(ended.data), timeout_s=200)
+    assert made.returncode == 0, made.stdout + made.stderr
+    text = html.read_text(encoding="utf-8")
+    with Store.open(ended.data, create=False) as store:
+        rows = store.artefacts(store.find_run("latest"))
+    for name in (FIXED, STEREO):
+        said = ended.said_of(name)
+        files = [row.ref for row in rows if row.device == name]
+        assert f"Contact sheet: Viewpoint capture at station 1, {name}" in text
+        assert f"{said['sigma_mm']:.3f}" in text
+        assert f"{said['clock_offset_s']:+.3f} ± {said['clock_offset_sigma_s']:.3f} s" in text
+        assert all(ref.sha256 in text for ref in files if ref.kind in ("further_image", "camera_calibration"))
 
 
 def test_the_evidence_verifies_and_replays(ended: Ended) -> None:

@@ -27,6 +27,7 @@ from service.store.database.tables import artefacts
 from service.store.files.artefacts import to_artefact
 from service.web.record.images import Capture, find_capture, further_of
 from service.web.record.pictures import IMAGE_WIDTHS, PICTURES, cached, nearest_width, reduced_jpeg, safe_name
+from service.web.record.rig_cameras import rig_cameras
 from service.web.security.guards import requires
 from service.web.site import CurrentSite, Site
 
@@ -166,11 +167,13 @@ def _photograph(log: RunRecord, capture: Capture, device: str) -> ArtefactRef:
     responses={204: {"description": "no frame yet"}},
     response_class=FileResponse,
 )
-def live_view(site: CurrentSite, run_id: RunId) -> Response:
-    """The camera's newest frame. Each request keeps the frames coming; an old frame is not shown as live."""
+def live_view(site: CurrentSite, run_id: RunId, camera: Annotated[str, Query(max_length=64)] = "") -> Response:
+    """A camera's newest frame. Each request keeps the frames coming; an old frame is not shown as live."""
+    if camera and camera not in rig_cameras(site.run(run_id)):
+        raise HTTPException(404, "the rig of this run has no further camera of this name")
     site.run(run_id)
-    ask_for_frames(site.data, run_id)
-    path = frame_path(site.data, run_id)
+    ask_for_frames(site.data, run_id, camera)
+    path = frame_path(site.data, run_id, camera)
     headers = {"Cache-Control": "no-store"}
     try:
         age_s = time.time() - path.stat().st_mtime

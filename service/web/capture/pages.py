@@ -21,6 +21,7 @@ from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.record.board_images import BoardUse, board_uses
 from service.web.record.images import Capture, captures_of
+from service.web.record.rig_cameras import rig_cameras
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
@@ -137,6 +138,7 @@ class CapturePage:
     log: RunRecord
     steps: list[Step]  # that take images with the robot
     held: bool  # a person holds the camera in another step
+    further_cameras: tuple[str, ...]  # of the rig
     images: StepImages | None  # None where no step takes images with the robot
 
 
@@ -169,6 +171,7 @@ def _shown(site: Site, person: Person, run_id: str, wanted: CaptureQuery) -> Cap
         log=log,
         steps=capture_view.capture_steps(log.protocol),
         held=any(s.by_hand for s in log.protocol.steps),
+        further_cameras=rig_cameras(log),
         images=None if step is None else _of_step(site, person, log, step, wanted),
     )
 
