@@ -1,4 +1,7 @@
-"""A whole small run with two further cameras: extrinsics against the simulators' truth, raw files, the data set."""
+"""A whole small run with a Canon on the arm and two further cameras, from doctor to data set, pages and report.
+
+One run for all of it: cameras of two makers over two dialects of PTP, raw files, extrinsics against the truth.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +17,21 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from service.cli.run.demo import true_errors_mm
 from service.compute.camera_model import CameraModel
 from service.compute.poses.files.camera_files import read_camera_json
 from service.compute.poses.files.pose_files import read_poses_csv
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad
 from service.core.records.events import JobFinished, ViewpointCaptured
+from service.dataset.summary import summarise
+from service.run_start import recorded_run
 from service.store.store import Store
 from tests.support.pages.web import web_site
 from tests.support.protocols.small_demo import SLICE_MM, VIEWS, small_demo
 from tests.support.rig.rig import orthocapture, simulated_rig
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
-FIXED, STEREO = "camera_2", "camera_3"  # a Canon on a stand; a Sony beside the first one
+FIXED, STEREO = "camera_2", "camera_3"  # a Sony on a stand; a Canon beside the first one
 PLACES = pytest.mark.parametrize("name", [FIXED, STEREO])
 
 
@@ -37,6 +43,8 @@ class Ended:
     plain: Path
     colmap: Path
     truth: dict[str, Any]
+    doctor: dict[str, Any]
+    true_mm: dict[str, float]
 
     def said_of(self, name: str) -> dict[str, Any]:
         """What the data set says of a further camera."""
@@ -57,26 +65,35 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
     folder = tmp_path_factory.mktemp("second")
     data, protocol = folder / "data", folder / "cameras.yaml"
     options = ("--scene", "7", "--image-width", "960", "--ct-voxel-mm", str(SLICE_MM), "--speed-up", "10")
-    further = ("--second-camera", "fixed", "stereo", "--second-camera-model", "Canon EOS R5", "Sony ILCE-7RM5")
-    with simulated_rig(folder, *options, *further, host="127.0.0.49") as rig:
+    canon, sony = "Canon EOS R5", "Sony ILCE-7RM5"
+    cameras = ("--camera", canon, "--second-camera", "fixed", "stereo", "--second-camera-model", sony, canon)
+    with simulated_rig(folder, *options, *cameras, host="127.0.0.49") as rig:
         only_jpeg(Path(rig["rig"]), FIXED)
+        doctor = orthocapture("doctor", "--rig", rig["rig"], "--json")
         answer = orthocapture(
             "run", str(small_demo(protocol, *FURTHER_GATES, raw=True)), "--rig", rig["rig"],
             "--data", str(data), "--operator", "Ada", "--auto-confirm", timeout_s=1400,
         )  # fmt: skip
         assert answer.returncode == 0, answer.stdout[-2000:] + answer.stderr[-3000:]
         truth = json.loads(Path(rig["truth"]).read_text())
+        with Store.open(data, create=False) as store:
+            run_id = store.find_run("latest")
+            true_mm = true_errors_mm(summarise(store, run_id, recorded_run(store, run_id)[0]), Path(rig["truth"]))
     for form in ("plain", "colmap"):
         made = orthocapture(
             "export", "latest", "--format", form, "--out", str(folder / form), "--data", str(data), timeout_s=400
         )
         assert made.returncode == 0, made.stdout + made.stderr
-    return Ended(data, folder / "plain", folder / "colmap", truth)
+    return Ended(data, folder / "plain", folder / "colmap", truth, json.loads(doctor.stdout), true_mm)
 
 
 def only_jpeg(rig: Path, name: str) -> None:
-    """Let one further camera write no raw files, although the protocol asks for them."""
+    """Let one further camera write no raw files, although the protocol asks for them.
+
+    A busy machine is no dead link, so the arm's stream is waited for longer than at a real one.
+    """
     record = yaml.safe_load(rig.read_text(encoding="utf-8"))
+    record["devices"]["robot"] |= {"stale_after_s": 20.0, "watchdog_s": 1.0, "unattended_s": 20.0}
     record["cameras"][name]["image_quality"] = "JPEG"
     rig.write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")
 
@@ -85,6 +102,29 @@ def error(found: Transform, truth: Transform) -> Array:
     """(6,) of (d, w), m and rad."""
     turned = Rotation.from_matrix(found[:3, :3] @ truth[:3, :3].T).as_rotvec()
     return np.concatenate([found[:3, 3] - truth[:3, 3], turned])
+
+
+def test_doctor_finds_the_cameras_ready(ended: Ended) -> None:
+    found = {name: ended.doctor["devices"][name] for name in ("camera", FIXED, STEREO)}
+    assert {name: one["identity"]["model"] for name, one in found.items()} == {
+        "camera": "Canon EOS R5", FIXED: "ILCE-7RM5", STEREO: "Canon EOS R5",
+    }  # fmt: skip
+    assert all(one["ok"] for one in found.values())
+
+
+def test_it_comes_to_its_end_with_every_view(ended: Ended) -> None:
+    with Store.open(ended.data, create=False) as store:
+        run_id = store.find_run("latest")
+        summary = summarise(store, run_id, recorded_run(store, run_id)[0])
+        captured = [e.payload for e in store.events(run_id) if isinstance(e.payload, ViewpointCaptured)]
+        rows = {row.poses: row for row in summary.table()}
+    assert summary.state.status == "completed"
+    assert not any(step.skipped_viewpoints for step in summary.state.steps.values())
+    assert len({one.viewpoint for one in captured if one.viewpoint.startswith("v")}) == VIEWS
+    assert {one.camera["lens"] for one in captured} == {"RF24-70mm F2.8 L IS USM"}
+    assert all(one.verdicts["settings"] for one in captured)
+    assert rows["robot_corrected"].mean_radial_error_mm < 0.35
+    assert ended.true_mm["robot_corrected"] < 0.35
 
 
 @PLACES
@@ -109,7 +149,7 @@ def test_the_offset_of_the_clocks_is_the_simulators(ended: Ended, name: str) -> 
     assert said["clock_offset_s"] == pytest.approx(
         ended.truth["further_cameras"][name]["clock_ahead_s"], abs=max(0.05, 4 * said["clock_offset_sigma_s"])
     )
-    # What the delay of another model may add is in the sigma of the Canon's.
+    # What the delay of another model may add is in the sigma of the Sony's.
     assert 0 < said["clock_offset_sigma_s"] < (0.2 if name == FIXED else 0.05)
 
 
@@ -119,13 +159,13 @@ def test_each_camera_wrote_its_own_files_and_is_measured_in_the_best(ended: Ende
         captured = [e.payload for e in store.events(run_id) if isinstance(e.payload, ViewpointCaptured)]
         located = [e.payload for e in store.events(run_id) if isinstance(e.payload, JobFinished)]
     bodies = {one.device: one.camera["model"] for capture in captured for one in capture.further}
-    assert bodies == {FIXED: "Canon EOS R5", STEREO: "ILCE-7RM5"}
+    assert bodies == {FIXED: "ILCE-7RM5", STEREO: "Canon EOS R5"}
     kinds = {
         one.device: [ref.original_name.rpartition(".")[2] for ref in one.artefacts]
         for capture in captured
         for one in capture.further
     }
-    assert kinds == {FIXED: ["JPG"], STEREO: ["JPG", "ARW"]}
+    assert kinds == {FIXED: ["JPG"], STEREO: ["JPG", "CR3"]}
     answers = [one.result for one in located if one.job_kind == "further_camera"]
     assert {one["device"]: one["measured_on"] for one in answers} == {FIXED: "jpeg", STEREO: "raw"}
     developed = [one.result["raw"] for one in located if one.job_kind == "develop"]
@@ -248,6 +288,6 @@ def test_the_report_states_every_camera(ended: Ended) -> None:
 def test_the_evidence_verifies_and_replays(ended: Ended) -> None:
     verified = orthocapture("audit", "verify", "latest", "--data", str(ended.data), "--json", timeout_s=300)
     assert json.loads(verified.stdout)["ok"] is True
-    kinds = "develop,register,further_camera"
+    kinds = "register,further_camera"
     again = orthocapture("replay", "latest", "--jobs", kinds, "--data", str(ended.data), timeout_s=600)
     assert again.returncode == 0, again.stdout + again.stderr
