@@ -15,7 +15,7 @@ from service.core.records.events import Record
 from service.core.records.import_list import ImportList
 from service.core.text.checked_yaml import checked, decoded, problem_of, refuse
 from service.core.text.json_text import parse_json
-from service.core.text.yaml_tree import NO_LINES, FieldPath, Plain, Problem, YamlTree, field_name, parse_yaml
+from service.core.text.yaml_tree import NO_LINES, FieldPath, Plain, YamlProblem, YamlTree, field_name, parse_yaml
 from service.core.units import metres
 
 _REMEDY = "Compare it with the example in docs/howto/your_hardware.md"
@@ -247,7 +247,7 @@ def parse_rig(source: bytes, path: Path) -> Rig:
     tree = _tree(source, path)
     section, problems = checked(tree.data, RigSection, tree)
     problems += tree.problems
-    problems += [Problem(tree.line(at), field_name(at), message) for at, message in _violations(tree.data)]
+    problems += [YamlProblem(tree.line(at), field_name(at), message) for at, message in _violations(tree.data)]
     if problems or section is None:
         refuse(problems, what="rig file", name=str(path), remedy=_REMEDY, error=ConfigurationError)
     return Rig(section, path.resolve(), source, tree)

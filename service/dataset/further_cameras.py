@@ -12,7 +12,7 @@ from service.core.equipment.camera_clocks import ClockOffset, clock_offset
 from service.core.equipment.recorded_devices import RecordedOptics, recorded_optics
 from service.core.geometry import Transform
 from service.core.protocol.models import Protocol
-from service.core.records.events import ArtefactRef, FurtherExposure, View, ViewpointCaptured
+from service.core.records.events import ArtefactRef, FurtherExposure, RecordedView, ViewpointCaptured
 from service.core.run.state import RunState
 from service.core.units import mm, mrad
 from service.dataset.registrations import further_cameras
@@ -79,7 +79,7 @@ def further_pose(located: Answer, T_scan_first: Matrix | None) -> Transform | No
 
 
 def further_poses(
-    protocol: Protocol, state: RunState, views: Iterable[View], T_scan_first: Mapping[str, Matrix]
+    protocol: Protocol, state: RunState, views: Iterable[RecordedView], T_scan_first: Mapping[str, Matrix]
 ) -> dict[str, dict[str, Transform]]:
     """T_scan_camera of every further camera by its name: by viewpoint if it is rigid, once if it is fixed."""
     found: dict[str, dict[str, Transform]] = {}
@@ -93,7 +93,7 @@ def further_poses(
 
 
 def known_further_cameras(
-    protocol: Protocol, state: RunState, views: Iterable[View]
+    protocol: Protocol, state: RunState, views: Iterable[RecordedView]
 ) -> tuple[KnownFurtherCamera, ...]:
     """The further cameras that exposed at these valid views, in the order of the rig file."""
     captures = [view for view in views if isinstance(view, ViewpointCaptured)]

@@ -286,9 +286,9 @@ class _Rig:
         return {"driver": "gphoto", "port": gphoto_port, "capture_timeout_s": self._exposure_s()}
 
     def _exposure_s(self) -> float:
-        """Longest time that one picture may take, since this camera renders it: up to some seconds per megapixel."""
-        megapixels = self.args.image_width**2 * 2 / 3 / 1e6
-        return round(40.0 + 4.0 * megapixels, 0)
+        """Longest time that one picture may take: this camera renders it, in up to some microseconds a pixel."""
+        pixels = self.args.image_width**2 * 2 / 3
+        return round(40.0 + 4e-6 * pixels, 0)
 
     def _lens(self) -> dict[str, Any]:
         """Nominal lens data, as engraved on the lens; the true lens differs by about a percent."""

@@ -25,7 +25,7 @@ from service.compute.stereo.surface import surface_of
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse, look_at
 from service.dataset.posed.pixels import Photographs
-from service.dataset.posed.records import DataSet, Mesh, View
+from service.dataset.posed.records import DataSet, Mesh, PosedView
 from tests.support.scenes.textured_scene import camera_of_width, render, ring_of_poses, slabs
 
 SCENE = slabs(3)
@@ -71,7 +71,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> DataSet:
     """Distorted photographs of the slabs, twelve around them."""
     folder, camera, mesh = tmp_path_factory.mktemp("slabs"), camera_of_width(320), truth()
     poses = {f"view_{k:02d}": T for k, T in enumerate(ring_of_poses(12))}
-    views = tuple(View(name, ".png", camera, T, np.zeros((6, 6))) for name, T in poses.items())
+    views = tuple(PosedView(name, ".png", camera, T, np.zeros((6, 6))) for name, T in poses.items())
     for k, view in enumerate(views):
         assert cv2.imwrite(str(folder / view.file), render(SCENE, camera, view.T_world_camera, k))
     files = {view.name: folder / view.file for view in views}

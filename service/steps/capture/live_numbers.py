@@ -15,13 +15,13 @@ from service.core.jobs.keys import key_stem
 from service.core.jobs.priorities import LIVE
 from service.core.jobs.references import Each, Reference, jobs_of, resolve
 from service.core.protocol.models import Gate
-from service.core.records.events import Record, View
+from service.core.records.events import Record, RecordedView
 from service.core.run.state import JobState
 from service.core.units import metres, rad_of_mrad
 from service.jobs.calibration import calibrate
 from service.jobs.capture import further_view, live_summary, live_view
 from service.jobs.looks import image_of
-from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Photograph, Point
+from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Point, PosedPhotograph
 from service.jobs.surfaces import coverage_points, locate_spheres
 from service.steps.capture.further_looks import describe_further, look_at_further
 from service.steps.capture.plan.viewpoints import Viewpoint
@@ -97,7 +97,7 @@ class LiveAnalysis:
             sha256 = capture.artefacts[0].sha256
             if sha256 in begun or not all(capture.verdicts.values()):
                 continue
-            image = Photograph(viewpoint=capture.viewpoint, station=capture.station, sha256=sha256)
+            image = PosedPhotograph(viewpoint=capture.viewpoint, station=capture.station, sha256=sha256)
             mounted = mounting_of(self.context, self.params.hand_eye, [capture.station])
             earlier, looks = self._earlier()
             arguments = live_view.Arguments(
@@ -221,7 +221,7 @@ class LiveAnalysis:
         """The files of the jobs on images that still count, in the order of capture, and the reference to them."""
         steps = dict.fromkeys((*self.params.images_of, self.context.step.id))
         state = self.context.evidence.state()
-        captures: list[View] = []
+        captures: list[RecordedView] = []
         for step in steps:
             captures += self.context.evidence.captures(step)
         hashes = [capture.artefacts[0].sha256 for capture in captures]

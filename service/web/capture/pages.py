@@ -28,7 +28,7 @@ from service.web.site import CurrentSite, Site
 if TYPE_CHECKING:
     from service.web.capture.cameras import CameraImage, SheetImage
     from service.web.capture.plan_drawing import PlanDrawing
-    from service.web.capture.view import Redo, Verdict, View, ViewState
+    from service.web.capture.view import StepViewpoint, Verdict, ViewpointRedo, ViewState
 
 router = APIRouter(tags=["capture"])
 
@@ -58,8 +58,8 @@ Wanted = Annotated[CaptureQuery, Query()]
 class ViewTable:
     """The viewpoints of a step, and a page of the table that lists them."""
 
-    views: list[View]
-    rows: list[View]  # on this page
+    views: list[StepViewpoint]
+    rows: list[StepViewpoint]  # on this page
     page: int
     pages: int
     counts: Mapping[ViewState, int]  # of all viewpoints; none is 0
@@ -116,8 +116,8 @@ class StepImages:
     sheet: ContactSheet
     image: ChosenImage
     drawings: list[PlanDrawing]
-    view: View | None
-    redo: Redo | None
+    view: StepViewpoint | None
+    redo: ViewpointRedo | None
     in_control: bool
     advice: str
     suggestions: tuple[Suggestion, ...]
@@ -217,7 +217,7 @@ def _chosen(captures: Sequence[Capture], wanted: CaptureQuery) -> Capture | None
     return (named or ([] if wanted.viewpoint else valid) or [None])[-1]
 
 
-def _table(views: list[View], view: View | None, page: int) -> ViewTable:
+def _table(views: list[StepViewpoint], view: StepViewpoint | None, page: int) -> ViewTable:
     """A page of the table: the one asked for, or the one with the viewpoint that is shown or comes next."""
     from service.web.capture import view as capture_view  # noqa: PLC0415
 
@@ -278,7 +278,7 @@ def _image(
     )
 
 
-def _drawings(log: RunRecord, views: Sequence[View], name: str) -> list[PlanDrawing]:
+def _drawings(log: RunRecord, views: Sequence[StepViewpoint], name: str) -> list[PlanDrawing]:
     """The plan of the viewpoints of each known station."""
     from service.web.capture import plan_drawing  # noqa: PLC0415
     from service.web.record import planned_poses  # noqa: PLC0415

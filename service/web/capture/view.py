@@ -54,7 +54,7 @@ FEWEST_SPHERES = 3
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class StepViewpoint:
     """One viewpoint of a step."""
 
     name: str
@@ -79,7 +79,7 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True)
-class Redo:
+class ViewpointRedo:
     """Whether a viewpoint may be redone now; and whether the robot drives there at once."""
 
     refused: str
@@ -106,7 +106,7 @@ def step_to_show(log: RunRecord, wanted: str) -> Step | None:
     return done[-1] if done else next(iter(steps.values()), None)
 
 
-def views_of(log: RunRecord, step: Step) -> list[View]:
+def views_of(log: RunRecord, step: Step) -> list[StepViewpoint]:
     """Every viewpoint of a step in the order of capture: planned, suggested, and taken without either."""
     state = log.state.steps[step.id]
     planned = {v.name: v for v in planned_viewpoints(log, step)}
@@ -119,7 +119,7 @@ def views_of(log: RunRecord, step: Step) -> list[View]:
     order = [name for name in _order(state) if name in planned]
     names = list(dict.fromkeys([*order, *planned, *valid, *state.skipped_viewpoints, *state.viewpoint_failures]))
     names.sort(key=lambda name: name in refused)
-    out: list[View] = []
+    out: list[StepViewpoint] = []
     next_found = state.phase not in ("ready", "running", "recovering") or log.state.current != step.id
     for name in names:
         capture = valid.get(name)
@@ -135,7 +135,7 @@ def views_of(log: RunRecord, step: Step) -> list[View]:
         station = "" if capture is None else capture.payload.station
         if name in planned:
             position, looks, station = planned[name].position_m, planned[name].looks, planned[name].station
-        out.append(View(name, station, now, why, position, looks, capture, replaced))
+        out.append(StepViewpoint(name, station, now, why, position, looks, capture, replaced))
     return out
 
 
@@ -303,12 +303,12 @@ def summary_of(step: Step, capture: Capture) -> list[Verdict]:
     return out
 
 
-def redo_of(log: RunRecord, step: Step, view: View, account: str) -> Redo:
+def redo_of(log: RunRecord, step: Step, view: StepViewpoint, account: str) -> ViewpointRedo:
     """Whether a viewpoint may be sent back now. While the step runs, the robot then drives there by itself."""
     action = OperatorAction(action="redo", step=step.id, viewpoint=view.name, reason="asked", via="web")
     refusal = refuse(log.protocol, log.state, action, account)
     moves = log.state.current == step.id and log.state.phase == "running"
-    return Redo("" if refusal is None else ". ".join(filter(None, (refusal.what, refusal.remedy))), moves)
+    return ViewpointRedo("" if refusal is None else ". ".join(filter(None, (refusal.what, refusal.remedy))), moves)
 
 
 def suggestions_of(log: RunRecord, step: Step) -> tuple[str, tuple[live_summary.Suggestion, ...]]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
 
-from service.core.records.events import FurtherExposure, View, ViewpointCaptured, ViewpointFailed
+from service.core.records.events import FurtherExposure, RecordedView, ViewpointCaptured, ViewpointFailed
 from service.core.run.state import JobState, StepState, Superseded
 from service.jobs.capture import further_view, live_view
 from service.jobs.looks import image_of
@@ -37,7 +37,7 @@ class StatedCamera(BaseModel):
     height: int | None = None
 
 
-def stated_camera(view: View | FurtherExposure) -> StatedCamera:
+def stated_camera(view: RecordedView | FurtherExposure) -> StatedCamera:
     """What the photograph of a view states about the camera."""
     return StatedCamera.model_validate(view.camera)
 
@@ -53,7 +53,7 @@ class Capture:
 
     seq: int
     at_utc: str
-    payload: View
+    payload: RecordedView
     replaced: Superseded | None
     live: JobState | None
 
@@ -90,7 +90,7 @@ def further_cameras_of(log: RunRecord) -> tuple[KnownFurtherCamera, ...]:
 
     seqs = sorted(seq for step in log.state.steps.values() for seq in step.captured.values())
     payloads = (log.events[seq - 1].payload for seq in seqs)
-    return known_further_cameras(log.protocol, log.state, (p for p in payloads if isinstance(p, View)))
+    return known_further_cameras(log.protocol, log.state, (p for p in payloads if isinstance(p, RecordedView)))
 
 
 def captures_of(log: RunRecord, step: str) -> list[Capture]:
@@ -100,7 +100,7 @@ def captures_of(log: RunRecord, step: str) -> list[Capture]:
     out: list[Capture] = []
     for event in log.events:
         payload = event.payload
-        if isinstance(payload, View) and payload.step == step and event.seq not in log.state.overtaken:
+        if isinstance(payload, RecordedView) and payload.step == step and event.seq not in log.state.overtaken:
             job = live.get(payload.artefacts[0].sha256)
             out.append(Capture(event.seq, event.at_utc, payload, replaced.get(event.seq), job))
     return out
@@ -117,7 +117,7 @@ def capture_at(log: RunRecord, seq: int) -> Capture | None:
     if not 1 <= seq <= len(log.events):
         return None
     event = log.events[seq - 1]
-    if not isinstance(event.payload, View) or event.payload.step not in log.state.steps:
+    if not isinstance(event.payload, RecordedView) or event.payload.step not in log.state.steps:
         return None
     job = live_jobs(log.state.steps[event.payload.step]).get(event.payload.artefacts[0].sha256)
     return Capture(seq, event.at_utc, event.payload, replaced_events(log).get(seq), job)

@@ -29,7 +29,7 @@ from service.store.files.space_used import forecast_of
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.record.rig_cameras import rig_cameras
-from service.web.run.notes import Note, notes_of
+from service.web.run.notes import PageNote, notes_of
 from service.web.run.view import run_view
 from service.web.run.view_records import RunView, Viewer
 from service.web.security.guards import SignedInPerson, requires
@@ -70,7 +70,7 @@ class RunPage:
     acceptors: list[Account]
     looking_back: bool
     dialog: str
-    notes: tuple[Note, ...]
+    notes: tuple[PageNote, ...]
     about: list[tuple[str, str]]
     reasons: Reasons
     signing: SigningSection

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.compute.evaluation.closure import Alignment
 from service.core.geometry import Array, Transform, inverse
-from service.core.records.events import ArtefactRef, View, ViewpointCaptured
+from service.core.records.events import ArtefactRef, RecordedView, ViewpointCaptured
 from service.core.units import metres, mm
 from service.dataset.further_cameras import further_poses
 from service.dataset.registered_scan import registered_scan
@@ -245,7 +245,7 @@ def _table(centre_m: tuple[float, float, float]) -> SceneMesh:
     return SceneMesh(np.array(centre_m) + offsets, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def _all_captures(log: RunRecord) -> list[View]:
+def _all_captures(log: RunRecord) -> list[RecordedView]:
     found = [c for step in log.protocol.steps for c in captures_of(log, step.id) if c.replaced is None]
     return [c.payload for c in sorted(found, key=lambda c: c.seq)]
 

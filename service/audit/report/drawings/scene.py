@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.audit.report.blocks import Box, Drawing, Label, Line, Raster, Scene, Shape
+from service.audit.report.blocks import Drawing, Label, Line, Raster, Rectangle, SceneBlock, Shape
 from service.compute.evaluation.closure import Alignment
 from service.core.errors import IntegrityError
 from service.core.geometry import Array, Transform, apply
@@ -58,7 +58,7 @@ class _Geometry:
     error_mm: tuple[float, float] | None
 
 
-def report_scene(summary: RunSummary, *, turning: bool) -> Scene | None:
+def report_scene(summary: RunSummary, *, turning: bool) -> SceneBlock | None:
     """Cameras, spheres and mesh in one frame; None without a registration. `turning`: also for a browser."""
     best, registrations = summary.best(), summary.registrations()
     spheres, scan = summary.scan_spheres_m(), summary.scan_mesh_file()
@@ -89,7 +89,7 @@ def report_scene(summary: RunSummary, *, turning: bool) -> Scene | None:
         f"{error_mm.max():.3g} mm. The bar has {scene_view.BAR_MM:.0f} mm."
     )
     drawing = _drawing(geometry, text, _rows(scene))
-    return Scene(drawing, _turned(geometry) if turning else "")
+    return SceneBlock(drawing, _turned(geometry) if turning else "")
 
 
 @dataclass(slots=True)
@@ -253,7 +253,7 @@ def _drawing(geometry: _Geometry, text: str, rows: tuple[tuple[str, ...], ...]) 
         shapes.append(Label(float(at[0]), float(at[1]), words, 13))
     x, y = 16.0, _HEIGHT + 24
     for colour, words in geometry.legend:
-        shapes += [Box(x, y - 10, 12, 12, colour), Label(x + 18, y, words, 13, anchor="start")]
+        shapes += [Rectangle(x, y - 10, 12, 12, colour), Label(x + 18, y, words, 13, anchor="start")]
         x += 44 + 7.4 * len(words)
     if geometry.error_mm is not None:
         shapes += _scale(geometry.error_mm, y)
@@ -267,7 +267,7 @@ def _scale(error_mm: tuple[float, float], y: float) -> list[Shape]:
     x = _WIDTH - width - 92
     shapes: list[Shape] = [Label(x - 62, y, "predicted error", 13, anchor="end")]
     for step, colour in enumerate(_viridis(np.linspace(0, 1, steps))):
-        shapes.append(Box(x + step * width / steps, y - 10, width / steps + 0.3, 12, _hex(colour)))
+        shapes.append(Rectangle(x + step * width / steps, y - 10, width / steps + 0.3, 12, _hex(colour)))
     shapes.append(Label(x - 8, y, f"{error_mm[0]:.3g}", 13, anchor="end"))
     shapes.append(Label(x + width + 8, y, f"{error_mm[1]:.3g} mm", 13, anchor="start"))
     return shapes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Cell, Column, Facts, Heading, Paragraph, Section, Table
+from service.audit.report.blocks import Block, Column, Facts, Heading, Paragraph, Section, Table, TableCell
 from service.core.text.counts import counted
 from service.dataset.further_cameras import KnownFurtherCamera, known_further_cameras
 
@@ -43,13 +43,13 @@ def _table(cameras: tuple[KnownFurtherCamera, ...]) -> Table:
     return Table(columns, tuple(_row(camera) for camera in cameras))
 
 
-def _row(camera: KnownFurtherCamera) -> tuple[Cell | str, ...]:
+def _row(camera: KnownFurtherCamera) -> tuple[TableCell | str, ...]:
     place = "in the room" if camera.mounted == "fixed" else "beside the first camera"
     clock = "not known" if camera.clock is None else f"{camera.clock.offset_s:+.3f} ± {camera.clock.sigma_s:.3f} s"
     if camera.sigma_mm is None or camera.sigma_mrad is None:
         why = "not registered" if camera.located is None else f"NOT LOCATED: {camera.located.why}"
         tone = "attention" if camera.located is None else "stop"
-        return camera.name, place, str(len(camera.images)), Cell(why, tone), "–", "–", clock
+        return camera.name, place, str(len(camera.images)), TableCell(why, tone), "–", "–", clock
     sigmas = f"{camera.sigma_mm:.3f}", f"{camera.sigma_mrad:.3f}"
     return camera.name, place, str(len(camera.images)), camera.outer, *sigmas, clock
 
@@ -57,7 +57,7 @@ def _row(camera: KnownFurtherCamera) -> tuple[Cell | str, ...]:
 def _facts(camera: KnownFurtherCamera) -> Facts:
     optics, located = camera.optics, camera.located
     body = ", ".join(filter(None, (optics.model, optics.lens, f"body {optics.body_serial}")))
-    rows: list[tuple[str, Cell | str]] = [
+    rows: list[tuple[str, TableCell | str]] = [
         ("Camera and lens", body),
         ("Calibration (SHA-256 of its file)", camera.calibration.sha256),
     ]
@@ -70,7 +70,7 @@ def _facts(camera: KnownFurtherCamera) -> Facts:
             rows.append(("Its images agree within", agree))
         if located.excluded:
             left_out = "; ".join(f"{view}: {why}" for view, why in located.excluded.items())
-            rows.append(("Images left out", Cell(left_out, "attention")))
+            rows.append(("Images left out", TableCell(left_out, "attention")))
     if camera.clock is not None:
         unlike = "; two models, whose delays differ" if camera.clock.unlike else ""
         rows.append(("Clocks compared by", counted(camera.clock.photographs, "pair") + " of photographs" + unlike))

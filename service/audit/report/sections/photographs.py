@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Pictures, Section, Table
+from service.audit.report.blocks import Block, Column, Heading, Paragraph, Pictures, Section, Table, TableCell
 from service.audit.report.drawings.pictures import LARGE_PX, THUMBNAIL_PX, picture
 from service.audit.report.drawings.scene import report_scene
-from service.core.records.events import FurtherExposure, View, ViewpointCaptured
+from service.core.records.events import FurtherExposure, RecordedView, ViewpointCaptured
 
 
 def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
@@ -34,11 +34,11 @@ def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
     scene = report_scene(run.summary(), turning=turning)
     if scene is not None:
         blocks += [Heading(scene.drawing.title), scene]
-    originals: list[tuple[Cell | str, ...]] = []
+    originals: list[tuple[TableCell | str, ...]] = []
     for step in run.protocol.steps:
         seqs = sorted(run.state.steps[step.id].captured.values())
         captures = [(seq, run.events[seq - 1].payload) for seq in seqs]
-        views = [(seq, capture) for seq, capture in captures if isinstance(capture, View)]
+        views = [(seq, capture) for seq, capture in captures if isinstance(capture, RecordedView)]
         if views:
             sheet = tuple(picture(run, view.artefacts[0].sha256, _caption(view), THUMBNAIL_PX) for _, view in views)
             blocks += [Heading(f"Contact sheet: {step.title}"), Pictures(sheet, 5)]
@@ -64,7 +64,7 @@ def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
     return Section("Pictures", tuple(blocks) or (Paragraph("No photograph was taken."),))
 
 
-def _further(views: Sequence[tuple[int, View]]) -> dict[str, list[tuple[int, str, FurtherExposure]]]:
+def _further(views: Sequence[tuple[int, RecordedView]]) -> dict[str, list[tuple[int, str, FurtherExposure]]]:
     """The images of each further camera: event, viewpoint, exposure."""
     found: dict[str, list[tuple[int, str, FurtherExposure]]] = {}
     for seq, view in views:
@@ -73,6 +73,6 @@ def _further(views: Sequence[tuple[int, View]]) -> dict[str, list[tuple[int, str
     return found
 
 
-def _caption(capture: View) -> str:
+def _caption(capture: RecordedView) -> str:
     failed = [name for name, passed in capture.verdicts.items() if not passed]
     return capture.viewpoint + (f" ✗ {', '.join(failed)}" if failed else "")

@@ -19,7 +19,7 @@ from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import ComputedBy, Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
-from service.jobs.records import Mounting, Photograph
+from service.jobs.records import Mounting, PosedPhotograph
 from service.jobs.registration import detect_spheres, further_camera, register
 from service.jobs.registration.register import Registration
 from service.jobs.surfaces import locate_spheres
@@ -203,7 +203,7 @@ def _search(context: StepContext, params: Params) -> JobRequest:
     return JobRequest.of(detect_spheres.KIND, arguments, references)
 
 
-def _mounting(context: StepContext, params: Params, images: list[Photograph]) -> CameraMounting:
+def _mounting(context: StepContext, params: Params, images: list[PosedPhotograph]) -> CameraMounting:
     """How the camera was mounted on the arm; empty where a person held it."""
     if params.hand_eye is None:
         return CameraMounting(Mounting(), {})
