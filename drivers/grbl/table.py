@@ -21,6 +21,7 @@ from drivers.errors import (
 )
 from drivers.grbl import GrblConfig
 from drivers.grbl.axes import Axes
+from drivers.grbl.homing import home
 from drivers.grbl.link import Link
 from drivers.grbl.mover import REACTION_S, Mover
 from drivers.grbl.setup import Setup, setup_of
@@ -36,6 +37,7 @@ from drivers.interfaces import (
     SettleReport,
     Transform,
 )
+from service.core.units import mm
 
 LONGEST_RINGING_S = 10.0
 STOP_S = 5.0
@@ -141,26 +143,28 @@ class GrblTable:
         """Permit motion after a person's confirmation, and home the axes if their position is not known.
 
         Raises SafetyStopError or LeaveNeededError for a stop that is active or was seen after that time, and for
-        homing that failed.
+        homing that failed; DeviceUnavailableError if the line is dead.
         """
         link, mover = self._linked(), self._mover
         mover.refuse_while_door_is_open()
         if mover.status is not None and not mover.at_rest(mover.status):
             self.stop()  # still braking: a reset now would lose the position
         mover.latch.let_move(confirmed_by, not_before_monotonic_s)
-        if mover.homed and mover.status is not None and mover.status.state == "Idle":
+        if mover.homed and mover.status is not None and mover.status.state == "Idle" and not link.unanswered:
             return
         mover.resetting = True
         try:
             link.reset(self._config.connect_timeout_s)  # after some alarms it hears nothing else
             if not mover.homed:
-                link.request(b"$H", self._config.homing_timeout_s)
+                home(link, lambda: mover.newest, self._config)
             mover.homed = True
         except DeviceError as error:
             if mover.latch.stop is None:  # not an alarm, which has stopped it already
                 with contextlib.suppress(DeviceError):
                     link.reset(self._config.connect_timeout_s)
                 mover.latch.end(f"homing failed ({error.what})")
+            if isinstance(error, DeviceUnavailableError):  # a confirmation alone would not bring the line back
+                raise
             raise (mover.latch.stop or error) from error
         finally:
             mover.resetting = False
@@ -193,9 +197,7 @@ class GrblTable:
         values, distance_m, angle_rad = self._axes.nearest(np.asarray(T_base_flange), self._values(near_rad))
         angle_deg = float(np.degrees(angle_rad))
         if distance_m > self._config.reach_within_m or angle_deg > self._config.reach_within_deg:
-            what = (
-                f"the axes bring the camera's mount only within {1e3 * distance_m:.0f} mm and {angle_deg:.1f}° of it"
-            )
+            what = f"the axes bring the camera's mount only within {mm(distance_m):.0f} mm and {angle_deg:.1f}° of it"
             remedy = "Choose a viewpoint on the circle that the axes reach, or correct the rig file"
             raise UnreachablePoseError(what, where=self._where, remedy=remedy)
         return values
@@ -220,7 +222,7 @@ class GrblTable:
                 remedy = "Lower the setting $120, $121 … of the axis, or change the motion of the protocol"
                 raise DeviceRefusedError(what, where=self._where, remedy=remedy)
         speeds = np.array(
-            [np.degrees(speed_rad_s) if a.turns else 1e3 * self._config.slide_speed_m_s for a in self._config.axes]
+            [np.degrees(speed_rad_s) if a.turns else mm(self._config.slide_speed_m_s) for a in self._config.axes]
         )
         # From a higher speed they would not stand in time if nobody were left to stop them.
         fastest = setup.acceleration * (self._config.rest_within_s - REACTION_S)
@@ -237,13 +239,14 @@ class GrblTable:
         while not link.death:
             status, asked_s = mover.newest
             rests = status is not None and mover.at_rest(status)
-            current = rests and not link.unanswered and asked_s > max(since_s, link.answered_s)
+            parsed = not link.unanswered or link.misses_answer(self._config.answer_timeout_s)  # or it was lost
+            current = rests and parsed and asked_s > max(since_s, link.answered_s)
             if current and self._shown_since(asked_s):
                 return
             if time.monotonic() > since_s + STOP_S:
                 remedy = "Press the emergency stop of the machine"
                 raise DeviceTimeoutError("the axes do not come to rest", where=self._where, remedy=remedy)
-            if not rests or link.unanswered:  # again and again: a jog that was not parsed yet begins after the others
+            if not rests or not parsed:  # again and again: a jog that was not parsed yet begins after the others
                 link.act(FEED_HOLD if status is not None and status.state == "Run" else JOG_CANCEL)
             time.sleep(0.01)
 

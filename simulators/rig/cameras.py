@@ -8,15 +8,10 @@ from typing import Any
 from simulators.gige_camera.registers import SERIAL
 
 CAMERAS = {"Sony ILCE-7RM5": "camera", "Canon EOS R5": "canon", "GigE Vision": "gige", "video": "video"}
-STILL = ("camera", "canon")  # simulators of cameras with a button, over PTP/IP
+STILL = ("Sony ILCE-7RM5", "Canon EOS R5")  # with a button; a person can hold them, and they can be second cameras
 _LENS = {"aperture_f": 22.0, "lens": "50 mm", "focal_length_mm": 50.0}  # set by hand, as the protocols want it
 _LONGEST_FRAME_S = 30.0  # this camera renders its images
 _VIDEO_LATENCY_S = 2.0  # twice what the simulator holds a frame back at most, and a frame
-
-
-def is_still(model: str) -> bool:
-    """Whether a person can hold the camera and press its button, and a second one can be beside it."""
-    return CAMERAS[model] in STILL
 
 
 def place(model: str, host: str, folder: Path) -> tuple[str, ...]:
@@ -36,9 +31,9 @@ def again(ready: dict[str, Any], taken: int) -> tuple[str, ...]:
     return (*(("--port", port) if port else ()), "--first-counter", str(taken + 1))
 
 
-def section(model: str, ready: dict[str, Any], exposure_s: float) -> dict[str, Any]:
-    """The camera in rig.yaml, where one picture may take this long, since it is rendered."""
-    match CAMERAS[model]:
+def section(ready: dict[str, Any], exposure_s: float) -> dict[str, Any]:
+    """The camera with this ready line in rig.yaml; one picture may take this long, since it is rendered."""
+    match ready["simulator"]:
         case "gige":
             found = {"driver": "genicam", "camera": ready["host"], "serial": SERIAL}
             return {**found, **_LENS, "frame_timeout_s": min(exposure_s, _LONGEST_FRAME_S)}

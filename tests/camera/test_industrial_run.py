@@ -60,8 +60,8 @@ def test_doctor_and_a_whole_small_run(way: str, tmp_path: Path, monkeypatch: pyt
         assert told["ok"], told
         assert told["identity"]["driver_version"].split()[0] == way
         answer = orthocapture(
-            "run", str(protocol(tmp_path / "small.yaml", calibrated=calibrated)), "--rig", rig["rig"], "--data", str(data),
-            "--operator", "Ada", "--auto-confirm", "--json", timeout_s=500,
+            "run", str(protocol(tmp_path / "small.yaml", calibrated=calibrated)), "--rig", rig["rig"],
+            "--data", str(data), "--operator", "Ada", "--auto-confirm", "--json", timeout_s=500,
         )  # fmt: skip
         assert answer.returncode == 0, answer.stdout[-2000:] + answer.stderr[-3000:]
         truth = json.loads(Path(rig["truth"]).read_text())
