@@ -10,11 +10,8 @@ import ctypes
 import ctypes.util
 from typing import Any
 
-<<<<<<< HEAD:drivers/genicam/aravis.py
 from drivers.genicam.link import Frame, LibraryMissingError, LinkError, NoImageError
-=======
 from service.core.units import seconds_of_us, us
->>>>>>> main:drivers/genicam/library.py
 
 LIBRARIES = ("aravis-0.8", "gobject-2.0", "glib-2.0")
 _SUCCESS = 0  # of ArvBufferStatus
@@ -94,13 +91,8 @@ class AravisCamera:
         self._of_camera("arv_camera_set_pixel_format_from_string", None, name.encode(), of=(_TEXT,))
 
     def acquire(self, timeout_s: float) -> Frame:
-<<<<<<< HEAD:drivers/genicam/aravis.py
         """Expose and receive one image. Raises NoImageError or LinkError."""
-        timeout_us = ctypes.c_uint64(round(timeout_s * _US))
-=======
-        """Expose and receive one image. Raises NoImageError or AravisError."""
         timeout_us = ctypes.c_uint64(round(us(timeout_s)))
->>>>>>> main:drivers/genicam/library.py
         buffer = self._of_camera("arv_camera_acquisition", _POINTER, timeout_us, of=(ctypes.c_uint64,))
         if not buffer:
             raise NoImageError("no image came")

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from drivers.genicam.link import Frame, LibraryMissingError, LinkError, NoImageError
+from service.core.units import seconds_of_us, us
 
 _LOG = logging.getLogger(__name__)
-_US = 1e6  # microseconds in a second: the unit of ExposureTime
 _POLL_MS = 20  # one wait of harvesters for an image
 _NAMED_BY = ("id_", "serial_number", "user_defined_name", "display_name")
 # By the Standard Features Naming Convention, and as older cameras have them.
@@ -111,7 +111,7 @@ class ProducerCamera:
     @property
     def exposure_s(self) -> float:
         """Exposure time that the camera reports."""
-        return float(self._value(*_EXPOSURE)) / _US
+        return seconds_of_us(float(self._value(*_EXPOSURE)))
 
     @property
     def gain(self) -> float:
@@ -120,7 +120,7 @@ class ProducerCamera:
 
     def set_exposure_s(self, exposure_s: float) -> None:
         """Set the exposure time; the camera may round it."""
-        self._set_number(exposure_s * _US, *_EXPOSURE)
+        self._set_number(us(exposure_s), *_EXPOSURE)
 
     def set_gain(self, gain: float) -> None:
         """Set the gain, in the camera's own unit."""

@@ -31,6 +31,7 @@ from simulators.rendering.picture_faults import Lens
 from simulators.serve import SimulatorError
 from simulators.still_camera.exif import ExposureSettings
 from simulators.still_camera.scene import ImageSource, Moment
+from simulators.units import nanoseconds, seconds_of_us
 
 _BASE_ISO = 100
 _LAST_BLOCK = 0xFFFF  # GVSP counts images in 16 bits, without zero
@@ -78,7 +79,7 @@ class IndustrialBody:
                     stop.set()
 
     def _expose(self, stop: threading.Event) -> None:
-        began_ns = time.monotonic_ns()
+        began_s = time.monotonic()
         counter, self._counter = self._counter, self._counter + 1
         settings = self._settings()
         fault = self._faults.check("camera", "image")
@@ -90,18 +91,18 @@ class IndustrialBody:
         if kind == "stale" and self._previous:
             pixels = self._previous
         self._previous = pixels
-        left_s = settings.exposure_s - (time.monotonic_ns() - began_ns) / 1e9
+        left_s = settings.exposure_s - (time.monotonic() - began_s)
         if stop.wait(max(0.0, left_s)) or kind == "no_image":
             return
         self._write_log(moment, settings)
         lost = 3 if kind in ("lost_packets", "truncate") else 0
         block = (counter - 1) % _LAST_BLOCK + 1
-        self._stream.send(block, code, pixels, began_ns, lost, for_good=kind == "truncate")
+        self._stream.send(block, code, pixels, nanoseconds(began_s), lost, for_good=kind == "truncate")
 
     def _settings(self) -> ExposureSettings:
         exposure_us = self._registers.real(EXPOSURE_US)
         iso = round(_BASE_ISO * 10 ** (self._registers.real(GAIN_DB) / 20))
-        return ExposureSettings(self._aperture_f, exposure_us / 1e6, (round(exposure_us), 1_000_000), iso)
+        return ExposureSettings(self._aperture_f, seconds_of_us(exposure_us), (round(exposure_us), 1_000_000), iso)
 
     def _write_log(self, moment: Moment, settings: ExposureSettings) -> None:
         if self._log is None:

@@ -19,6 +19,7 @@ from simulators.gige_camera.registers import (
     Registers,
 )
 from simulators.serve import SimulatorError
+from simulators.units import ms
 
 PORT = 3956
 _KEY, _WANTS_ANSWER = 0x42, 0x01
@@ -127,4 +128,4 @@ class ControlServer:
     def _is_controlled(self) -> bool:
         """Whether a client has control and was heard within the time of its heartbeat."""
         silent_s = time.monotonic() - self._heard_s
-        return self._controller is not None and 1e3 * silent_s < self._registers.get(HEARTBEAT_MS)
+        return self._controller is not None and ms(silent_s) < self._registers.get(HEARTBEAT_MS)
