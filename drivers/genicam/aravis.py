@@ -15,8 +15,8 @@ from service.core.units import seconds_of_us, us
 
 LIBRARIES = ("aravis-0.8", "gobject-2.0", "glib-2.0")
 _SUCCESS = 0  # of ArvBufferStatus
-# Of the same: nothing of an image is in the buffer. Where a process may open packet sockets (as root), Aravis reads one
-# that, until its filter is set, sees all traffic of the machine; a foreign packet then ends the wait for the image.
+# Of the same: nothing of an image is in the buffer. Where a process may open packet sockets (as root), Aravis reads
+# one that sees all traffic of the machine until its filter is set; a foreign packet ends the wait for the image.
 _NOTHING_IN_IT = (1, 8)
 _TRIES = 5  # exposures
 _POINTER, _TEXT, _REAL = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_double
