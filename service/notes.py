@@ -20,7 +20,7 @@ _REMEDY = "Take the photograph again, as JPEG or PNG"
 
 
 @dataclass(frozen=True, slots=True)
-class Photograph:
+class NotePhotograph:
     """A photograph as received, with its file name."""
 
     content: bytes
@@ -30,7 +30,7 @@ class Photograph:
 def take_note(
     log: RunRecord,
     text: str,
-    photograph: Photograph | None,
+    photograph: NotePhotograph | None,
     *,
     step: str,
     actor: str,
@@ -87,7 +87,7 @@ def _plain(name: str) -> str:
     return "".join(c if c.isprintable() else "_" for c in name)
 
 
-def _checked(photograph: Photograph) -> tuple[str, str]:
+def _checked(photograph: NotePhotograph) -> tuple[str, str]:
     """Media type and file suffix, after decoding the picture. Raises DataError."""
     # The decoder takes long to load, and a web process starts without it.
     import cv2  # noqa: PLC0415

@@ -15,7 +15,7 @@ from service.core.records.events import Record
 from service.core.records.import_list import ImportList
 from service.core.text.checked_yaml import checked, decoded, problem_of, refuse
 from service.core.text.json_text import parse_json
-from service.core.text.yaml_tree import NO_LINES, FieldPath, Plain, Problem, YamlTree, field_name, parse_yaml
+from service.core.text.yaml_tree import NO_LINES, FieldPath, Plain, YamlProblem, YamlTree, field_name, parse_yaml
 from service.core.units import metres
 
 _REMEDY = "Compare it with the example in docs/howto/your_hardware.md"
@@ -98,9 +98,10 @@ class FurtherCameraSection(Record):
     mounted: Literal["fixed", "rigid"]  # fixed: on a stand in the room; rigid: beside the first camera on its mount
     calibration: str  # camera.json from `calibrate intrinsics` for this camera, relative to the rig file
     every: Literal["viewpoint", "station"] = "viewpoint"  # exposes at each viewpoint, or once at each station
-    aperture_f: Annotated[float, Field(gt=0)] | None = None  # None: that of the protocol, as the next two
+    aperture_f: Annotated[float, Field(gt=0)] | None = None  # None: that of the protocol, as the next three
     exposure_s: Annotated[float, Field(gt=0)] | None = None  # exposure time
     iso: Annotated[int, Field(gt=0)] | None = None  # sensitivity
+    image_quality: Literal["JPEG", "RAW+JPEG"] | None = None  # files of an exposure
 
     @model_validator(mode="after")
     def _seen_once(self) -> Self:
@@ -246,7 +247,7 @@ def parse_rig(source: bytes, path: Path) -> Rig:
     tree = _tree(source, path)
     section, problems = checked(tree.data, RigSection, tree)
     problems += tree.problems
-    problems += [Problem(tree.line(at), field_name(at), message) for at, message in _violations(tree.data)]
+    problems += [YamlProblem(tree.line(at), field_name(at), message) for at, message in _violations(tree.data)]
     if problems or section is None:
         refuse(problems, what="rig file", name=str(path), remedy=_REMEDY, error=ConfigurationError)
     return Rig(section, path.resolve(), source, tree)

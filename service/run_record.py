@@ -15,7 +15,7 @@ from typing import Literal
 from service.core.errors import ComputeError, IntegrityError
 from service.core.jobs.keys import arguments_name, job_key
 from service.core.protocol.models import Protocol, parse_protocol
-from service.core.records.events import ArtefactRef, Event, Payload, RunStarted, View
+from service.core.records.events import ArtefactRef, Event, Payload, RecordedView, RunStarted
 from service.core.run.decide import advance, fold
 from service.core.run.state import JobState, RunState
 from service.jobs.words import term
@@ -52,10 +52,10 @@ class RunRecord:
     events: tuple[Event, ...]
     state: RunState
 
-    def captures(self, step_id: str) -> tuple[View, ...]:
+    def captures(self, step_id: str) -> tuple[RecordedView, ...]:
         """The valid captures of a step's current attempt, in the order of capture."""
         payloads = (self.events[seq - 1].payload for seq in sorted(self.state.steps[step_id].captured.values()))
-        return tuple(payload for payload in payloads if isinstance(payload, View))
+        return tuple(payload for payload in payloads if isinstance(payload, RecordedView))
 
 
 @dataclass
@@ -156,7 +156,7 @@ class StepEvidence:
         """Whether the run has recorded a file with this content."""
         return self.log.store.holds(self.log.run_id, sha256)
 
-    def captures(self, step_id: str) -> tuple[View, ...]:
+    def captures(self, step_id: str) -> tuple[RecordedView, ...]:
         """The valid captures of a step's current attempt, in the order of capture."""
         return self.log.now().captures(step_id)
 

@@ -28,7 +28,7 @@ from service.compute.images.files import read_image, read_reduced
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.anchors import ANCHOR_WIDTH_PX
-from service.compute.markers.search.predicted import WIDE, Prediction, Tone, locate_predicted, tone_of
+from service.compute.markers.search.predicted import WIDE, PredictedSpheres, Tone, locate_predicted, tone_of
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json
 from service.compute.poses.files.pose_files import read_poses
 from service.core.geometry import inverse
@@ -91,7 +91,7 @@ def measure(folder: Path, most: int) -> dict[str, object]:
             ("exact", exact[file.name], 0.05),
             ("robot", T_world_base @ flange[file.name] @ T_flange_camera, WIDE),
         ):
-            expected = Prediction(inverse(T_scan_world @ T_world_camera), centres, known.radius_m, margin, tone)
+            expected = PredictedSpheres(inverse(T_scan_world @ T_world_camera), centres, known.radius_m, margin, tone)
             row[f"{label}_s"], found = cpu(partial(locate_predicted, image, camera, expected))
             row[f"{label}_found"], row[f"{label}_expected"] = len(found.outlines), found.expected
         rows.append(row)

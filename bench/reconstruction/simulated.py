@@ -18,7 +18,7 @@ from service.compute.poses.files.pose_files import read_poses_csv
 from service.core.geometry import Array, apply, inverse
 from service.core.units import metres
 from service.dataset.posed.pixels import Photographs
-from service.dataset.posed.records import DataSet, Mesh, View
+from service.dataset.posed.records import DataSet, Mesh, PosedView
 
 _POINTS = 2000  # of the scan, by which the sparse views are chosen
 
@@ -34,7 +34,9 @@ def simulated_data_set(folder: Path) -> DataSet:
     centres_mm = np.array([*spheres["registration_mm"], *spheres["control_mm"]])
     balls = tuple(Ball(metres(centre), metres(float(spheres["radius_mm"]))) for centre in centres_mm)
     poses = {name: T_scan_world @ T for name, T in read_poses_csv(folder / "poses.csv").items()}
-    views = tuple(View(Path(n).stem, Path(n).suffix, camera, T, np.zeros((6, 6))) for n, T in sorted(poses.items()))
+    views = tuple(
+        PosedView(Path(n).stem, Path(n).suffix, camera, T, np.zeros((6, 6))) for n, T in sorted(poses.items())
+    )
     files = {view.name: folder / "images" / view.file for view in views}
     points = mesh.vertices_m[:: max(1, len(mesh.vertices_m) // _POINTS)]
     sees = {view.name: _within(camera.project(apply(inverse(view.T_world_camera), points)), camera) for view in views}

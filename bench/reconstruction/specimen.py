@@ -19,9 +19,10 @@ import numpy as np
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.reconstruction.simulated import simulated_data_set
-from bench.scenes import CACHE, render_scene
+from bench.reconstruction.viewpoints import protocol_scene
+from bench.scenes import CACHE
 from drivers.meshes.surface_file import read_surface_file
-from service.benchmark.records import Result, Score, read_results
+from service.benchmark.records import BenchmarkResult, Score, read_results
 from service.benchmark.scoring import compare
 from service.compute.ground_truth.fusion.cut_out import Markers
 from service.compute.ground_truth.fusion.fuse import compact
@@ -64,7 +65,7 @@ def score_specimen(mesh: Path, truth: Mesh, markers: tuple[Markers, ...]) -> Sco
     return compare(found, Mesh(bare.vertices_m, bare.faces)).score
 
 
-def table(results: list[tuple[Result, Score]]) -> str:
+def table(results: list[tuple[BenchmarkResult, Score]]) -> str:
     """Both scores of each result, as Markdown."""
     lines = [
         "| method | scenario | views | px | compared | Chamfer mm | accuracy mm | completeness mm "
@@ -92,10 +93,10 @@ def main() -> None:
     parser.add_argument("--work", type=Path, help="folder of the results; that of bench.reconstruction otherwise")
     parser.add_argument("--out", default="reconstruction-specimen")
     args = parser.parse_args()
-    folder = render_scene(args.scene, args.width, args.views, cache=args.cache)
+    folder = protocol_scene(args.scene, args.width, args.views, args.cache)
     truth, markers = simulated_data_set(folder).mesh, markers_of(folder)
     work = args.work or WORK / f"scene{args.scene:02d}_{args.width}_{args.views}"
-    scored: list[tuple[Result, Score]] = []
+    scored: list[tuple[BenchmarkResult, Score]] = []
     for result in read_results(work):
         if result.score is not None:
             mesh = work / f"{result.method}-{result.scenario}" / "mesh.ply"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bench.machine import RESULTS
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, cone_of_sphere
-from service.compute.markers.records import Evidence, SphereOutline, outline_from_cone
+from service.compute.markers.records import OutlineEvidence, SphereOutline, outline_from_cone
 from service.compute.registration.identification.identity import identify_each
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
@@ -68,7 +68,7 @@ def make_trial(seed: int, visible: int, n_false: int, noise_px: float) -> Trial:
             break
     chosen = rng.choice(inside, visible, replace=False)
     f = CAMERA.fx
-    evidence = Evidence(
+    evidence = OutlineEvidence(
         1.0, 0.2, 0.2, 300, 0.1, 0.3, (180.0, 180.0, 180.0), 0.9, np.eye(3) * (max(noise_px, 0.02) / f) ** 2
     )
     outlines: list[SphereOutline] = []

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from bench.machine import RESULTS, machine
 from service.compute.camera_model import CameraModel
 from service.compute.layout.ambiguity import check_layout, layout_bounds
-from service.compute.layout.photo_adjustment import LensPrior, Photograph
+from service.compute.layout.photo_adjustment import LensPrior, SpherePhotograph
 from service.compute.layout.photographs import layout_from_photographs
 from service.compute.markers.cones import Cone, cone_of_sphere, fit_cone
 from simulators.geometry import apply, inverse
@@ -60,7 +60,7 @@ def layout_of(kind: str, rng: np.random.Generator, scene: Scene) -> Array:
     return np.concatenate([ring + rng.normal(0, spread, ring.shape), scene.control_m])
 
 
-def photograph(world: Array, T_world_camera: Array, lens: CameraModel, rng: np.random.Generator) -> Photograph:
+def photograph(world: Array, T_world_camera: Array, lens: CameraModel, rng: np.random.Generator) -> SpherePhotograph:
     """Outlines of all spheres as read with the nominal camera, in any order."""
     cones: list[Cone] = []
     for centre in apply(inverse(T_world_camera), world)[rng.permutation(len(world))]:
@@ -72,7 +72,9 @@ def photograph(world: Array, T_world_camera: Array, lens: CameraModel, rng: np.r
         axis = cone.axis + cone.frame()[:, :2] @ shift[:2]
         half = cone.half_angle_rad + float(shift[2]) + BIAS_PX / NOMINAL.fx
         cones.append(Cone(axis / np.linalg.norm(axis), half))
-    return Photograph(NOMINAL, tuple(cones), np.tile((STATED_PX / NOMINAL.fx) ** 2 * np.eye(3), (len(cones), 1, 1)))
+    return SpherePhotograph(
+        NOMINAL, tuple(cones), np.tile((STATED_PX / NOMINAL.fx) ** 2 * np.eye(3), (len(cones), 1, 1))
+    )
 
 
 def judge(kind: str, seed: int) -> Outcome:
@@ -83,7 +85,7 @@ def judge(kind: str, seed: int) -> Outcome:
     lens = CameraModel.from_record(scene.camera_intrinsics(1920).to_json())
     truth = check_layout(world)
     good = all(bounded.value_m >= limit for bounded, limit in layout_bounds(truth).values())
-    photographs: list[Photograph] = []
+    photographs: list[SpherePhotograph] = []
     passed = failed = False
     for T_world_held in HELD_CAMERAS.values():
         jitter = rng.normal(0.0, 0.01, 3)

@@ -19,7 +19,7 @@ from bench.scenes import CACHE, render_scene
 from service.compute.evaluation.accuracy import evaluate, leave_one_out, true_error_m
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.cones import Cone, cone_of_sphere
-from service.compute.markers.records import Evidence, SphereOutline, outline_from_cone
+from service.compute.markers.records import OutlineEvidence, SphereOutline, outline_from_cone
 from service.compute.pipeline import detect_all, register_images
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.settings import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
@@ -200,7 +200,7 @@ def _outlines(
     pixels = CAMERA.project(centres_camera_m)
     inside = np.nonzero(np.all((pixels > 40) & (pixels < [CAMERA.width - 40, CAMERA.height - 40]), axis=1))[0]
     covariance = np.eye(3) * (case.outline_px / CAMERA.fx) ** 2
-    evidence = Evidence(1.0, 0.2, 0.2, 300, 0.1, 0.3, (180.0, 180.0, 180.0), 0.9, covariance)
+    evidence = OutlineEvidence(1.0, 0.2, 0.2, 300, 0.1, 0.3, (180.0, 180.0, 180.0), 0.9, covariance)
     found: list[SphereOutline] = []
     for m in inside:
         cone = cone_of_sphere(centres_camera_m[m], RADIUS_M)

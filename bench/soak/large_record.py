@@ -19,7 +19,7 @@ from bench.soak.sparse import SparseFiles, sparse_photograph
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import ViewpointCaptured
 from service.jobs.capture import live_view
-from service.jobs.records import Camera, Limits, Photograph
+from service.jobs.records import Camera, Limits, PosedPhotograph
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
@@ -164,5 +164,5 @@ def _arguments(viewpoint: str, sha256: str) -> live_view.Arguments:
         spheres_m=tuple((0.1 * k, 0.1, 0.1) for k in range(10)),
         radius_m=0.015,
         limits=Limits(min_views=3, max_angle_deg=60.0, max_distance_m=0.8),
-        image=Photograph(viewpoint=viewpoint, sha256=sha256, station=_STATION),
+        image=PosedPhotograph(viewpoint=viewpoint, sha256=sha256, station=_STATION),
     )

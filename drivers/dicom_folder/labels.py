@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import Array, Transform
+from service.core.units import mm
 
 _TOLERANCE = 0.05  # voxels, at the farthest corner: what rounding of positions explains
 #: NIfTI's axes (x right, y front, z head) in DICOM's (x left, y back, z head).
@@ -88,7 +89,7 @@ def _elsewhere(block: Block, shape: tuple[int, int, int], T_ct_voxel: Transform,
             where=str(where),
             remedy="Write it with a program that changes the axes (3D Slicer and nibabel leave them to the affine)",
         )
-    own, series = (1e3 * np.linalg.norm(T[:3, :3], axis=0) for T in (block.T_ct_block, T_ct_voxel))
+    own, series = (mm(np.linalg.norm(T[:3, :3], axis=0)) for T in (block.T_ct_block, T_ct_voxel))
     return UnreadableFileError(
         f"the voxels of the segmentation{block.name} are not those of the CT series: they have {_sides(own)} mm, "
         f"those of the series {_sides(series)} mm, and the first one is {_offset(block, T_ct_voxel)} voxels from a "

@@ -16,6 +16,7 @@ from drivers.dicom_folder.headers import SEGMENTATION, grouped, items
 from drivers.dicom_folder.labels import Block, chosen
 from drivers.dicom_folder.pixels import DECODE_ERRORS
 from drivers.errors import UnreadableFileError
+from service.core.units import metres
 
 _LARGEST_PIXELS = 8192 * 8192
 _AGAIN = "Export the segmentation again as a DICOM Segmentation object of this series"
@@ -112,7 +113,7 @@ def _place(groups: tuple[Dataset, ...]) -> NDArray[np.float64] | None:
     T[:3, 1] = along_row * spacing[1]
     T[:3, 2] = np.cross(along_row, down_column)
     T[:3, 3] = position
-    T[:3] *= 1e-3
+    T[:3] = metres(T[:3])
     return T
 
 

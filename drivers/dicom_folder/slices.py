@@ -11,6 +11,7 @@ from pydicom.uid import UID
 from drivers.dicom_folder.codecs import lacking_decoder
 from drivers.dicom_folder.headers import SliceHeader
 from drivers.interfaces import Array, Transform
+from service.core.units import metres
 
 _LARGEST_PIXELS = 8192 * 8192  # per image; a CT slice has at most a sixteenth of it
 _ORIENTATION_TOLERANCE = 1e-3
@@ -146,6 +147,6 @@ def arrange(headers: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Transfor
     T[:3, 1] = np.array(orientation[3:]) * row_spacing
     T[:3, 2] = (last - first) / (len(ordered) - 1)
     T[:3, 3] = first
-    T[:3] *= 1e-3
+    T[:3] = metres(T[:3])
     i, j, k = np.linalg.norm(T[:3, :3], axis=0)
     return ordered, T, (float(i), float(j), float(k))

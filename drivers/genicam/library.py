@@ -11,10 +11,11 @@ import ctypes.util
 from dataclasses import dataclass
 from typing import Any
 
+from service.core.units import seconds_of_us, us
+
 LIBRARIES = ("aravis-0.8", "gobject-2.0", "glib-2.0")
 _SUCCESS = 0  # of ArvBufferStatus
 _POINTER, _TEXT, _REAL = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_double
-_US = 1e6  # microseconds in a second: Aravis' unit of times
 
 
 class AravisError(Exception):
@@ -71,7 +72,7 @@ class AravisCamera:
     @property
     def exposure_s(self) -> float:
         """Exposure time that the camera reports."""
-        return float(self._of_camera("arv_camera_get_exposure_time", _REAL)) / _US
+        return seconds_of_us(float(self._of_camera("arv_camera_get_exposure_time", _REAL)))
 
     @property
     def gain(self) -> float:
@@ -80,7 +81,7 @@ class AravisCamera:
 
     def set_exposure_s(self, exposure_s: float) -> None:
         """Set the exposure time; the camera may round it."""
-        self._of_camera("arv_camera_set_exposure_time", None, exposure_s * _US, of=(_REAL,))
+        self._of_camera("arv_camera_set_exposure_time", None, us(exposure_s), of=(_REAL,))
 
     def set_gain(self, gain: float) -> None:
         """Set the gain, in the camera's own unit."""
@@ -92,7 +93,7 @@ class AravisCamera:
 
     def acquire(self, timeout_s: float) -> Frame:
         """Expose and receive one image. Raises NoImageError or AravisError."""
-        timeout_us = ctypes.c_uint64(round(timeout_s * _US))
+        timeout_us = ctypes.c_uint64(round(us(timeout_s)))
         buffer = self._of_camera("arv_camera_acquisition", _POINTER, timeout_us, of=(ctypes.c_uint64,))
         if not buffer:
             raise NoImageError("no image came")

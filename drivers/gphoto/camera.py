@@ -26,6 +26,7 @@ from drivers.gphoto.profiles import profile_for
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
 from drivers.photos.photo_file import check_jpeg_complete, read_exif, sha256_of
 from drivers.plugin import DriverConfig
+from service.core.units import megabytes, ms
 
 _LOG = logging.getLogger(__name__)
 BUSY_ATTEMPTS = 5
@@ -158,7 +159,7 @@ class GphotoCamera:
         if program != self._profile.manual_program:
             problems.append(f"Exposure program is {program}: turn the mode dial to M")
         if free is not None and free < LEAST_FREE_BYTES:
-            problems.append(f"{free / 1e6:.0f} MB free in the camera: empty or change the card")
+            problems.append(f"{megabytes(free):.0f} MB free in the camera: empty or change the card")
         return tuple(problems)
 
     # --- settings -----------------------------------------------------------------------------------------
@@ -213,7 +214,7 @@ class GphotoCamera:
             if announced:
                 images.append(self._released(folder))
                 continue
-            left_ms = max(1, round(1000 * (deadline_s - time.monotonic())))
+            left_ms = max(1, round(ms(deadline_s - time.monotonic())))
             event, data = self._link.next_event(1 if images else min(200, left_ms))
             if event == gp.GP_EVENT_FILE_ADDED:
                 announced.append(AddedFile(str(data.folder), str(data.name)))
@@ -257,6 +258,7 @@ class GphotoCamera:
             height=exif.height,
             lens_serial=exif.lens_serial,
             body_serial=exif.body_serial,
+            model=exif.model,
             focus_distance_m=exif.focus_distance_m or 0.0,
             focus_position=exif.focus_position,
         )
@@ -279,7 +281,9 @@ class GphotoCamera:
         free = self._link.free_bytes()
         if free is not None and (free == 0 or (self._target != "computer" and free < LEAST_FREE_BYTES)):
             raise DeviceStorageFullError(
-                f"{free / 1e6:.0f} MB free in the camera", where=self._link.where, remedy="Empty or change the card"
+                f"{megabytes(free):.0f} MB free in the camera",
+                where=self._link.where,
+                remedy="Empty or change the card",
             )
 
     def _trigger(self) -> float:

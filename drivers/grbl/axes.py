@@ -10,6 +10,7 @@ import numpy as np
 
 from drivers.grbl import GrblAxis
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad, transform
+from service.core.units import metres
 
 _GRID = 12  # starts of the search on each axis that turns
 _REFINED = 3  # of the best starts
@@ -36,7 +37,7 @@ class Axes:
 
     @property
     def _scale(self) -> Array:
-        return np.array([np.radians(1.0) if axis.turns else 1e-3 for axis in self.axes])
+        return np.array([np.radians(1.0) if axis.turns else metres(1.0) for axis in self.axes])
 
     @property
     def limits(self) -> tuple[Array, Array]:

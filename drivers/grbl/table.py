@@ -37,6 +37,7 @@ from drivers.interfaces import (
     SettleReport,
     Transform,
 )
+from service.core.units import mm
 
 LONGEST_RINGING_S = 10.0
 STOP_S = 5.0
@@ -196,9 +197,7 @@ class GrblTable:
         values, distance_m, angle_rad = self._axes.nearest(np.asarray(T_base_flange), self._values(near_rad))
         angle_deg = float(np.degrees(angle_rad))
         if distance_m > self._config.reach_within_m or angle_deg > self._config.reach_within_deg:
-            what = (
-                f"the axes bring the camera's mount only within {1e3 * distance_m:.0f} mm and {angle_deg:.1f}° of it"
-            )
+            what = f"the axes bring the camera's mount only within {mm(distance_m):.0f} mm and {angle_deg:.1f}° of it"
             remedy = "Choose a viewpoint on the circle that the axes reach, or correct the rig file"
             raise UnreachablePoseError(what, where=self._where, remedy=remedy)
         return values
@@ -223,7 +222,7 @@ class GrblTable:
                 remedy = "Lower the setting $120, $121 … of the axis, or change the motion of the protocol"
                 raise DeviceRefusedError(what, where=self._where, remedy=remedy)
         speeds = np.array(
-            [np.degrees(speed_rad_s) if a.turns else 1e3 * self._config.slide_speed_m_s for a in self._config.axes]
+            [np.degrees(speed_rad_s) if a.turns else mm(self._config.slide_speed_m_s) for a in self._config.axes]
         )
         # From a higher speed they would not stand in time if nobody were left to stop them.
         fastest = setup.acceleration * (self._config.rest_within_s - REACTION_S)

@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 
 from service.benchmark.method import Command
-from service.benchmark.records import Effort, Machine
+from service.benchmark.records import ComputingEffort, Machine
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.units import gigabytes, megabytes
 
@@ -21,7 +21,7 @@ _LAST_LINES = 12  # of a failed program's output, for the message
 _ANSWER_S = 10.0  # that the NVIDIA driver may take to name its GPU
 
 
-def run_commands(commands: tuple[Command, ...], work: Path, log: Path) -> Effort:
+def run_commands(commands: tuple[Command, ...], work: Path, log: Path) -> ComputingEffort:
     """Run commands one after the other in a folder, with their output in a file.
 
     Raises:
@@ -55,7 +55,9 @@ def run_commands(commands: tuple[Command, ...], work: Path, log: Path) -> Effort
                 where=shlex.join(command),
                 remedy=f"Its whole output is in {log}",
             )
-    return Effort(wall_s=round(wall_s, 2), cpu_s=round(cpu_s, 2), peak_memory_mb=round(megabytes(peak_bytes)))
+    return ComputingEffort(
+        wall_s=round(wall_s, 2), cpu_s=round(cpu_s, 2), peak_memory_mb=round(megabytes(peak_bytes))
+    )
 
 
 def this_machine() -> Machine:

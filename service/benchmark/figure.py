@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.method import Method
-from service.benchmark.records import SCENARIOS, Result, Scenario
+from service.benchmark.records import SCENARIOS, BenchmarkResult, Scenario
 from service.benchmark.running import truth_file
 from service.compute.ground_truth.distances.chamfer import OUTLIER_M, Compared
 from service.compute.ground_truth.distances.heat_map import HeatScale, Panel, heat_bar, heat_row
@@ -25,7 +25,7 @@ FULL_M = 2e-3  # end of the colours: one scale for all figures
 _PANEL_PX = 520
 
 
-def figure(out: Path, results: Sequence[Result], known: Mapping[str, Method]) -> NDArray[np.uint8]:
+def figure(out: Path, results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> NDArray[np.uint8]:
     """(H, W, 3) picture, blue first: a row for each scenario and a column for each method, of the newest data set.
 
     Args:
@@ -55,12 +55,12 @@ def figure(out: Path, results: Sequence[Result], known: Mapping[str, Method]) ->
     return np.vstack([body, heat_bar(body.shape[1], scale)])
 
 
-def figure_png(out: Path, results: Sequence[Result], known: Mapping[str, Method]) -> bytes:
+def figure_png(out: Path, results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> bytes:
     """The figure as PNG; raises as `figure`."""
     return cv2.imencode(".png", figure(out, results, known))[1].tobytes()
 
 
-def _panel(out: Path, result: Result | None, title: str, index: PointIndex, scale: HeatScale) -> Panel:
+def _panel(out: Path, result: BenchmarkResult | None, title: str, index: PointIndex, scale: HeatScale) -> Panel:
     if result is None or result.score is None:
         return Panel(np.empty((0, 3)), np.empty((0, 3), dtype=np.uint8), None, f"{title}: -")
     surface = _surface(out / f"{result.method}-{result.scenario}" / "mesh.ply")

@@ -17,7 +17,7 @@ Command = tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Workplace:
     """Where a method works.
 
     Attributes:
@@ -55,8 +55,8 @@ class Method:
     words: str
     expects: str
     form: str
-    commands: Callable[[Place], tuple[Command, ...]]
-    mesh: Callable[[Place], Path]
+    commands: Callable[[Workplace], tuple[Command, ...]]
+    mesh: Callable[[Workplace], Path]
     to_world: Callable[[Array, Path], Array] = lambda vertices, _data: vertices
     programs: tuple[str, ...] = ()
     variable: str = ""
@@ -93,7 +93,7 @@ def missing(method: Method, environment: Mapping[str, str] = os.environ) -> str:
     return method.lacking()
 
 
-def place_of(method: Method, folder: Path, environment: Mapping[str, str] = os.environ) -> Place:
+def place_of(method: Method, folder: Path, environment: Mapping[str, str] = os.environ) -> Workplace:
     """Where a method works below a folder: `data` and `work`, with its checkout and interpreter.
 
     `VARIABLE_PYTHON` names the interpreter of a checkout with an environment of its own, `python` is the default;
@@ -102,6 +102,6 @@ def place_of(method: Method, folder: Path, environment: Mapping[str, str] = os.e
     folder = folder.resolve()
     data, work = folder / "data", folder / "work"
     if not method.variable:
-        return Place(data, work, python=sys.executable)
+        return Workplace(data, work, python=sys.executable)
     python = environment.get(f"{method.variable}_PYTHON", "python")
-    return Place(data, work, Path(environment.get(method.variable, f"${method.variable}")), python)
+    return Workplace(data, work, Path(environment.get(method.variable, f"${method.variable}")), python)

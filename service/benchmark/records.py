@@ -24,7 +24,7 @@ class Machine(Record):
     gpu: str  # "" where no NVIDIA driver answers
 
 
-class Effort(Record):
+class ComputingEffort(Record):
     """What the commands of a method took.
 
     Attributes:
@@ -66,7 +66,7 @@ class Score(Record):
     seen_percent: float
 
 
-class Result(Record):
+class BenchmarkResult(Record):
     """One method in one scenario.
 
     Attributes:
@@ -96,7 +96,7 @@ class Result(Record):
     height: int
     commands: tuple[tuple[str, ...], ...]
     elsewhere: bool
-    effort: Effort | None
+    effort: ComputingEffort | None
     mesh_sha256: str
     faces: int
     score: Score | None
@@ -105,16 +105,16 @@ class Result(Record):
     finished_utc: str
 
 
-def read_results(out: Path) -> tuple[Result, ...]:
+def read_results(out: Path) -> tuple[BenchmarkResult, ...]:
     """All results in a folder, by name of their folders.
 
     Raises:
         DataError: a file is no result.
     """
-    results: list[Result] = []
+    results: list[BenchmarkResult] = []
     for path in sorted(out.glob(f"*/{RESULT}")):
         try:
-            results.append(Result.model_validate_json(path.read_bytes()))
+            results.append(BenchmarkResult.model_validate_json(path.read_bytes()))
         except ValidationError as error:
             raise DataError("this is no result of the benchmark", where=str(path), remedy="Remove it") from error
     return tuple(results)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.commands import run_commands, this_machine
-from service.benchmark.method import Command, Method, Place, missing, place_of
-from service.benchmark.records import RESULT, Effort, Result, Scenario, Score
+from service.benchmark.method import Command, Method, Workplace, missing, place_of
+from service.benchmark.records import RESULT, BenchmarkResult, ComputingEffort, Scenario, Score
 from service.benchmark.scoring import score_mesh, write_scored
 from service.compute.ground_truth.distances.chamfer import ChamferSettings
 from service.compute.ground_truth.ply import write_ply
@@ -53,7 +53,9 @@ class Trial:
         return self.out / f"{self.method.name}-{self.scenario}"
 
 
-def run_trial(trial: Trial, whole: DataSet, progress: Progress = lambda _what, _done, _total: None) -> Result:
+def run_trial(
+    trial: Trial, whole: DataSet, progress: Progress = lambda _what, _done, _total: None
+) -> BenchmarkResult:
     """Run a method, or take its mesh, and score that; the result is kept in the trial's folder.
 
     A method that is installed and makes no mesh has a result without a score, as COLMAP in the paper's sparse
@@ -83,7 +85,7 @@ def run_trial(trial: Trial, whole: DataSet, progress: Progress = lambda _what, _
     if not truth.is_file():
         write_ply(truth, Surface(whole.mesh.vertices_m, whole.mesh.faces), 1.0, {}, ["world frame, metres"])
     score, sha256, faces = _scored(trial, mesh, dataset, progress) if mesh is not None else (None, "", 0)
-    result = Result(
+    result = BenchmarkResult(
         method=trial.method.name,
         scenario=trial.scenario,
         dataset_sha256=whole.identity,
@@ -136,8 +138,8 @@ def _require_installed(trial: Trial, commands: tuple[Command, ...]) -> None:
 
 
 def _mesh(
-    trial: Trial, place: Place, commands: tuple[Command, ...], progress: Progress
-) -> tuple[Path | None, Effort | None, str]:
+    trial: Trial, place: Workplace, commands: tuple[Command, ...], progress: Progress
+) -> tuple[Path | None, ComputingEffort | None, str]:
     """The mesh given or made, what it took to make it, and why there is none."""
     if trial.mesh is not None:
         return trial.mesh, None, ""
@@ -150,7 +152,7 @@ def _mesh(
     return mesh, effort, ""
 
 
-def _run(trial: Trial, place: Place, commands: tuple[Command, ...]) -> tuple[Effort, Path]:
+def _run(trial: Trial, place: Workplace, commands: tuple[Command, ...]) -> tuple[ComputingEffort, Path]:
     if place.work.exists():
         shutil.rmtree(place.work)
     place.work.mkdir()
@@ -171,7 +173,7 @@ def _scored(trial: Trial, mesh: Path, dataset: DataSet, progress: Progress) -> t
     return scored.score, hash_file(mesh)[0], len(file.faces)
 
 
-def _keep(path: Path, result: Result) -> None:
+def _keep(path: Path, result: BenchmarkResult) -> None:
     part = path.with_suffix(".part")
     part.write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")
     DurableFiles().sync_file(part)

@@ -12,42 +12,16 @@ import trimesh
 from service.benchmark.records import Score
 from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, chamfer
 from service.compute.ground_truth.distances.heat_map import HeatScale, heat_picture
+from service.compute.ground_truth.fusion.regions import Box
 from service.compute.ground_truth.ply import write_ply
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import DataError
-from service.core.geometry import Array, Transform, apply, inverse
+from service.core.geometry import inverse
 from service.core.units import mm
 from service.dataset.posed.records import Mesh
 
 MARGIN_M = 0.002
 _POINTS = 200_000  # of the truth, by which its box is found
-
-
-@dataclass(frozen=True, slots=True)
-class Box:
-    """A box with its own axes.
-
-    Attributes:
-        T_world_box: pose of its centre.
-        half_m: (3,) half its edges.
-    """
-
-    T_world_box: Transform
-    half_m: Array
-
-    @classmethod
-    def around(cls, mesh: Mesh, margin_m: float = MARGIN_M) -> Box:
-        """The smallest box around a mesh, and a margin."""
-        points = mesh.vertices_m[:: max(1, len(mesh.vertices_m) // _POINTS)]
-        to_origin, extents = trimesh.bounds.oriented_bounds(points)
-        return cls(inverse(np.asarray(to_origin)), np.asarray(extents) / 2 + margin_m)
-
-    def cut(self, surface: Surface) -> Surface:
-        """The faces whose centres are within."""
-        centres = surface.vertices_m[surface.faces].mean(axis=1)
-        within = (np.abs(apply(inverse(self.T_world_box), centres)) <= self.half_m).all(axis=1)
-        kept, faces = np.unique(surface.faces[within], return_inverse=True)
-        return Surface(surface.vertices_m[kept], faces.reshape(-1, 3).astype(np.int64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,13 +43,27 @@ def score_mesh(found: Surface, truth: Mesh, settings: ChamferSettings | None = N
         DataError: nothing of the mesh is within the box.
         ComputeError: the meshes cannot be compared.
     """
-    cut = Box.around(truth).cut(found)
+    cut = _cropped(found, _box_around(truth, MARGIN_M))
     if not cut.is_mesh or not cut.area_m2 > 0:
         raise DataError(
             "the mesh has no face within the box of the ground truth",
             remedy="Check that the mesh is the file as the method wrote it, and that it belongs to this data set",
         )
     return compare(cut, truth, settings, 100 * max(0.0, 1 - cut.area_m2 / found.area_m2))
+
+
+def _box_around(mesh: Mesh, margin_m: float) -> Box:
+    """The smallest box around a mesh, and a margin."""
+    points = mesh.vertices_m[:: max(1, len(mesh.vertices_m) // _POINTS)]
+    to_origin, extents = trimesh.bounds.oriented_bounds(points)
+    return Box(inverse(np.asarray(to_origin)), np.asarray(extents) + 2 * margin_m)
+
+
+def _cropped(surface: Surface, box: Box) -> Surface:
+    """The faces whose centres are in a box."""
+    within = box.contains(surface.vertices_m[surface.faces].mean(axis=1))
+    kept, faces = np.unique(surface.faces[within], return_inverse=True)
+    return Surface(surface.vertices_m[kept], faces.reshape(-1, 3).astype(np.int64))
 
 
 def compare(

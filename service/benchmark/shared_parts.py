@@ -9,22 +9,22 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
-from service.benchmark.method import Command, Place
+from service.benchmark.method import Command, Workplace
 from service.core.errors import DataError
 from service.core.geometry import Array
 
 _Axis = Annotated[int, Field(ge=0, le=2)]
 
 
-def at(name: str) -> Callable[[Place], Path]:
+def at(name: str) -> Callable[[Workplace], Path]:
     """A mesh of this name in the method's folder."""
     return newest(name)
 
 
-def newest(pattern: str) -> Callable[[Place], Path]:
+def newest(pattern: str) -> Callable[[Workplace], Path]:
     """The youngest of the files in the method's folder that match a pattern."""
 
-    def find(place: Place) -> Path:
+    def find(place: Workplace) -> Path:
         found = [path for path in place.work.glob(pattern) if path.is_file()]
         if not found:
             raise DataError(
@@ -58,6 +58,6 @@ def from_unit_box(vertices: Array, data: Path) -> Array:
     return vertices[:, box.mesh_axes] + np.array(box.centre_m)
 
 
-def triangulation(place: Place, dense: Path) -> Command:
+def triangulation(place: Workplace, dense: Path) -> Command:
     """The command of ours that makes COLMAP's workspace `dense` of the export `colmap-pinhole` in `place.data`."""
     return (place.python, "-m", "service.benchmark.programs.triangulated", str(place.data), str(dense))

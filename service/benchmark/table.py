@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from service.benchmark.method import Method, Place, missing
-from service.benchmark.records import SCENARIOS, Result
+from service.benchmark.method import Method, Workplace, missing
+from service.benchmark.records import SCENARIOS, BenchmarkResult
 
 _NONE = "–"
 
 
-def table_record(results: Sequence[Result], known: Mapping[str, Method]) -> dict[str, Any]:
+def table_record(results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> dict[str, Any]:
     """All results; for each method without a result, what is missing, what it expects, and its commands."""
     done = {(result.method, result.scenario) for result in results}
     return {
@@ -33,7 +33,7 @@ def table_record(results: Sequence[Result], known: Mapping[str, Method]) -> dict
     }
 
 
-def table_markdown(results: Sequence[Result], known: Mapping[str, Method]) -> str:
+def table_markdown(results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> str:
     """Format the results for people: the paper's Chamfer distances, then details, commands, and what was not run."""
     lines: list[str] = ["# Reconstruction from posed images", ""]
     for dataset in dict.fromkeys(result.dataset_sha256 for result in results):
@@ -42,7 +42,7 @@ def table_markdown(results: Sequence[Result], known: Mapping[str, Method]) -> st
     return "\n".join(lines + _not_run(table_record(results, known)["not_run"], known)) + "\n"
 
 
-def _chamfer(results: Sequence[Result], known: Mapping[str, Method]) -> list[str]:
+def _chamfer(results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> list[str]:
     by = {(result.method, result.scenario): result for result in results}
     names = list(dict.fromkeys(result.method for result in results))
     best = {
@@ -73,7 +73,7 @@ def _chamfer(results: Sequence[Result], known: Mapping[str, Method]) -> list[str
     ]
 
 
-def _details(results: Sequence[Result], known: Mapping[str, Method]) -> list[str]:
+def _details(results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> list[str]:
     head = (
         "method", "scenario", "views", "px", "Chamfer mm", "accuracy mm", "completeness mm", "F 0.5 mm", "F 1 mm",
         "normals", "wall s", "CPU s", "memory MB",
@@ -88,7 +88,7 @@ def _details(results: Sequence[Result], known: Mapping[str, Method]) -> list[str
     ]
 
 
-def _detail_cells(result: Result, known: Mapping[str, Method]) -> list[str]:
+def _detail_cells(result: BenchmarkResult, known: Mapping[str, Method]) -> list[str]:
     score, effort = result.score, result.effort
     scores, took = [_NONE] * 6, [_NONE] * 3
     if score is not None:
@@ -102,7 +102,7 @@ def _detail_cells(result: Result, known: Mapping[str, Method]) -> list[str]:
     return [_words(result.method, known), result.scenario, str(result.views), size, *scores, *took]
 
 
-def _remarks(results: Sequence[Result], known: Mapping[str, Method]) -> list[str]:
+def _remarks(results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> list[str]:
     floors = [result.score.floor_mm for result in results if result.score is not None]
     machines = dict.fromkeys(
         f"{m.processor}, {m.cores} cores, {m.memory_gb:g} GB, {m.gpu or 'no GPU'}"
@@ -125,7 +125,7 @@ def _remarks(results: Sequence[Result], known: Mapping[str, Method]) -> list[str
     ]
 
 
-def _commands(results: Sequence[Result], known: Mapping[str, Method]) -> list[str]:
+def _commands(results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> list[str]:
     lines = ["Command lines:", "", "```"]
     for result in results:
         lines.append(f"# {_words(result.method, known)}, {result.scenario}, {result.finished_utc}")
@@ -151,10 +151,10 @@ def _not_run(entries: Sequence[Mapping[str, Any]], known: Mapping[str, Method]) 
     return lines
 
 
-def _named(method: Method) -> Place:
+def _named(method: Method) -> Workplace:
     """A place with names instead of folders, for commands that are only shown."""
     checkout = f"${method.variable}" if method.variable else ""
-    return Place(Path("DATA"), Path("WORK"), Path(checkout), "python")
+    return Workplace(Path("DATA"), Path("WORK"), Path(checkout), "python")
 
 
 def _words(name: str, known: Mapping[str, Method]) -> str:

@@ -63,6 +63,11 @@ def seconds_of_ms(duration_ms: float) -> float:
     return duration_ms / 1e3
 
 
+def us(duration_s: float) -> float:
+    """Microseconds of a duration in seconds."""
+    return 1e6 * duration_s
+
+
 def seconds_of_us(duration_us: float) -> float:
     """Seconds of a duration in microseconds."""
     return duration_us / 1e6

@@ -15,7 +15,7 @@ from service.compute.ground_truth.ply import read_ply
 from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.protocol.models import Protocol
-from service.core.records.events import ArtefactRef, Event, JobFinished, RunStarted, View
+from service.core.records.events import ArtefactRef, Event, JobFinished, RecordedView, RunStarted
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.core.units import metres
@@ -93,11 +93,11 @@ class RunSummary:
         """The row of a registration that arrived after the evaluation and beats the run's own, if any."""
         return better_later(self.protocol, self.state)
 
-    def captures(self) -> Iterable[View]:
+    def captures(self) -> Iterable[RecordedView]:
         """Every valid capture in order, including those for calibration."""
         seqs = sorted(seq for step in self.state.steps.values() for seq in step.captured.values())
         payloads = (self.events[seq - 1].payload for seq in seqs)
-        return (payload for payload in payloads if isinstance(payload, View))
+        return (payload for payload in payloads if isinstance(payload, RecordedView))
 
     def artefacts(self, kind: str) -> tuple[ArtefactRef, ...]:
         """Artefacts of a kind in the results of the run's valid steps."""

@@ -73,7 +73,7 @@ class ImageFile(JobRecord):
     sha256: Hash
 
 
-class Photograph(ImageFile):
+class PosedPhotograph(ImageFile):
     """A photograph and the pose of its camera.
 
     Attributes:

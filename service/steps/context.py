@@ -14,7 +14,7 @@ from service.core.jobs.references import Each, Reference
 from service.core.protocol.models import Protocol as LabProtocol
 from service.core.protocol.models import Step
 from service.core.protocol.step_params import StepParams
-from service.core.records.events import ArtefactRef, ComputedBy, Payload, Record, StepNote, Uncertainty, View
+from service.core.records.events import ArtefactRef, ComputedBy, Payload, Record, RecordedView, StepNote, Uncertainty
 from service.core.records.import_list import ImportList
 from service.core.run.decide import RunState, StepState
 from service.core.run.state import JobState
@@ -208,7 +208,7 @@ class Evidence(Protocol):
         """Whether a file with these bytes is in the evidence of this run already."""
         ...
 
-    def captures(self, step_id: str) -> tuple[View, ...]:
+    def captures(self, step_id: str) -> tuple[RecordedView, ...]:
         """The valid captures of a step's current attempt, up to this moment, in order."""
         ...
 

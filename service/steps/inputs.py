@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from service.core.errors import ConfigurationError, IntegrityError
 from service.core.jobs.references import Each, Reference
-from service.core.records.events import ArtefactRef, View, ViewHeld, ViewpointCaptured
+from service.core.records.events import ArtefactRef, RecordedView, ViewHeld, ViewpointCaptured
 from service.core.run.computed import answered_by
 from service.core.run.state import JobState
 from service.core.text.counts import counted
@@ -18,7 +18,7 @@ from service.jobs.calibration import calibrate
 from service.jobs.capture import hand_board, hand_view
 from service.jobs.kind import JobKind, JobRecord
 from service.jobs.looks import image_of
-from service.jobs.records import ArmCorrection, Mounting, ParameterCovariance, Photograph
+from service.jobs.records import ArmCorrection, Mounting, ParameterCovariance, PosedPhotograph
 from service.steps.context import StepContext
 
 R = TypeVar("R", bound=JobRecord)
@@ -90,12 +90,12 @@ def artefact_of(context: StepContext, step_id: str, kind: str) -> ArtefactRef:
     return found[-1]
 
 
-def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[Photograph]:
+def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[PosedPhotograph]:
     """Every valid photograph of the given capture steps with its pose, in the order of capture.
 
     Read from the evidence, because the context's state lacks events since the step began, such as its own images.
     """
-    images: list[Photograph] = []
+    images: list[PosedPhotograph] = []
     for step_id in step_ids:
         held = held_views(context, step_id)
         for capture in context.evidence.captures(step_id):
@@ -115,32 +115,36 @@ def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[Photo
     return images
 
 
-def raw_files(context: StepContext, images: Iterable[Photograph]) -> dict[str, str]:
-    """SHA-256 of the raw file of each photograph, by viewpoint.
+def raw_files(context: StepContext, images: Iterable[PosedPhotograph]) -> list[tuple[PosedPhotograph, str]]:
+    """Each photograph with the SHA-256 of its raw file.
 
     Raises:
         ConfigurationError: a photograph has none.
     """
-    wanted = {image.sha256: image for image in images}
-    found: dict[str, str] = {}
-    for step_id in dict.fromkeys(image.step for image in wanted.values()):
+    wanted = list(images)
+    raws: dict[str, str] = {}
+    for step_id in dict.fromkeys(image.step for image in wanted):
         for capture in context.evidence.captures(step_id):
-            image = wanted.get(capture.artefacts[0].sha256)
-            raw = next((ref.sha256 for ref in capture.artefacts if ref.kind == "raw"), None)
-            if image is not None and raw is not None:
-                found[image.viewpoint] = raw
-    missing = [image.viewpoint for image in wanted.values() if image.viewpoint not in found]
+            raw = raw_of(capture.artefacts)
+            if raw is not None:
+                raws[capture.artefacts[0].sha256] = raw
+    missing = [image.viewpoint for image in wanted if image.sha256 not in raws]
     if missing:
         raise ConfigurationError(
             f"{counted(len(missing), 'image')} of {len(wanted)} without a raw file, the first is {missing[0]}",
             where=f"step {context.step.id}",
             remedy="Set `image_quality` of the camera to RAW+JPEG and take the images again, or `measure_on` to jpeg",
         )
-    return found
+    return [(image, raws[image.sha256]) for image in wanted]
 
 
-def _photograph(capture: View, step_id: str, look: hand_view.Answer | None) -> Photograph:
-    image = Photograph(
+def raw_of(files: Iterable[ArtefactRef]) -> str | None:
+    """SHA-256 of the raw file among the files of an exposure; None without one."""
+    return next((ref.sha256 for ref in files if ref.kind == "raw"), None)
+
+
+def _photograph(capture: RecordedView, step_id: str, look: hand_view.Answer | None) -> PosedPhotograph:
+    image = PosedPhotograph(
         name=f"{capture.viewpoint}.jpg",
         step=step_id,
         viewpoint=capture.viewpoint,
@@ -153,7 +157,7 @@ def _photograph(capture: View, step_id: str, look: hand_view.Answer | None) -> P
     return by_robot.model_copy(update={"T_scene_camera": look.T_scene_camera})
 
 
-def with_robot_pose(photograph: Photograph, view: View) -> Photograph:
+def with_robot_pose(photograph: PosedPhotograph, view: RecordedView) -> PosedPhotograph:
     """Add the robot's pose to a photograph; return it unchanged if no robot held the camera."""
     if isinstance(view, ViewpointCaptured):
         return photograph.model_copy(update={"T_base_flange": view.T_base_flange, "joints_rad": view.joints_rad})

@@ -10,7 +10,7 @@ import difflib
 from collections.abc import Iterator, Mapping
 
 from service.core.protocol.models import Gate, LoadedProtocol, Step
-from service.core.text.yaml_tree import FieldPath, Plain, Problem, field_name, parse_yaml
+from service.core.text.yaml_tree import FieldPath, Plain, YamlProblem, field_name, parse_yaml
 from service.rig import RigSection
 from service.steps import step_kinds
 from service.steps.measures import Measure, RegistrationMeasures
@@ -41,7 +41,7 @@ def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, 
     )
 
 
-def implausible(loaded: LoadedProtocol, rig: RigSection | None = None) -> tuple[Problem, ...]:
+def implausible(loaded: LoadedProtocol, rig: RigSection | None = None) -> tuple[YamlProblem, ...]:
     """Unknown measures, wrong units, limits that are not credible and, with a rig, unknown stations; by line."""
     tree = parse_yaml(loaded.source, name="the protocol")
     found: list[tuple[FieldPath, str]] = []
@@ -61,7 +61,7 @@ def implausible(loaded: LoadedProtocol, rig: RigSection | None = None) -> tuple[
             found += [(("steps", index, "gates", number, *at), words) for at, words in _gate(gate, step, known)]
     if rig is not None:
         found += list(_stations(data, rig))
-    problems = [Problem(tree.line(at), field_name(at), words) for at, words in found]
+    problems = [YamlProblem(tree.line(at), field_name(at), words) for at, words in found]
     return tuple(sorted(problems, key=lambda p: (p.line, p.field)))
 
 

@@ -21,7 +21,7 @@ from service.web.server.open_streams import OpenStreams
 
 
 @dataclass
-class FollowedRuns:
+class OpenedRuns:
     """The runs whose pages were asked for. The first read of a run takes long; only its own pages wait for it.
 
     `first_read` reads a run from its beginning; its errors go to whoever asked, and the next one tries again.
@@ -60,10 +60,10 @@ class Site:
     hosts: tuple[str, ...] = ("127.0.0.1", "localhost")  # names by which browsers may ask
     sealed_seq: int = 0  # last event of the site's chain that is known to be signed
     streams: OpenStreams = field(default_factory=OpenStreams)
-    runs: FollowedRuns = field(init=False)
+    runs: OpenedRuns = field(init=False)
 
     def __post_init__(self) -> None:
-        self.runs = FollowedRuns(self._first_read)
+        self.runs = OpenedRuns(self._first_read)
 
     def run(self, run_id: str) -> RunRecord:
         """A run's record as of now. Raises UnknownRunError, IntegrityError."""

@@ -98,7 +98,7 @@ def _do(store: Store, job: Job, progress: Callable[[str, int, int], None], follo
     started_s = time.monotonic()
     at(run=job.run_id, step=job.step, job=job.job_id)
     answer = JobAnswer({})
-    attempt = _Attempt(store, job)
+    attempt = _JobAttempt(store, job)
     progress(term(job.kind), 0, 0)
     with attempt, tempfile.TemporaryDirectory(prefix="orthocapture-job-") as scratch:
         arguments = following.resolved(job)
@@ -120,7 +120,7 @@ def _worth_another_try(error: Exception) -> bool:
     return isinstance(error, BrokenProcessPool)  # a helper of the job was killed
 
 
-class _Attempt:
+class _JobAttempt:
     """Renews a job's lease while it is computed, and holds the error that ends it."""
 
     def __init__(self, store: Store, job: Job) -> None:

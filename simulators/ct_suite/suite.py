@@ -19,6 +19,7 @@ from simulators.faults import FaultPlan
 from simulators.geometry import Array, from_euler, inverse
 from simulators.scene.world import Scene, parse_moved
 from simulators.serve import SimulatorError, Termination, announce
+from simulators.units import metres, mm
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +83,7 @@ def true_frames(seed: int) -> tuple[Array, Array]:
 
 def _scan(scene: Scene, args: argparse.Namespace) -> dict[str, object]:
     T_world_ct, T_world_gantry = true_frames(scene.seed)
-    grid = grid_around(scene, T_world_gantry, args.voxel_mm * 1e-3, control_spheres=args.control_spheres)
+    grid = grid_around(scene, T_world_gantry, metres(args.voxel_mm), control_spheres=args.control_spheres)
     volume = voxelise(scene, grid, control_spheres=args.control_spheres)
     folder: Path = args.folder
     series = generate_uid(entropy_srcs=[str(scene.seed), str(args.voxel_mm), str(time.time_ns())])
@@ -124,7 +125,7 @@ def write_series(
             continue
         if kind == "disk_full":
             raise SimulatorError(f"no space left in {folder}: the series is incomplete")
-        position = (T_ct_grid[:3, 3] + k * grid.voxel_m * T_ct_grid[:3, 2]) * 1000.0
+        position = mm(T_ct_grid[:3, 3] + k * grid.voxel_m * T_ct_grid[:3, 2])
         path = folder
         for _ in range(2 if kind == "duplicate" else 1):
             number += 1
@@ -136,7 +137,7 @@ def write_series(
     if (fault := faults.check("ct", "series")) is not None and fault.kind == "localiser":
         number += 1
         common.ImageType = ["ORIGINAL", "PRIMARY", "LOCALIZER"]
-        position = T_ct_grid[:3, 3] * 1000.0
+        position = mm(T_ct_grid[:3, 3])
         _write_slice(folder / f"CT{number:05d}.dcm", common, volume[0], position, number, syntax, tilted=True)
 
 
@@ -153,11 +154,11 @@ def _common(shape: tuple[int, ...], grid: Grid, T_ct_grid: Array, series: str) -
     common.StudyInstanceUID = generate_uid(entropy_srcs=[series, "study"])
     common.SeriesInstanceUID = series
     common.FrameOfReferenceUID = generate_uid(entropy_srcs=[series, "frame"])
-    common.SeriesDescription = f"specimen {grid.voxel_m * 1000:.2f} mm"
+    common.SeriesDescription = f"specimen {mm(grid.voxel_m):.2f} mm"
     common.SeriesNumber = 2
     common.Rows, common.Columns = shape[1], shape[2]
-    common.PixelSpacing = [_decimal(grid.voxel_m * 1000)] * 2
-    common.SliceThickness = _decimal(grid.voxel_m * 1000)
+    common.PixelSpacing = [_decimal(mm(grid.voxel_m))] * 2
+    common.SliceThickness = _decimal(mm(grid.voxel_m))
     common.ImageOrientationPatient = [_decimal(x) for x in [*T_ct_grid[:3, 0], *T_ct_grid[:3, 1]]]
     common.SamplesPerPixel = 1
     common.PhotometricInterpretation = "MONOCHROME2"

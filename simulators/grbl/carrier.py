@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from simulators.geometry import Array, from_euler, look_at, transform
 from simulators.scene.world import SCENE_CENTRE_M
+from simulators.units import metres
 
 # How the camera's mount differs from its drawing: roll, pitch, yaw and shift.
 _MOUNT_RAD, _MOUNT_M = np.radians([0.4, -0.3, 0.2]), np.array([0.002, -0.003, 0.001])
@@ -28,5 +29,5 @@ class Carrier:
     def T_world_camera(self, position: Array) -> Array:
         """The camera (4, 4) at machine coordinates X (degrees) and Y (millimetres)."""
         back = Rotation.from_euler("z", -position[0], degrees=True).as_matrix()
-        lifted = transform(np.eye(3), np.array([0.0, 0.0, 1e-3 * position[1]]))
+        lifted = transform(np.eye(3), np.array([0.0, 0.0, metres(position[1])]))
         return transform(back, np.zeros(3)) @ lifted @ self._T_room_camera

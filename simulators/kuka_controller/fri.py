@@ -14,6 +14,7 @@ import zlib
 from collections import deque
 
 from simulators.kuka_controller.controller import Controller
+from simulators.units import ms
 
 _LOG = logging.getLogger(__name__)
 
@@ -54,7 +55,7 @@ class Session:
         fault = self._controller.faults.check(self._controller.device, "fri")
         if fault is not None and fault.kind == "drop":
             return
-        message = self._message(round(1000 * period_s) * self._cycles)
+        message = self._message(round(ms(period_s)) * self._cycles)
         if fault is not None and fault.kind == "corrupt":
             message = message[:-1] + bytes([message[-1] ^ 0xFF])
         try:

@@ -17,6 +17,7 @@ import numpy as np
 from simulators.kuka_controller.controller import MODES, SAFETY, Controller, End, RefusedError
 from simulators.kuka_controller.fri import Session
 from simulators.serve import SimulatorError, Termination
+from simulators.units import seconds
 from simulators.world_link import WorldLink
 
 _LOG = logging.getLogger(__name__)
@@ -266,7 +267,7 @@ class Server:
             raise RefusedError("not_ready", "this controller has no FRI")
         self._end_fri()
         if period_ms:
-            cycles = max(1, round(period_ms / 1000 / PERIOD_S))
+            cycles = max(1, round(seconds(period_ms) / PERIOD_S))
             self._fri = Session(self.controller, self._host, (host, int(port)), self._fri_version, cycles)
         return {}
 

@@ -11,6 +11,7 @@ from simulators.geometry import Array, Array32, Bytes
 from simulators.rendering.noise import Noise, mixed, ramp
 from simulators.scene.specimen import HALF_LENGTH_M
 from simulators.scene.world import BOARD_HALF_M, Scene
+from simulators.units import metres, mm
 
 DRAPE_HALF_M = 1.3
 _DRAPE_CORE = 0.30  # the centre ± this fraction of the texture covers ± DRAPE_CORE_M at full resolution
@@ -269,12 +270,12 @@ _LABELS = (
 def _labels(size: int, extent_m: tuple[float, float], seed: int) -> tuple[Array32, Array32]:
     """Ink and paper (H, W), 0…1, of rulers along the board's rim and of labels."""
     ink, paper = np.zeros((size, size), dtype=np.uint8), np.zeros((size, size), dtype=np.uint8)
-    for mm in range(10, round(extent_m[0] * 1000) - 10):
-        at = round(mm * 1e-3 / extent_m[0] * size)
-        long = 0.022 if mm % 10 == 0 else 0.016 if mm % 5 == 0 else 0.010
+    for at_mm in range(10, round(mm(extent_m[0])) - 10):
+        at = round(metres(at_mm) / extent_m[0] * size)
+        long = 0.022 if at_mm % 10 == 0 else 0.016 if at_mm % 5 == 0 else 0.010
         cv2.line(ink, (at, round(0.985 * size)), (at, round((0.985 - long) * size)), 255, max(1, size // 1800))
-        if mm % 10 == 0:
-            _text(ink, str(mm // 10), (at / size - 0.006, 0.955), 0.010)
+        if at_mm % 10 == 0:
+            _text(ink, str(at_mm // 10), (at / size - 0.006, 0.955), 0.010)
     rng = np.random.default_rng([seed, 5])
     for text, column, row in _LABELS:
         word = text.format(seed=seed)

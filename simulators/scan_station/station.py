@@ -23,6 +23,7 @@ from simulators.scan_station.formats import encode
 from simulators.scene.parts import Part, sphere_mesh, vertex_normals
 from simulators.scene.world import RADIUS_M, Scene, parse_moved
 from simulators.serve import SimulatorError, Termination, announce
+from simulators.units import metres, mm
 
 log = logging.getLogger(__name__)
 
@@ -230,12 +231,12 @@ def _export(scene: Scene, args: argparse.Namespace, *, announce_it: bool) -> Non
         scene,
         spray=args.spray,
         control_spheres=args.control_spheres,
-        spacing_m=args.spacing_mm * 1e-3,
+        spacing_m=metres(args.spacing_mm),
         nth=nth,
     )
-    scale = 1000.0 if args.unit == "mm" else 1.0
+    vertices = mm(scan.vertices_m) if args.unit == "mm" else scan.vertices_m
     name = f"scan_{nth:02d}.{args.format}"
-    files = encode(args.format, name, scan.vertices_m * scale, scan.faces, scan.normals if args.normals else None)
+    files = encode(args.format, name, vertices, scan.faces, scan.normals if args.normals else None)
     fault = faults.check("scanner", "export")
     for file_name, data in files:
         _write_progressively(folder / file_name, data, fault if file_name == name else None)

@@ -14,8 +14,8 @@ import pytest
 import trimesh
 
 from service.benchmark.figure import figure_png
-from service.benchmark.method import Place, methods, missing
-from service.benchmark.records import Result, read_results
+from service.benchmark.method import Workplace, methods, missing
+from service.benchmark.records import BenchmarkResult, read_results
 from service.benchmark.running import Trial, run_trial
 from service.benchmark.table import table_markdown, table_record
 from service.compute.ground_truth.distances.chamfer import ChamferSettings
@@ -28,7 +28,7 @@ from tests.support.processes import reconstruction_stand_in
 from tests.support.scenes.posed import posed_data_set, scene
 
 COARSE = ChamferSettings(spacing_m=1e-3)
-PLACE = Place(Path("/d"), Path("/w"), Path("/c"), "python")
+PLACE = Workplace(Path("/d"), Path("/w"), Path("/c"), "python")
 TRIANGULATED = "python -m service.benchmark.programs.triangulated /d /w/dense"
 COMMANDS = {
     "colmap": [
@@ -102,7 +102,7 @@ def stand_ins(tmp_path: Path, dataset: DataSet, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv("STAND_IN", str(tmp_path / "known.json"))
 
 
-def exact(result: Result) -> bool:
+def exact(result: BenchmarkResult) -> bool:
     """Whether the mesh is the truth: its distances are those of the sampling alone."""
     assert result.score is not None, result.failure
     return abs(result.score.chamfer_mm - result.score.floor_mm) < 0.01 and result.score.outside_percent < 0.01
@@ -151,6 +151,7 @@ def test_command_lines(name: str) -> None:
     assert [shlex.join(command) for command in methods()[name].commands(PLACE)] == COMMANDS[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STAND_INS)
 @pytest.mark.usefixtures("stand_ins")
 def test_a_method_is_run_and_its_mesh_comes_back_into_the_world(name: str, dataset: DataSet, tmp_path: Path) -> None:
@@ -231,6 +232,7 @@ def test_what_the_method_sees_beyond_the_truth_is_cut_off(dataset: DataSet, tmp_
     assert result.score.outside_percent > 50
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("stand_ins")
 def test_the_table_has_dense_and_sparse_and_what_was_not_run(dataset: DataSet, tmp_path: Path) -> None:
     for scenario in ("dense", "sparse"):

@@ -16,7 +16,7 @@ from service.compute.ground_truth.frames import close_transforms, distance_chang
 from service.compute.ground_truth.fusion.cut_out import Markers, without_markers
 from service.compute.ground_truth.fusion.fuse import Fused, FusionSettings, Source, fuse
 from service.compute.ground_truth.fusion.overlap import overlap, rim_vertices
-from service.compute.ground_truth.fusion.regions import Box, Correction, Prism, corrected, outline
+from service.compute.ground_truth.fusion.regions import Box, Prism, RegionCorrection, corrected, outline
 from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, transform
@@ -125,14 +125,14 @@ def test_sigma_is_each_sources_and_includes_the_alignment() -> None:
 
 def test_a_person_overrules_the_proposal() -> None:
     elsewhere = Box(transform(np.eye(3), np.array([0.018, 0.015, 0.03])), np.array([0.006, 0.006, 0.02]))
-    drawn = (Correction(elsewhere, from_ct=True, by="A. Surgeon"),)
+    drawn = (RegionCorrection(elsewhere, from_ct=True, by="A. Surgeon"),)
     result = fuse(ct_mesh(), scan_mesh(), UP, corrections=drawn)
     within = Box(elsewhere.T_world_box, elsewhere.size_m - 4e-4)  # at the box's faces the blend begins
     inside = within.contains(result.surface.vertices_m)
     assert np.all(result.source[inside] == Source.CT)
     assert np.all(result.wound[inside])
     assert result.corrections == drawn
-    mask = corrected(np.ones(1, dtype=bool), np.zeros((1, 3)), [Correction(elsewhere, False, "A. Surgeon")])
+    mask = corrected(np.ones(1, dtype=bool), np.zeros((1, 3)), [RegionCorrection(elsewhere, False, "A. Surgeon")])
     assert mask.all()  # outside the box nothing changes
 
 

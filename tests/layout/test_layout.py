@@ -17,7 +17,7 @@ from bench.registration.layout_gate import judge
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
 from service.compute.layout.ambiguity import REQUIRED_MARGIN_M, check_layout
-from service.compute.layout.photo_adjustment import LensPrior, Photograph
+from service.compute.layout.photo_adjustment import LensPrior, SpherePhotograph
 from service.compute.layout.photographs import layout_from_photographs
 from service.compute.layout.sphere_moves import Move, suggest_moves
 from service.compute.layout.words import show_move
@@ -124,7 +124,7 @@ def test_flat_and_one_sided_spheres_are_told() -> None:
         check_layout(np.zeros((5, 3)))
 
 
-def _photographed(scene: Scene, count: int, seed: int = 0) -> list[Photograph]:
+def _photographed(scene: Scene, count: int, seed: int = 0) -> list[SpherePhotograph]:
     """Outlines as detected with the nominal camera, imaged through the true lens from the technician's positions."""
     rng = np.random.default_rng(seed)
     lens = scene.camera_intrinsics(1920)
@@ -132,7 +132,7 @@ def _photographed(scene: Scene, count: int, seed: int = 0) -> list[Photograph]:
     nominal = CameraModel(1920, 1280, 2689.0, 2689.0, 959.5, 639.5)
     world = np.concatenate([scene.registration_m, scene.control_m])
     sigma = 0.05 / nominal.fx
-    photographs: list[Photograph] = []
+    photographs: list[SpherePhotograph] = []
     for T_world_camera in list(HELD_CAMERAS.values())[:count]:
         cones: list[Cone] = []
         for centre in apply(inverse(T_world_camera), world)[rng.permutation(len(world))]:
@@ -146,7 +146,7 @@ def _photographed(scene: Scene, count: int, seed: int = 0) -> list[Photograph]:
             shift = rng.normal(0.0, sigma, 3)
             axis = cone.axis + cone.frame()[:, :2] @ shift[:2]
             cones.append(Cone(axis / np.linalg.norm(axis), cone.half_angle_rad + float(shift[2])))
-        photographs.append(Photograph(nominal, tuple(cones), np.tile(sigma**2 * np.eye(3), (len(world), 1, 1))))
+        photographs.append(SpherePhotograph(nominal, tuple(cones), np.tile(sigma**2 * np.eye(3), (len(world), 1, 1))))
     return photographs
 
 

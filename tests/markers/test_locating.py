@@ -23,7 +23,7 @@ from service.compute.markers.search.cone_pose import fit_pose
 from service.compute.markers.search.image_files import LocatedOutlines, detect_all, locate_outlines
 from service.compute.markers.search.predicted import (
     WIDE,
-    Prediction,
+    PredictedSpheres,
     locate_predicted,
     tone_of,
     visible_cones,
@@ -85,6 +85,7 @@ def true_spheres(made: Scene, image: int, located: LocatedOutlines) -> list[tupl
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poses", ["true", "robot", "no scale"])
 def test_as_good_as_the_search_of_whole_images(captured: Captured, poses: str) -> None:
     made, paths, whole = captured
@@ -206,7 +207,7 @@ def test_what_is_not_where_it_is_predicted_is_missing(captured: Captured) -> Non
     """A marker moved since the scan, one removed, one of another colour: none is forced into the registration."""
     made, _, whole = captured
     centres = made.centres_camera(0, EVERYTHING)
-    expected = Prediction(
+    expected = PredictedSpheres(
         inverse(made.T_world_camera[0]) @ made.T_world_scan, EVERYTHING, RADIUS_M, WIDE, tone_of(whole[0])
     )
     shown = list(visible_cones(expected.T_camera_scan, EVERYTHING, RADIUS_M, made.camera))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.crops import Crop, marker_free_crops
+from service.compute.pixels.crops import ImageCrop, marker_free_crops
 from service.compute.pixels.masks import Ball, Post, marker_mask, posts_below
 from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.rays import pixel_rays
@@ -138,7 +138,7 @@ def test_an_image_full_of_markers_has_no_crop_and_a_crop_larger_than_the_image_i
 
 
 def test_the_camera_of_a_crop_projects_to_the_same_places() -> None:
-    crop = Crop(40, 24, 90, 60)
+    crop = ImageCrop(40, 24, 90, 60)
     points = apply(inverse(T), np.random.default_rng(2).uniform(-0.1, 0.1, (50, 3)))
     inside = crop.camera(CAMERA)
     assert (inside.width, inside.height) == (90, 60)
@@ -147,7 +147,7 @@ def test_the_camera_of_a_crop_projects_to_the_same_places() -> None:
 
 def test_depth_of_a_crop_is_that_of_the_image() -> None:
     corners = np.array([[-0.2, -0.2, 0], [0.2, -0.2, 0], [0.2, 0.2, 0.1], [-0.2, 0.2, 0]])
-    surface, crop = RayMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), Crop(40, 24, 90, 60)
+    surface, crop = RayMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), ImageCrop(40, 24, 90, 60)
     whole, part = (depth_map(surface, camera, T) for camera in (CAMERA, crop.camera(CAMERA)))
     assert np.abs(part - whole[crop.slices]).max() < 1e-6
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.compute.capture.hand_bundle import Bundle, Reading, adjust_together
+from service.compute.capture.hand_bundle import AdjustedCapture, ImageReading, adjust_together
 from service.core.geometry import Array, Transform, align_points, apply, inverse, look_at, rotation_angle_rad
 from tests.support.runs.measuring_rig import SPHERES_M
 from tests.support.scenes.sphere_images import Scene, camera, exact_outlines
@@ -28,27 +28,27 @@ POSES = [around(5, 0), around(30, 0), around(30, 100), around(30, 200), around(3
 ROUGH_M = SPHERES_M + np.random.default_rng(3).normal(0.0, 0.002, SPHERES_M.shape)
 
 
-def readings(noise_px: float = 0.15) -> list[Reading]:
+def readings(noise_px: float = 0.15) -> list[ImageReading]:
     """Readings of images whose cameras are known to a centimetre and a degree, as from rough spheres."""
     rng = np.random.default_rng(8)
     made = Scene(np.eye(4), np.array(POSES), CAMERA)
-    found: list[Reading] = []
+    found: list[ImageReading] = []
     for image, T in enumerate(POSES):
         outlines, spheres = exact_outlines(made, image, SPHERES_M, noise_px, margin_px=30)
         off = T.copy()
         off[:3, 3] += rng.normal(0.0, 0.004, 3)
-        found.append(Reading.of(f"h_{image}", off, dict(zip(spheres, outlines, strict=True))))
+        found.append(ImageReading.of(f"h_{image}", off, dict(zip(spheres, outlines, strict=True))))
     return found
 
 
-def spheres_error_m(bundle: Bundle) -> float:
+def spheres_error_m(bundle: AdjustedCapture) -> float:
     """Largest sphere error, of the shape alone."""
     true, found = SPHERES_M[bundle.known], bundle.spheres_m[bundle.known]
     T, _ = align_points(true, found)
     return float(np.linalg.norm(apply(T, found) - true, axis=1).max())
 
 
-def poses_error_m(bundle: Bundle) -> float:
+def poses_error_m(bundle: AdjustedCapture) -> float:
     """Largest distance between true and estimated camera, after aligning the scenes."""
     T, _ = align_points(SPHERES_M[bundle.known], bundle.spheres_m[bundle.known])
     return max(
@@ -58,7 +58,7 @@ def poses_error_m(bundle: Bundle) -> float:
     )
 
 
-def bundle_of(count: int) -> Bundle:
+def bundle_of(count: int) -> AdjustedCapture:
     found = adjust_together(readings()[:count], ROUGH_M, CAMERA, RADIUS_M)
     assert found is not None
     return found
@@ -98,7 +98,7 @@ def test_the_frame_stays_where_it_was() -> None:
 
 def test_what_is_recorded_is_read_again() -> None:
     for reading in readings():
-        again = Reading.read(reading.viewpoint, reading.T_scene_camera, reading.record())
+        again = ImageReading.read(reading.viewpoint, reading.T_scene_camera, reading.record())
         np.testing.assert_array_equal(again.axes, reading.axes)
         np.testing.assert_array_equal(again.spheres, reading.spheres)
         np.testing.assert_array_equal(again.covariances, reading.covariances)
@@ -111,7 +111,7 @@ def test_one_image_alone_changes_nothing() -> None:
 @pytest.mark.parametrize("spheres", [SPHERES_M[::-1], SPHERES_M[:0]])
 def test_images_that_do_not_fit_together_change_nothing(spheres: Array) -> None:
     wrong = [
-        Reading(r.viewpoint, r.T_scene_camera, np.roll(r.spheres, i), r.axes, r.half_angles_rad, r.covariances)
+        ImageReading(r.viewpoint, r.T_scene_camera, np.roll(r.spheres, i), r.axes, r.half_angles_rad, r.covariances)
         for i, r in enumerate(readings())
     ]
     assert adjust_together(wrong if len(spheres) else [], spheres, CAMERA, RADIUS_M) is None

@@ -17,7 +17,7 @@ from drivers.interfaces import CameraSettings
 from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm.inverse_kinematics import postures
 from service.compute.capture.live import LiveView, clipped_fraction, register_station, sharpness
-from service.compute.markers.search.predicted import NEAR, ImageOutlines, Prediction, find_spheres, tone_of
+from service.compute.markers.search.predicted import NEAR, ImageOutlines, PredictedSpheres, find_spheres, tone_of
 from service.compute.planning.coverage import (
     CoverageLimits,
 )
@@ -58,8 +58,10 @@ def test_prediction_finds_what_a_search_of_the_whole_image_finds(pictures: tuple
     T_camera_scan = inverse(made.T_world_camera[0]) @ made.T_world_scan
     whole = find_spheres(images[0], made.camera, None).outlines
 
-    def near_to(off_m: Array) -> Prediction:
-        return Prediction(transform(np.eye(3), off_m) @ T_camera_scan, SPHERES_M, RADIUS_M, NEAR, tone_of(whole))
+    def near_to(off_m: Array) -> PredictedSpheres:
+        return PredictedSpheres(
+            transform(np.eye(3), off_m) @ T_camera_scan, SPHERES_M, RADIUS_M, NEAR, tone_of(whole)
+        )
 
     near = find_spheres(images[0], made.camera, near_to(np.full(3, 5e-4))).outlines
     assert len(near) >= len(whole) >= 6
@@ -90,7 +92,7 @@ def test_images_register_one_after_the_other(pictures: tuple[Scene, list[Any]]) 
         expected = None
         if known is not None:
             shown = tone_of([o for view in views for o in view.outlines])
-            expected = Prediction(inverse(made.T_world_camera[i]) @ known, SPHERES_M, RADIUS_M, NEAR, shown)
+            expected = PredictedSpheres(inverse(made.T_world_camera[i]) @ known, SPHERES_M, RADIUS_M, NEAR, shown)
         outlines = find_spheres(image, made.camera, expected).outlines
         views.append(LiveView(f"v{i}", made.T_world_camera[i], outlines))
         known = register_station(views, SPHERES_M, RADIUS_M, made.camera, known).T_base_scan
@@ -282,6 +284,7 @@ def measured_run(
     return bench
 
 
+@pytest.mark.slow
 def test_confirming_takes_the_suggested_views_and_the_gate_is_judged_again(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

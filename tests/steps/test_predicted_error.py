@@ -22,7 +22,7 @@ from service.compute.planning.information import (
     predicted_information,
     view_information,
 )
-from service.compute.planning.next_best_view import Candidate, CurrentInformation, next_best_views
+from service.compute.planning.next_best_view import CurrentInformation, ViewGain, next_best_views
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
@@ -105,14 +105,14 @@ def test_an_error_of_the_mounting_moves_the_scan_with_the_cameras() -> None:
 # --- next best view --------------------------------------------------------------------------------------
 
 
-def choice(made: Scene, taken: int) -> tuple[CurrentInformation, list[Candidate]]:
+def choice(made: Scene, taken: int) -> tuple[CurrentInformation, list[ViewGain]]:
     centre = apply(made.T_world_scan, CENTRE_M)
     views = informations(made)
     P = np.diag([1e-7] * 3 + [1e-8] * 3)
     targets = apply(made.T_world_scan, SPHERES_M) - centre
     present = CurrentInformation(tuple(v.information for v in views[:taken]), P, targets, np.zeros(4, dtype=np.int64))
     rng = np.random.default_rng(0)
-    rest = [Candidate(f"x{i}", v.information, rng.random(4) > 0.5, float(i)) for i, v in enumerate(views[taken:])]
+    rest = [ViewGain(f"x{i}", v.information, rng.random(4) > 0.5, float(i)) for i, v in enumerate(views[taken:])]
     return present, rest
 
 

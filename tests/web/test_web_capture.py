@@ -21,9 +21,9 @@ from service.dataset.scene_view import Scene, SceneSphere, scene_json, viewing_f
 from service.steps.context import StationLayout
 from service.web.calibration.board_advice import empty_regions
 from service.web.capture.plan_drawing import WIDTH, plan_drawing
-from service.web.capture.view import View
+from service.web.capture.view import StepViewpoint
 from service.web.page.charts import LEVELS, dots, heat_map, vector_field
-from service.web.record.planned_poses import Station
+from service.web.record.planned_poses import StationPlan
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.record.core import EYE
 from tests.support.recorded.calibrated_run import VIEWS, begin_calibrated_run, capture
@@ -173,10 +173,10 @@ def test_the_robots_side_is_at_the_bottom_and_the_scale_is_right() -> None:
     layout = StationLayout("s", "r", (0.7, 0.0, 0.0), (-1.0, 0.0, 0.0))
     near, far, left = (0.5, 0.0, 0.6), (0.9, 0.0, 0.6), (0.7, -0.25, 0.6)
     views = [
-        View(name, "s", "open", "", place, (0.0, 0.0, -1.0), None, 0)
+        StepViewpoint(name, "s", "open", "", place, (0.0, 0.0, -1.0), None, 0)
         for name, place in (("v_1", near), ("v_2", far), ("v_3", left))
     ]
-    drawing = plan_drawing(Station(layout, (0.3, 0.4)), views)
+    drawing = plan_drawing(StationPlan(layout, (0.3, 0.4)), views)
     assert drawing is not None
     at = {s.name: (s.x, s.y) for s in drawing.symbols}
     assert at["v_1"][1] > at["v_2"][1]

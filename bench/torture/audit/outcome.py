@@ -21,7 +21,7 @@ from service.core.errors import OrthocaptureError
 from service.store.database import engine as database
 from service.store.database.engine import database_path
 from service.store.signatures import log as signature_log
-from service.store.signatures.log import Line
+from service.store.signatures.log import LogLine
 from service.store.verification import chain_checks as audit_checks
 from service.store.verification import file_checks
 from service.store.verification import search_checks as audit_words
@@ -108,7 +108,7 @@ def quickened(*, files_stay: bool, database_stays: bool = False) -> Generator[No
         for target, name, new in (
             (audit_checks, "_payload_of", remembered),
             (audit_signatures, "signed_by", functools.cache(audit_signatures.signed_by)),
-            (Line, "signed_by", functools.cache(Line.signed_by)),
+            (LogLine, "signed_by", functools.cache(LogLine.signed_by)),
             (signature_log, "_line", functools.cache(vars(signature_log)["_line"])),
             (database, "_engine", functools.cache(vars(database)["_engine"])),
             (file_checks, "hash_file", file_hash),

@@ -14,7 +14,7 @@ from typing import Any
 from bench.torture.crash.mortal import read_journal
 from bench.torture.crash.run import Place, Role
 from bench.torture.crash.scene import import_list, planned
-from service.core.records.events import Event, JobFinished, OperatorAction, SessionStarted, StepMeasured, View
+from service.core.records.events import Event, JobFinished, OperatorAction, RecordedView, SessionStarted, StepMeasured
 from service.run_record import read_log
 from service.run_start import recorded_run
 from service.store.database.engine import database_path
@@ -131,7 +131,7 @@ def at_the_end(place: Place, expected: Outcome | None) -> tuple[list[str], int]:
 
 def _once(events: Sequence[Event], names: Sequence[str]) -> list[str]:
     """Faults if a viewpoint or photograph is missing or duplicated."""
-    taken = Counter(event.payload.viewpoint for event in events if isinstance(event.payload, View))
+    taken = Counter(event.payload.viewpoint for event in events if isinstance(event.payload, RecordedView))
     wrong = {name: taken[name] for name in {*names, *taken} if taken[name] != (name in names)}
     return [f"{name} is in the record {count} times" for name, count in sorted(wrong.items())]
 

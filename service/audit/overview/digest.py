@@ -21,7 +21,7 @@ from service.core.records.events import (
     GatesEvaluated,
     GateVerdict,
     Payload,
-    View,
+    RecordedView,
 )
 from service.core.run.fold import DECISIVE_EVENTS, RUN_EVENTS, advance, initial_state
 from service.core.run.state import Deviation, RunState
@@ -36,7 +36,7 @@ _JOB_EVENTS = ("job_enqueued", "job_finished")
 _JOB_KINDS = (evaluate.KIND.name,)
 
 # The fold needs only step, attempt and viewpoint of these events.
-_VIEWS = {kind: payload for kind, payload in RUN_EVENTS.items() if issubclass(payload, View)}
+_VIEWS = {kind: payload for kind, payload in RUN_EVENTS.items() if issubclass(payload, RecordedView)}
 _PLACE: TypeAdapter[tuple[str, int, str]] = TypeAdapter(tuple[str, int, str])
 
 

@@ -15,7 +15,7 @@ from service.core.records.events import OperatorAction, RunReleased
 
 
 @dataclass(frozen=True, slots=True)
-class Signature:
+class RecordedSignature:
     """A signature: who signed what, when, with which meaning, and whether it is still valid."""
 
     seq: int
@@ -31,7 +31,7 @@ class Signature:
     known_by: str  # password, pin, badge or claimed; "" if not recorded
 
 
-def signatures(connection: Connection, run_id: str, digest: Digest | None) -> list[Signature]:
+def signatures(connection: Connection, run_id: str, digest: Digest | None) -> list[RecordedSignature]:
     """All signatures of a run in order, its release included. With `digest`, also whether each is still valid."""
     # The word index narrows the actions down before any payload is read.
     seqs = connection.execute(
@@ -50,14 +50,14 @@ def signatures(connection: Connection, run_id: str, digest: Digest | None) -> li
     ]
 
 
-def _signature(connection: Connection, run_id: str, row: EventRow, digest: Digest | None) -> Signature:
+def _signature(connection: Connection, run_id: str, row: EventRow, digest: Digest | None) -> RecordedSignature:
     action, release = row.record(OperatorAction), row.record(RunReleased)
     signed = action.signed_sha256 if action else release.signed_sha256 if release else ""
     seq = seq_of_hash(connection, run_id, signed) if signed else None
     # The hash covers the whole payload, however long.
     bound = next(iter(read_rows(connection, run_id, [seq], whole=True)), None) if seq else None
     refused = digest is not None and any(d.seq == row.seq and d.kind == "refused" for d in digest.deviations)
-    return Signature(
+    return RecordedSignature(
         seq=row.seq,
         at_utc=row.at_utc,
         person=row.actor,

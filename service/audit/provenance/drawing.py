@@ -23,7 +23,7 @@ Edge = tuple[str, str]  # keys of two nodes
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class NodeBox:
     """A node and where it is drawn, in pixels."""
 
     node: Node
@@ -32,7 +32,7 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True)
-class Arrow:
+class EdgeArrow:
     """An edge as a cubic curve."""
 
     path: str
@@ -42,17 +42,17 @@ class Arrow:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawing:
+class GraphDrawing:
     """The whole drawing and its size, in pixels."""
 
     width: float
     height: float
-    boxes: list[Box]
-    arrows: list[Arrow]
+    boxes: list[NodeBox]
+    arrows: list[EdgeArrow]
     left_out: int  # number of nodes that are only in the list
 
 
-def draw(graph: Graph) -> Drawing:
+def draw(graph: Graph) -> GraphDrawing:
     """Lay out a graph: columns by the longest path from a source, rows so that the arrows are short."""
     ordered = graph.ordered()
     connected = {key for edge in graph.edges for key in edge if graph.nodes[key].kind not in _ASIDE}
@@ -66,7 +66,7 @@ def draw(graph: Graph) -> Drawing:
     row = _rows(columns, edges, {node.key: index for index, node in enumerate(shown)})
     tallest = max((len(keys) for keys in columns.values()), default=0)
     boxes = [
-        Box(
+        NodeBox(
             node,
             _MARGIN + column[node.key] * _COLUMN,
             _MARGIN + (row[node.key] + (tallest - len(columns[column[node.key]])) / 2) * _ROW,
@@ -76,7 +76,7 @@ def draw(graph: Graph) -> Drawing:
     at = {box.node.key: box for box in boxes}
     arrows = [_arrow(at[a], at[b], graph.edges[a, b]) for a, b in edges]
     width = _MARGIN * 2 + max(columns, default=0) * _COLUMN + BOX_WIDTH
-    return Drawing(width, _MARGIN * 2 + tallest * _ROW, boxes, arrows, len(ordered) - len(shown))
+    return GraphDrawing(width, _MARGIN * 2 + tallest * _ROW, boxes, arrows, len(ordered) - len(shown))
 
 
 def _columns(shown: Sequence[Node], edges: Sequence[Edge]) -> dict[str, int]:
@@ -111,8 +111,8 @@ def _mean(values: list[int]) -> float:
     return sum(values) / len(values)
 
 
-def _arrow(a: Box, b: Box, count: int) -> Arrow:
+def _arrow(a: NodeBox, b: NodeBox, count: int) -> EdgeArrow:
     x0, y0, x1, y1 = a.x + BOX_WIDTH, a.y + BOX_HEIGHT / 2, b.x, b.y + BOX_HEIGHT / 2
     bend = max(24.0, (x1 - x0) / 2) if x1 > x0 else 60.0
     path = f"M{x0:.0f} {y0:.0f}C{x0 + bend:.0f} {y0:.0f} {x1 - bend:.0f} {y1:.0f} {x1 - 5:.0f} {y1:.0f}"
-    return Arrow(path, count, a.node.key, b.node.key)
+    return EdgeArrow(path, count, a.node.key, b.node.key)

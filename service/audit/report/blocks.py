@@ -11,7 +11,7 @@ Style = Literal["text", "number", "code"]
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class TableCell:
     """A text and its tone."""
 
     text: str
@@ -46,7 +46,7 @@ class Heading:
 class Facts:
     """A list of names and values."""
 
-    rows: tuple[tuple[str, Cell | str], ...]
+    rows: tuple[tuple[str, TableCell | str], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class Table:
     """Rows. `strong`: indices of highlighted rows; `spanning`: of rows whose first text spans every column."""
 
     columns: tuple[Column, ...]
-    rows: tuple[tuple[Cell | str, ...], ...]
+    rows: tuple[tuple[TableCell | str, ...], ...]
     strong: frozenset[int] = frozenset()
     spanning: frozenset[int] = frozenset()
     small: bool = False
@@ -83,7 +83,7 @@ class Pictures:
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class Rectangle:
     """A filled rectangle of a drawing; y grows downwards."""
 
     x: float
@@ -128,7 +128,7 @@ class Raster:
     png: bytes = field(repr=False)
 
 
-Shape = Box | Line | Label | Raster
+Shape = Rectangle | Line | Label | Raster
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,14 +155,14 @@ class Drawings:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class SceneBlock:
     """The 3D scene: a drawing of the initial view, and an HTML element that can be turned, or ""."""
 
     drawing: Drawing
     html: str = field(repr=False)
 
 
-Block = Paragraph | Heading | Facts | Table | Pictures | Drawings | Scene
+Block = Paragraph | Heading | Facts | Table | Pictures | Drawings | SceneBlock
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,11 +179,11 @@ class Report:
 
     title: str
     simulated: bool
-    origin: Cell | None  # None: the run took its photographs itself
-    release: Cell | None  # None: the protocol does not ask for one
-    verification: Cell
-    result: Cell
-    deviations: Cell
+    origin: TableCell | None  # None: the run took its photographs itself
+    release: TableCell | None  # None: the protocol does not ask for one
+    verification: TableCell
+    result: TableCell
+    deviations: TableCell
     facts: Facts
     sections: tuple[Section, ...]
     run_id: str

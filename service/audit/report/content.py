@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Cell, Paragraph, Report, Section
+from service.audit.report.blocks import Paragraph, Report, Section, TableCell
 from service.audit.report.sections.accuracy import accuracy_section, budget_section, later_section, result_sentence
 from service.audit.report.sections.certificates import certificate_sections
 from service.audit.report.sections.course import (
@@ -17,6 +17,7 @@ from service.audit.report.sections.course import (
     steps_section,
 )
 from service.audit.report.sections.facts import facts
+from service.audit.report.sections.further_cameras import further_cameras_section
 from service.audit.report.sections.notes import notes_section
 from service.audit.report.sections.origin import devices_section, software_section
 from service.audit.report.sections.photographs import pictures_section
@@ -53,9 +54,9 @@ def report_content(
         origin=_origin(run),
         verification=_verification(audit),
         result=result_sentence(run.summary()),
-        deviations=Cell(f"{counted(len(listed), 'deviation')}, listed first", "attention")
+        deviations=TableCell(f"{counted(len(listed), 'deviation')}, listed first", "attention")
         if listed
-        else Cell("No deviation: every step was done as the protocol says", "ok"),
+        else TableCell("No deviation: every step was done as the protocol says", "ok"),
         release=_release(run),
         facts=facts(run),
         sections=tuple(section for section in sections if section is not None),
@@ -82,6 +83,7 @@ def _sections(
         accuracy_section(summary, true_error_mm),
         later_section(summary),
         budget_section(summary),
+        further_cameras_section(run),
         steps_section(run),
         people_section(run),
         notes_section(run, with_pictures=with_pictures),
@@ -93,27 +95,27 @@ def _sections(
     ]
 
 
-def _verification(audit: AuditReport) -> Cell:
+def _verification(audit: AuditReport) -> TableCell:
     if audit.first_fault is None:
-        return Cell("The evidence verifies: every file and every record is as it was recorded", "ok")
+        return TableCell("The evidence verifies: every file and every record is as it was recorded", "ok")
     others = len(audit.faults) - 1
     more = f", and {others} more {'fault' if others == 1 else 'faults'}" if others else ""
-    return Cell(
+    return TableCell(
         f"THE EVIDENCE DOES NOT VERIFY: {audit.first_fault}{more}. Nothing in this report can be relied on.", "stop"
     )
 
 
-def _origin(run: RecordedRun) -> Cell | None:
+def _origin(run: RecordedRun) -> TableCell | None:
     """The statement on imported photographs; None if the run took its photographs itself."""
     if run.root.origin != "imported":
         return None
-    return Cell(imported_sentence(run.events[0].at_utc, run.named(run.root.operator)), "attention")
+    return TableCell(imported_sentence(run.events[0].at_utc, run.named(run.root.operator)), "attention")
 
 
-def _release(run: RecordedRun) -> Cell | None:
+def _release(run: RecordedRun) -> TableCell | None:
     """The statement on the release; None if the protocol does not ask for one."""
     if run.protocol.release != "second_person":
         return None
     if run.state.released_by:
-        return Cell(f"Released by a second person: {run.named(run.state.released_by)}", "ok")
-    return Cell("NOT RELEASED: the protocol asks that a second person reads and releases this run", "stop")
+        return TableCell(f"Released by a second person: {run.named(run.state.released_by)}", "ok")
+    return TableCell("NOT RELEASED: the protocol asks that a second person reads and releases this run", "stop")

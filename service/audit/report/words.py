@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from service.audit.report.blocks import Cell
+from service.audit.report.blocks import TableCell
 from service.core.gates.verdict import Standing, figure, limits, standing
 from service.core.records.events import GateVerdict
 from service.jobs.words import term
@@ -56,15 +56,15 @@ def measured(verdict: GateVerdict) -> tuple[str, str]:
     return words(name), figure(verdict)
 
 
-_JUDGED: dict[Standing, Cell] = {
-    "within": Cell("✓ passed", "ok"),
-    "not_decided": Cell("? not decided", "attention"),
-    "accepted": Cell("! accepted", "attention"),
-    "outside": Cell("✗ failed", "stop"),
+_JUDGED: dict[Standing, TableCell] = {
+    "within": TableCell("✓ passed", "ok"),
+    "not_decided": TableCell("? not decided", "attention"),
+    "accepted": TableCell("! accepted", "attention"),
+    "outside": TableCell("✗ failed", "stop"),
 }
 
 
-def judged(verdict: GateVerdict, *, accepted: bool = False) -> Cell:
+def judged(verdict: GateVerdict, *, accepted: bool = False) -> TableCell:
     """The verdict of a gate as a sign and a word with a tone. `accepted`: a person accepted the step's figures."""
     return _JUDGED[standing(verdict, accepted=accepted)]
 

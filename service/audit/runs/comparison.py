@@ -20,7 +20,7 @@ from service.core.units import mm
 from service.dataset.registrations import evaluated
 from service.jobs.calibration import calibrate
 from service.jobs.records import Camera
-from service.jobs.registration.evaluate import Row as EvaluatedRow
+from service.jobs.registration.evaluate import Row
 from service.people.approvals import difference
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "°", "_min": "min"}  # by the end of a measure's name
@@ -45,7 +45,7 @@ class ComparedRun:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ComparedProperty:
     """One property of both runs, in words; `change`: from the first to the second, "" if there is none."""
 
     name: str
@@ -62,14 +62,14 @@ class RunComparison:
 
     first: ComparedRun
     second: ComparedRun
-    about: tuple[Row, ...]
+    about: tuple[ComparedProperty, ...]
     same_protocol: bool
     protocol_changes: tuple[str, ...]  # lines with − are of the first run, with + of the second
-    gates: tuple[Row, ...]
-    measures: tuple[Row, ...]
-    accuracy: tuple[Row, ...]
-    calibration: tuple[Row, ...]
-    durations: tuple[Row, ...]
+    gates: tuple[ComparedProperty, ...]
+    measures: tuple[ComparedProperty, ...]
+    accuracy: tuple[ComparedProperty, ...]
+    calibration: tuple[ComparedProperty, ...]
+    durations: tuple[ComparedProperty, ...]
     deviations: tuple[tuple[str, ...], tuple[str, ...]]
 
 
@@ -99,11 +99,11 @@ def root_of(events: Sequence[Event]) -> RunStarted:
     return root
 
 
-def _row(name: str, first: str, second: str, *, change: str = "", step: str = "") -> Row:
-    return Row(name, first or "–", second or "–", change, first != second, step)
+def _row(name: str, first: str, second: str, *, change: str = "", step: str = "") -> ComparedProperty:
+    return ComparedProperty(name, first or "–", second or "–", change, first != second, step)
 
 
-def _about(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
+def _about(first: ComparedRun, second: ComparedRun) -> Iterable[ComparedProperty]:
     said = [run.root.about or RunAbout() for run in (first, second)]
     for field, name in ABOUT.items():
         pair = [str(getattr(about, field)) for about in said]
@@ -126,7 +126,7 @@ def _state(run: ComparedRun, step: str) -> StepState:
     return run.state.steps.get(step) or StepState(step)
 
 
-def _gates(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
+def _gates(first: ComparedRun, second: ComparedRun) -> Iterable[ComparedProperty]:
     for step, title in _steps(first, second):
         states = _state(first, step), _state(second, step)
         verdicts = [{v.measure: v for v in state.verdicts} for state in states]
@@ -145,7 +145,7 @@ def _judged(verdict: GateVerdict | None, state: StepState) -> str:
     return f"{figure(verdict)} ({limits(verdict.minimum, verdict.maximum)}): {how}"
 
 
-def _measures(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
+def _measures(first: ComparedRun, second: ComparedRun) -> Iterable[ComparedProperty]:
     for step, title in _steps(first, second):
         numbers = _state(first, step).measures, _state(second, step).measures
         for measure in dict.fromkeys([*numbers[0], *numbers[1]]):
@@ -167,14 +167,14 @@ def _change(values: Sequence[float | None], unit: str = "") -> str:
     return f"{apart:+.4g} {unit}".rstrip().replace("-", "−", 1)
 
 
-_ERRORS: tuple[tuple[str, str, Callable[[EvaluatedRow], float | None]], ...] = (
+_ERRORS: tuple[tuple[str, str, Callable[[Row], float | None]], ...] = (
     ("mean radial error", "mm", lambda row: row.mean_radial_error_mm),
     ("predicted error", "mm", lambda row: row.predicted_error_mm),
     ("reprojection", "px", lambda row: row.mean_reprojection_error_px),
 )
 
 
-def _accuracy(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
+def _accuracy(first: ComparedRun, second: ComparedRun) -> Iterable[ComparedProperty]:
     tables = [{row.poses: row for row in evaluated(run.protocol, run.state)} for run in (first, second)]
     for poses in dict.fromkeys([*tables[0], *tables[1]]):
         rows = [table.get(poses) for table in tables]
@@ -193,7 +193,7 @@ _OF_CALIBRATION = (
 )  # fmt: skip
 
 
-def _calibration(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
+def _calibration(first: ComparedRun, second: ComparedRun) -> Iterable[ComparedProperty]:
     found = [_calibrated(run) for run in (first, second)]
     for name in _CAMERA:
         values = [one.parameter(name) for one in found]
@@ -247,7 +247,7 @@ def _calibrated(run: ComparedRun) -> _Calibrated:
     return _Calibrated(camera, T_flange_camera, measures)
 
 
-def _durations(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
+def _durations(first: ComparedRun, second: ComparedRun) -> Iterable[ComparedProperty]:
     for step, title in _steps(first, second):
         seconds = [
             _between(state.started_utc, state.ended_utc) for state in (_state(first, step), _state(second, step))

@@ -125,7 +125,7 @@ def by_instrument(rows: Sequence[HistoryRow]) -> dict[Instrument, list[HistoryRo
 
 
 @dataclass(frozen=True, slots=True)
-class _Calibration:
+class _CalibrationResult:
     """The last result of one calibration step."""
 
     at_utc: str
@@ -134,7 +134,7 @@ class _Calibration:
     robots: tuple[str, ...]
 
 
-def _calibrations(connection: Connection) -> dict[str, tuple[_Calibration, ...]]:
+def _calibrations(connection: Connection) -> dict[str, tuple[_CalibrationResult, ...]]:
     rows = connection.execute(
         text(
             "SELECT e.run_id, e.at_utc, json_extract(e.payload, '$.step') AS step, "
@@ -146,12 +146,12 @@ def _calibrations(connection: Connection) -> dict[str, tuple[_Calibration, ...]]
             "AND json_type(e.payload, '$.result.camera') = 'object' ORDER BY e.run_id, e.seq"
         )
     )
-    found: dict[str, dict[str, _Calibration]] = defaultdict(dict)
+    found: dict[str, dict[str, _CalibrationResult]] = defaultdict(dict)
     for row in rows:
         measures = _numbers(row.measures)
         if any(name in measures for name in _MEASURED):
             robots = json.loads(row.robots) if row.robots else []
-            found[row.run_id][str(row.step)] = _Calibration(
+            found[row.run_id][str(row.step)] = _CalibrationResult(
                 row.at_utc, measures, _numbers(row.camera), tuple(map(str, robots))
             )
     return {run: tuple(steps.values()) for run, steps in found.items()}
@@ -191,7 +191,7 @@ def _numbers(content: str | None) -> dict[str, float]:
     return {name: float(v) for name, v in read.items() if isinstance(v, int | float) and not isinstance(v, bool)}
 
 
-def _values(steps: Iterable[_Calibration]) -> dict[str, float]:
+def _values(steps: Iterable[_CalibrationResult]) -> dict[str, float]:
     values: dict[str, float] = {}
     for step in steps:
         values |= {name: step.measures[name] for name in _MEASURED if name in step.measures}
@@ -212,7 +212,7 @@ def _optical(
     )
 
 
-def _arms(devices: Mapping[str, RecordedIdentity], steps: Sequence[_Calibration]) -> tuple[Instrument, ...]:
+def _arms(devices: Mapping[str, RecordedIdentity], steps: Sequence[_CalibrationResult]) -> tuple[Instrument, ...]:
     """The arms that the calibration names; if it names none, every arm that was opened."""
     named = dict.fromkeys(robot for step in steps for robot in step.robots)
     names = named or [name for name, i in devices.items() if i.kind == "robot" or name.startswith("robot")]

@@ -787,7 +787,7 @@ _CONTENT_TYPE, _MESSAGE_DIGEST, _TST_INFO = (
 )
 
 
-class Node:
+class DerValue:
     """One DER value: its tag, its content, and its bytes as a whole."""
 
     def __init__(self, data: bytes, start: int = 0) -> None:
@@ -804,12 +804,12 @@ class Node:
         self.end = at + length
         self.whole = data[start : self.end]
 
-    def children(self) -> list[Node]:
+    def children(self) -> list[DerValue]:
         """The values within."""
-        found: list[Node] = []
+        found: list[DerValue] = []
         at = 0
         while at < len(self.content):
-            found.append(Node(self.content, at))
+            found.append(DerValue(self.content, at))
             at = found[-1].end
         return found
 
@@ -829,7 +829,7 @@ class Token:
     """A TimeStampResp: what it was given for, when, and by whom. Raises ValueError, IndexError for what is none."""
 
     def __init__(self, data: bytes) -> None:
-        status, content = Node(data).children()[:2]
+        status, content = DerValue(data).children()[:2]
         if status.children()[0].content != b"\x00":
             raise ValueError("the authority did not grant it")
         signed = content.children()[1].children()[0].children()
@@ -837,7 +837,7 @@ class Token:
         if encapsulated[0].oid() != _TST_INFO:
             raise ValueError("it holds no time stamp")
         self._info = encapsulated[1].children()[0].content
-        info = Node(self._info).children()
+        info = DerValue(self._info).children()
         imprint = info[2].children()
         self._imprint = (imprint[0].children()[0].oid(), imprint[1].content)
         text = info[4].content.decode("ascii")

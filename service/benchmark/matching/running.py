@@ -14,7 +14,7 @@ from service.benchmark.matching.table import markdown
 from service.compute.matching.methods.method import Match, Matcher
 from service.compute.matching.pairs.difficulty import CLASSES
 from service.compute.matching.pairs.loader import MatchingData, Pair
-from service.compute.matching.scores.evaluate import DAMAGED, Progress, Views, chosen_pairs, evaluate
+from service.compute.matching.scores.evaluate import DAMAGED, LoadedViews, Progress, chosen_pairs, evaluate
 from service.compute.matching.scores.matches import match_errors_px
 from service.core.errors import DataError
 
@@ -124,7 +124,7 @@ def require_same_pairs(results: Sequence[MethodResult], folder: Path) -> None:
 
 def _write_examples(wanted: WantedRun, match: Match, data: MatchingData, pairs: Sequence[Pair]) -> None:
     """The middle pair of each class, with its matches."""
-    views = Views(data)
+    views = LoadedViews(data)
     for name in CLASSES:
         same = [pair for pair in pairs if pair["difficulty"] == name]
         if not same:

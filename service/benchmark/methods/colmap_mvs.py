@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import subprocess
 
-from service.benchmark.method import Command, Method, Place
+from service.benchmark.method import Command, Method, Workplace
 from service.benchmark.shared_parts import at, triangulation
 
 DENSE, FUSED, MESH = "dense", "fused.ply", "mesh.ply"
 _HELP_S = 120.0
 
 
-def commands(place: Place) -> tuple[Command, ...]:
+def commands(place: Workplace) -> tuple[Command, ...]:
     """Features are triangulated with the given poses, as COLMAP's FAQ describes, since PatchMatch needs points."""
     dense = str(place.work / DENSE)
     workspace = ("--workspace_path", dense, "--workspace_format", "COLMAP")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib
 import importlib.util
 
-from service.benchmark.method import Command, Method, Place
+from service.benchmark.method import Command, Method, Workplace
 from service.benchmark.shared_parts import at
 
 MESH = "mesh.ply"
 
 
-def commands(place: Place) -> tuple[Command, ...]:
+def commands(place: Workplace) -> tuple[Command, ...]:
     """A process of its own, which alone loads torch."""
     return ((place.python, "-m", "service.benchmark.programs.gaussians", str(place.data), str(place.work / MESH)),)
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from service.benchmark.method import Command, Method, Place
+from service.benchmark.method import Command, Method, Workplace
 from service.benchmark.shared_parts import at, from_unit_box
 
 STEPS, RESOLUTION, THRESHOLD = 35_000, 512, 2.5
 MESH = "mesh.ply"
 
 
-def commands(place: Place) -> tuple[Command, ...]:
+def commands(place: Workplace) -> tuple[Command, ...]:
     """Training and marching cubes in one call of its script."""
     return (
         (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.benchmark.method import Command, Method, Place
+from service.benchmark.method import Command, Method, Workplace
 from service.benchmark.shared_parts import at, from_unit_box
 
 STEPS = 15_000
@@ -10,7 +10,7 @@ NAME = "orthocapture"
 MESH = f"output/{NAME}/mesh/{STEPS}.obj"  # relative to the folder that it is run in
 
 
-def commands(place: Place) -> tuple[Command, ...]:
+def commands(place: Workplace) -> tuple[Command, ...]:
     """Training and marching cubes in one call of its script, which saves the mesh in any case."""
     return (
         (

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from service.benchmark.method import Command, Method, Place
+from service.benchmark.method import Command, Method, Workplace
 from service.benchmark.shared_parts import at, triangulation
 
 MESH = "scene_mesh_refined.ply"
 
 
-def commands(place: Place) -> tuple[Command, ...]:
+def commands(place: Workplace) -> tuple[Command, ...]:
     """OpenMVS chooses neighbouring views by common points, so features are triangulated first."""
     work, dense = str(place.work), str(place.work / "dense")
     images = str(place.work / "dense" / "images")

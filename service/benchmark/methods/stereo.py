@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from service.benchmark.method import Command, Method, Place
+from service.benchmark.method import Command, Method, Workplace
 from service.benchmark.shared_parts import at
 
 MESH = "mesh.ply"
 
 
-def commands(place: Place) -> tuple[Command, ...]:
+def commands(place: Workplace) -> tuple[Command, ...]:
     """A process of its own, so that its time and memory are measured as those of the others."""
     return ((place.python, "-m", "service.benchmark.programs.stereo", str(place.data), str(place.work / MESH)),)
 

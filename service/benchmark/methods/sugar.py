@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from service.benchmark.method import Command, Method, Place
+from service.benchmark.method import Command, Method, Workplace
 from service.benchmark.shared_parts import newest
 
 ITERATIONS = 7000
 
 
-def commands(place: Place) -> tuple[Command, ...]:
+def commands(place: Workplace) -> tuple[Command, ...]:
     """3D Gaussian splatting first, then SuGaR on its result with all images (its default keeps every eighth)."""
     data, first, out = str(place.data), str(place.work / "gaussians"), str(place.work / "sugar")
     splatting = str(place.checkout / "gaussian_splatting" / "train.py")

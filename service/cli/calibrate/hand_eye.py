@@ -117,7 +117,7 @@ def hand_eye_command(
             setup=setup,
             camera_covariance=read_camera_covariance(camera),
         )
-        reach = None if kinematics is None or joints_rad is None else _Reach(kinematics, joints_rad, session)
+        reach = None if kinematics is None or joints_rad is None else _Reachable(kinematics, joints_rad, session)
         # A camera that stands still has no poses to suggest.
         suggested = _suggested(result, session, reach, suggest if setup == "eye-in-hand" else 0)
         record = HandEyeFile(
@@ -138,7 +138,7 @@ def hand_eye_command(
 
 
 @dataclass(frozen=True, slots=True)
-class _Session:
+class _BoardSession:
     """The N images in which the board was found: their names, corners, and poses (N, 4, 4)."""
 
     names: list[str]
@@ -149,8 +149,8 @@ class _Session:
 
 def _session(
     usable: UsableViews, names: list[str], poses: Mapping[str, Transform], board: Board, camera: CameraModel
-) -> _Session:
-    return _Session(
+) -> _BoardSession:
+    return _BoardSession(
         names,
         board_corners(usable.views, board, camera),
         np.array([poses[name] for name in names]),
@@ -168,10 +168,10 @@ def _require_possible(setup: Setup, joints: Path | None, arm: str | None, previe
         arm_model(arm)
 
 
-class _Reach:
+class _Reachable:
     """Whether an arm can reach a pose from the joint positions of the nearest recorded pose."""
 
-    def __init__(self, arm: ArmModel, joints_rad: Array, session: _Session) -> None:
+    def __init__(self, arm: ArmModel, joints_rad: Array, session: _BoardSession) -> None:
         self._arm, self._joints, self._poses = arm, joints_rad, session.T_base_flange
 
     def __call__(self, T_base_flange: Transform) -> bool:
@@ -181,7 +181,7 @@ class _Reach:
         return solve_joints(self._arm, T_base_flange, self._joints[nearest]) is not None
 
 
-def _arm(joints: Path | None, arm: str | None, session: _Session) -> tuple[Array | None, ArmModel | None]:
+def _arm(joints: Path | None, arm: str | None, session: _BoardSession) -> tuple[Array | None, ArmModel | None]:
     """The joints of each image, and the arm's model; None where no joints are given."""
     if joints is None:
         if arm is not None:
@@ -202,7 +202,7 @@ def _arm(joints: Path | None, arm: str | None, session: _Session) -> tuple[Array
 
 
 def _suggested(
-    result: HandEyeResult, session: _Session, reach: _Reach | None, count: int
+    result: HandEyeResult, session: _BoardSession, reach: _Reachable | None, count: int
 ) -> tuple[SuggestedPose, ...]:
     corners = session.corners
     return suggest_board_poses(
@@ -225,7 +225,7 @@ def _as_recorded(pose: SuggestedPose) -> SuggestedBoardPose:
     )
 
 
-def _drawn(result: HandEyeResult, session: _Session, suggested: Sequence[SuggestedPose]) -> bytes:
+def _drawn(result: HandEyeResult, session: _BoardSession, suggested: Sequence[SuggestedPose]) -> bytes:
     best, corners = result.corrected or result, session.corners
     cameras = session.T_base_flange @ best.T_flange_camera
     return draw_board_plan(cameras, suggested, best.T_base_board, corners.points_m, corners.camera)

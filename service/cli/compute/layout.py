@@ -14,7 +14,7 @@ from service.cli.common import JsonOption, console, print_json, print_table, rep
 from service.cli.compute.spheres import spheres_of
 from service.compute.images.files import read_image
 from service.compute.layout.ambiguity import LayoutReport, check_layout
-from service.compute.layout.photo_adjustment import CALIBRATED, Photograph
+from service.compute.layout.photo_adjustment import CALIBRATED, SpherePhotograph
 from service.compute.layout.photographs import layout_from_photographs
 from service.compute.layout.sphere_moves import Move, suggest_moves
 from service.compute.markers.detect import detect_spheres
@@ -70,7 +70,7 @@ def _centres(
     if camera is None:
         raise typer.BadParameter("--photo needs --camera")
     model = read_camera_json(camera)
-    seen = [Photograph.of(model, detect_spheres(read_image(path), model)) for path in photos]
+    seen = [SpherePhotograph.of(model, detect_spheres(read_image(path), model)) for path in photos]
     found = layout_from_photographs(seen, radius_m, CALIBRATED)
     return found.centres_m, found.covariance, radius_m
 

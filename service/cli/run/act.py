@@ -19,7 +19,7 @@ from service.core.records.events import CaptureAsked, OperatorAction
 from service.core.run.actions import VERBS, capture_refusal, record_to_sign, refuse
 from service.core.run.fold import fold
 from service.core.run.state import RunState
-from service.notes import Photograph, require_size, take_note
+from service.notes import NotePhotograph, require_size, take_note
 from service.people.authorisation import Identity, identity_for, who_acts
 from service.people.sessions import People
 from service.run_record import read_log
@@ -142,10 +142,10 @@ def note_command(
         _report_recorded(run_id, "note", step or log.state.current, name, json=json, seq=event.seq)
 
 
-def _photograph(path: Path) -> Photograph:
+def _photograph(path: Path) -> NotePhotograph:
     try:
         require_size(path.stat().st_size, path.name)
-        return Photograph(path.read_bytes(), path.name)
+        return NotePhotograph(path.read_bytes(), path.name)
     except OSError as error:
         raise ConfigurationError(
             f"the photograph cannot be read: {error.strerror}", where=str(path), remedy="Check --photo"

@@ -193,7 +193,7 @@ def listing_record(listing: ImportList) -> dict[str, object]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Photographs:
+class _PhotographsOfRole:
     """Counts, cameras, lenses, dates (EXIF; "" if not stated) and sizes of the photographs with one role."""
 
     count: int
@@ -207,10 +207,10 @@ class _Photographs:
     bytes: int
 
 
-def _photographs(listing: ImportList, role: PhotographRole) -> _Photographs:
+def _photographs(listing: ImportList, role: PhotographRole) -> _PhotographsOfRole:
     views = listing.of(role)
     times = sorted(str(view.camera["exif_time"]) for view in views if view.camera.get("exif_time"))
-    return _Photographs(
+    return _PhotographsOfRole(
         count=len(views),
         raw_files=sum(len(view.raws) for view in views),
         cameras=_stated(views, ("make", "model", "body_serial")),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.layout.photo_adjustment import CALIBRATED, Photograph, adjust
+from service.compute.layout.photo_adjustment import CALIBRATED, SpherePhotograph, adjust
 from service.compute.markers.cones import Cone
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.settings import EXPECTED_COMMON_ERRORS
@@ -22,7 +22,7 @@ _LEAST_SPHERES = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class ImageReading:
     """One image's contribution: n outlines with their spheres' numbers, and the camera pose from this image alone."""
 
     viewpoint: str
@@ -33,7 +33,7 @@ class Reading:
     covariances: Array  # (n, 3, 3), as SphereOutline.cone_covariance
 
     @classmethod
-    def of(cls, viewpoint: str, T_scene_camera: Transform, shown: Mapping[int, SphereOutline]) -> Reading:
+    def of(cls, viewpoint: str, T_scene_camera: Transform, shown: Mapping[int, SphereOutline]) -> ImageReading:
         """From an image's outlines by sphere."""
         outlines = list(shown.values())
         return cls(
@@ -45,7 +45,7 @@ class Reading:
             np.array([o.cone_covariance for o in outlines]).reshape(-1, 3, 3),
         )
 
-    def of_spheres(self, numbers: NDArray[np.int64]) -> Reading:
+    def of_spheres(self, numbers: NDArray[np.int64]) -> ImageReading:
         """The reading with these spheres only."""
         kept = np.isin(self.spheres, numbers)
         return replace(
@@ -66,7 +66,7 @@ class Reading:
         }
 
     @classmethod
-    def read(cls, viewpoint: str, T_scene_camera: Transform, data: Mapping[str, Any]) -> Reading:
+    def read(cls, viewpoint: str, T_scene_camera: Transform, data: Mapping[str, Any]) -> ImageReading:
         """Read plain data written by `record`."""
         return cls(
             viewpoint,
@@ -77,14 +77,14 @@ class Reading:
             np.array(data["covariances"]).reshape(-1, 3, 3),
         )
 
-    def photograph(self, camera: CameraModel) -> Photograph:
+    def photograph(self, camera: CameraModel) -> SpherePhotograph:
         """The reading as input of the adjustment."""
         cones = tuple(Cone(axis, float(half)) for axis, half in zip(self.axes, self.half_angles_rad, strict=True))
-        return Photograph(camera, cones, self.covariances)
+        return SpherePhotograph(camera, cones, self.covariances)
 
 
 @dataclass(frozen=True, slots=True)
-class Bundle:
+class AdjustedCapture:
     """The adjusted spheres and poses.
 
     Attributes:
@@ -101,8 +101,8 @@ class Bundle:
 
 
 def adjust_together(
-    readings: Sequence[Reading], spheres_m: Array, camera: CameraModel, radius_m: float
-) -> Bundle | None:
+    readings: Sequence[ImageReading], spheres_m: Array, camera: CameraModel, radius_m: float
+) -> AdjustedCapture | None:
     """Refine spheres (N, 3) and cameras from the outlines of all images.
 
     Spheres seen in only one image take no part, because one image determines their distance poorly. None if fewer
@@ -138,7 +138,7 @@ def adjust_together(
     poses = {r.viewpoint: T_scene_first @ inverse(T) for r, T in zip(joined, found.T_photo_first, strict=True)}
     halves = np.concatenate([r.half_angles_rad for r in joined])
     scale_sigma = EXPECTED_COMMON_ERRORS.growth_px / (camera.fx * float(np.tan(np.median(halves))))
-    return Bundle(refined, shared, _worst_sigma_m(found.centres_m, found.covariance, scale_sigma), poses)
+    return AdjustedCapture(refined, shared, _worst_sigma_m(found.centres_m, found.covariance, scale_sigma), poses)
 
 
 def _worst_sigma_m(centres_m: Array, covariance: Array, scale_sigma: float) -> float:

@@ -27,7 +27,7 @@ from service.core.units import mm
 
 
 @dataclass(frozen=True, slots=True)
-class ControlError:
+class ControlSphereError:
     """One control sphere in one image."""
 
     image: int
@@ -45,7 +45,7 @@ class Evaluation:
 
     mean_radial_error_mm: float
     mean_reprojection_error_px: float
-    errors: tuple[ControlError, ...]
+    errors: tuple[ControlSphereError, ...]
 
     @property
     def normalised_rms(self) -> float | None:
@@ -106,7 +106,7 @@ def evaluate(
         rows = held_out_rows(registration.solution, outlines, members, controls.centres_m)
         spread = None if controls.covariance_m2 is None else controls.covariance_m2[[s for _, _, s in members]]
         stated = predict(registration.solution, rows, refined=refined, centre_covariance_m2=spread)
-    errors: list[ControlError] = []
+    errors: list[ControlSphereError] = []
     for k, (i, j, s) in enumerate(members):
         centre = apply(inverse(images.poses[i]), controls.centres_m[s])
         distances = _distances(outlines[i][j].points, centre, controls.radius_m, images.camera)
@@ -129,7 +129,7 @@ def leave_one_out(registration: RegistrationResult, *, refined: bool = False) ->
     """
     full = registration.solution
     problem = full.problem
-    errors: list[ControlError] = []
+    errors: list[ControlSphereError] = []
     for m in sorted(set(problem.marker.tolist())):
         out = problem.marker == m
         weights = np.where(out, 0.0, full.weights)
@@ -183,10 +183,10 @@ def _distances(points: Array, centre: Array, radius_m: float, camera: CameraMode
 
 def _error(
     member: tuple[int, int, int], distances: tuple[float, float], centre: Array, stated: Prediction | None
-) -> ControlError:
+) -> ControlSphereError:
     """The record of one outline (image, outline, sphere)."""
     radial_m, reprojection_px = distances
-    return ControlError(
+    return ControlSphereError(
         *member,
         mm(radial_m),
         reprojection_px,
@@ -195,7 +195,7 @@ def _error(
     )
 
 
-def _summary(errors: list[ControlError]) -> Evaluation:
+def _summary(errors: list[ControlSphereError]) -> Evaluation:
     return Evaluation(
         float(np.mean([e.radial_error_mm for e in errors])),
         float(np.mean([e.reprojection_error_px for e in errors])),

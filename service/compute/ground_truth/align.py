@@ -18,7 +18,7 @@ TRANSPORT_GATE_M = 3e-4  # largest change of a distance between spheres over the
 
 
 @dataclass(frozen=True, slots=True)
-class Spheres:
+class MeshSpheres:
     """The spheres of a mesh: centres (M, 3), covariances (M, 3, 3), rms (M,) of the surface about them; metres."""
 
     centres_m: Array
@@ -66,7 +66,7 @@ def align(ct: Surface, scan: Surface, radius_m: float) -> Aligned:
     return align_spheres(_located(ct, radius_m), _located(scan, radius_m))
 
 
-def align_spheres(ct: Spheres, scan: Spheres) -> Aligned:
+def align_spheres(ct: MeshSpheres, scan: MeshSpheres) -> Aligned:
     """Register the spheres of a CT with those of a scan. Raises ComputeError if the constellations do not agree."""
     match = match_constellations(scan.centres_m, ct.centres_m)
     loop = close_loop(scan.centres_m, scan.covariances_m2, ct.centres_m, ct.covariances_m2, match)
@@ -85,9 +85,9 @@ def align_spheres(ct: Spheres, scan: Spheres) -> Aligned:
     )
 
 
-def _located(surface: Surface, radius_m: float) -> Spheres:
+def _located(surface: Surface, radius_m: float) -> MeshSpheres:
     found = locate_spheres(surface.vertices_m, surface.faces, radius_m)
-    return Spheres(
+    return MeshSpheres(
         np.array([s.centre_m for s in found]),
         np.array([s.covariance for s in found]),
         np.array([s.rms_m for s in found]),

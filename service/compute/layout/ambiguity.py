@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from service.compute.layout.confusions import (
     MOST_JUDGED,
     SUBSET,
-    Matches,
+    Confusions,
     by_visible_count,
     confusions,
     distances,
@@ -135,7 +135,7 @@ def check_layout(
     )
     by_count = by_visible_count(centres, matches, order)
     best = order[:MOST_JUDGED]
-    margin = _least(centres, joint, Matches(matches.seen[best], matches.taken[best], matches.misfit[best]))
+    margin = _least(centres, joint, Confusions(matches.seen[best], matches.taken[best], matches.misfit[best]))
     of_five = _least(centres, joint, by_count[SUBSET + 1]) if SUBSET + 1 in by_count else _NO_BOUND
     _, singular, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
     report = LayoutReport(
@@ -166,7 +166,7 @@ def _checked(centres_m: Array, radius_m: float) -> Array:
     return centres
 
 
-def _sphere_margins(count: int, matches: Matches) -> Array:
+def _sphere_margins(count: int, matches: Confusions) -> Array:
     """(N,) smallest misfit of an assignment that takes each sphere for another one; infinite if there is none."""
     margins = np.full(count, np.inf)
     moved = matches.seen != matches.taken
@@ -223,7 +223,7 @@ def layout_measures(report: LayoutReport) -> dict[str, float]:
 _NO_BOUND = BoundedLength(np.inf, np.inf, np.inf)
 
 
-def _least(centres: Array, joint: Array | None, matches: Matches) -> BoundedLength:
+def _least(centres: Array, joint: Array | None, matches: Confusions) -> BoundedLength:
     """The least misfit, bounded by the least of all lower bounds and the least of all upper ones."""
     if joint is None:
         least = float(matches.misfit.min())

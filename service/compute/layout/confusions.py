@@ -20,7 +20,7 @@ MOST_JUDGED = 600  # assignments whose bounds are computed, the best first
 
 
 @dataclass(frozen=True, slots=True)
-class Matches:
+class Confusions:
     """Wrong assignments: `seen` (M, n) are taken for `taken` (M, n), with these misfits (M,) in metres."""
 
     seen: IntArray
@@ -28,7 +28,7 @@ class Matches:
     misfit: Array
 
 
-def confusions(centres: Array, beyond_m: float = 0.0) -> Matches:
+def confusions(centres: Array, beyond_m: float = 0.0) -> Confusions:
     """All wrong assignments of four up to a misfit of `beyond_m`; if there are none, up to the first found."""
     between = distances(centres)
     tolerance = max(_FIRST_TOLERANCE_M, beyond_m)
@@ -37,7 +37,7 @@ def confusions(centres: Array, beyond_m: float = 0.0) -> Matches:
         misfit = misfits(centres, seen, taken)
         sure = misfit <= tolerance
         if np.any(sure):
-            return Matches(seen[sure], taken[sure], misfit[sure])
+            return Confusions(seen[sure], taken[sure], misfit[sure])
         tolerance *= 2
 
 
@@ -84,7 +84,7 @@ def distances(centres: Array) -> Array:
     return np.linalg.norm(centres[:, None] - centres[None], axis=2)
 
 
-def distinct(matches: Matches, order: IntArray, most: int = 8) -> list[int]:
+def distinct(matches: Confusions, order: IntArray, most: int = 8) -> list[int]:
     """Indices of the best assignments, each pair of sets once: an assignment and its inverse have equal misfits."""
     chosen: list[int] = []
     known: set[frozenset[tuple[int, int]]] = set()
@@ -99,11 +99,11 @@ def distinct(matches: Matches, order: IntArray, most: int = 8) -> list[int]:
     return chosen
 
 
-def by_visible_count(centres: Array, matches: Matches, order: IntArray) -> dict[int, Matches]:
+def by_visible_count(centres: Array, matches: Confusions, order: IntArray) -> dict[int, Confusions]:
     """The best assignments by number of visible spheres, best first; those of four are extended to more spheres."""
     n = len(centres)
     seen, taken = matches.seen[order[:2000]], matches.taken[order[:2000]]
-    found = {SUBSET: Matches(seen, taken, matches.misfit[order[:2000]])}
+    found = {SUBSET: Confusions(seen, taken, matches.misfit[order[:2000]])}
     R, t = rigid_motions(centres, seen, taken)
     carried = np.einsum("mij,nj->mni", R, centres) + t[:, None]
     distance = np.linalg.norm(carried[:, :, None] - centres[None, None], axis=3)
@@ -118,5 +118,5 @@ def by_visible_count(centres: Array, matches: Matches, order: IntArray) -> dict[
         seen, taken = np.concatenate([seen, i[:, None]], axis=1), np.concatenate([taken, j[:, None]], axis=1)
         misfit = misfits(centres, seen, taken)
         best = np.argsort(misfit, kind="stable")[:MOST_JUDGED]
-        found[count] = Matches(seen[best], taken[best], misfit[best])
+        found[count] = Confusions(seen[best], taken[best], misfit[best])
     return found

@@ -61,7 +61,7 @@ CALIBRATED = LensPrior(focal=2e-4, refocused=1e-4, aspect=5e-5, centre=2e-4, k1=
 
 
 @dataclass(frozen=True, slots=True)
-class Photograph:
+class SpherePhotograph:
     """Sphere outlines of one photograph, interpreted with a nominal camera.
 
     Attributes:
@@ -75,7 +75,7 @@ class Photograph:
     covariances: Array
 
     @classmethod
-    def of(cls, camera: CameraModel, outlines: Sequence[SphereOutline]) -> Photograph:
+    def of(cls, camera: CameraModel, outlines: Sequence[SphereOutline]) -> SpherePhotograph:
         """From the outlines that the detector found with this camera."""
         return cls(
             camera,
@@ -107,7 +107,7 @@ class AdjustedLayout:
 
 
 def adjust(
-    photographs: Sequence[Photograph],
+    photographs: Sequence[SpherePhotograph],
     spheres: Sequence[IntArray],
     centres_m: Array,
     T_photo_first: Sequence[Transform],
@@ -183,7 +183,7 @@ class _Problem:
     @classmethod
     def of(
         cls,
-        photographs: Sequence[Photograph],
+        photographs: Sequence[SpherePhotograph],
         spheres: Sequence[IntArray],
         radius_m: float,
         prior: LensPrior,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from service.compute.layout.confusions import distances
-from service.compute.layout.photo_adjustment import AdjustedLayout, LensPrior, Photograph, adjust
+from service.compute.layout.photo_adjustment import AdjustedLayout, LensPrior, SpherePhotograph, adjust
 from service.compute.markers.cones import Cone
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, align_points, apply, inverse
@@ -52,7 +52,7 @@ class PhotoLayout:
 
 
 def layout_from_photographs(
-    photographs: Sequence[Photograph], radius_m: float, prior: LensPrior, expected: int | None = None
+    photographs: Sequence[SpherePhotograph], radius_m: float, prior: LensPrior, expected: int | None = None
 ) -> PhotoLayout:
     """One layout from photographs of spheres that did not move in between.
 
@@ -100,20 +100,25 @@ class _Group:
 
 
 def _adjusted(
-    photographs: Sequence[Photograph], group: _Group, centres: Array, radius_m: float, prior: LensPrior
+    photographs: Sequence[SpherePhotograph], group: _Group, centres: Array, radius_m: float, prior: LensPrior
 ) -> AdjustedLayout:
-    chosen: list[Photograph] = []
+    chosen: list[SpherePhotograph] = []
     spheres: list[IntArray] = []
     for k, ids in zip(group.photographs, group.spheres, strict=True):
         shown = np.nonzero(ids >= 0)[0]
         photo = photographs[k]
-        chosen.append(Photograph(photo.camera, tuple(photo.cones[i] for i in shown), photo.covariances[shown]))
+        chosen.append(SpherePhotograph(photo.camera, tuple(photo.cones[i] for i in shown), photo.covariances[shown]))
         spheres.append(ids[shown])
     return adjust(chosen, spheres, centres, group.poses, radius_m, prior)
 
 
 def _joined(
-    photographs: Sequence[Photograph], group: _Group, found: AdjustedLayout, k: int, radius_m: float, prior: LensPrior
+    photographs: Sequence[SpherePhotograph],
+    group: _Group,
+    found: AdjustedLayout,
+    k: int,
+    radius_m: float,
+    prior: LensPrior,
 ) -> tuple[_Group, AdjustedLayout]:
     """The group with photograph k added by its best-fitting assignment; unchanged if none fits."""
     places = places_by_size(photographs[k].cones, radius_m)
@@ -147,7 +152,7 @@ def _nearest_m(centres: Array) -> float:
 
 
 def _reduced(
-    photographs: Sequence[Photograph],
+    photographs: Sequence[SpherePhotograph],
     group: _Group,
     found: AdjustedLayout,
     expected: int,

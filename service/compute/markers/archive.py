@@ -9,9 +9,9 @@ import numpy as np
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone
-from service.compute.markers.records import DetectionOptions, Evidence, SphereOutline, outline_from_cone
+from service.compute.markers.records import DetectionOptions, OutlineEvidence, SphereOutline, outline_from_cone
 
-_EVIDENCE = tuple(field.name for field in dataclasses.fields(Evidence))
+_EVIDENCE = tuple(field.name for field in dataclasses.fields(OutlineEvidence))
 
 
 def outline_record(outline: SphereOutline) -> dict[str, Any]:
@@ -30,7 +30,7 @@ def outline_from_record(record: dict[str, Any], camera: CameraModel) -> SphereOu
     """Rebuild an outline from `outline_record`'s data, with its points sampled anew on the same conic."""
     values = {name: _value(record[name]) for name in _EVIDENCE}
     values["cone_covariance"] = np.array(record["cone_covariance"], dtype=np.float64)
-    evidence = Evidence(**values)
+    evidence = OutlineEvidence(**values)
     cone = Cone(np.array(record["axis"]), float(record["half_angle_rad"]))
     return outline_from_cone(cone, camera, DetectionOptions().n_points, evidence)
 

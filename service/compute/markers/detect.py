@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.markers.colours import ColourModel, given_colour, learn_colour
 from service.compute.markers.cones import Cone
-from service.compute.markers.outlines.candidates import Candidate, colour_gradient, edges, find_candidates
+from service.compute.markers.outlines.candidates import CircleCandidate, colour_gradient, edges, find_candidates
 from service.compute.markers.outlines.refine import refine_outlines
 from service.compute.markers.outlines.rough import (
     CLEAN_INTERIOR,
@@ -162,7 +162,7 @@ def find_rough(image_bgr: NDArray[np.uint8], camera: CameraModel, options: Detec
 def _searched(
     coarse: NDArray[np.uint8],
     camera: CameraModel,
-    candidates: list[Candidate],
+    candidates: list[CircleCandidate],
     given: ColourModel | None,
     options: DetectionOptions,
 ) -> list[RoughSphere]:

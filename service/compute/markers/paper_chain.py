@@ -13,7 +13,13 @@ from scipy.optimize import minimize
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, angles_to, ransac_cone
 from service.compute.markers.outlines.candidates import find_candidates
-from service.compute.markers.records import DEFAULTS, DetectionOptions, Evidence, SphereOutline, outline_from_cone
+from service.compute.markers.records import (
+    DEFAULTS,
+    DetectionOptions,
+    OutlineEvidence,
+    SphereOutline,
+    outline_from_cone,
+)
 from service.core.geometry import Array
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom, pixels
@@ -233,11 +239,11 @@ def _evidence(
     rays: Array,
     estimate: EllipseEstimate,
     coverage: float,
-) -> Evidence:
+) -> OutlineEvidence:
     off_px = angles_to(cone, rays) * camera.fx
     sigma_px = max(_LEAST_SIGMA_PX, 1.4826 * float(np.median(np.abs(off_px))))
     variance = (sigma_px / camera.fx) ** 2 / (_INDEPENDENT * coverage)
-    return Evidence(
+    return OutlineEvidence(
         coverage=coverage,
         rms_px=float(np.sqrt(np.mean(off_px**2))),
         sigma_px=sigma_px,

@@ -79,7 +79,7 @@ class SphereOutline:
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class OutlineEvidence:
     """Quality measures of the fit of one outline."""
 
     coverage: float
@@ -93,7 +93,7 @@ class Evidence:
     cone_covariance: Array  # (3, 3), see SphereOutline
 
 
-def outline_from_cone(cone: Cone, camera: CameraModel, n_points: int, evidence: Evidence) -> SphereOutline:
+def outline_from_cone(cone: Cone, camera: CameraModel, n_points: int, evidence: OutlineEvidence) -> SphereOutline:
     """The outline of a cone, with its conic and `n_points` equidistant points."""
     ellipse = cone_ellipse(cone)
     points = ellipse.equidistant(n_points)

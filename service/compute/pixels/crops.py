@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Crop:
+class ImageCrop:
     """A part of an image: `x`, `y` is its first pixel."""
 
     x: int
@@ -39,7 +39,9 @@ class Crop:
         return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
 
 
-def marker_free_crops(wanted: Mask, forbidden: Mask, size: tuple[int, int] = FULL_HD, most: int = 16) -> list[Crop]:
+def marker_free_crops(
+    wanted: Mask, forbidden: Mask, size: tuple[int, int] = FULL_HD, most: int = 16
+) -> list[ImageCrop]:
     """Crops without a forbidden pixel that show most of the wanted pixels, the best first.
 
     Each further crop is the one that shows most pixels which no earlier one shows, as long as these are a twentieth
@@ -64,13 +66,13 @@ def marker_free_crops(wanted: Mask, forbidden: Mask, size: tuple[int, int] = FUL
     whole = (size[1] // _CELL_PX, size[0] // _CELL_PX)
     places = ((height - size[1]) // _CELL_PX + 1, (width - size[0]) // _CELL_PX + 1)
     free = _window_sums(_pooled(forbidden), touched, places) == 0
-    left, crops = _pooled(wanted), list[Crop]()
+    left, crops = _pooled(wanted), list[ImageCrop]()
     while len(crops) < most:
         gain = np.where(free, _window_sums(left, whole, places), -1)
         row, column = (int(k) for k in np.unravel_index(int(gain.argmax()), gain.shape))
         if gain[row, column] < max(1, _LEAST_NEW * size[0] * size[1]):
             break
-        crops.append(Crop(column * _CELL_PX, row * _CELL_PX, *size))
+        crops.append(ImageCrop(column * _CELL_PX, row * _CELL_PX, *size))
         left[row : row + whole[0], column : column + whole[1]] = 0
     return crops
 

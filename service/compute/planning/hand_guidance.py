@@ -45,7 +45,7 @@ class Attitude:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class WantedView:
     """A wanted view: the camera pose in the level frame."""
 
     name: str
@@ -72,7 +72,7 @@ def away_from_plane(spheres_m: Array, eye_m: Array) -> Array:
 
 def place_at(
     name: str, *, tilt_deg: float, azimuth_deg: float, distance_m: float, walk_round: bool, aim_m: Sequence[float]
-) -> Place:
+) -> WantedView:
     """A place on the hemisphere around the scene.
 
     Args:
@@ -89,7 +89,9 @@ def place_at(
     top = -out if walk_round else np.array([0.0, 1.0, 0.0])
     right = np.cross(axis, top)
     right /= np.linalg.norm(right)
-    return Place(name, transform(np.column_stack([right, np.cross(axis, right), axis]), aim - distance_m * axis), aim)
+    return WantedView(
+        name, transform(np.column_stack([right, np.cross(axis, right), axis]), aim - distance_m * axis), aim
+    )
 
 
 def words(T_level_here: Transform, T_level_there: Transform) -> str:
@@ -123,7 +125,7 @@ def _angle(radians: float, verb: str, positive: str, negative: str) -> str:
     return f"{verb} {told}° {positive if degrees > 0 else negative}" if told else ""
 
 
-def covered(places: Iterable[Place], T_level_cameras: Sequence[Transform], within_deg: float) -> set[str]:
+def covered(places: Iterable[WantedView], T_level_cameras: Sequence[Transform], within_deg: float) -> set[str]:
     """Names of the places that an image covers: position and axis agree within `within_deg`."""
     limit = np.cos(np.deg2rad(within_deg))
     done: set[str] = set()
@@ -138,10 +140,10 @@ def covered(places: Iterable[Place], T_level_cameras: Sequence[Transform], withi
     return done
 
 
-def nearest(places: Iterable[Place], T_level_here: Transform) -> Place:
+def nearest(places: Iterable[WantedView], T_level_here: Transform) -> WantedView:
     """The place with the shortest way from here, a radian of rotation counting as 40 cm. `places` is not empty."""
 
-    def way(place: Place) -> float:
+    def way(place: WantedView) -> float:
         moved = float(np.linalg.norm(place.T_level_camera[:3, 3] - T_level_here[:3, 3]))
         turned = Rotation.from_matrix(T_level_here[:3, :3].T @ place.T_level_camera[:3, :3]).magnitude()
         return moved + 0.4 * float(turned)

@@ -16,7 +16,7 @@ _AS_GOOD = 1.01  # errors within 1 % count as equal; coverage and travel then de
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class ViewGain:
     """A possible viewpoint and its predicted gain."""
 
     name: str
@@ -58,7 +58,7 @@ class Suggestion:
 
 def next_best_views(
     present: CurrentInformation,
-    candidates: Sequence[Candidate],
+    candidates: Sequence[ViewGain],
     *,
     limit_m: float,
     min_coverage: float,

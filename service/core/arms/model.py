@@ -33,7 +33,7 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
-class Tolerances:
+class ArmTolerances:
     """Usual errors of an arm's geometry, one standard deviation; a calibration estimates their common scale.
 
     Attributes:
@@ -80,7 +80,7 @@ class ArmModel:
     allowed: frozenset[tuple[str, str]] = field(repr=False)
     usual_rad: Array = field(repr=False)
     payload_kg: float
-    tolerances: Tolerances = Tolerances()
+    tolerances: ArmTolerances = ArmTolerances()
 
     @property
     def axes(self) -> int:

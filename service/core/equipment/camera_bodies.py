@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from service.core.equipment.recorded_devices import RecordedIdentity, recorded_optics, recorded_report
-from service.core.records.events import DeviceOpened, Event, View
+from service.core.records.events import DeviceOpened, Event, RecordedView
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class CameraBodies:
 def bodies(events: Sequence[Event]) -> CameraBodies:
     """The serial numbers in a run's events."""
     opened = [event.payload for event in events if isinstance(event.payload, DeviceOpened)]
-    views = (event.payload for event in events if isinstance(event.payload, View))
+    views = (event.payload for event in events if isinstance(event.payload, RecordedView))
     identities = ((payload.device, recorded_report(payload.report).identity) for payload in opened)
     return bodies_of(identities, (recorded_optics(view.camera).body_serial for view in views))
 

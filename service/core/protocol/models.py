@@ -27,7 +27,7 @@ from service.core.records.events import Record
 from service.core.recovery.reasons import Reasons
 from service.core.run.lifecycle import RESERVED_STEP_IDS
 from service.core.text.checked_yaml import checked, decoded, did_you_mean, refuse
-from service.core.text.yaml_tree import Plain, Problem, YamlTree, field_name, parse_yaml
+from service.core.text.yaml_tree import Plain, YamlProblem, YamlTree, field_name, parse_yaml
 
 ParamsT = TypeVar("ParamsT", bound=StepParams)
 
@@ -78,7 +78,7 @@ class Spheres(Record):
     colour: Annotated[str, Field(pattern=r"^(white|grey|green|orange|#[0-9a-fA-F]{6})$")] | None = None
 
 
-class Board(Record):
+class CalibrationBoard(Record):
     """The calibration checkerboard, counted in inner corners."""
 
     columns: Annotated[int, Field(ge=3)]  # inner corners in a row
@@ -224,7 +224,7 @@ class ProtocolFields(Record):
     title: Text  # what people read
     source: str = ""  # where the procedure comes from
     spheres: Spheres  # radius and number of the spheres
-    board: Board | None = None  # the calibration board; needed by a step that calibrates
+    board: CalibrationBoard | None = None  # the calibration board; needed by a step that calibrates
     camera: CameraSection | None = None  # None: no settings are required, and no step sets a camera
     motion: Motion = Motion()  # speed and acceleration of the arm
     settle: Settle = Settle()  # when the arm counts as standing still
@@ -306,11 +306,11 @@ def parse_protocol(content: bytes, params_models: Mapping[str, type[StepParams]]
     problems = list(tree.problems)
     data = tree.data if isinstance(tree.data, dict) else {}
     if not isinstance(tree.data, dict):
-        problems.append(Problem(1, "", "not a protocol: the file must hold fields such as id, version and steps"))
+        problems.append(YamlProblem(1, "", "not a protocol: the file must hold fields such as id, version and steps"))
         _refuse(problems, name)
     parsed, found = checked(data, _FileProtocol, tree)
     problems += found
-    problems += [Problem(tree.line(at), field_name(at), message) for at, message in rule_violations(data)]
+    problems += [YamlProblem(tree.line(at), field_name(at), message) for at, message in rule_violations(data)]
     params = _validate_params(data, params_models, tree, problems)
     if problems or parsed is None:
         _refuse(problems, name)
@@ -323,7 +323,7 @@ def parse_protocol(content: bytes, params_models: Mapping[str, type[StepParams]]
 
 
 def _validate_params(
-    data: Mapping[str, Plain], models: Mapping[str, type[StepParams]], tree: YamlTree, problems: list[Problem]
+    data: Mapping[str, Plain], models: Mapping[str, type[StepParams]], tree: YamlTree, problems: list[YamlProblem]
 ) -> dict[int, StepParams]:
     """The params of every valid step by its index; appends what is wrong with the others to `problems`."""
     params: dict[int, StepParams] = {}
@@ -334,7 +334,7 @@ def _validate_params(
         kind, at = str(step["kind"]), ("steps", index)
         if kind not in models:
             message = f"unknown kind {kind!r}{did_you_mean(kind, models)}; kinds: {', '.join(sorted(models))}"
-            problems.append(Problem(tree.line((*at, "kind")), field_name((*at, "kind")), message))
+            problems.append(YamlProblem(tree.line((*at, "kind")), field_name((*at, "kind")), message))
             continue
         given = step.get("params", {})
         if not isinstance(given, dict):
@@ -346,7 +346,7 @@ def _validate_params(
     return params
 
 
-def _refuse(problems: list[Problem], name: str) -> NoReturn:
+def _refuse(problems: list[YamlProblem], name: str) -> NoReturn:
     remedy = "See docs/reference/protocol.schema.json for what a protocol may hold"
     refuse(problems, what="protocol", name=name, remedy=remedy, error=ProtocolError)
 

@@ -37,7 +37,7 @@ class Mending(_NoteRecord):
     images: int = 0
 
 
-class PlannedView(_NoteRecord):
+class NotedView(_NoteRecord):
     """A viewpoint in a motion plan.
 
     Attributes:
@@ -57,22 +57,22 @@ class PlannedView(_NoteRecord):
     travel_s: float = 0.0
 
 
-class PlannedStation(_NoteRecord):
+class NotedStation(_NoteRecord):
     """The viewpoints of one station in the order of capture, and how long all of them take."""
 
     station: str = ""
     order: str = ""
     estimated_s: float = 0.0
-    views: tuple[PlannedView, ...]
+    views: tuple[NotedView, ...]
 
 
-class MotionPlan(_NoteRecord):
+class NotedMotionPlan(_NoteRecord):
     """How the arm moves in a capture."""
 
-    stations: tuple[PlannedStation, ...] = ()
+    stations: tuple[NotedStation, ...] = ()
 
     @property
-    def views(self) -> tuple[PlannedView, ...]:
+    def views(self) -> tuple[NotedView, ...]:
         """All viewpoints in the order of capture."""
         return tuple(view for station in self.stations for view in station.views)
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from service.core.jobs.priorities import WAITED
 from service.core.records.events import ArtefactRef, ComputedBy, GateVerdict, Identified, RegionDrawn, Uncertainty
 from service.core.run.lifecycle import Phase
-from service.core.run.noted import MOTION_PLAN, Mending, MotionPlan
+from service.core.run.noted import MOTION_PLAN, Mending, NotedMotionPlan
 from service.core.text.counts import counted
 
 # The progress text of a step while a person takes the images: the camera is idle and shows its live view.
@@ -143,11 +143,11 @@ class StepState:
         return None if newest is None else Mending.model_validate(dict(newest))
 
     @property
-    def motion_plan(self) -> MotionPlan:
+    def motion_plan(self) -> NotedMotionPlan:
         """How the arm moves, by the newest plan; empty without one."""
         planned = (note.data for note in reversed(self.notes) if note.note == MOTION_PLAN)
         newest = next(planned, None)
-        return MotionPlan() if newest is None else MotionPlan.model_validate(dict(newest))
+        return NotedMotionPlan() if newest is None else NotedMotionPlan.model_validate(dict(newest))
 
 
 @dataclass(frozen=True, slots=True)

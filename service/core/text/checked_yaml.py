@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from service.core.errors import OrthocaptureError
-from service.core.text.yaml_tree import FieldPath, Plain, Problem, YamlTree, field_name
+from service.core.text.yaml_tree import FieldPath, Plain, YamlProblem, YamlTree, field_name
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -27,7 +27,7 @@ def decoded(content: bytes, *, name: str, error: type[OrthocaptureError]) -> str
 
 def checked(
     data: Plain, model: type[ModelT], tree: YamlTree, at: FieldPath = ()
-) -> tuple[ModelT | None, list[Problem]]:
+) -> tuple[ModelT | None, list[YamlProblem]]:
     """Part of a file as an instance of `model`, or None and what is wrong with it.
 
     Types are strict, as in JSON: quoted text is not a number, and `yes` is not a boolean.
@@ -44,23 +44,23 @@ def checked(
         return None, [problem_of(details, tree, model, at) for details in error.errors()]
 
 
-def problem_of(details: ErrorDetails, tree: YamlTree, model: type[BaseModel], at: FieldPath = ()) -> Problem:
-    """A pydantic error as a Problem with its line, in plain words; the instance of `model` begins at path `at`."""
+def problem_of(details: ErrorDetails, tree: YamlTree, model: type[BaseModel], at: FieldPath = ()) -> YamlProblem:
+    """A pydantic error in plain words, with its line; the instance of `model` begins at path `at`."""
     start = len(at)
     for part in details["loc"]:
         if (*at, part) in tree.lines:  # pydantic also puts names of union members into the path
             at = (*at, part)
     kind, last = details["type"], details["loc"][-1] if details["loc"] else ""
     if kind == "missing":
-        return Problem(tree.line(at), field_name((*at, last)), "missing field")
+        return YamlProblem(tree.line(at), field_name((*at, last)), "missing field")
     if kind == "extra_forbidden":
         near = did_you_mean(str(last), _known(model, at[start:-1]))
-        return Problem(tree.line(at), field_name(at), f"unknown field{near}")
+        return YamlProblem(tree.line(at), field_name(at), f"unknown field{near}")
     message = details["msg"].removeprefix("Value error, ")
     given = details["input"]
     shown = "" if isinstance(given, (dict, list)) else f" (it is {json.dumps(given, default=str)})"
     quote = '; put it in quotes: "…"' if kind == "string_type" and isinstance(given, (int, float)) else ""
-    return Problem(tree.line(at), field_name(at), f"{message}{shown}{quote}")
+    return YamlProblem(tree.line(at), field_name(at), f"{message}{shown}{quote}")
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
@@ -70,7 +70,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def refuse(
-    problems: Iterable[Problem], *, what: str, name: str, remedy: str, error: type[OrthocaptureError]
+    problems: Iterable[YamlProblem], *, what: str, name: str, remedy: str, error: type[OrthocaptureError]
 ) -> NoReturn:
     """Raise `error` listing every problem in the order of its line.
 

@@ -28,7 +28,7 @@ _SCALARS: tuple[tuple[re.Pattern[str], Callable[[str], Plain]], ...] = (
 
 
 @dataclass(frozen=True)
-class Problem:
+class YamlProblem:
     """One thing that is wrong in a file."""
 
     line: int  # from 1
@@ -42,7 +42,7 @@ class YamlTree:
 
     data: Plain
     lines: Mapping[FieldPath, int]
-    problems: tuple[Problem, ...]
+    problems: tuple[YamlProblem, ...]
 
     def line(self, path: FieldPath) -> int:
         """The line of a field, or of the nearest enclosing field that is in the file."""
@@ -112,7 +112,7 @@ class _Builder:
         self._name = name
         self._values = 0
         self.lines: dict[FieldPath, int] = {(): 1}
-        self.problems: list[Problem] = []
+        self.problems: list[YamlProblem] = []
 
     def build(self, node: Node, path: FieldPath, around: tuple[Node, ...]) -> Plain:
         if any(node is outer for outer in around):
@@ -152,7 +152,7 @@ class _Builder:
         return data
 
     def _problem(self, node: Node, path: FieldPath, message: str) -> None:
-        self.problems.append(Problem(node.start_mark.line + 1, field_name(path), message))
+        self.problems.append(YamlProblem(node.start_mark.line + 1, field_name(path), message))
 
 
 def _scalar(node: ScalarNode) -> Plain:

@@ -14,7 +14,7 @@ from service.core.units import mm
 from service.dataset.formats.meshes import mask_png, ply, png
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder, Part, json_bytes
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, PosedView
 
 _SCENE = "test/000001"
 _OBJECT = 1
@@ -62,7 +62,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
             )
 
 
-def _camera(view: View) -> dict[str, Any]:
+def _camera(view: PosedView) -> dict[str, Any]:
     T_camera_world = inverse(view.T_world_camera)
     return {
         "cam_K": view.camera.matrix.ravel().tolist(),
@@ -72,7 +72,7 @@ def _camera(view: View) -> dict[str, Any]:
     }
 
 
-def _pose(view: View) -> dict[str, Any]:
+def _pose(view: PosedView) -> dict[str, Any]:
     T_camera_model = inverse(view.T_world_camera)
     return {
         "cam_R_m2c": T_camera_model[:3, :3].ravel().tolist(),

@@ -10,7 +10,7 @@ from typing import Any
 from service.compute.poses.files.pose_files import OPENGL
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, PosedView
 
 _FLOAT, _UNSIGNED = 5126, 5125  # component types
 _VERTICES, _INDICES = 34962, 34963  # targets of buffer views
@@ -62,12 +62,12 @@ def _chunk(kind: bytes, data: bytes, filler: bytes) -> bytes:
     return struct.pack("<I4s", len(data), kind) + data
 
 
-def _node(number: int, view: View) -> dict[str, Any]:
+def _node(number: int, view: PosedView) -> dict[str, Any]:
     """The pose with OpenGL's axes; matrices are stored column by column."""
     return {"name": view.name, "camera": number, "matrix": (view.T_world_camera @ OPENGL).T.ravel().tolist()}
 
 
-def _camera(view: View) -> dict[str, Any]:
+def _camera(view: PosedView) -> dict[str, Any]:
     """A symmetric pinhole: glTF has neither a principal point nor distortion."""
     camera = view.camera
     lens = {

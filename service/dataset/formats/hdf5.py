@@ -10,7 +10,7 @@ import numpy as np
 
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder, Part
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, PosedView
 
 LOADER = "loader.py"
 
@@ -34,7 +34,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     folder.file(LOADER, source.read_bytes)
 
 
-def _view(path: Path, dataset: DataSet, view: View) -> None:
+def _view(path: Path, dataset: DataSet, view: PosedView) -> None:
     pixels, camera = dataset.pixels, view.camera
     rows = min(64, camera.height)
     with h5py.File(path, "w") as file:

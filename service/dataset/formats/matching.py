@@ -21,7 +21,7 @@ from service.compute.matching.pairs.loader import View as GroundTruth
 from service.core.units import mm, mrad
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder, Part
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, PosedView
 
 _POINTS = 20_000  # of the surface, by which overlap is measured: to within half a per cent
 _SEED = 14
@@ -44,7 +44,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     stored: `loader.py`, which needs numpy alone, computes them of any pair from depth and poses. Overlap is the share
     of the surface's points that both images show. Markers have no depth.
     """
-    truth = _GroundTruth(dataset)
+    truth = _DepthOfViews(dataset)
     for view in dataset.views:
         folder.file(f"images/{view.file}", lambda view=view: dataset.pixels.picture(view), Part("image", view.name))
         folder.written_by(
@@ -60,7 +60,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     folder.file("loader.py", loader.read_bytes)
 
 
-class _GroundTruth:
+class _DepthOfViews:
     """What is computed from the views' depth, once and only when a file needs it."""
 
     def __init__(self, dataset: DataSet) -> None:
@@ -69,7 +69,7 @@ class _GroundTruth:
         mesh = dataset.mesh
         self._surface = Surface(mesh.vertices_m, mesh.faces)
 
-    def depth_m(self, view: View) -> NDArray[np.float32]:
+    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
         """(H, W) of the surface where the image shows it; what it shows of the surface's points is kept."""
         pixels = self._dataset.pixels
         shown = pixels.valid(view) & ~pixels.markers(view)
@@ -97,7 +97,7 @@ class _GroundTruth:
         return random_points(self._surface, _POINTS, np.random.default_rng(_SEED))
 
 
-def _ground_truth(view: View, depth_m: NDArray[np.float32]) -> GroundTruth:
+def _ground_truth(view: PosedView, depth_m: NDArray[np.float32]) -> GroundTruth:
     return GroundTruth(Path("images") / view.file, view.camera.matrix, view.T_world_camera, depth_m)
 
 

@@ -28,7 +28,7 @@ from service.core.units import nanoseconds, nanoseconds_of_us
 from service.dataset.formats.meshes import ground_truth_ply
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, PosedView
 
 FILE = "data_set.mcap"
 WORLD, SCAN, CAMERA = "world", "scan", "camera"
@@ -72,7 +72,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     folder.file("mesh.ply", lambda: ground_truth_ply(dataset.mesh, dataset.mark))
 
 
-def stamps_ns(views: Sequence[View]) -> dict[str, int]:
+def stamps_ns(views: Sequence[PosedView]) -> dict[str, int]:
     """The stamp of each view, ns since 1970: of its photograph; counted if one lacks or repeats its time."""
     taken = {view.name: _time_ns(view.taken) for view in views}
     known = {name: stamp for name, stamp in taken.items() if stamp is not None}

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, PosedView
 
 NAME = "views.csv"
 CAMERA = ("width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -59,7 +59,7 @@ def _flag(value: bool) -> str:
     return "true" if value else "false"
 
 
-def _numbers(view: View) -> Sequence[str]:
+def _numbers(view: PosedView) -> Sequence[str]:
     camera, T = view.camera, view.T_world_camera
     lens = [getattr(camera, name) for name in CAMERA]
     pose = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]

@@ -19,7 +19,7 @@ from service.core.errors import DataError
 from service.core.text.json_text import parse_json
 from service.dataset.formats.meshes import png
 from service.dataset.posed.folder import SUMS, check_folder
-from service.dataset.posed.records import DataSet, Mesh, View
+from service.dataset.posed.records import DataSet, Mesh, PosedView
 
 INDEX = "data.h5"
 _REMEDY = "Export it again with --format hdf5"
@@ -50,31 +50,31 @@ class Stored:
         """Take the folder of the data set; `mark` is written into pictures where it is not empty."""
         self._folder, self._mark = folder, mark
 
-    def picture(self, view: View) -> bytes:
+    def picture(self, view: PosedView) -> bytes:
         """The pixels as PNG: the camera's own file is not in the folder."""
         return png(self.colours(view), self._mark)
 
-    def colours(self, view: View) -> NDArray[np.uint8]:
+    def colours(self, view: PosedView) -> NDArray[np.uint8]:
         """(H, W, 3) BGR."""
         return np.ascontiguousarray(self._array(view, "image")[..., ::-1], dtype=np.uint8)
 
-    def depth_m(self, view: View) -> NDArray[np.float32]:
+    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
         """(H, W) z of the mesh."""
         return self._array(view, "depth_m").astype(np.float32)
 
-    def normal(self, view: View) -> NDArray[np.float32]:
+    def normal(self, view: PosedView) -> NDArray[np.float32]:
         """(H, W, 3) normals of the mesh."""
         return self._array(view, "normal").astype(np.float32)
 
-    def valid(self, view: View) -> NDArray[np.bool_]:
+    def valid(self, view: PosedView) -> NDArray[np.bool_]:
         """Pixels that the photograph has."""
         return self._array(view, "valid").astype(np.bool_)
 
-    def markers(self, view: View) -> NDArray[np.bool_]:
+    def markers(self, view: PosedView) -> NDArray[np.bool_]:
         """Spheres and posts."""
         return self._array(view, "markers").astype(np.bool_)
 
-    def _array(self, view: View, name: str) -> NDArray[Any]:
+    def _array(self, view: PosedView, name: str) -> NDArray[Any]:
         try:
             with h5py.File(self._folder / "views" / f"{view.name}.h5", "r") as file:
                 return np.asarray(file[name])
@@ -106,27 +106,27 @@ class _Scaled:
     def __init__(self, whole: DataSet) -> None:
         self._whole, self._views = whole, {view.name: view for view in whole.views}
 
-    def picture(self, view: View) -> bytes:
+    def picture(self, view: PosedView) -> bytes:
         return png(self.colours(view), self._whole.mark)
 
-    def colours(self, view: View) -> NDArray[np.uint8]:
+    def colours(self, view: PosedView) -> NDArray[np.uint8]:
         image = self._whole.pixels.colours(self._views[view.name])
         size = (view.camera.width, view.camera.height)
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
-    def depth_m(self, view: View) -> NDArray[np.float32]:
+    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
         return self._nearest(self._whole.pixels.depth_m(self._views[view.name]), view).astype(np.float32)
 
-    def normal(self, view: View) -> NDArray[np.float32]:
+    def normal(self, view: PosedView) -> NDArray[np.float32]:
         return self._nearest(self._whole.pixels.normal(self._views[view.name]), view).astype(np.float32)
 
-    def valid(self, view: View) -> NDArray[np.bool_]:
+    def valid(self, view: PosedView) -> NDArray[np.bool_]:
         return self._nearest(self._whole.pixels.valid(self._views[view.name]), view).astype(np.bool_)
 
-    def markers(self, view: View) -> NDArray[np.bool_]:
+    def markers(self, view: PosedView) -> NDArray[np.bool_]:
         return self._nearest(self._whole.pixels.markers(self._views[view.name]), view).astype(np.bool_)
 
-    def _nearest(self, pixels: NDArray[Any], view: View) -> NDArray[Any]:
+    def _nearest(self, pixels: NDArray[Any], view: PosedView) -> NDArray[Any]:
         """The values (H, W, …) at the centres of the larger pixels."""
         rows, columns = (
             ((np.arange(small) + 0.5) * (large / small)).astype(np.int64)
@@ -160,7 +160,7 @@ def _mesh(stored: Any) -> Mesh:
     return Mesh(vertices_m, faces, source, sigma_m)
 
 
-def _view(folder: Path, name: str) -> View:
+def _view(folder: Path, name: str) -> PosedView:
     with h5py.File(folder / "views" / f"{name}.h5", "r") as file:
         K, terms = np.array(file["K"], dtype=np.float64), np.array(file["distortion"], dtype=np.float64)
         height, width = np.asarray(file["valid"]).shape
@@ -171,4 +171,4 @@ def _view(folder: Path, name: str) -> View:
         )  # fmt: skip
         pose, covariance = np.array(file["T_world_camera"]), np.array(file["covariance"])
         device = str(file.attrs.get("camera", ""))
-    return View(name, ".png", camera, pose, covariance, device=device)
+    return PosedView(name, ".png", camera, pose, covariance, device=device)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.images.files import read_image_of
-from service.compute.pixels.crops import FULL_HD, Crop, marker_free_crops
+from service.compute.pixels.crops import FULL_HD, ImageCrop, marker_free_crops
 from service.compute.pixels.masks import Ball, Post, marker_mask
 from service.compute.pixels.metadata import described, with_metadata_of, without_personal_data
 from service.compute.pixels.ray_mesh import RayMesh
@@ -20,7 +20,7 @@ from service.compute.pixels.render import depth_map, seen
 from service.compute.pixels.splits import Splits
 from service.compute.pixels.undistort import pinhole_of, undistorted, valid_pixels
 from service.core.errors import DataError
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, PosedView
 
 _T = TypeVar("_T")
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
@@ -29,11 +29,11 @@ _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMW
 class _Last(Generic[_T]):
     """Keeps what was made last: crops of an image follow each other, and each image is decoded once for them all."""
 
-    def __init__(self, make: Callable[[View], _T]) -> None:
+    def __init__(self, make: Callable[[PosedView], _T]) -> None:
         self._make = make
         self._kept: tuple[str, _T] | None = None
 
-    def of(self, view: View) -> _T:
+    def of(self, view: PosedView) -> _T:
         """What belongs to a view; not to be written to."""
         if self._kept is None or self._kept[0] != view.name:
             self._kept = None  # the memory of the last one is free while the next is made
@@ -68,7 +68,7 @@ class Photographs:
         self._personal, self._mark = personal, mark
         self._colours = _Last(lambda view: read_image_of(files[view.name], view.camera))
 
-    def picture(self, view: View) -> bytes:
+    def picture(self, view: PosedView) -> bytes:
         """The file as the camera wrote it, but for what was asked to be removed or marked."""
         try:
             data = self._files[view.name].read_bytes()
@@ -80,28 +80,28 @@ class Photographs:
             data = without_personal_data(data, view.name)
         return described(data, self._mark, view.name) if self._mark else data
 
-    def colours(self, view: View) -> NDArray[np.uint8]:
+    def colours(self, view: PosedView) -> NDArray[np.uint8]:
         """(H, W, 3) BGR."""
         return self._colours.of(view)
 
-    def depth_m(self, view: View) -> NDArray[np.float32]:
+    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
         """(H, W) z of the mesh."""
         return depth_map(self._surface, view.camera, view.T_world_camera)
 
-    def normal(self, view: View) -> NDArray[np.float32]:
+    def normal(self, view: PosedView) -> NDArray[np.float32]:
         """(H, W, 3) normals of the mesh."""
         return seen(self._surface, view.camera, view.T_world_camera).normal
 
-    def valid(self, view: View) -> NDArray[np.bool_]:
+    def valid(self, view: PosedView) -> NDArray[np.bool_]:
         """All pixels."""
         return np.ones((view.camera.height, view.camera.width), dtype=np.bool_)
 
-    def markers(self, view: View) -> NDArray[np.bool_]:
+    def markers(self, view: PosedView) -> NDArray[np.bool_]:
         """Spheres and posts."""
         return marker_mask(view.camera, view.T_world_camera, self._balls, self._posts)
 
 
-class Undistorted:
+class UndistortedViews:
     """The views of a data set as pinhole cameras: `undistorted_data_set` makes them."""
 
     def __init__(self, distorted: DataSet, *, personal: bool) -> None:
@@ -110,31 +110,31 @@ class Undistorted:
         self._personal = personal
         self._colours = _Last(self._resampled)
 
-    def picture(self, view: View) -> bytes:
+    def picture(self, view: PosedView) -> bytes:
         """Resampled, with the photograph's metadata."""
         return _encoded(view, self.colours(view), self._inner.picture(self._sources[view.name]), self._personal)
 
-    def colours(self, view: View) -> NDArray[np.uint8]:
+    def colours(self, view: PosedView) -> NDArray[np.uint8]:
         """(H, W, 3) BGR; black where the photograph has no pixel."""
         return self._colours.of(view)
 
-    def _resampled(self, view: View) -> NDArray[np.uint8]:
+    def _resampled(self, view: PosedView) -> NDArray[np.uint8]:
         source = self._sources[view.name]
         return undistorted(self._inner.colours(source), source.camera).image
 
-    def depth_m(self, view: View) -> NDArray[np.float32]:
+    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
         """(H, W) z of the mesh for the pinhole."""
         return self._inner.depth_m(view)
 
-    def normal(self, view: View) -> NDArray[np.float32]:
+    def normal(self, view: PosedView) -> NDArray[np.float32]:
         """(H, W, 3) normals for the pinhole."""
         return self._inner.normal(view)
 
-    def valid(self, view: View) -> NDArray[np.bool_]:
+    def valid(self, view: PosedView) -> NDArray[np.bool_]:
         """Pixels that the photograph has."""
         return valid_pixels(self._sources[view.name].camera)
 
-    def markers(self, view: View) -> NDArray[np.bool_]:
+    def markers(self, view: PosedView) -> NDArray[np.bool_]:
         """Spheres and posts for the pinhole."""
         return self._inner.markers(view)
 
@@ -142,35 +142,35 @@ class Undistorted:
 class Cropped:
     """Parts of the views of a data set: `cropped_data_set` makes them."""
 
-    def __init__(self, whole: DataSet, crops: Mapping[str, tuple[View, Crop]], *, personal: bool) -> None:
+    def __init__(self, whole: DataSet, crops: Mapping[str, tuple[PosedView, ImageCrop]], *, personal: bool) -> None:
         """Take the whole data set, and for each new view its source and its place there."""
         self._inner, self._crops, self._personal = whole.pixels, crops, personal
         self._originals = _Last(whole.pixels.picture)
 
-    def picture(self, view: View) -> bytes:
+    def picture(self, view: PosedView) -> bytes:
         """Cut out and encoded anew, with the photograph's metadata."""
         original = self._originals.of(self._crops[view.name][0])
         return _encoded(view, self.colours(view), original, self._personal)
 
-    def colours(self, view: View) -> NDArray[np.uint8]:
+    def colours(self, view: PosedView) -> NDArray[np.uint8]:
         """(H, W, 3) BGR."""
         source, crop = self._crops[view.name]
         return np.ascontiguousarray(self._inner.colours(source)[crop.slices])
 
-    def depth_m(self, view: View) -> NDArray[np.float32]:
+    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
         """(H, W) z of the mesh."""
         return self._inner.depth_m(view)
 
-    def normal(self, view: View) -> NDArray[np.float32]:
+    def normal(self, view: PosedView) -> NDArray[np.float32]:
         """(H, W, 3) normals of the mesh."""
         return self._inner.normal(view)
 
-    def valid(self, view: View) -> NDArray[np.bool_]:
+    def valid(self, view: PosedView) -> NDArray[np.bool_]:
         """Pixels that the source has."""
         source, crop = self._crops[view.name]
         return self._inner.valid(source)[crop.slices]
 
-    def markers(self, view: View) -> NDArray[np.bool_]:
+    def markers(self, view: PosedView) -> NDArray[np.bool_]:
         """None: crops are chosen so."""
         return self._inner.markers(view)
 
@@ -180,13 +180,13 @@ def undistorted_data_set(dataset: DataSet, *, personal: bool = True) -> DataSet:
     if not any(view.camera.distortion.any() for view in dataset.views):
         return dataset
     views = tuple(dataclasses.replace(view, camera=pinhole_of(view.camera)) for view in dataset.views)
-    pixels = Undistorted(dataset, personal=personal)
+    pixels = UndistortedViews(dataset, personal=personal)
     return dataclasses.replace(dataset, identity=f"{dataset.identity} undistorted", views=views, pixels=pixels)
 
 
 def cropped_data_set(
     dataset: DataSet,
-    wanted: Callable[[View], NDArray[np.bool_]],
+    wanted: Callable[[PosedView], NDArray[np.bool_]],
     size: tuple[int, int] = FULL_HD,
     *,
     most: int = 1,
@@ -205,8 +205,8 @@ def cropped_data_set(
         ConfigurationError: a crop is larger than an image.
         DataError: no view has a crop.
     """
-    crops: dict[str, tuple[View, Crop]] = {}
-    views: list[View] = []
+    crops: dict[str, tuple[PosedView, ImageCrop]] = {}
+    views: list[PosedView] = []
     children: dict[str, list[str]] = {}
     for view in dataset.views:
         forbidden = dataset.pixels.markers(view) | ~dataset.pixels.valid(view)
@@ -235,7 +235,7 @@ def cropped_data_set(
     )
 
 
-def _encoded(view: View, colours: NDArray[np.uint8], original: bytes, personal: bool) -> bytes:
+def _encoded(view: PosedView, colours: NDArray[np.uint8], original: bytes, personal: bool) -> bytes:
     """As PNG, or as JPEG of quality 97 without subsampled colours, with the original's metadata."""
     encoded, data = cv2.imencode(view.suffix, colours, _JPEG if view.suffix == ".jpg" else ())
     if not encoded:

@@ -20,7 +20,7 @@ from service.dataset.posed.about import About
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class PosedView:
     """One image.
 
     Attributes:
@@ -75,27 +75,27 @@ class ScanFile:
 class Pixels(Interface):
     """What belongs to the pixels of a view; read or computed at each call, at the size of `view.camera`."""
 
-    def picture(self, view: View) -> bytes:
+    def picture(self, view: PosedView) -> bytes:
         """The JPEG or PNG file. Raises DataError if it cannot be read."""
         ...
 
-    def colours(self, view: View) -> NDArray[np.uint8]:
+    def colours(self, view: PosedView) -> NDArray[np.uint8]:
         """(H, W, 3) BGR of the picture. Raises DataError if it cannot be read."""
         ...
 
-    def depth_m(self, view: View) -> NDArray[np.float32]:
+    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
         """(H, W) z of the mesh in the camera frame, m; 0 where none is seen."""
         ...
 
-    def normal(self, view: View) -> NDArray[np.float32]:
+    def normal(self, view: PosedView) -> NDArray[np.float32]:
         """(H, W, 3) unit normals of the mesh in the camera frame, towards the camera; 0 where none is seen."""
         ...
 
-    def valid(self, view: View) -> NDArray[np.bool_]:
+    def valid(self, view: PosedView) -> NDArray[np.bool_]:
         """(H, W) pixels that the picture has; others are outside the photograph that was resampled."""
         ...
 
-    def markers(self, view: View) -> NDArray[np.bool_]:
+    def markers(self, view: PosedView) -> NDArray[np.bool_]:
         """(H, W) pixels that a sphere or post covers."""
         ...
 
@@ -121,7 +121,7 @@ class DataSet:
     identity: str
     simulated: bool
     statement: Mapping[str, Any]
-    views: tuple[View, ...]
+    views: tuple[PosedView, ...]
     pixels: Pixels
     mesh: Mesh
     splits: Splits

@@ -13,7 +13,7 @@ from service.compute.ground_truth.ply import read_ply
 from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.units import metres
-from service.dataset.preview.records import DrawnRegion, ShownGroundTruth
+from service.dataset.preview.records import DecidedRegion, ShownGroundTruth
 from service.dataset.recorded_fusion import RecordedFusion
 from service.dataset.scene_view import MeshColours
 
@@ -44,7 +44,7 @@ def shown_ground_truth(fusion: RecordedFusion, sources: str, sigmas: str, sigma_
         distance_change_max_mm=measures["sphere_distance_change_max_mm"],
         loop_closure_mm=measures.get("loop_closure_mm"),
         faces=int(measures["ground_truth_faces"]),
-        regions=tuple(DrawnRegion(region.source, region.by) for region in fusion.answer.regions),
+        regions=tuple(DecidedRegion(region.source, region.by) for region in fusion.answer.regions),
         sources=sources,
         sigmas=sigmas,
     )

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.crops import FULL_HD, Crop, marker_free_crops
+from service.compute.pixels.crops import FULL_HD, ImageCrop, marker_free_crops
 from service.core.errors import DataError
 from service.core.units import mm
-from service.dataset.posed.records import DataSet, Pixels, View
+from service.dataset.posed.records import DataSet, Pixels, PosedView
 from service.dataset.preview.records import ShownCrop, ShownView, put
 
 THUMBNAIL_PX, IMAGE_PX = 320, 1280  # widths
@@ -38,7 +38,7 @@ class SmallDepth:
     depth_m: NDArray[np.float32]
 
 
-def crop_size(dataset: DataSet, wanted: Callable[[View], Mask]) -> tuple[int, int]:
+def crop_size(dataset: DataSet, wanted: Callable[[PosedView], Mask]) -> tuple[int, int]:
     """Full HD where that is within the photograph, else a half, a third or a quarter of its sides.
 
     The largest that is free of markers in one of three views; the smallest if none is.
@@ -58,7 +58,7 @@ def crop_size(dataset: DataSet, wanted: Callable[[View], Mask]) -> tuple[int, in
 
 
 def small_pictures(
-    folder: Path, shown: ShownView, view: View, pixels: Pixels, crops: Sequence[Crop]
+    folder: Path, shown: ShownView, view: PosedView, pixels: Pixels, crops: Sequence[ImageCrop]
 ) -> tuple[ShownView, SmallDepth]:
     """Write the pictures of a view. Returns the view with what they tell, and its depth.
 
@@ -98,7 +98,7 @@ def depth_colours(depth_m: NDArray[np.float32], near_m: float, far_m: float) -> 
     return np.dstack([colours, np.where(depth_m > 0, 255, 0).astype(np.uint8)])
 
 
-def _part(folder: Path, shown: ShownView, colours: Colours, crop: Crop, number: int) -> ShownCrop:
+def _part(folder: Path, shown: ShownView, colours: Colours, crop: ImageCrop, number: int) -> ShownCrop:
     """Write the small picture of a crop."""
     name = shown.thumbnail.replace("-thumb.", f"-crop{number}.")
     put(folder, name, _encoded(".jpg", _reduced(colours[crop.slices], THUMBNAIL_PX), _JPEG))

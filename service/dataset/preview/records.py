@@ -60,7 +60,7 @@ class ShownCoverage:
 
 
 @dataclass(frozen=True, slots=True)
-class DrawnRegion:
+class DecidedRegion:
     """A region in which a person or the protocol decided which source counts: `ct` or `scan`, and who it was."""
 
     source: str
@@ -92,7 +92,7 @@ class ShownGroundTruth:
     distance_change_max_mm: float
     loop_closure_mm: float | None
     faces: int
-    regions: tuple[DrawnRegion, ...]
+    regions: tuple[DecidedRegion, ...]
     sources: str
     sigmas: str
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from service.jobs.calibration.records import HandEye, Intrinsics, KnownBoard
 from service.jobs.kind import JobKind, JobRecord
-from service.jobs.records import BoardSize, Camera, Hash, Matrix, Photograph
+from service.jobs.records import BoardSize, Camera, Hash, Matrix, PosedPhotograph
 
 
 class Arguments(BoardSize):
@@ -21,7 +21,7 @@ class Arguments(BoardSize):
     """
 
     solve: tuple[Literal["intrinsics", "hand_eye"], ...]
-    images: tuple[Photograph, ...]
+    images: tuple[PosedPhotograph, ...]
     camera: Camera | None = None
     corners: tuple[Hash | None, ...] | None = None
     known: KnownBoard | None = None

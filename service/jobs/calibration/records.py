@@ -187,7 +187,7 @@ class RobotNoise(JobRecord):
     deg: float | None = None
 
 
-class Method(JobRecord):
+class HandEyeMethod(JobRecord):
     """A hand-eye transform by one method, and its distance from the one in use."""
 
     T_flange_camera: Matrix
@@ -202,7 +202,7 @@ class MethodSpread(JobRecord):
     deg: float
 
 
-class Motion(JobRecord):
+class ArmRotations(JobRecord):
     """Whether the arm's rotations determine the transform.
 
     Attributes:
@@ -254,10 +254,10 @@ class HandEye(JobRecord):
     robot_noise: RobotNoise = RobotNoise()
     setup: str = ""
     method: str = ""
-    methods: dict[str, Method] = Field(default_factory=dict[str, Method])
+    methods: dict[str, HandEyeMethod] = Field(default_factory=dict[str, HandEyeMethod])
     spread: MethodSpread | None = None
     corner_sigma_px: float | None = None
-    motion: Motion | None = None
+    motion: ArmRotations | None = None
     excluded: dict[str, str] = Field(default_factory=dict[str, str])
     turned: tuple[str, ...] = ()
     arm_held_out_rms_mm: dict[str, float] = Field(default_factory=dict[str, float])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.jobs.kind import JobKind, JobRecord
-from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Photograph, Point
+from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Point, PosedPhotograph
 
 
 class LiveArguments(Mounting):
@@ -33,7 +33,7 @@ class LiveArguments(Mounting):
 class Arguments(LiveArguments):
     """The new image, and the files of this job for the earlier ones."""
 
-    image: Photograph
+    image: PosedPhotograph
     earlier: tuple[Hash, ...] = ()
 
 

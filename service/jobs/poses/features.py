@@ -6,7 +6,7 @@ from service.jobs.kind import JobKind, JobRecord, NoAnswer
 from service.jobs.records import ImageFile, ImagesCamera
 
 
-class Effort(JobRecord):
+class SfmEffort(JobRecord):
     """How much effort structure from motion makes; SfmOptions has further fields, and the same defaults.
 
     Attributes:
@@ -23,7 +23,7 @@ class Effort(JobRecord):
 class FrontEndArguments(ImagesCamera):
     """Arguments that features and matches share."""
 
-    effort: Effort
+    effort: SfmEffort
 
 
 class ImagesToMatch(JobRecord):

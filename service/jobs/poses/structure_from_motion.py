@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 from service.jobs.kind import JobKind, JobRecord, NoAnswer
-from service.jobs.poses.features import Effort
-from service.jobs.records import Hash, ImagesCamera, Matrix, Photograph
+from service.jobs.poses.features import SfmEffort
+from service.jobs.records import Hash, ImagesCamera, Matrix, PosedPhotograph
 
 
 class Arguments(ImagesCamera):
@@ -21,9 +21,9 @@ class Arguments(ImagesCamera):
         matches: files.
     """
 
-    images: tuple[Photograph, ...] = ()
+    images: tuple[PosedPhotograph, ...] = ()
     mappers: tuple[Literal["incremental", "global", "triangulated"], ...]
-    effort: Effort
+    effort: SfmEffort
     prior: dict[str, Matrix] | None = None
     features: dict[str, Hash] | None = None
     matches: tuple[Hash, ...] = ()

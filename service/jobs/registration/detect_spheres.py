@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from service.jobs.kind import JobKind, NoAnswer
-from service.jobs.records import Hash, ImagesCamera, Matrix, Mounting, ParameterCovariance, Photograph, Point
+from service.jobs.records import Hash, ImagesCamera, Matrix, Mounting, ParameterCovariance, Point, PosedPhotograph
 
 DetectorName = Literal["classical", "paper", "grounded", "vote"]
 
@@ -21,7 +21,7 @@ class SceneArguments(ImagesCamera, Mounting):
         radius_m: of the spheres.
     """
 
-    images: tuple[Photograph, ...]
+    images: tuple[PosedPhotograph, ...]
     intrinsics_covariance: Matrix | ParameterCovariance | None = None
     spheres_m: tuple[Point, ...]
     sphere_covariance_m2: tuple[Matrix, ...]

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pydantic import Field
 
 from service.jobs.kind import JobKind, JobRecord
-from service.jobs.records import Photograph, SpheresFound
+from service.jobs.records import PosedPhotograph, SpheresFound
 from service.jobs.registration.register import Registration
 
 
 class Arguments(JobRecord):
     """Control captures, registrations by name, and the spheres as scanner and CT measured them."""
 
-    images: tuple[Photograph, ...]
+    images: tuple[PosedPhotograph, ...]
     registrations: dict[str, Registration]
     scan: SpheresFound
     control_scan: SpheresFound | None = None

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from service.compute.calibration.board.board import Board
-from service.compute.calibration.board_poses.design import CalibrationTargets, ChosenViews, Prediction
+from service.compute.calibration.board_poses.design import CalibrationTargets, ChosenViews, PlanPrediction
 from service.compute.calibration.board_poses.knowledge import BoardKnowledge, refined_knowledge
 from service.compute.camera_model import CameraModel
 from service.compute.planning.motion_plan import best_posture
@@ -130,7 +130,10 @@ class BoardCapture:
     # --- planning ---
 
     def mend(
-        self, count: int, enough: Callable[[Prediction, Prediction], bool], advise: Callable[[int, str, str], str]
+        self,
+        count: int,
+        enough: Callable[[PlanPrediction, PlanPrediction], bool],
+        advise: Callable[[int, str, str], str],
     ) -> bool:
         """Plan up to `count` further poses for the next attempt, so that the calibration passes its gates.
 
@@ -151,7 +154,7 @@ class BoardCapture:
         count: int,
         looks: Sequence[SearchedBoardImage],
         *,
-        enough: Callable[[Prediction, Prediction], bool] | None = None,
+        enough: Callable[[PlanPrediction, PlanPrediction], bool] | None = None,
         advise: Callable[[int, str, str], str] | None = None,
     ) -> tuple[Viewpoint, ...]:
         """Plan board poses, record them and tell the operator; none if the arm can reach no other useful pose."""
@@ -177,7 +180,7 @@ class BoardCapture:
         why: Why,
         poses: tuple[Viewpoint, ...],
         looks: Sequence[SearchedBoardImage],
-        predicted: Prediction,
+        predicted: PlanPrediction,
         from_images: int,
         advise: Callable[[int, str, str], str] | None,
     ) -> None:

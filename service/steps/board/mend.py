@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from service.compute.calibration.board_poses.design import Prediction
+from service.compute.calibration.board_poses.design import PlanPrediction
 from service.core.gates.verdict import describe, evaluate_gates
 from service.core.records.events import GateVerdict
 from service.core.text.counts import counted
@@ -17,7 +17,7 @@ _AGAIN = 10  # further poses if their number cannot be predicted
 _AIM = 0.9  # share of a limit to reach, because predictions may be slightly optimistic
 _SPARE = 0.03  # added to a required coverage, because a corner may miss its predicted cell
 
-Enough = Callable[[Prediction, Prediction], bool]
+Enough = Callable[[PlanPrediction, PlanPrediction], bool]
 
 
 def mend_calibration(context: StepContext, capture: BoardCapture, measures: Mapping[str, float]) -> None:
@@ -81,7 +81,7 @@ def _rule(name: str, value: float | None, low: float | None, high: float | None)
     return lambda before, after: value * of(after) / of(before) <= _AIM * high
 
 
-_PREDICTED: Mapping[str, Callable[[Prediction], float]] = {
+_PREDICTED: Mapping[str, Callable[[PlanPrediction], float]] = {
     "coverage": lambda p: p.coverage,
     "tilt_deg": lambda p: p.tilt_deg - 0.5,
     "rotation_spread_deg": lambda p: p.rotation_spread_deg - 0.5,

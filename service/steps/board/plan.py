@@ -15,7 +15,7 @@ from service.compute.calibration.board_poses.design import (
     CalibrationTargets,
     ChosenViews,
     DesignProblem,
-    Prediction,
+    PlanPrediction,
     choose_poses,
 )
 from service.compute.calibration.board_poses.knowledge import BoardKnowledge, Tolerances, nominal_knowledge
@@ -42,7 +42,7 @@ class PlannedBoard:
     """Camera poses T_base_camera (K, 4, 4) with the estimated mount, and the prediction with all images."""
 
     T_base_camera: Array
-    prediction: Prediction
+    prediction: PlanPrediction
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Planner:
         known: BoardKnowledge,
         taken: ChosenViews = NOTHING,
         *,
-        enough: Callable[[Prediction], bool] | None = None,
+        enough: Callable[[PlanPrediction], bool] | None = None,
         seed: int = 0,
     ) -> PlannedBoard:
         """Up to `count` further poses; fewer if the arm can reach no others that show the board."""
@@ -92,7 +92,7 @@ class Planner:
                 break
         return PlannedBoard(poses, predicted)
 
-    def prediction(self, taken: ChosenViews, known: BoardKnowledge) -> Prediction:
+    def prediction(self, taken: ChosenViews, known: BoardKnowledge) -> PlanPrediction:
         """The prediction without further images."""
         return self._problem(known).predict(taken)
 
@@ -156,7 +156,7 @@ def nominal_camera(lens: LensSection | None, size: tuple[int, int] | None = None
     return CameraModel(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2), share
 
 
-def prediction_record(prediction: Prediction) -> BoardPrediction:
+def prediction_record(prediction: PlanPrediction) -> BoardPrediction:
     """The prediction as it is recorded: rounded, and without NaN."""
 
     def number(value: float, digits: int = 4) -> float | None:

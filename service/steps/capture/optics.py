@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from service.compute.calibration.intrinsics.optics import Optics, OpticsDeparture, compare_optics, summary
-from service.core.records.events import View
+from service.core.records.events import RecordedView
 from service.steps.context import StepContext
 from service.steps.notes import DEPARTING
 
@@ -20,7 +20,7 @@ _STATED = (
 
 def optics_departures(
     context: StepContext,
-    captures: Sequence[View] | None = None,
+    captures: Sequence[RecordedView] | None = None,
     *,
     quiet: bool = False,
     against_itself: bool = False,
@@ -64,7 +64,7 @@ class _CalibrationParams(BaseModel):
     images_of: str | None = None
 
 
-def _calibration_images(context: StepContext) -> tuple[View, ...]:
+def _calibration_images(context: StepContext) -> tuple[RecordedView, ...]:
     ids = [step.id for step in context.protocol.steps]
     until = ids.index(context.step.id) + 1
     for step in reversed(context.protocol.steps[:until]):
@@ -78,7 +78,7 @@ def _calibration_images(context: StepContext) -> tuple[View, ...]:
     return ()
 
 
-def _optics(capture: View) -> Optics:
+def _optics(capture: RecordedView) -> Optics:
     record = capture.camera
     return Optics(image=capture.viewpoint, **{name: record[name] for name in _STATED if _stated(name, record)})
 

@@ -25,7 +25,7 @@ from service.core.run.state import JobState, RunState
 from service.jobs.calibration import calibrate
 from service.jobs.kind import read_part
 from service.jobs.poses import features, match
-from service.jobs.poses.features import Effort, FrontEndArguments
+from service.jobs.poses.features import FrontEndArguments, SfmEffort
 from service.jobs.records import Camera, ImageFile
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import JobRequest, StepContext
@@ -44,7 +44,7 @@ class EarlyFeatures:
 
     context: StepContext
     camera: EarlierAnswer[calibrate.Answer]
-    effort: Effort
+    effort: SfmEffort
     neighbours: Mapping[str, Sequence[str]]  # by viewpoint, as planned
     asked: set[str] = field(default_factory=set[str])
 
@@ -160,7 +160,7 @@ class EarlyJobs:
         ]
 
 
-def found_early(state: RunState, jobs: Jobs, camera: Camera, effort: Effort) -> EarlyJobs:
+def found_early(state: RunState, jobs: Jobs, camera: Camera, effort: SfmEffort) -> EarlyJobs:
     """The jobs that computed features and matches with this camera and effort while the images arrived."""
     early = EarlyJobs()
     for step in state.steps.values():

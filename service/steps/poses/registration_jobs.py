@@ -23,7 +23,7 @@ from service.jobs import job_kinds
 from service.jobs.kind import JobRecord, read_part
 from service.jobs.poses.features import ImagesToMatch
 from service.jobs.poses.match import PairsToMatch
-from service.jobs.records import ImageFile, ImagesCamera, Photograph
+from service.jobs.records import ImageFile, ImagesCamera, PosedPhotograph
 from service.steps.context import JobRequest
 from service.steps.poses.front_end import IMAGES_A_JOB, PAIRS_A_JOB, EarlyJobs, chunks, found_early
 from service.steps.poses.sources import PLANNED, QUICK, WantedRegistrations, decisive, posed
@@ -85,7 +85,7 @@ def registration_jobs(
 class _Images(JobRecord):
     """The images of a job's arguments."""
 
-    images: tuple[Photograph, ...]
+    images: tuple[PosedPhotograph, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,8 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict
 
 from service.core.protocol.models import Protocol, Step
-from service.jobs.poses.features import Effort
-from service.jobs.records import Photograph
+from service.jobs.poses.features import SfmEffort
+from service.jobs.records import PosedPhotograph
 
 # "robot" is the paper's baseline: the arm's poses as reported. "robot_corrected" removes the arm's errors as the
 # hand-eye calibration estimated them, and each pose's error as the spheres show it. "spheres" locates each image of a
@@ -44,7 +44,7 @@ class WantedRegistrations(BaseModel):
     poses: tuple[str, ...]
     reduced: tuple[str, ...]
     reduced_poses: tuple[str, ...]
-    structure_from_motion: Effort
+    structure_from_motion: SfmEffort
 
     @classmethod
     def of(cls, params: BaseModel) -> WantedRegistrations:
@@ -102,6 +102,6 @@ def _named(measure: str, names: Iterable[str]) -> list[str]:
     return found[-1:]
 
 
-def posed(images: Iterable[Photograph]) -> bool:
+def posed(images: Iterable[PosedPhotograph]) -> bool:
     """Whether the poses of any of the images are known, from a robot or from the spheres."""
     return any(image.T_base_flange is not None or image.T_scene_camera is not None for image in images)

@@ -36,7 +36,7 @@ _COLUMNS = {field.name: int if field.type == "int" else str for field in fields(
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class LogLine:
     """One line of the log: a checkpoint, and a signature that binds it to the line before.
 
     Attributes:
@@ -74,7 +74,7 @@ class SignatureLog:
         self.path = data_dir / NAME
         self._files = files
 
-    def lines(self) -> list[Line] | None:
+    def lines(self) -> list[LogLine] | None:
         """Every line, oldest first; None if there is no log. Raises StoreError if it cannot be read."""
         return read_log(self.path)
 
@@ -95,7 +95,7 @@ class SignatureLog:
             raise _unwritten(self.path, error) from error
 
 
-def unlogged(checkpoints: Sequence[Checkpoint], lines: Sequence[Line]) -> bool:
+def unlogged(checkpoints: Sequence[Checkpoint], lines: Sequence[LogLine]) -> bool:
     """Whether a checkpoint has no line yet, because the log could not be written when it was made."""
     held = {(one.checkpoint.run_id, one.checkpoint.seq) for one in lines if one.checkpoint is not None}
     return any((one.run_id, one.seq) not in held for one in checkpoints)
@@ -109,7 +109,7 @@ def _unwritten(path: Path, error: OSError) -> StoreError:
     )
 
 
-def read_log(path: Path) -> list[Line] | None:
+def read_log(path: Path) -> list[LogLine] | None:
     """The lines of a log; None if the file does not exist. Raises StoreError if it cannot be read."""
     try:
         content = path.read_bytes()
@@ -124,7 +124,7 @@ def read_log(path: Path) -> list[Line] | None:
     return list(_parsed(content))
 
 
-def _parsed(content: bytes) -> Iterator[Line]:
+def _parsed(content: bytes) -> Iterator[LogLine]:
     previous = _FIRST
     # A line without a line end was cut off by a power failure and was never reported as written.
     whole = content[: content.rfind(b"\n") + 1]
@@ -133,7 +133,7 @@ def _parsed(content: bytes) -> Iterator[Line]:
         previous = hashlib.sha256(raw).hexdigest()
 
 
-def _line(number: int, raw: bytes, previous: str) -> Line:
+def _line(number: int, raw: bytes, previous: str) -> LogLine:
     try:
         data = json.loads(raw)
         values = {name: data["checkpoint"][name] for name in _COLUMNS}
@@ -145,11 +145,11 @@ def _line(number: int, raw: bytes, previous: str) -> Line:
         message = _message(number, previous, checkpoint, key_id)
         written = canonical_parsed(data).encode() + b"\n"
     except (ValueError, TypeError, KeyError, RecursionError, StoreError):
-        return Line(number, None, "it cannot be read")
+        return LogLine(number, None, "it cannot be read")
     problem = "" if (said_before, said_number) == (previous, number) else "it does not follow the line before it"
     if not problem and raw != written:
         problem = "it is not as it was written: its text was altered"
-    return Line(number, checkpoint, problem, message, key_id, signature)
+    return LogLine(number, checkpoint, problem, message, key_id, signature)
 
 
 def _message(number: int, previous: str, checkpoint: Checkpoint, key_id: str) -> bytes:
@@ -185,7 +185,7 @@ def _add(files: Files, path: Path, checkpoints: Sequence[Checkpoint], key: Ed255
 
 
 def log_findings(
-    lines: Sequence[Line] | None,
+    lines: Sequence[LogLine] | None,
     present: Mapping[str, Sequence[Checkpoint]],
     public_keys: Mapping[str, bytes],
     *,

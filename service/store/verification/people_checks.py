@@ -27,7 +27,7 @@ def session_sha256(row: Mapping[str, Any]) -> str:
 
 
 @dataclass
-class _Account:
+class _AccountState:
     role: str = ""
     state: str = ""
     full_name: str = ""
@@ -45,7 +45,7 @@ class _Link:
 class _RecordedAccounts:
     """The state of accounts, links and sessions according to the site's chain."""
 
-    accounts: dict[str, _Account] = field(default_factory=dict[str, _Account])
+    accounts: dict[str, _AccountState] = field(default_factory=dict[str, _AccountState])
     links: dict[str, _Link] = field(default_factory=dict[str, _Link])  # by SHA-256 of the stored token_sha256
     open_links: dict[str, str] = field(default_factory=dict[str, str])  # account → hash of its valid link
     unhashed_links: set[str] = field(default_factory=set[str])  # accounts with events older than these hashes
@@ -64,7 +64,7 @@ class _RecordedAccounts:
             return
         if change["field"] in ("state", "created"):
             self.open_links.pop(name if change["field"] == "state" else "", None)
-        account = self.accounts.setdefault(name, _Account())
+        account = self.accounts.setdefault(name, _AccountState())
         match change["field"]:
             case "created":
                 account.role, _, account.state = new.partition(", ")

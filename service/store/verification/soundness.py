@@ -11,12 +11,12 @@ from service.store.database.tables import checkpoints, events
 from service.store.events import ROOT
 from service.store.records import SITE
 from service.store.signatures.checkpoints import read_checkpoints
-from service.store.signatures.log import NAME, Line
+from service.store.signatures.log import NAME, LogLine
 from service.store.store import Store
 from service.store.verification.chain_checks import Fault, chain_fault
 
 
-def require_sound(store: Store, connection: Connection, run_id: str, lines: Sequence[Line] | None) -> None:
+def require_sound(store: Store, connection: Connection, run_id: str, lines: Sequence[LogLine] | None) -> None:
     """Raise IntegrityError unless the chain, its earlier signatures and the log of signatures agree.
 
     Events that this process has verified before are not read again; only the last of them must still be there.
@@ -49,7 +49,7 @@ def _chain(store: Store, connection: Connection, run_id: str) -> Fault | tuple[i
     return chain_fault(run_id, connection.execute(rows.where(events.c.seq > end[0])).mappings(), end)
 
 
-def _signature_fault(connection: Connection, run_id: str, lines: Sequence[Line] | None) -> Fault | None:
+def _signature_fault(connection: Connection, run_id: str, lines: Sequence[LogLine] | None) -> Fault | None:
     """A disagreement of a chain's earlier signatures with their events or with the log of signatures, or None."""
     of_event = (events.c.run_id == checkpoints.c.run_id) & (events.c.seq == checkpoints.c.seq)
     joined = select(checkpoints.c.seq).outerjoin_from(checkpoints, events, of_event)

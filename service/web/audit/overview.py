@@ -15,7 +15,7 @@ from service.audit.overview.devices import bodies_of_run, opened_devices
 from service.audit.overview.digest import Digest
 from service.audit.overview.first_page import GROUPS
 from service.audit.overview.shots import failed_exposures_of, shots_of, together
-from service.audit.overview.signatures import Signature
+from service.audit.overview.signatures import RecordedSignature
 from service.audit.overview.signatures import signatures as signatures_of
 from service.audit.record import event_rows, run_rows
 from service.audit.record.event_rows import EventRow
@@ -66,7 +66,7 @@ class _Recorded:
     session: EventRow | None
     sessions: int
     exports: list[EventRow]
-    signatures: list[Signature]
+    signatures: list[RecordedSignature]
     failures: dict[str, int]
     bodies: CameraBodies
 

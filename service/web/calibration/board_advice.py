@@ -19,7 +19,7 @@ from service.compute.camera_model import CameraModel
 from service.core.arms.known import known_arm
 from service.core.errors import OrthocaptureError
 from service.core.geometry import Array, Transform, inverse
-from service.core.protocol.models import Board as BoardSection
+from service.core.protocol.models import CalibrationBoard as BoardSection
 from service.core.records.events import ViewpointCaptured
 from service.core.units import deg, metres, mm
 from service.jobs.calibration.records import ArmAnswer, HandEye

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from service.core.equipment.recorded_devices import RecordedIdentity, recorded_report
 from service.core.protocol.models import Step
-from service.core.records.events import ArtefactRef, DeviceOpened, OperatorAction, View
+from service.core.records.events import ArtefactRef, DeviceOpened, OperatorAction, RecordedView
 from service.core.run.state import StepState
 from service.jobs.calibration import calibrate
 from service.jobs.calibration.records import ArmAnswer, HandEye, Intrinsics, Residuals
@@ -59,7 +59,7 @@ class Calibration:
     intrinsics: Intrinsics | None
     hand_eye: HandEye | None
     best: HandEye | ArmAnswer | None
-    captures: tuple[View, ...]
+    captures: tuple[RecordedView, ...]
     artefact: ArtefactRef | None
     robots: tuple[str, ...]
     states: Mapping[str, StepState]
@@ -114,7 +114,7 @@ class _Robots(BaseModel):
     robots: tuple[str, ...] = ()
 
 
-def _board_images(log: RunRecord, step: Step) -> tuple[View, ...]:
+def _board_images(log: RunRecord, step: Step) -> tuple[RecordedView, ...]:
     """The valid board images that a calibration step used: its own, or those of an earlier step."""
     source = step.params_as(Params).images_of or step.id
     return tuple(capture.payload for capture in captures_of(log, source) if capture.replaced is None)
@@ -224,7 +224,7 @@ def _limit(calibration: Calibration, measure: str) -> float | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Signature:
+class StepSignature:
     """Who signed a calibration step, when, and with which meaning."""
 
     step: str
@@ -260,7 +260,7 @@ class Certificate:
     environment: Mapping[str, float]
     operator: str
     passed: tuple[int, str, str] | None
-    signatures: tuple[Signature, ...]
+    signatures: tuple[StepSignature, ...]
     checks: tuple[LaterCheck, ...]
     stops: tuple[str, ...]
 
@@ -281,7 +281,7 @@ def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
     first = calibration.captures[0] if calibration.captures else None
     ids = {step.id for step, _ in calibration.steps}
     signatures = [
-        Signature(event.payload.step or "", event.actor, event.at_utc, event.payload.meaning)
+        StepSignature(event.payload.step or "", event.actor, event.at_utc, event.payload.meaning)
         for event in log.events
         if isinstance(event.payload, OperatorAction)
         and event.payload.action == "sign"

@@ -7,8 +7,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.web.capture.view import View, ViewState
-from service.web.record.planned_poses import Station, Vector
+from service.web.capture.view import StepViewpoint, ViewState
+from service.web.record.planned_poses import StationPlan, Vector
 
 WIDTH = 640.0  # of the drawing; its height follows from what is on it
 _MARGIN = 62.0
@@ -53,7 +53,7 @@ class PlanDrawing:
     robot: tuple[float, float] | None
 
 
-def plan_drawing(station: Station, views: Sequence[View], chosen: str = "") -> PlanDrawing | None:
+def plan_drawing(station: StationPlan, views: Sequence[StepViewpoint], chosen: str = "") -> PlanDrawing | None:
     """The drawing; None without a viewpoint whose position is known. `chosen` is always drawn."""
     placed = [(v, v.position_m, v.looks) for v in views if v.position_m is not None and v.looks is not None]
     if not placed:

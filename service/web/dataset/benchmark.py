@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.benchmark.records import SCENARIOS, Result, read_results
+from service.benchmark.records import SCENARIOS, BenchmarkResult, read_results
 from service.core.errors import DataError
 from service.core.records.events import Event, EvidenceExported
 
@@ -23,7 +23,7 @@ class Benchmark:
         problem: why they cannot be read; "".
     """
 
-    results: tuple[Result, ...]
+    results: tuple[BenchmarkResult, ...]
     best: tuple[tuple[str, float], ...]
     problem: str = ""
 

@@ -20,7 +20,7 @@ class Tick:
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class HeatMapCell:
     """A cell of a heat map; `text` is "" where there is no room."""
 
     x: float
@@ -38,7 +38,7 @@ class HeatMap:
     height: float
     cell_width: float
     cell_height: float
-    cells: tuple[Cell, ...]
+    cells: tuple[HeatMapCell, ...]
     x_ticks: tuple[Tick, ...]
     y_ticks: tuple[Tick, ...]
     scale: tuple[str, ...]  # lower end of each level, then the highest value
@@ -122,13 +122,13 @@ def heat_map(
             return math.log(value / low) / math.log(high / low)
         return (value - low) / (high - low)
 
-    cells: list[Cell] = []
+    cells: list[HeatMapCell] = []
     for r, row in enumerate(values):
         for c, value in enumerate(row):
             level = min(LEVELS - 1, int(LEVELS * share(value)))
             written = r % every == every // 2 and c % every == every // 2
             text = f"{value:.{digits}f}" if written else ""
-            cells.append(Cell(round(_LEFT + c * w, 2), round(_TOP + r * h, 2), level, text))
+            cells.append(HeatMapCell(round(_LEFT + c * w, 2), round(_TOP + r * h, 2), level, text))
     edges = [low * (high / low) ** (k / LEVELS) if logarithmic and low > 0 else low + (high - low) * k / LEVELS
              for k in range(LEVELS + 1)]  # fmt: skip
     return HeatMap(

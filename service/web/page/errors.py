@@ -51,7 +51,7 @@ _WORDS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class PageProblem:
     """An error in the words of the page and of the JSON body."""
 
     status: int
@@ -81,7 +81,7 @@ def wants_json(request: Request) -> bool:
     return "application/json" in accepted and "text/html" not in accepted
 
 
-def respond(request: Request, problem: Problem, headers: dict[str, str] | None = None) -> Response:
+def respond(request: Request, problem: PageProblem, headers: dict[str, str] | None = None) -> Response:
     """A problem as page or as JSON."""
     if wants_json(request):
         return JSONResponse(asdict(problem), status_code=problem.status, headers=headers)
@@ -112,7 +112,7 @@ def _expected(request: Request, error: Exception) -> Response:
         if isinstance(error, IntegrityError)
         else SAFE
     )
-    problem = Problem(status_of(error), error.what, error.where, error.remedy, safe)
+    problem = PageProblem(status_of(error), error.what, error.where, error.remedy, safe)
     headers = {"Retry-After": f"{error.wait_s:.0f}"} if isinstance(error, people.TooManyTriesError) else None
     return respond(request, problem, headers)
 
@@ -129,7 +129,7 @@ def _invalid(request: Request, error: Exception) -> Response:
     details: Sequence[Any] = error.errors()
     places = [".".join(str(part) for part in detail["loc"][1:]) or str(detail["loc"][0]) for detail in details]
     words = [f"{place}: {detail['msg'].lower()}" for place, detail in zip(places, details, strict=True)]
-    problem = Problem(
+    problem = PageProblem(
         422,
         "the form is not complete or not valid",
         "; ".join(words[:5]),
@@ -143,14 +143,14 @@ def _http(request: Request, error: Exception) -> Response:
     if not isinstance(error, HTTPException):
         raise error
     what, remedy = _WORDS.get(error.status_code, ("the request was refused", "Load the page again and repeat"))
-    problem = Problem(error.status_code, what, request.url.path, remedy, SAFE)
+    problem = PageProblem(error.status_code, what, request.url.path, remedy, SAFE)
     return respond(request, problem, dict(error.headers or {}))
 
 
 def _unexpected(request: Request, error: Exception) -> Response:
     reference = secrets.token_hex(4)
     _log.error("reference %s: %s %s", reference, request.method, request.url.path, exc_info=error)
-    problem = Problem(
+    problem = PageProblem(
         500,
         "the software has made a mistake",
         request.url.path,

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from service.core.records.events import Event, View
+from service.core.records.events import Event, RecordedView
 from service.core.run.state import RunState, StepState
 from service.jobs.calibration import board_view, calibrate
 from service.jobs.calibration.records import Intrinsics
@@ -38,7 +38,7 @@ def board_uses(run: RunState, events: Sequence[Event], step: str) -> Mapping[str
     images = {
         payload.artefacts[0].sha256: payload
         for seq in state.captured.values()
-        if isinstance(payload := events[seq - 1].payload, View) and payload.artefacts[0].kind == BOARD_IMAGE
+        if isinstance(payload := events[seq - 1].payload, RecordedView) and payload.artefacts[0].kind == BOARD_IMAGE
     }
     return {sha256: board_use(state, view) for sha256, view in images.items()}
 
@@ -48,7 +48,7 @@ def calibration_in(state: StepState) -> calibrate.Answer | None:
     return calibrate.KIND.read_answer(state.result) if "camera" in state.result else None
 
 
-def board_use(state: StepState, view: View) -> BoardUse:
+def board_use(state: StepState, view: RecordedView) -> BoardUse:
     """Whether one image of a step is used."""
     sha256, name = view.artefacts[0].sha256, view.viewpoint
     looks = [job for job in state.jobs.values() if job.kind == board_view.KIND.name]

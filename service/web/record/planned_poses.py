@@ -36,14 +36,14 @@ class PlannedPose:
 
 
 @dataclass(frozen=True, slots=True)
-class Station:
+class StationPlan:
     """A station, as needed to draw a plan of it."""
 
     layout: StationLayout
     specimen_m: tuple[float, float]  # along the approach, across it
 
 
-def station_of(log: RunRecord, name: str) -> Station | None:
+def station_of(log: RunRecord, name: str) -> StationPlan | None:
     """A station of the rig as it was when the run began; None if the rig has no such station."""
     section = recorded_rig(log)
     there = section.stations.get(name)
@@ -52,7 +52,7 @@ def station_of(log: RunRecord, name: str) -> Station | None:
     azimuth = math.radians(there.approach_azimuth_deg)
     layout = StationLayout(name, there.robot, there.scene_centre_m, (math.cos(azimuth), math.sin(azimuth), 0.0))
     size = section.collision.specimen_size_m
-    return Station(layout, (size[0], size[1]))
+    return StationPlan(layout, (size[0], size[1]))
 
 
 def planned_poses(log: RunRecord, step: Step) -> tuple[Viewpoint, ...]:

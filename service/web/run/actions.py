@@ -20,9 +20,9 @@ from service.core.records.events import (
     JobFailed,
     JobFinished,
     OperatorAction,
+    RecordedView,
     SessionStarted,
     StepNote,
-    View,
 )
 from service.core.recovery.reasons import full_reason
 from service.core.run.actions import needs_leave, refuse
@@ -58,7 +58,7 @@ _HARMLESS = (
     JobFinished,
     SessionStarted,
     StepNote,
-    View,
+    RecordedView,
 )
 
 

@@ -11,7 +11,7 @@ from service.core.equipment.clocks import ClockReading
 from service.core.equipment.disk_space import Forecast, size_words
 from service.core.gates.verdict import figure
 from service.core.protocol.models import Gate, Protocol, Step
-from service.core.records.events import Event, GateVerdict, SessionStarted, View
+from service.core.records.events import Event, GateVerdict, RecordedView, SessionStarted
 from service.core.run.state import RunState, StepState
 from service.monitor.snapshot import Snapshot
 from service.web.page.run_words import gate_word, limit, measure_name, planned_views
@@ -35,7 +35,7 @@ class GateLine:
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class CaptureProgress:
     """Images of the data set taken so far, and how long the rest takes."""
 
     done: int
@@ -80,7 +80,7 @@ def _gate_line(gate: Gate, verdict: GateVerdict | None, skipped: frozenset[str],
     return GateLine(name, figure(verdict), limits, gate.why, status, tone, percent, _BAR_LIMIT)
 
 
-def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event]) -> Progress:
+def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event]) -> CaptureProgress:
     """Counted from the record; the time left from the times between this run's own exposures."""
     data_set = [s for s in protocol.steps if getattr(s.params, "purpose", "") == "dataset"]
     total = sum(planned_views(step) for step in data_set)
@@ -98,7 +98,7 @@ def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event
         if state.steps[step.id].phase != "passed"
     )
     each_s = median(intervals) if len(intervals) >= 2 else None
-    return Progress(
+    return CaptureProgress(
         done=done,
         total=total,
         percent=100.0 * done / total if total else 0.0,
@@ -115,7 +115,7 @@ def view_intervals_s(events: Sequence[Event], step: str | None = None) -> list[f
     for event in events:
         if isinstance(event.payload, SessionStarted):
             chains.append([])
-        elif isinstance(event.payload, View) and step in (None, event.payload.step):
+        elif isinstance(event.payload, RecordedView) and step in (None, event.payload.step):
             chains[-1].append((event.payload.step, event.payload.attempt, event.monotonic_s))
     pairs = [pair for chain in chains for pair in pairwise(chain)]
     return [later[2] - earlier[2] for earlier, later in pairs if earlier[:2] == later[:2] and later[2] > earlier[2]]

@@ -14,7 +14,7 @@ from starlette.datastructures import UploadFile
 from service.core.errors import DataError
 from service.core.records.entered import NoteTaken
 from service.core.records.events import ArtefactRef, Event
-from service.notes import Photograph, require_size, take_note
+from service.notes import NotePhotograph, require_size, take_note
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite
 
@@ -23,7 +23,7 @@ RunId = Annotated[str, Path(max_length=64)]
 
 
 @dataclass(frozen=True, slots=True)
-class Note:
+class PageNote:
     """A note as pages show it."""
 
     seq: int
@@ -34,10 +34,10 @@ class Note:
     photograph: ArtefactRef | None
 
 
-def notes_of(events: Iterable[Event], step: str = "") -> tuple[Note, ...]:
+def notes_of(events: Iterable[Event], step: str = "") -> tuple[PageNote, ...]:
     """The notes of a run, or of one of its steps, in order."""
     return tuple(
-        Note(event.seq, event.at_utc, event.actor, note.step, note.text, note.photograph)
+        PageNote(event.seq, event.at_utc, event.actor, note.step, note.text, note.photograph)
         for event in events
         if isinstance(note := event.payload, NoteTaken) and step in ("", note.step)
     )
@@ -57,7 +57,7 @@ async def take(request: Request, site: CurrentSite, person: SignedInPerson, run_
         if isinstance(file, UploadFile) and (file.filename or file.size):
             name = file.filename or "photograph"
             require_size(file.size or 0, name)
-            photograph = Photograph(await file.read(), name)
+            photograph = NotePhotograph(await file.read(), name)
         elif isinstance(file, str) and file:
             raise DataError("the photograph did not arrive", where=run_id, remedy="Load the page again and repeat")
     log = await run_in_threadpool(site.run, run_id)

@@ -39,10 +39,10 @@ from service.web.run.view_records import (
     MainAction,
     Question,
     RecordOfRun,
-    Redo,
     RunView,
-    Signature,
+    SignedContent,
     StepLine,
+    StepRedo,
     StepTrouble,
     StepView,
     Viewer,
@@ -262,7 +262,7 @@ def _way(way: WayOn) -> Choice:
     return Choice(way.verb, way.step, sentence(way.words), takes, way.loses, way.why_not, _BUTTONS.get(way.verb, ""))
 
 
-def _signature(protocol: Protocol, state: RunState) -> Signature | None:
+def _signature(protocol: Protocol, state: RunState) -> SignedContent | None:
     if state.terminal or not needs_signature_now(protocol, state):
         return None
     step = protocol.step(state.current)
@@ -278,7 +278,7 @@ def _signature(protocol: Protocol, state: RunState) -> Signature | None:
         if state.steps[name].verdicts
     )
     sha256 = record_to_sign(protocol, state)
-    return Signature(sha256, step.title, figures, meaning) if sha256 else None
+    return SignedContent(sha256, step.title, figures, meaning) if sha256 else None
 
 
 def _acceptance(protocol: Protocol, state: RunState) -> Acceptance | None:
@@ -295,8 +295,8 @@ def _acceptance(protocol: Protocol, state: RunState) -> Acceptance | None:
     )
 
 
-def _redo(protocol: Protocol, state: RunState, target: str) -> Redo:
+def _redo(protocol: Protocol, state: RunState, target: str) -> StepRedo:
     steps = protocol.steps[protocol.index(target) :]
     begun = [s for s in steps if state.steps[s.id].started_utc or state.steps[s.id].skipped]
     images = sum(len(state.steps[s.id].captured) for s in begun)
-    return Redo(target, protocol.step(target).title, tuple(s.title for s in begun if s.id != target), images)
+    return StepRedo(target, protocol.step(target).title, tuple(s.title for s in begun if s.id != target), images)

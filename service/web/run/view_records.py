@@ -11,7 +11,7 @@ from service.core.protocol.models import Protocol
 from service.core.records.events import Event, OperatorVerb
 from service.core.run.state import Deviation, RunState
 from service.jobs.registration.evaluate import Row
-from service.web.run.figures import GateLine, Progress, Reading
+from service.web.run.figures import CaptureProgress, GateLine, Reading
 
 
 class RecordOfRun(Interface):
@@ -114,7 +114,7 @@ class MainAction:
 
 
 @dataclass(frozen=True, slots=True)
-class Redo:
+class StepRedo:
     """A step that can be done again, and what that resets."""
 
     step: str
@@ -124,7 +124,7 @@ class Redo:
 
 
 @dataclass(frozen=True, slots=True)
-class Signature:
+class SignedContent:
     """What a signature binds."""
 
     sha256: str
@@ -194,9 +194,9 @@ class Question:
     standing: bool
     trouble: StepTrouble | None
     ways: tuple[Choice, ...]
-    signature: Signature | None
+    signature: SignedContent | None
     acceptance: Acceptance | None
-    redos: tuple[Redo, ...]
+    redos: tuple[StepRedo, ...]
     skip_overrides: bool
 
 
@@ -217,7 +217,7 @@ class RunView:
     shown: StepView
     question: Question
     viewer: Viewer
-    progress: Progress
+    progress: CaptureProgress
     readings: tuple[Reading, ...]
     working: tuple[str, int, int]
     deviations: tuple[Deviation, ...]

@@ -23,7 +23,7 @@ from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.jobs.calibration import calibrate as job
 from service.jobs.calibration.records import HandEye, Intrinsics
-from service.jobs.records import Photograph
+from service.jobs.records import PosedPhotograph
 from service.worker.calibration.board_view import board_of, boards_of
 from service.worker.calibration.records import hand_eye_record, intrinsics_record
 from service.worker.camera import camera_of, camera_record
@@ -74,7 +74,7 @@ def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
 
 
 def _hand_eye(
-    images: Sequence[Photograph], usable: UsableViews, board: Board, camera: CameraModel
+    images: Sequence[PosedPhotograph], usable: UsableViews, board: Board, camera: CameraModel
 ) -> tuple[HandEye, dict[str, float]]:
     """The whole record of the hand-eye calibration, and measures."""
     used = [images[i] for i in usable.indices]

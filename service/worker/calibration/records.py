@@ -68,10 +68,10 @@ def intrinsics_record(
 def hand_eye_record(result: HandEyeResult, images: Sequence[str], setup: Setup = "eye-in-hand") -> records.HandEye:
     """The whole result of a hand-eye calibration; `images` are the names of its views."""
     chosen = result.T_flange_camera
-    methods: dict[str, records.Method] = {}
+    methods: dict[str, records.HandEyeMethod] = {}
     for name, T in result.methods.items():
         away_mm, away_deg = distance(T, chosen)
-        methods[name] = records.Method(T_flange_camera=matrix(T), distance_mm=away_mm, distance_deg=away_deg)
+        methods[name] = records.HandEyeMethod(T_flange_camera=matrix(T), distance_mm=away_mm, distance_deg=away_deg)
     corrected = result.corrected
     return records.HandEye(
         T_flange_camera=matrix(chosen),
@@ -84,7 +84,7 @@ def hand_eye_record(result: HandEyeResult, images: Sequence[str], setup: Setup =
         methods=methods,
         spread=records.MethodSpread(mm=result.spread_mm, deg=result.spread_deg),
         corner_sigma_px=result.corner_sigma_px,
-        motion=records.Motion(
+        motion=records.ArmRotations(
             rotation_spread_deg=result.rotation_spread_deg,
             second_axis_deg=result.second_axis_deg,
             condition=result.condition,

@@ -9,13 +9,13 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.capture.hand_bundle import Reading
-from service.compute.planning.hand_guidance import Place, level_frame, same_view
+from service.compute.capture.hand_bundle import ImageReading
+from service.compute.planning.hand_guidance import WantedView, level_frame, same_view
 from service.core.geometry import Array, Transform, inverse
 from service.jobs.capture import hand_view as job
 from service.jobs.capture.hand_view import HeldArguments
 from service.jobs.records import Matrix, Point, matrices, matrix
-from service.worker.capture.hand_guide import Guide
+from service.worker.capture.hand_guide import HandGuide
 from service.worker.capture.held_images import HandheldImage
 from service.worker.capture.scene import CaptureScene
 from service.worker.job import JobAnswer, JobContext
@@ -46,7 +46,7 @@ class NewImage:
     up: Array
     middle_m: Array
     cells: NDArray[np.int64] = field(repr=False)
-    reading: Reading | None = field(default=None, repr=False)
+    reading: ImageReading | None = field(default=None, repr=False)
 
 
 def answer_to(
@@ -69,7 +69,7 @@ def answer_to(
         spheres_m=scene.spheres_m,
     )
     good = [*used, new] if new.used and T is not None else used
-    guide = Guide(arguments, scene, new, earlier, good)
+    guide = HandGuide(arguments, scene, new, earlier, good)
     measures = {**found.measures, **guide.totals()}
     ref = context.keep_json(new.plain(rough=arguments.rough), kind="hand_view", name=f"{new.viewpoint}.hand.json")
     answer = _result(guide, why)
@@ -86,7 +86,7 @@ def _level(found: NewImage, earlier: Sequence[HandheldImage]) -> Transform | Non
     return level
 
 
-def _result(guide: Guide, why: str) -> job.Answer:
+def _result(guide: HandGuide, why: str) -> job.Answer:
     new, done = guide.new, guide.done()
     next_words, target = guide.next_place()
     T, level = new.T_scene_camera, new.T_scene_level
@@ -107,14 +107,14 @@ def _result(guide: Guide, why: str) -> job.Answer:
     )
 
 
-def _refined(answer: job.Answer, guide: Guide, used: Sequence[HandheldImage]) -> job.Answer:
+def _refined(answer: job.Answer, guide: HandGuide, used: Sequence[HandheldImage]) -> job.Answer:
     """Add the spheres and all camera poses, as estimated from the images, to the answer."""
     poses = {v.viewpoint: v.T_scene_camera for v in [*used, guide.new] if v.T_scene_camera is not None}
     spheres_m: tuple[Point, ...] = tuple((float(x), float(y), float(z)) for x, y, z in guide.scene.spheres_m)
     return answer.model_copy(update={"spheres_m": spheres_m, "T_scene_cameras": matrices(poses)})
 
 
-def _pose(place: Place) -> Matrix:
+def _pose(place: WantedView) -> Matrix:
     return matrix(place.T_level_camera)
 
 

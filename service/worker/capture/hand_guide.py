@@ -9,9 +9,9 @@ import numpy as np
 
 from service.compute.capture.live import expected_spheres
 from service.compute.planning.coverage import covered_fraction
-from service.compute.planning.hand_guidance import Place, covered, nearest, place_at, words
+from service.compute.planning.hand_guidance import WantedView, covered, nearest, place_at, words
 from service.compute.planning.information import predicted_information
-from service.compute.planning.next_best_view import Candidate, CurrentInformation, next_best_views
+from service.compute.planning.next_best_view import CurrentInformation, ViewGain, next_best_views
 from service.core.geometry import Transform, inverse
 from service.core.units import mm
 from service.jobs.capture import hand_view as job
@@ -26,7 +26,7 @@ _TYPICAL_PX = 0.08  # standard deviation of an outline, for views that are only 
 
 
 @dataclass(frozen=True, slots=True)
-class Guide:
+class HandGuide:
     """The state of a capture by hand after one more image.
 
     Attributes:
@@ -43,7 +43,7 @@ class Guide:
     earlier: Sequence[HandheldImage]
     good: Sequence[HandheldImage]
 
-    def places(self) -> list[Place]:
+    def places(self) -> list[WantedView]:
         """The planned places."""
         return [_place(spot) for spot in self.arguments.places]
 
@@ -67,7 +67,7 @@ class Guide:
             measures["specimen_coverage"] = covered_fraction([view.seen for view in self.good], present.min_views)
         return measures
 
-    def next_place(self) -> tuple[str, Place | None]:
+    def next_place(self) -> tuple[str, WantedView | None]:
         """Directions to the next place, and the place; the first words again if the pose was lost repeatedly."""
         T, level = self.new.T_scene_camera, self.new.T_scene_level
         if T is None or level is None:
@@ -106,13 +106,13 @@ class Guide:
             arguments.limits.min_views,
         )
 
-    def _most_helpful(self, arguments: job.Arguments, T_scene_level: Transform) -> Place | None:
+    def _most_helpful(self, arguments: job.Arguments, T_scene_level: Transform) -> WantedView | None:
         """The most helpful view of a denser hemisphere, once every planned place has its image."""
         scene, taken = self.scene, self._poses(T_scene_level)
         distance_m = float(np.median([spot.distance_m for spot in arguments.places]))
         typical = (_TYPICAL_PX / scene.camera.fx) ** 2 * np.eye(3)
-        places: dict[str, Place] = {}
-        candidates: list[Candidate] = []
+        places: dict[str, WantedView] = {}
+        candidates: list[ViewGain] = []
         for place in _denser_places(distance_m):
             if covered([place], taken, 8.0):
                 continue
@@ -120,7 +120,7 @@ class Guide:
             visible = expected_spheres(inverse(T), scene.spheres_m, scene.radius_m, scene.camera)
             centre = scene.spheres_m.mean(axis=0)
             information = predicted_information(T, scene.spheres_m[visible], scene.radius_m, centre, typical)
-            candidates.append(Candidate(place.name, information, scene.seen_from(T)))
+            candidates.append(ViewGain(place.name, information, scene.seen_from(T)))
             places[place.name] = place
         found = next_best_views(
             self._information(arguments),
@@ -132,7 +132,7 @@ class Guide:
         return places[found[0].name] if found else None
 
 
-def _denser_places(distance_m: float) -> list[Place]:
+def _denser_places(distance_m: float) -> list[WantedView]:
     return [
         place_at(
             f"t{tilt:02.0f}{azimuth:+04.0f}",
@@ -147,7 +147,7 @@ def _denser_places(distance_m: float) -> list[Place]:
     ]
 
 
-def _place(spot: PlannedPlace) -> Place:
+def _place(spot: PlannedPlace) -> WantedView:
     return place_at(
         spot.name,
         tilt_deg=spot.tilt_deg,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from service.compute.capture.hand_bundle import Reading, adjust_together
+from service.compute.capture.hand_bundle import ImageReading, adjust_together
 from service.compute.capture.hand_view import HandView, look_at_image
 from service.compute.images.files import read_image
 from service.compute.markers.detectors import options_for
@@ -39,7 +39,7 @@ def hand_view(context: JobContext[job.Arguments]) -> JobAnswer:
     if arguments.rough:
         name = arguments.image.viewpoint
         good = not (view.why or arguments.image.settings)
-        reading = Reading.of(name, pose, view.shown) if pose is not None and good else None
+        reading = ImageReading.of(name, pose, view.shown) if pose is not None and good else None
         readings = [*_readings(earlier), *([reading] if reading else [])]
         bundle = adjust_together(readings, scene.spheres_m, scene.camera, scene.radius_m)
         if bundle is not None:
@@ -85,7 +85,7 @@ def _measures(view: HandView) -> dict[str, float]:
     }
 
 
-def _readings(earlier: Sequence[HandheldImage]) -> list[Reading]:
+def _readings(earlier: Sequence[HandheldImage]) -> list[ImageReading]:
     return [e.reading for e in earlier if e.used and e.reading is not None]
 
 

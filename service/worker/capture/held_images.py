@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.capture.hand_bundle import Reading
+from service.compute.capture.hand_bundle import ImageReading
 from service.core.geometry import Array, Transform
 from service.jobs.capture.hand_view import HeldArguments
 from service.worker.capture.scene import CaptureScene
@@ -41,7 +41,7 @@ class HandheldImage:
     information: Array = field(repr=False)
     seen: NDArray[np.bool_] = field(repr=False)
     cells: NDArray[np.int64] = field(repr=False)
-    reading: Reading | None = field(repr=False)
+    reading: ImageReading | None = field(repr=False)
     spheres_m: Array | None = field(repr=False)
 
     def plain(self, *, rough: bool) -> dict[str, object]:
@@ -82,6 +82,6 @@ def _read(context: JobContext[_H], sha256: str, scene: CaptureScene) -> Handheld
         information=np.array(data["information"]),
         seen=visible,
         cells=np.array(data["cells"], dtype=np.int64),
-        reading=None if reading is None or T is None else Reading.read(data["viewpoint"], T, reading),
+        reading=None if reading is None or T is None else ImageReading.read(data["viewpoint"], T, reading),
         spheres_m=None if data.get("spheres_m") is None else np.array(data["spheres_m"]),
     )

@@ -9,7 +9,7 @@ import numpy as np
 from service.compute.capture.live import expected_spheres
 from service.compute.planning.coverage import covered_fraction
 from service.compute.planning.information import predicted_information
-from service.compute.planning.next_best_view import Candidate, CurrentInformation, next_best_views
+from service.compute.planning.next_best_view import CurrentInformation, ViewGain, next_best_views
 from service.core.errors import ComputeError
 from service.core.geometry import apply, inverse
 from service.core.units import mm
@@ -82,13 +82,13 @@ def _suggestions(
 
 def _candidates(
     arguments: job.Arguments, scene: CaptureScene, here: LiveStation, records: Sequence[LiveRecord]
-) -> list[Candidate]:
+) -> list[ViewGain]:
     """The information that each candidate view would add, with outlines as precise as those seen so far."""
     spheres, radius_m = scene.spheres_m, scene.radius_m
     typical = np.median([o.cone_covariance for r in records for o in r.view.outlines], axis=0)
     typical = np.diag(np.diag(typical))  # a median of matrices need not be positive definite
     T_base_scan = here.solved.T_base_scan
-    out: list[Candidate] = []
+    out: list[ViewGain] = []
     for candidate in arguments.candidates:
         T_base_camera = np.array(candidate.T_base_camera)
         T_scan_camera = inverse(T_base_scan) @ T_base_camera
@@ -100,5 +100,5 @@ def _candidates(
             visible = [m for m, is_free in zip(visible, free, strict=True) if is_free]
         base = apply(T_base_scan, spheres[visible]) if visible else np.zeros((0, 3))
         information = predicted_information(T_base_camera, base, radius_m, here.centre_m, typical)
-        out.append(Candidate(candidate.name, information, scene.seen_from(T_scan_camera), candidate.travel_s))
+        out.append(ViewGain(candidate.name, information, scene.seen_from(T_scan_camera), candidate.travel_s))
     return out

@@ -10,7 +10,7 @@ import numpy as np
 from service.compute.capture.live import LiveView, clipped_fraction, expected_spheres, sharpness
 from service.compute.images.files import read_image
 from service.compute.images.quality import image_quality
-from service.compute.markers.search.predicted import NEAR, Prediction, find_spheres, tone_of
+from service.compute.markers.search.predicted import NEAR, PredictedSpheres, find_spheres, tone_of
 from service.compute.planning.coverage import covered_fraction
 from service.core.errors import ComputeError
 from service.core.geometry import Transform, inverse
@@ -65,12 +65,12 @@ def live_view(context: JobContext[job.Arguments]) -> JobAnswer:
 
 def _prediction(
     scene: CaptureScene, mine: Sequence[LiveRecord], known: Transform | None, T_base_camera: Transform
-) -> Prediction | None:
+) -> PredictedSpheres | None:
     """Where the image should show the spheres; None before the station is registered."""
     shown = [outline for record in mine for outline in record.view.outlines]
     if known is None or not shown:
         return None
-    return Prediction(inverse(T_base_camera) @ known, scene.spheres_m, scene.radius_m, NEAR, tone_of(shown))
+    return PredictedSpheres(inverse(T_base_camera) @ known, scene.spheres_m, scene.radius_m, NEAR, tone_of(shown))
 
 
 def _station_measures(station: LiveStation, view: LiveView, scene: CaptureScene) -> dict[str, float]:

@@ -20,7 +20,7 @@ from service.core.units import mm
 from service.jobs.poses import hybrid as hybrid_job
 from service.jobs.poses import structure_from_motion as sfm_job
 from service.jobs.poses.structure_from_motion import ModelFile
-from service.jobs.records import Hash, Photograph, matrices, matrix
+from service.jobs.records import Hash, PosedPhotograph, matrices, matrix
 from service.worker.camera import camera_used
 from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.front_end import read_features, read_matches
@@ -128,7 +128,7 @@ def hybrid(context: JobContext[hybrid_job.Arguments]) -> JobAnswer:
     return JobAnswer(measures, (ref,))
 
 
-def _held(images: Sequence[Photograph]) -> bool:
+def _held(images: Sequence[PosedPhotograph]) -> bool:
     return any(image.T_scene_camera is not None for image in images)
 
 

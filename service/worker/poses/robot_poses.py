@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from service.core.geometry import Array
-from service.jobs.records import Mounting, Photograph
+from service.jobs.records import Mounting, PosedPhotograph
 from service.worker.calibration.records import corrected_mounting
 
 
-def robot_camera_poses(mounting: Mounting, images: Sequence[Photograph]) -> Array:
+def robot_camera_poses(mounting: Mounting, images: Sequence[PosedPhotograph]) -> Array:
     """(N, 4, 4) T_base_camera of a job's images, each in the base frame of its station.
 
     Args:

@@ -36,7 +36,7 @@ from service.core.geometry import Array, apply, inverse
 from service.core.records.events import ArtefactRef
 from service.core.units import metres, mm
 from service.dataset.registrations import best_row
-from service.jobs.records import Hash, Photograph, SpheresFound
+from service.jobs.records import Hash, PosedPhotograph, SpheresFound
 from service.jobs.registration import evaluate as job
 from service.jobs.registration.register import Registration
 from service.worker.camera import camera_of
@@ -47,7 +47,7 @@ _COMMON = ("common", "intrinsics")  # components that move all spheres equally
 
 
 @dataclass(frozen=True, slots=True)
-class _MeasuredSpheres:
+class _ScanAndCtSpheres:
     """The spheres as scanner and CT measured them, in the frame of the registered scan."""
 
     scan: MeasuredSpheres
@@ -62,7 +62,7 @@ class _Registered:
     name: str
     record: Registration
     camera: CameraModel
-    images: Sequence[Photograph]
+    images: Sequence[PosedPhotograph]
     outlines: Sequence[Sequence[SphereOutline]]
     T_scan_camera: Array
     markers: Sequence[Assignment]
@@ -153,7 +153,7 @@ class _Errors:
     control_outlines: int
 
 
-def _errors(registered: _Registered, measured: _MeasuredSpheres, radius_m: float) -> _Errors:
+def _errors(registered: _Registered, measured: _ScanAndCtSpheres, radius_m: float) -> _Errors:
     """The paper's two errors: on the control spheres or, without any, on each sphere predicted from the others."""
     if not len(measured.control.centres_m):
         left_out = registered.record.leave_one_out
@@ -174,18 +174,18 @@ def _errors(registered: _Registered, measured: _MeasuredSpheres, radius_m: float
     )
 
 
-def _measured(arguments: job.Arguments) -> _MeasuredSpheres:
+def _measured(arguments: job.Arguments) -> _ScanAndCtSpheres:
     """Scan, control scan and CT, matched by their spheres."""
     scan = _spheres(arguments.scan)
     control = _control(scan, arguments.control_scan)
     if arguments.ct is None:
-        return _MeasuredSpheres(scan, control, None)
+        return _ScanAndCtSpheres(scan, control, None)
     ct = _spheres(arguments.ct)
     shared = match_constellations(scan.centres_m, ct.centres_m).pairs
     centres, covariance = np.full_like(scan.centres_m, np.nan), np.zeros((len(scan.centres_m), 3, 3))
     for a, b in shared:
         centres[a], covariance[a] = ct.centres_m[b], ct.covariance_m2[b]
-    return _MeasuredSpheres(scan, control, MeasuredSpheres(centres, covariance, ct.surface_rms_m))
+    return _ScanAndCtSpheres(scan, control, MeasuredSpheres(centres, covariance, ct.surface_rms_m))
 
 
 def _control(scan: MeasuredSpheres, control_scan: SpheresFound | None) -> MeasuredSpheres:
@@ -224,7 +224,7 @@ def _registered(
     arguments: job.Arguments,
     name: str,
     record: Registration,
-    measured: _MeasuredSpheres,
+    measured: _ScanAndCtSpheres,
     read: Callable[[Hash], Any],
 ) -> _Registered:
     camera = camera_of(record.camera)
@@ -245,7 +245,7 @@ def _registered(
     return _Registered(name, record, camera, images, outlines, T_scan_camera, markers, controls)
 
 
-def _budget(registered: _Registered, measured: _MeasuredSpheres, radius_m: float) -> ErrorBudget:
+def _budget(registered: _Registered, measured: _ScanAndCtSpheres, radius_m: float) -> ErrorBudget:
     """The error budget at the centre of the control spheres, which is the middle of the anatomy."""
     record = registered.record
     T_world_scan = np.array(record.T_world_scan)
@@ -285,7 +285,7 @@ def _budget(registered: _Registered, measured: _MeasuredSpheres, radius_m: float
 
 
 def _overlays(
-    context: JobContext[job.Arguments], registered: _Registered, measured: _MeasuredSpheres, radius_m: float
+    context: JobContext[job.Arguments], registered: _Registered, measured: _ScanAndCtSpheres, radius_m: float
 ) -> list[ArtefactRef]:
     """One image of each station with detected and predicted outlines drawn over it."""
     first: dict[str, int] = {}

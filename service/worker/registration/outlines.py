@@ -20,7 +20,7 @@ from service.compute.markers.search.paper_files import detect_file_by_masks
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
 from service.jobs.poses.structure_from_motion import ModelFile
-from service.jobs.records import Hash, Photograph
+from service.jobs.records import Hash, PosedPhotograph
 from service.jobs.registration import detect_spheres as job
 from service.worker.camera import camera_used
 from service.worker.job import JobAnswer, JobContext
@@ -56,14 +56,14 @@ def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:
 
 
 def read_outlines(
-    read: Callable[[Hash], Any], outlines: Hash, images: Sequence[Photograph], camera: CameraModel
+    read: Callable[[Hash], Any], outlines: Hash, images: Sequence[PosedPhotograph], camera: CameraModel
 ) -> list[list[SphereOutline]]:
     """The outlines in each image, from the file that `detect_spheres` wrote; `read` gives the content of a file."""
     found = read(outlines)
     return [[outline_from_record(record, camera) for record in found[image.viewpoint]] for image in images]
 
 
-def _posed(context: JobContext[job.Arguments]) -> tuple[Sequence[Photograph], Array | None]:
+def _posed(context: JobContext[job.Arguments]) -> tuple[Sequence[PosedPhotograph], Array | None]:
     """The images to search, and (N, 4, 4) their poses; None: those of the robot."""
     arguments = context.arguments
     if arguments.model is None:
@@ -75,7 +75,7 @@ def _posed(context: JobContext[job.Arguments]) -> tuple[Sequence[Photograph], Ar
 
 def _measured(
     context: JobContext[job.Arguments],
-    images: Sequence[Photograph],
+    images: Sequence[PosedPhotograph],
     outlines: Sequence[tuple[SphereOutline, ...]],
 ) -> tuple[Sequence[tuple[SphereOutline, ...]], dict[str, float]]:
     """The outlines measured in the developed raw files, where there are any, and how many these do not show."""
@@ -93,7 +93,10 @@ def _measured(
 
 
 def _located(
-    context: JobContext[job.Arguments], images: Sequence[Photograph], poses: Array | None, weights: Weights | None
+    context: JobContext[job.Arguments],
+    images: Sequence[PosedPhotograph],
+    poses: Array | None,
+    weights: Weights | None,
 ) -> LocatedOutlines:
     arguments = context.arguments
     files = photographs(context, images)

@@ -22,7 +22,7 @@ from service.core.geometry import Array, Transform, inverse
 from service.core.units import mm
 from service.jobs.poses.hybrid import HybridModel
 from service.jobs.poses.structure_from_motion import ModelFile
-from service.jobs.records import ParameterCovariance, Photograph, matrices, matrix
+from service.jobs.records import ParameterCovariance, PosedPhotograph, matrices, matrix
 from service.jobs.registration import register as job
 from service.worker.camera import camera_record, camera_reduced, camera_used
 from service.worker.job import JobAnswer, JobContext
@@ -69,7 +69,7 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
 
 
 @dataclass(frozen=True, slots=True)
-class _PosedImages:
+class _ImagesToRegister:
     """The images that are registered.
 
     Attributes:
@@ -80,7 +80,7 @@ class _PosedImages:
         outlines: of each image.
     """
 
-    images: Sequence[Photograph]
+    images: Sequence[PosedPhotograph]
     poses: Array
     groups: Sequence[int]
     camera: CameraModel
@@ -100,7 +100,7 @@ class _PosedImages:
         return next(image.station for image, g in zip(self.images, self.groups, strict=True) if g == group)
 
 
-def _posed_images(context: JobContext[job.Arguments]) -> _PosedImages:
+def _posed_images(context: JobContext[job.Arguments]) -> _ImagesToRegister:
     arguments = context.arguments
     images = arguments.images
     if arguments.poses in ("robot", "robot_corrected", "spheres"):
@@ -116,7 +116,7 @@ def _posed_images(context: JobContext[job.Arguments]) -> _PosedImages:
         groups = [0] * len(images)
     camera = camera_used(arguments)
     outlines = read_outlines(context.input_json, arguments.outlines, images, camera)
-    return _PosedImages(images, poses, groups, camera, outlines)
+    return _ImagesToRegister(images, poses, groups, camera, outlines)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ class _Placed:
     given: tuple[Mapping[str, Transform], Array] | None = None
 
 
-def _placed(context: JobContext[job.Arguments], images: _PosedImages, answer: RegistrationResult) -> _Placed:
+def _placed(context: JobContext[job.Arguments], images: _ImagesToRegister, answer: RegistrationResult) -> _Placed:
     arguments = context.arguments
     stated = answer
     if arguments.tracks is not None:
@@ -186,7 +186,7 @@ class _Judged:
 
 
 def _record(
-    arguments: job.Arguments, images: _PosedImages, answer: RegistrationResult, judged: _Judged
+    arguments: job.Arguments, images: _ImagesToRegister, answer: RegistrationResult, judged: _Judged
 ) -> job.Registration:
     placed, full = judged.placed, camera_reduced(arguments)
     record = job.Registration(

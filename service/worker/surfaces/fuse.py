@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.compute.ground_truth.align import Aligned, Spheres, align_spheres
+from service.compute.ground_truth.align import Aligned, MeshSpheres, align_spheres
 from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, chamfer
 from service.compute.ground_truth.distances.heat_map import HeatScale
 from service.compute.ground_truth.distances.heat_mesh import write_heat_mesh
@@ -17,7 +17,7 @@ from service.compute.ground_truth.fusion.cut_out import Markers, without_markers
 from service.compute.ground_truth.fusion.fuse import Fused, FusionSettings, Source
 from service.compute.ground_truth.fusion.fuse import fuse as fuse_surfaces
 from service.compute.ground_truth.fusion.picture import fusion_picture
-from service.compute.ground_truth.fusion.regions import Box, Correction, Prism, outline, seen_along
+from service.compute.ground_truth.fusion.regions import Box, Prism, RegionCorrection, outline, seen_along
 from service.compute.ground_truth.ply import write_ply
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import DataError
@@ -61,13 +61,13 @@ def fuse(context: JobContext[job.Arguments]) -> JobAnswer:
         regions=arguments.regions,
         taken_away=aligned.only_ct,
     )
-    files = _files(context, _Compared(common.ct, scan, score), fused)
+    files = _files(context, _ComparedSurfaces(common.ct, scan, score), fused)
     return JobAnswer(_measures(aligned, loop, score, fused), files, answer)
 
 
-def _spheres(found: SpheresFound) -> Spheres:
+def _spheres(found: SpheresFound) -> MeshSpheres:
     details = found.details.spheres
-    return Spheres(
+    return MeshSpheres(
         np.array(found.spheres_m),
         np.array([sphere.covariance_m2 for sphere in details]),
         metres(np.array([sphere.rms_mm for sphere in details])),
@@ -92,14 +92,14 @@ def _frames(arguments: job.Arguments, aligned: Aligned) -> dict[str, Transform]:
     return frames
 
 
-def _correction(region: job.Region, frames: dict[str, Transform], up: Array) -> Correction:
+def _correction(region: job.Region, frames: dict[str, Transform], up: Array) -> RegionCorrection:
     T = frames.get(region.frame)
     if T is None:
         raise DataError(
             f"a region of the wound is in the frame {region.frame}, which this run does not know",
             remedy="Register the images first, or give the region in the frame of the scan",
         )
-    return Correction(_space(region, T, up), from_ct=region.source == "ct", by=region.by)
+    return RegionCorrection(_space(region, T, up), from_ct=region.source == "ct", by=region.by)
 
 
 def _space(region: job.Region, T_scan_frame: Transform, up: Array) -> Box | Prism:
@@ -132,7 +132,7 @@ def _loop(arguments: job.Arguments, aligned: Aligned) -> TransformLoop | None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Compared:
+class _ComparedSurfaces:
     """CT and scan in the scan's frame, and their distances."""
 
     ct: Surface
@@ -140,7 +140,7 @@ class _Compared:
     score: ChamferScore
 
 
-def _files(context: JobContext[job.Arguments], compared: _Compared, fused: Fused) -> tuple[ArtefactRef, ...]:
+def _files(context: JobContext[job.Arguments], compared: _ComparedSurfaces, fused: Fused) -> tuple[ArtefactRef, ...]:
     scale = HeatScale.of(compared.score, ChamferSettings().outlier_m)
     mesh, heat = context.scratch / "ground_truth.ply", context.scratch / "ct_to_scan.ply"
     properties = {"source": fused.source, "sigma_mm": mm(fused.sigma_m)}

@@ -17,7 +17,7 @@ from service.compute.layout.ambiguity import (
     layout_bounds,
     layout_measures,
 )
-from service.compute.layout.photo_adjustment import LensPrior, Photograph
+from service.compute.layout.photo_adjustment import LensPrior, SpherePhotograph
 from service.compute.layout.photographs import PhotoLayout, layout_from_photographs
 from service.compute.layout.sphere_moves import innermost, suggest_moves
 from service.compute.layout.words import PhotographedMove, show_move
@@ -47,7 +47,7 @@ def layout(context: JobContext[job.Arguments]) -> JobAnswer:
         photographs.append(_not_wider(read_image(context.input(image.sha256)), _WIDTHS_PX[0]))
     focal_mm = [image.focal_mm for image in arguments.images]
     seen, pixels = _look(photographs, focal_mm, arguments.sensor_width_mm, expected)
-    found = layout_from_photographs([Photograph.of(c, o) for c, o in seen], radius_m, LensPrior(), expected)
+    found = layout_from_photographs([SpherePhotograph.of(c, o) for c, o in seen], radius_m, LensPrior(), expected)
     report = check_layout(found.centres_m, found.covariance, radius_m=radius_m)
     shown = _moves(found, report, seen[-1][0], radius_m, arguments.control)
     measures = {

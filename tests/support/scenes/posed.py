@@ -18,7 +18,7 @@ from service.compute.pixels.rays import pixel_rays
 from service.compute.pixels.splits import splits
 from service.core.geometry import Array, Transform, apply, inverse, look_at
 from service.dataset.posed.pixels import Photographs
-from service.dataset.posed.records import DataSet, Mesh, View
+from service.dataset.posed.records import DataSet, Mesh, PosedView
 
 CAMERA = CameraModel(160, 120, 190.0, 191.0, 78.0, 61.5, -0.12, 0.04, 8e-4, -5e-4)
 BOXES_M = np.array([[[-0.08, -0.03, 0.0], [0.08, 0.03, 0.03]], [[0.04, 0.03, 0.0], [0.08, 0.09, 0.05]]])
@@ -88,7 +88,7 @@ def posed_data_set(
     vertices, faces = np.asarray(shown.mesh.vertices), np.asarray(shown.mesh.faces, dtype=np.int64)
     surface = RayMesh(vertices, faces)
     covariance = np.diag([1e-10, 1e-10, 2e-10, 1e-9, 1e-9, 3e-9])
-    views = tuple(View(name, ".png", camera, T, covariance) for name, T in poses(count).items())
+    views = tuple(PosedView(name, ".png", camera, T, covariance) for name, T in poses(count).items())
     files = {view.name: folder / view.file for view in views}
     blank = Photographs(files, surface, shown.balls)
     for view in views:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.core.geometry import Array, apply, inverse
 from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, PosedView
 from tests.support.scenes.posed import scene
 
 
@@ -37,12 +37,12 @@ def corners() -> Array:
     return np.asarray(scene().mesh.vertices)
 
 
-def truth_px(view: View) -> Array:
+def truth_px(view: PosedView) -> Array:
     """Our own projection of the corners; its first pixel has its centre at 0."""
     return view.camera.project(apply(inverse(view.T_world_camera), corners()))
 
 
-def check_depth(view: View, depth_m: Array, tolerance_m: float) -> None:
+def check_depth(view: PosedView, depth_m: Array, tolerance_m: float) -> None:
     """Points at the depth of their pixels lie on the solid."""
     v, u = (k.ravel() for k in np.mgrid[8:112:9, 8:152:9])
     z = depth_m[v, u]

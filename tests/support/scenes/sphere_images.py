@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, cone_of_sphere
-from service.compute.markers.records import Evidence, SphereOutline, outline_from_cone
+from service.compute.markers.records import OutlineEvidence, SphereOutline, outline_from_cone
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, apply, inverse, look_at, transform
 
@@ -82,7 +82,9 @@ def exact_outlines(
     )
     order = rng.permutation(np.nonzero(inside & (c[:, 2] > 0.1))[0])
     covariance = np.eye(3) * (max(noise_px, 0.02) / made.camera.fx) ** 2
-    evidence = Evidence(1.0, 0.1, max(noise_px, 0.02) * 10, 300, 0.02, 0.3, (180.0, 180.0, 180.0), 0.9, covariance)
+    evidence = OutlineEvidence(
+        1.0, 0.1, max(noise_px, 0.02) * 10, 300, 0.02, 0.3, (180.0, 180.0, 180.0), 0.9, covariance
+    )
     out: list[SphereOutline] = []
     for k in order:
         cone = cone_of_sphere(c[k], RADIUS_M)
@@ -96,7 +98,9 @@ def exact_outlines(
 def false_outlines(cam: CameraModel, n: int, seed: int = 0) -> tuple[SphereOutline, ...]:
     """False detections at random places, of plausible sizes."""
     rng = np.random.default_rng(seed)
-    evidence = Evidence(0.8, 0.2, 0.2, 200, 0.05, 0.2, (120.0, 120.0, 120.0), 0.6, np.eye(3) * (0.1 / cam.fx) ** 2)
+    evidence = OutlineEvidence(
+        0.8, 0.2, 0.2, 200, 0.05, 0.2, (120.0, 120.0, 120.0), 0.6, np.eye(3) * (0.1 / cam.fx) ** 2
+    )
     out: list[SphereOutline] = []
     for _ in range(n):
         pixel = rng.uniform([0, 0], [cam.width, cam.height])[None]

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from service.audit.record.run import read_run
-from service.benchmark.records import Effort, Machine, Result, Score
+from service.benchmark.records import BenchmarkResult, ComputingEffort, Machine, Score
 from service.core.records.events import EvidenceExported
 from service.dataset.posed.of_run.data_set import data_set_of
 from service.dataset.preview.records import (
-    DrawnRegion,
+    DecidedRegion,
     Preview,
     ShownGroundTruth,
     ShownView,
@@ -76,6 +76,7 @@ def picture(browser: Browser, run: str, name: str) -> np.ndarray[tuple[int, ...]
     return np.asarray(found, dtype=np.uint8)
 
 
+@pytest.mark.slow
 def test_the_page_shows_every_view_with_its_splits_and_pictures(web: WebSite, run: str, auditor: Browser) -> None:
     dataset = data_set_of(read_run(web.site.data, run).summary())
     page = auditor.get(f"/runs/{run}/dataset").text
@@ -168,7 +169,7 @@ def test_the_figures_of_a_fused_mesh_are_told(web: WebSite, run: str, auditor: B
     truth = ShownGroundTruth(
         step="Fuse <both>", ct_share=0.125, scan_share=0.75, blend_share=0.125, sigma_median_mm=0.031,
         sigma_high_mm=0.222, distance_change_max_mm=0.017, loop_closure_mm=0.043, faces=4711,
-        regions=(DrawnRegion("ct", "grace <b>"),), sources="sources.json", sigmas="sigmas.json",
+        regions=(DecidedRegion("ct", "grace <b>"),), sources="sources.json", sigmas="sigmas.json",
     )  # fmt: skip
     distances = replace(before.distances, step="Fuse <both>", excluded=None)
     try:
@@ -209,6 +210,7 @@ def test_a_name_on_the_page_is_escaped(web: WebSite, run: str, auditor: Browser)
     assert auditor.get(f"/runs/{run}/dataset?split={hostile}").status_code == 422
 
 
+@pytest.mark.slow
 def test_what_cannot_be_made_is_told_and_can_be_tried_again(web: WebSite, auditor: Browser) -> None:
     """The photographs of this run are smaller than its camera says."""
     run = record_reported_run(web.folder, registered=True)
@@ -252,7 +254,7 @@ def test_the_benchmark_of_an_exported_data_set_is_shown(web: WebSite, run: str, 
     assert (page.status_code, "The results cannot be read" in page.text) == (200, True)
 
 
-def result(method: str, dataset_sha256: str, chamfer_mm: float | None, failure: str) -> Result:
+def result(method: str, dataset_sha256: str, chamfer_mm: float | None, failure: str) -> BenchmarkResult:
     """What the benchmark keeps of a method."""
     score = None
     if chamfer_mm is not None:
@@ -261,10 +263,10 @@ def result(method: str, dataset_sha256: str, chamfer_mm: float | None, failure: 
             f_score_05=0.8, f_score_10=0.9, normal_consistency=0.9, outside_percent=0, excluded_percent=1,
             seen_percent=90,
         )  # fmt: skip
-    return Result(
+    return BenchmarkResult(
         method=method, scenario="dense", dataset_sha256=dataset_sha256, simulated=True, views=6,
         width=320, height=240, commands=(("colmap",),), elsewhere=False,
-        effort=Effort(wall_s=60, cpu_s=100, peak_memory_mb=900), mesh_sha256="", faces=0, score=score,
+        effort=ComputingEffort(wall_s=60, cpu_s=100, peak_memory_mb=900), mesh_sha256="", faces=0, score=score,
         failure=failure, machine=Machine(processor="x", cores=2, memory_gb=4, gpu=""),
         finished_utc="2026-11-23T17:00:00Z",
     )  # fmt: skip

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from service.audit.report.blocks import Box, Drawing, Label, Line, Shape
+from service.audit.report.blocks import Drawing, Label, Line, Rectangle, Shape
 from service.core.geometry import Array
 from service.core.units import mm
 from service.jobs.calibration.records import Coverage, ProjectionUncertainty, ResidualField
@@ -63,7 +63,7 @@ def residual_drawing(residuals: ResidualField, rms_px: float | None, size: tuple
     rows, columns = counts.shape
     height = _WIDTH * size[1] / size[0]
     cell = np.array([_WIDTH / columns, height / rows])
-    shapes: list[Shape] = [Box(0, 0, _WIDTH, height, "#f7f9fb")]
+    shapes: list[Shape] = [Rectangle(0, 0, _WIDTH, height, "#f7f9fb")]
     for row, column in np.argwhere(known):
         middle = (np.array([column, row]) + 0.5) * cell
         length = min(2.0, lengths[row, column] / max(usual, 1e-9)) * 0.45 * float(cell.min())
@@ -102,7 +102,7 @@ def bars_drawing(name: str, title: str, text: str, values: Mapping[str, float], 
     every = max(1, math.ceil(len(values) / 16))
     for k, (view, value) in enumerate(values.items()):
         x = 48 + k * step
-        shapes.append(Box(x, base - 130 * value / largest, 0.7 * step, 130 * value / largest, _BLUE))
+        shapes.append(Rectangle(x, base - 130 * value / largest, 0.7 * step, 130 * value / largest, _BLUE))
         if k % every == 0:
             shapes.append(Label(x + 0.35 * step, base + 14, view, 8))
     rows = (("view", f"error_{unit}"), *((view, f"{value:.6f}") for view, value in values.items()))
@@ -132,7 +132,7 @@ def _cells(values: Array, size: tuple[int, int], text: Callable[[float], str]) -
     shapes: list[Shape] = []
     for (row, column), value in np.ndenumerate(values):
         share = (float(value) - low) / (high - low) if high > low else 0.0
-        shapes.append(Box(column * width, row * tall, width - 1, tall - 1, _mixed(share)))
+        shapes.append(Rectangle(column * width, row * tall, width - 1, tall - 1, _mixed(share)))
         ink = "#ffffff" if share > 0.55 else _INK
         shapes.append(Label((column + 0.5) * width, (row + 0.5) * tall + 3.5, text(float(value)), 9.5, ink))
     return shapes, height

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from service.audit.report.blocks import Drawing, Drawings, Report, Scene
+from service.audit.report.blocks import Drawing, Drawings, Report, SceneBlock
 from service.audit.report.output.svg import drawing_svg
 from service.dataset.summary import RunSummary
 
@@ -65,7 +65,7 @@ def _drawings(blocks: Sequence[object]) -> Iterator[Drawing]:
     for block in blocks:
         if isinstance(block, Drawings):
             yield from block.items
-        elif isinstance(block, Scene):
+        elif isinstance(block, SceneBlock):
             yield block.drawing
 
 

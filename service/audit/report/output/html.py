@@ -9,7 +9,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
-from service.audit.report.blocks import Cell, Drawing, Picture, Report
+from service.audit.report.blocks import Drawing, Picture, Report, TableCell
 from service.audit.report.output.svg import drawing_svg
 from service.audit.report.words import moment
 
@@ -37,7 +37,7 @@ def _kind(block: object) -> str:
     return type(block).__name__
 
 
-def _cell(value: Cell | str) -> Markup:
+def _cell(value: TableCell | str) -> Markup:
     if isinstance(value, str):
         return Markup(escape(value))
     if value.tone == "plain":

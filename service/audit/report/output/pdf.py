@@ -18,7 +18,6 @@ import typst
 
 from service.audit.report.blocks import (
     Block,
-    Cell,
     Drawing,
     Drawings,
     Facts,
@@ -27,8 +26,9 @@ from service.audit.report.blocks import (
     Picture,
     Pictures,
     Report,
-    Scene,
+    SceneBlock,
     Table,
+    TableCell,
 )
 from service.audit.report.output.svg import drawing_svg
 from service.audit.report.words import moment
@@ -108,8 +108,8 @@ def _document(report: Report, folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _sentence(cell: Cell) -> dict[str, Any]:
-    return _cell(Cell(cell.text + ("" if cell.text.endswith(".") else "."), cell.tone))
+def _sentence(cell: TableCell) -> dict[str, Any]:
+    return _cell(TableCell(cell.text + ("" if cell.text.endswith(".") else "."), cell.tone))
 
 
 def _block(block: Block, folder: Path, numbers: Iterator[int]) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def _block(block: Block, folder: Path, numbers: Iterator[int]) -> dict[str, Any]
         case Heading(text):
             made: dict[str, Any] = {"kind": "heading", "text": text}
         case Paragraph(text, tone):
-            made = {"kind": "paragraph", **_cell(Cell(text, tone))}
+            made = {"kind": "paragraph", **_cell(TableCell(text, tone))}
         case Facts():
             made = {"kind": "facts", "rows": _facts(block)}
         case Table():
@@ -127,7 +127,7 @@ def _block(block: Block, folder: Path, numbers: Iterator[int]) -> dict[str, Any]
             made = {"kind": "pictures", "columns": columns, "items": shown}
         case Drawings(items):
             made = {"kind": "drawings", "items": [_drawing(one, folder, next(numbers)) for one in items]}
-        case Scene(drawing):
+        case SceneBlock(drawing):
             made = {"kind": "scene", **_drawing(drawing, folder, next(numbers))}
     return made
 
@@ -157,7 +157,7 @@ def _table(table: Table) -> dict[str, Any]:
     }
 
 
-def _cell(value: Cell | str, *, code: bool = False, wide: bool = True) -> dict[str, Any]:
+def _cell(value: TableCell | str, *, code: bool = False, wide: bool = True) -> dict[str, Any]:
     text, tone = (value, "plain") if isinstance(value, str) else (value.text, value.tone)
     if _is_hash(text):
         # A hash is easier to compare in a monospaced font, and is copied without line breaks.

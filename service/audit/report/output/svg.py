@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from html import escape
 
-from service.audit.report.blocks import Box, Drawing, Line, Raster
+from service.audit.report.blocks import Drawing, Line, Raster, Rectangle
 
 _FONTS = "'DejaVu Sans', system-ui, sans-serif"
 
@@ -14,7 +14,7 @@ def drawing_svg(drawing: Drawing) -> str:
     """An svg element with title and description for screen readers."""
     parts: list[str] = []
     for shape in drawing.shapes:
-        if isinstance(shape, Box):
+        if isinstance(shape, Rectangle):
             place = f'x="{shape.x:.2f}" y="{shape.y:.2f}" width="{shape.width:.2f}" height="{shape.height:.2f}"'
             parts.append(f'<rect {place} fill="{shape.colour}"/>')
         elif isinstance(shape, Line):

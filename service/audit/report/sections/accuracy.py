@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from service.audit.record.missing_results import not_in_yet
-from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Section, Table
+from service.audit.report.blocks import Block, Column, Heading, Paragraph, Section, Table, TableCell
 from service.audit.report.words import mm, utc, words
 from service.core.gates.dependence import depends_on
 from service.dataset.late_results import late_results
@@ -37,11 +37,11 @@ _SOURCES = {
 }
 
 
-def result_sentence(summary: RunSummary) -> Cell:
+def result_sentence(summary: RunSummary) -> TableCell:
     """The result with its uncertainty and its limit."""
     best, row = summary.best(), _best_row(summary)
     if best is None or row is None:
-        return Cell("Not evaluated: nothing can be said about the accuracy of this data set.", "attention")
+        return TableCell("Not evaluated: nothing can be said about the accuracy of this data set.", "attention")
     limit_mm, whose = _limit(summary)
     error_mm = row.mean_radial_error_mm
     within = error_mm <= limit_mm
@@ -50,7 +50,7 @@ def result_sentence(summary: RunSummary) -> Cell:
     total_mm = None if known is None else known.total_mm
     budget = "" if total_mm is None else f", {total_mm:.3f} mm with the scan's own error"
     on = {"control spheres": "control spheres, which took no part in the registration,"}
-    return Cell(
+    return TableCell(
         f"With {best} poses ({_SOURCES.get(row.source, words(row.source))}), the mean error on the "
         f"{on.get(row.evaluated_on, 'spheres, each predicted by the others,')} is {error_mm:.3f} mm, "
         f"{'within' if within else 'OUTSIDE'} the limit of {limit_mm:g} mm ({whose}), with a predicted uncertainty "
@@ -225,7 +225,7 @@ def _observations(budget: ErrorBudget) -> Table:
                 f"{o.observed_mm:.4f}",
                 f"{o.predicted_mm:.4f}",
                 f"{o.normalised_chi2:.2f}",
-                Cell(o.verdict, "ok" if _HONEST[0] <= o.normalised_chi2 <= _HONEST[1] else "attention"),
+                TableCell(o.verdict, "ok" if _HONEST[0] <= o.normalised_chi2 <= _HONEST[1] else "attention"),
             )
             for o in budget.observations
         ),

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Cell, Column, Drawings, Facts, Heading, Paragraph, Section, Table
+from service.audit.report.blocks import Block, Column, Drawings, Facts, Heading, Paragraph, Section, Table, TableCell
 from service.audit.report.drawings.charts import bars_drawing, coverage_drawing, residual_drawing, uncertainty_drawing
 from service.audit.report.words import judged, limit, measured, utc
 from service.core.equipment.recorded_devices import RecordedOptics, recorded_optics
 from service.core.gates.dependence import depends_on
-from service.core.records.events import View
+from service.core.records.events import RecordedView
 from service.jobs.calibration import calibrate
 from service.jobs.calibration.records import HandEye, Intrinsics, Residuals
 from service.jobs.records import Camera
@@ -44,8 +44,8 @@ def certificate_sections(run: RecordedRun) -> Iterator[Section]:
 def _facts(run: RecordedRun, step_id: str, sha256: str, solved: calibrate.Answer) -> Facts:
     state = run.state.steps[step_id]
     first = next((run.events[seq - 1].payload for seq in sorted(state.captured.values())), None)
-    camera = recorded_optics(first.camera if isinstance(first, View) else {})
-    rows: list[tuple[str, Cell | str]] = [
+    camera = recorded_optics(first.camera if isinstance(first, RecordedView) else {})
+    rows: list[tuple[str, TableCell | str]] = [
         ("Certificate number (SHA-256 of calibration.json)", sha256),
         ("Calibrated", utc(state.ended_utc) if state.ended_utc else "not accepted yet"),
         ("Camera and lens", _camera_and_lens(camera) or "not recorded"),
@@ -155,7 +155,7 @@ def _validity(run: RecordedRun, step_id: str) -> Iterator[Block]:
         "camera taken off or knocked; another arm, for the hand-eye and its correction; a gate below that fails; a "
         "registration whose error budget does not hold."
     )
-    rows: list[tuple[Cell | str, ...]] = []
+    rows: list[tuple[TableCell | str, ...]] = []
     for step in run.protocol.steps:
         state = run.state.steps[step.id]
         accepted = state.accepted is not None

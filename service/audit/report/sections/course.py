@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from service.audit.overview.shots import Shots, failed_exposures, shots_by_step
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Cell, Column, Paragraph, Section, Table
+from service.audit.report.blocks import Block, Column, Paragraph, Section, Table, TableCell
 from service.audit.report.words import clock, duration, judged, limit, measured, utc, words
 from service.core.gates.verdict import BOUNDS_HOLD, describe_judged
 from service.core.records.events import (
@@ -92,7 +92,7 @@ def deviations_section(run: RecordedRun, listed: Sequence[NotableEvent]) -> Sect
             Column("who", 0.8),
         )
         rows = tuple(
-            (str(d.seq), at[d.seq], Cell(d.kind, "attention"), d.step, d.text, run.named(d.who)) for d in listed
+            (str(d.seq), at[d.seq], TableCell(d.kind, "attention"), d.step, d.text, run.named(d.who)) for d in listed
         )
         blocks.append(Table(columns, rows))
     else:
@@ -118,7 +118,7 @@ def steps_section(run: RecordedRun) -> Section:
         Column("limit", 1.4, "number"),
         Column("verdict", 1.1),
     )
-    rows: list[tuple[Cell | str, ...]] = []
+    rows: list[tuple[TableCell | str, ...]] = []
     heads: set[int] = set()
     shots = {one.step: one for one in shots_by_step(run.protocol, run.state, failed_exposures(run.events))}
     for number, step in enumerate(run.protocol.steps, 1):
@@ -132,7 +132,7 @@ def steps_section(run: RecordedRun) -> Section:
     return Section("Steps and gates", (table, *([Paragraph(f"{BOUNDS_HOLD}.")] if bounded else [])))
 
 
-def _state(run: RecordedRun, title: str, state: StepState, shots: Mapping[str, Shots]) -> Cell:
+def _state(run: RecordedRun, title: str, state: StepState, shots: Mapping[str, Shots]) -> TableCell:
     went_on = state.phase == "passed" and not state.skipped
     phase = ("gates overridden" if state.verdicts else "skipped") if state.skipped else words(state.phase)
     parts = [
@@ -147,7 +147,7 @@ def _state(run: RecordedRun, title: str, state: StepState, shots: Mapping[str, S
     parts.append(shots[state.step].words if state.step in shots else "")
     parts.append(f"signed by {run.named(state.signed_by)}" if state.signed_by else "")
     within = went_on and state.accepted is None
-    return Cell(f"{title}: {', '.join(filter(None, parts))}", "plain" if within else "attention")
+    return TableCell(f"{title}: {', '.join(filter(None, parts))}", "plain" if within else "attention")
 
 
 def people_section(run: RecordedRun) -> Section:
@@ -170,7 +170,7 @@ def people_section(run: RecordedRun) -> Section:
 
 def _signatures(run: RecordedRun) -> Table:
     titles = {step.id: step.title for step in run.protocol.steps}
-    rows: list[tuple[Cell | str, ...]] = []
+    rows: list[tuple[TableCell | str, ...]] = []
     for event in run.events:
         payload = event.payload
         if isinstance(payload, OperatorAction) and payload.action in ("sign", "accept"):

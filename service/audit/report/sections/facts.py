@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from service.audit.overview.shots import failed_exposures, shots_by_step, together
 from service.audit.record.missing_results import not_in_yet
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Cell, Facts
+from service.audit.report.blocks import Facts, TableCell
 from service.audit.report.sections.notes import about_facts
 from service.audit.report.words import duration, utc
 from service.core.errors import OrthocaptureError
@@ -30,7 +30,7 @@ def facts(run: RecordedRun) -> Facts:
             ("Last record", f"{utc(events[-1].at_utc)}, after {duration(events[0].at_utc, events[-1].at_utc)}"),
             (
                 "State",
-                Cell(
+                TableCell(
                     status + (f": {state.stop_reason}" if state.stop_reason else ""),
                     "ok" if status == "completed" else "attention",
                 ),
@@ -54,7 +54,7 @@ def facts(run: RecordedRun) -> Facts:
     )
 
 
-def _of_what_and_where(run: RecordedRun) -> Iterator[tuple[str, Cell | str]]:
+def _of_what_and_where(run: RecordedRun) -> Iterator[tuple[str, TableCell | str]]:
     """Specimen, site and purpose as entered, the rig, and the machine that drove the run."""
     entered = about_facts(run)
     names = {name for name, _ in entered}
@@ -80,10 +80,10 @@ def _rig_name(run: RecordedRun) -> str:
         return ""  # the first page names the file
 
 
-def _later(run: RecordedRun) -> Iterator[tuple[str, Cell]]:
+def _later(run: RecordedRun) -> Iterator[tuple[str, TableCell]]:
     late = late_results(run.protocol, run.state)
     if late:
-        yield "Results that arrived after the evaluation", Cell(", ".join(one.name for one in late), "attention")
+        yield "Results that arrived after the evaluation", TableCell(", ".join(one.name for one in late), "attention")
     missing = not_in_yet(run.protocol, run.state, run.events)
     if missing:
-        yield "Results not in yet", Cell("; ".join(missing), "attention")
+        yield "Results not in yet", TableCell("; ".join(missing), "attention")

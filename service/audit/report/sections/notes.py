@@ -5,7 +5,7 @@ from __future__ import annotations
 from textwrap import wrap
 
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Cell, Column, Heading, Pictures, Section, Table
+from service.audit.report.blocks import Block, Column, Heading, Pictures, Section, Table, TableCell
 from service.audit.report.drawings.pictures import picture
 from service.audit.report.words import utc
 from service.core.records.entered import NoteTaken, about_rows
@@ -14,9 +14,9 @@ _WIDTH_PX = 500
 _PIECE_CHARACTERS = 900
 
 
-def about_facts(run: RecordedRun) -> list[tuple[str, Cell | str]]:
+def about_facts(run: RecordedRun) -> list[tuple[str, TableCell | str]]:
     """What was entered when the run began; empty for old runs, which did not ask."""
-    rows: list[tuple[str, Cell | str]] = []
+    rows: list[tuple[str, TableCell | str]] = []
     for name, value in about_rows(run.root.about):
         rows += [(name if part == 0 else "", text) for part, text in enumerate(_pieces(value))]
     return rows

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Section, Table
+from service.audit.report.blocks import Block, Column, Heading, Paragraph, Section, Table, TableCell
 from service.audit.report.words import clock
 from service.core.equipment.camera_bodies import CameraBodies, bodies
 from service.core.equipment.clocks import clock_offset_words, clock_readings
@@ -46,7 +46,7 @@ def _devices(run: RecordedRun, known: CameraBodies) -> Table:
         Column("its clock when it was opened", 1.7),
         Column("opened (UTC)", 0.9),
     )
-    rows: list[tuple[Cell | str, ...]] = []
+    rows: list[tuple[TableCell | str, ...]] = []
     for event in run.events:
         if isinstance(event.payload, DeviceOpened):
             report = recorded_report(event.payload.report)
@@ -89,7 +89,11 @@ def _clocks(run: RecordedRun) -> Iterator[Block]:
         Column("verdict", 0.9),
         Column("what it means", 3.6),
     )
-    verdicts = {True: Cell("✓ within", "ok"), False: Cell("✗ beyond", "stop"), None: Cell("? not known", "attention")}
+    verdicts = {
+        True: TableCell("✓ within", "ok"),
+        False: TableCell("✗ beyond", "stop"),
+        None: TableCell("? not known", "attention"),
+    }
     yield Heading("Clocks")
     yield Table(
         columns,

@@ -6,11 +6,13 @@ their hashes, which are their names in the evidence.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Pictures, Section, Table
+from service.audit.report.blocks import Block, Column, Heading, Paragraph, Pictures, Section, Table, TableCell
 from service.audit.report.drawings.pictures import LARGE_PX, THUMBNAIL_PX, picture
 from service.audit.report.drawings.scene import report_scene
-from service.core.records.events import View
+from service.core.records.events import FurtherExposure, RecordedView, ViewpointCaptured
 
 
 def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
@@ -32,18 +34,21 @@ def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
     scene = report_scene(run.summary(), turning=turning)
     if scene is not None:
         blocks += [Heading(scene.drawing.title), scene]
-    originals: list[tuple[Cell | str, ...]] = []
+    originals: list[tuple[TableCell | str, ...]] = []
     for step in run.protocol.steps:
         seqs = sorted(run.state.steps[step.id].captured.values())
         captures = [(seq, run.events[seq - 1].payload) for seq in seqs]
-        views = [(seq, capture) for seq, capture in captures if isinstance(capture, View)]
+        views = [(seq, capture) for seq, capture in captures if isinstance(capture, RecordedView)]
         if views:
             sheet = tuple(picture(run, view.artefacts[0].sha256, _caption(view), THUMBNAIL_PX) for _, view in views)
             blocks += [Heading(f"Contact sheet: {step.title}"), Pictures(sheet, 5)]
-        originals += [
-            (str(seq), view.viewpoint, view.artefacts[0].original_name, view.artefacts[0].sha256)
-            for seq, view in views
-        ]
+        further = _further(views)
+        for device, mine in further.items():
+            sheet = tuple(picture(run, one.artefacts[0].sha256, caption, THUMBNAIL_PX) for _, caption, one in mine)
+            blocks += [Heading(f"Contact sheet: {step.title}, {device}"), Pictures(sheet, 5)]
+        shown = [(seq, view.viewpoint, view.artefacts[0]) for seq, view in views]
+        shown += [(seq, f"{name}, {one.device}", one.artefacts[0]) for m in further.values() for seq, name, one in m]
+        originals += [(str(seq), name, ref.original_name, ref.sha256) for seq, name, ref in shown]
     if originals:
         columns = (
             Column("event", 0.5, "number"),
@@ -59,6 +64,15 @@ def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
     return Section("Pictures", tuple(blocks) or (Paragraph("No photograph was taken."),))
 
 
-def _caption(capture: View) -> str:
+def _further(views: Sequence[tuple[int, RecordedView]]) -> dict[str, list[tuple[int, str, FurtherExposure]]]:
+    """The images of each further camera: event, viewpoint, exposure."""
+    found: dict[str, list[tuple[int, str, FurtherExposure]]] = {}
+    for seq, view in views:
+        for one in view.further if isinstance(view, ViewpointCaptured) else ():
+            found.setdefault(one.device, []).append((seq, view.viewpoint, one))
+    return found
+
+
+def _caption(capture: RecordedView) -> str:
     failed = [name for name, passed in capture.verdicts.items() if not passed]
     return capture.viewpoint + (f" ✗ {', '.join(failed)}" if failed else "")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Cell, Column, Facts, Heading, Paragraph, Section, Table
+from service.audit.report.blocks import Block, Column, Facts, Heading, Paragraph, Section, Table, TableCell
 from service.core.text.counts import counted
 from service.core.units import megabytes
 from service.store.verification.verify import AuditReport
@@ -40,8 +40,11 @@ def _checked(run: RecordedRun, audit: AuditReport) -> Facts:
     """How much was checked, the chain head, and the keys."""
     head = run.events[-1]
     unsigned = audit.unsigned_events.get(run.run_id, 0)
-    rows: list[tuple[str, Cell | str]] = [
-        ("Evidence", Cell("verified", "ok") if audit.ok else Cell(counted(len(audit.faults), "fault"), "stop")),
+    rows: list[tuple[str, TableCell | str]] = [
+        (
+            "Evidence",
+            TableCell("verified", "ok") if audit.ok else TableCell(counted(len(audit.faults), "fault"), "stop"),
+        ),
         (
             "Records walked",
             f"{counted(audit.events, 'event')}, {counted(audit.artefacts, 'artefact row')}, "
@@ -49,7 +52,10 @@ def _checked(run: RecordedRun, audit: AuditReport) -> Facts:
         ),
         ("Files hashed again", f"{audit.files}, {megabytes(audit.bytes_hashed):.1f} MB"),
         (f"Chain head (event {head.seq})", head.sha256),
-        ("Signed checkpoints (Ed25519)", str(audit.checkpoints) if audit.checkpoints else Cell("none", "attention")),
+        (
+            "Signed checkpoints (Ed25519)",
+            str(audit.checkpoints) if audit.checkpoints else TableCell("none", "attention"),
+        ),
         ("Events after the last checkpoint", str(unsigned)),
         ("Time stamps of an authority (RFC 3161)", str(audit.timestamps) if audit.timestamps else "none"),
     ]
@@ -61,7 +67,7 @@ def _checked(run: RecordedRun, audit: AuditReport) -> Facts:
 def _faults(audit: AuditReport) -> Iterator[Block]:
     shown = audit.faults[:_FAULTS_SHOWN]
     columns = (Column("event", 0.5, "number"), Column("file", 2.0, "code"), Column("what does not verify", 3.0))
-    texts = tuple(("" if f.seq is None else str(f.seq), f.file, Cell(f.what, "stop")) for f in shown)
+    texts = tuple(("" if f.seq is None else str(f.seq), f.file, TableCell(f.what, "stop")) for f in shown)
     yield Heading("Faults")
     yield Table(columns, texts)
     if len(audit.faults) > len(shown):

@@ -47,7 +47,7 @@ class CalibrationTargets:
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
+class PlanPrediction:
     """The predicted result of a set of images.
 
     Attributes:
@@ -105,7 +105,7 @@ class DesignProblem:
         poses = T_base_camera.reshape(-1, 4, 4)
         return ChosenViews(poses, tuple(expected_pixels(self.known, self.board, poses)))
 
-    def predict(self, taken: ChosenViews) -> Prediction:
+    def predict(self, taken: ChosenViews) -> PlanPrediction:
         """What calibrations from these images will achieve."""
         known, board, sigma_px = self.known, self.board, self.aims.corner_sigma_px
         counts = _counts(taken.pixels, known)
@@ -118,7 +118,7 @@ class DesignProblem:
             sigma_mm = mm(float(np.sqrt(np.trace(covariance[:3, :3]))))
             sigma_deg = deg(np.sqrt(np.trace(covariance[3:6, 3:6])))
         tilts = np.degrees(np.arccos(np.clip(np.abs(boards[:, 2, 2]), 0, 1)))
-        return Prediction(
+        return PlanPrediction(
             images=len(boards),
             coverage=float(np.count_nonzero(counts)) / counts.size,
             coverage_map=counts,
@@ -137,7 +137,7 @@ def choose_poses(
     *,
     taken: ChosenViews = NOTHING,
     feasible: Callable[[Transform], bool] = lambda _T: True,
-    enough: Callable[[Prediction], bool] | None = None,
+    enough: Callable[[PlanPrediction], bool] | None = None,
     seed: int = 0,
 ) -> Array:
     """Up to `count` of the candidates' poses (K, 4, 4), in the order of their gain.

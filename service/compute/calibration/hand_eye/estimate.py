@@ -21,9 +21,9 @@ from service.compute.calibration.hand_eye.closed_form import (
     untwist,
 )
 from service.compute.calibration.hand_eye.fit import (
-    Answer,
     ArmTerms,
     HandEyeMeasurements,
+    HandEyeSolution,
     Method,
     arm_is_possible,
     arm_noise,
@@ -147,7 +147,7 @@ class _Agreed:
     turned: NDArray[np.bool_]
     corner_sigma_px: float | None
     excluded: dict[int, str]
-    plain: Answer
+    plain: HandEyeSolution
 
     @property
     def keep(self) -> NDArray[np.bool_]:
@@ -159,7 +159,7 @@ class _Agreed:
 class _Outcome:
     """An answer, and the distance (N,) of each view's board from an answer without this view."""
 
-    answer: Answer
+    answer: HandEyeSolution
     held_out_mm: Array
     held_out_deg: Array
 
@@ -288,8 +288,8 @@ def _straightened(
 
 
 def _arm_answer(
-    data: HandEyeMeasurements, keep: NDArray[np.bool_], plain: Answer, terms: ArmTerms, noise: Noise
-) -> tuple[Answer, NDArray[np.bool_], Noise]:
+    data: HandEyeMeasurements, keep: NDArray[np.bool_], plain: HandEyeSolution, terms: ArmTerms, noise: Noise
+) -> tuple[HandEyeSolution, NDArray[np.bool_], Noise]:
     """The fit with the arm's errors (refitted without its own outliers), the views used, and the noise."""
     good = data.take(keep)
     answer = fit_with_arm(good, plain, terms, noise)
@@ -303,7 +303,7 @@ def _arm_answer(
     return fit_with_arm(good, plain, terms, noise), used, noise
 
 
-def _methods(data: HandEyeMeasurements, method: Method, answer: Answer) -> dict[Method, Transform]:
+def _methods(data: HandEyeMeasurements, method: Method, answer: HandEyeSolution) -> dict[Method, Transform]:
     """T_flange_camera by every method that has an answer."""
     answers: dict[Method, Transform] = {method: answer.T_flange_camera}
     for name, T in all_closed_forms(data.hands, data.boards).items():

@@ -30,9 +30,9 @@ from service.compute.calibration.hand_eye.closed_form import (
 from service.compute.calibration.hand_eye.reprojection import BoardCorners, solve_reprojection
 from service.compute.calibration.hand_eye.weighted import (
     FLOOR_M,
+    BoardViews,
     Fit,
     Noise,
-    Views,
     estimate_noise,
     linearise,
     mahalanobis,
@@ -59,7 +59,7 @@ _ROUNDS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class HandEyeSolution:
     """T_flange_camera and T_base_board, with the model of a weighted fit.
 
     Attributes:
@@ -73,7 +73,7 @@ class Answer:
 
     T_flange_camera: Transform
     T_base_board: Transform
-    views: Views | None = None
+    views: BoardViews | None = None
     noise: Noise | None = None
     fit: Fit | None = None
     correction: ArmCorrection | None = None
@@ -101,7 +101,7 @@ class HandEyeMeasurements:
             self.arm,
         )
 
-    def views(self, terms: ArmTerms) -> Views:
+    def views(self, terms: ArmTerms) -> BoardViews:
         """The views for a weighted fit with these parameters of the arm."""
         if terms == "none":
             kind, design = np.zeros(0, dtype=np.int64), np.zeros((len(self.hands), 6, 0))
@@ -111,9 +111,9 @@ class HandEyeMeasurements:
             check_arm(self.arm, self.joints_rad, self.hands)
             kind = _kinds(self.arm, terms)
             design = correction_design(self.arm, self.joints_rad)[:, :, : len(kind)]
-        return Views(self.hands, self.boards, self.covariance, design, kind)
+        return BoardViews(self.hands, self.boards, self.covariance, design, kind)
 
-    def placed(self, answer: Answer) -> Array:
+    def placed(self, answer: HandEyeSolution) -> Array:
         """(N, 4, 4) T_base_board from each view alone."""
         hands = self.hands
         if answer.correction is not None:
@@ -149,7 +149,7 @@ def find_outliers(data: HandEyeMeasurements, rng: np.random.Generator) -> dict[i
         good = views.take(keep)
         noise = estimate_noise(good, fit.T_flange_camera, fit.T_base_board, noise)
         fit = solve(good, noise, fit.T_flange_camera, fit.T_base_board)
-    mm, deg = deviation(data.placed(Answer(fit.T_flange_camera, fit.T_base_board)), fit.T_base_board)
+    mm, deg = deviation(data.placed(HandEyeSolution(fit.T_flange_camera, fit.T_base_board)), fit.T_base_board)
     return {
         int(
             i
@@ -165,7 +165,7 @@ def _median_noise(e: Array) -> Noise:
     return Noise(robot_m, robot_rad)
 
 
-def turned_back(data: HandEyeMeasurements, answer: Answer, T_board_turned: Transform) -> NDArray[np.bool_]:
+def turned_back(data: HandEyeMeasurements, answer: HandEyeSolution, T_board_turned: Transform) -> NDArray[np.bool_]:
     """(N,) views that fit the answer better with the board turned by half a turn."""
     apart = [
         HandEyeMeasurements(data.hands, boards, data.covariance, None, data.joints_rad, data.arm).placed(answer)
@@ -175,7 +175,7 @@ def turned_back(data: HandEyeMeasurements, answer: Answer, T_board_turned: Trans
     return turned < as_is
 
 
-def fit_method(data: HandEyeMeasurements, method: Method, start: Answer | None = None) -> Answer:
+def fit_method(data: HandEyeMeasurements, method: Method, start: HandEyeSolution | None = None) -> HandEyeSolution:
     """One method's answer from these views, without a model of the arm's error.
 
     Args:
@@ -193,7 +193,7 @@ def fit_method(data: HandEyeMeasurements, method: Method, start: Answer | None =
     if method == "reprojection":
         if data.corners is None:
             raise ComputeError("the method `reprojection` needs the corners, not only the board's poses")
-        return Answer(*solve_reprojection(data.hands, data.corners, X, B))
+        return HandEyeSolution(*solve_reprojection(data.hands, data.corners, X, B))
     views = data.views("none")
     noise = start.noise if start is not None else None
     if noise is None:
@@ -201,16 +201,16 @@ def fit_method(data: HandEyeMeasurements, method: Method, start: Answer | None =
         noise = _median_noise(e)
     noise = estimate_noise(views, X, B, Noise(noise.robot_m, noise.robot_rad))
     fit = solve(views, noise, X, B)
-    return Answer(fit.T_flange_camera, fit.T_base_board, views, noise, fit)
+    return HandEyeSolution(fit.T_flange_camera, fit.T_base_board, views, noise, fit)
 
 
-def fit_closed_form(data: HandEyeMeasurements, method: ClosedForm) -> Answer:
+def fit_closed_form(data: HandEyeMeasurements, method: ClosedForm) -> HandEyeSolution:
     """A closed form's answer, with the board at its mean pose."""
     X = solve_closed_form(data.hands, data.boards, method)
-    return Answer(X, mean_pose(data.hands @ X @ data.boards))
+    return HandEyeSolution(X, mean_pose(data.hands @ X @ data.boards))
 
 
-def arm_noise(data: HandEyeMeasurements, plain: Answer, terms: ArmTerms) -> Noise:
+def arm_noise(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTerms) -> Noise:
     """Noise of the model with these arm parameters, before any selection among them.
 
     Raises:
@@ -223,7 +223,7 @@ def arm_noise(data: HandEyeMeasurements, plain: Answer, terms: ArmTerms) -> Nois
     return estimate_noise(views, plain.T_flange_camera, plain.T_base_board, first, floor_m=_ARM_FLOOR_M)
 
 
-def fit_with_arm(data: HandEyeMeasurements, plain: Answer, terms: ArmTerms, start: Noise) -> Answer:
+def fit_with_arm(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTerms, start: Noise) -> HandEyeSolution:
     """The weighted answer with the arm's systematic error estimated.
 
     Args:
@@ -247,7 +247,7 @@ def fit_with_arm(data: HandEyeMeasurements, plain: Answer, terms: ArmTerms, star
     scaled = np.zeros(dh_count(data.arm) + gear_count(data.arm))
     scaled[: len(fit.arm)] = fit.arm
     correction = correction_of(data.arm, scaled, _observed(data.arm, fit, noise, views.kind))
-    return Answer(fit.T_flange_camera, fit.T_base_board, views, noise, fit, correction)
+    return HandEyeSolution(fit.T_flange_camera, fit.T_base_board, views, noise, fit, correction)
 
 
 def _kinds(arm: ArmModel, terms: ArmTerms) -> NDArray[np.int64]:
@@ -272,7 +272,7 @@ def _observed(arm: ArmModel, fit: Fit, noise: Noise, kind: NDArray[np.int64]) ->
     return np.array([1 - left[of == j].sum() / prior[of == j].sum() for j in joints])
 
 
-def arm_outliers(answer: Answer) -> NDArray[np.bool_]:
+def arm_outliers(answer: HandEyeSolution) -> NDArray[np.bool_]:
     """(N,) views that a fit with the arm's errors does not explain, though a fit without them may."""
     assert answer.views is not None
     assert answer.noise is not None
@@ -291,7 +291,7 @@ def held_out(
     keep: NDArray[np.bool_],
     method: Method,
     terms: ArmTerms,
-    start: tuple[Answer, Noise | None],
+    start: tuple[HandEyeSolution, Noise | None],
     folds: NDArray[np.int64],
     point_m: Array,
 ) -> tuple[Array, Array]:

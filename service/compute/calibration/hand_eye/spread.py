@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.board.board import BoardView
 from service.compute.calibration.hand_eye.closed_form import CLOSED_FORMS, solve_closed_form
-from service.compute.calibration.hand_eye.fit import Answer, HandEyeMeasurements, Method, fit_closed_form
+from service.compute.calibration.hand_eye.fit import HandEyeMeasurements, HandEyeSolution, Method, fit_closed_form
 from service.compute.calibration.hand_eye.reprojection import BoardCorners, resample_reprojection
 from service.compute.calibration.hand_eye.weighted import resample
 from service.compute.calibration.intrinsics.adjustment import fit_pose, pose_matrix
@@ -21,7 +21,7 @@ _MIN_DISTINCT = 4  # distinct views in a bootstrap replicate
 
 
 def bootstrap_covariance(
-    data: HandEyeMeasurements, method: Method, answer: Answer, count: int, rng: np.random.Generator
+    data: HandEyeMeasurements, method: Method, answer: HandEyeSolution, count: int, rng: np.random.Generator
 ) -> Array:
     """(6, 6) covariance of T_flange_camera from resampling whole images.
 

@@ -35,7 +35,7 @@ _SINGULAR = 3e-7  # smallest accepted pivot of the scaled normal matrix
 
 
 @dataclass(frozen=True, slots=True)
-class Views:
+class BoardViews:
     """Measurements of N board views.
 
     Attributes:
@@ -52,9 +52,9 @@ class Views:
     design: Array
     kind: NDArray[np.int64]
 
-    def take(self, which: NDArray[np.bool_]) -> Views:
+    def take(self, which: NDArray[np.bool_]) -> BoardViews:
         """Select these views."""
-        return Views(
+        return BoardViews(
             self.T_base_flange[which],
             self.T_camera_board[which],
             self.covariance[which],
@@ -114,7 +114,7 @@ def linearise(hands: Array, boards: Array, X: Transform, B: Transform) -> tuple[
     return e, J, JM
 
 
-def _grams(views: Views, noise: Noise, X: Transform, B: Transform) -> tuple[Array, Array]:
+def _grams(views: BoardViews, noise: Noise, X: Transform, B: Transform) -> tuple[Array, Array]:
     """(N, P + 1, P + 1) Gram matrices of each view's whitened rows [J | e], and (N,) ½ log|V|; P = 12 + K."""
     e, J, JM = linearise(views.T_base_flange, views.T_camera_board, X, B)
     L = np.linalg.cholesky(_robot(noise) + JM @ views.covariance @ np.swapaxes(JM, 1, 2))
@@ -159,7 +159,7 @@ def _factor(scaled: Array) -> Array:
     return L
 
 
-def solve(views: Views, noise: Noise, X: Transform, B: Transform, *, iterations: int = _ITERATIONS) -> Fit:
+def solve(views: BoardViews, noise: Noise, X: Transform, B: Transform, *, iterations: int = _ITERATIONS) -> Fit:
     """Gauss–Newton least squares weighted by `noise`, in increments scaled by the normal matrix.
 
     Args:
@@ -196,7 +196,7 @@ def solve(views: Views, noise: Noise, X: Transform, B: Transform, *, iterations:
     return replace(fit, covariance=minimum_at(fit)[1])
 
 
-def estimate_noise(views: Views, X: Transform, B: Transform, start: Noise, *, floor_m: float = FLOOR_M) -> Noise:
+def estimate_noise(views: BoardViews, X: Transform, B: Transform, start: Noise, *, floor_m: float = FLOOR_M) -> Noise:
     """Standard deviations that maximise the restricted likelihood, linearised near the answer.
 
     Args:
@@ -245,7 +245,7 @@ def _noise(logs: Array) -> Noise:
     return Noise(float(values[0]), float(values[1]), tuple(float(v) for v in values[2:]))
 
 
-def select_scales(views: Views, noise: Noise, X: Transform, B: Transform, groups: NDArray[np.int64]) -> Noise:
+def select_scales(views: BoardViews, noise: Noise, X: Transform, B: Transform, groups: NDArray[np.int64]) -> Noise:
     """A prior scale for each group of arm parameters; those that the data do not need go to zero.
 
     Automatic relevance determination (MacKay 1992, Tipping 2001): expectation maximisation first, which is safe, then
@@ -277,7 +277,7 @@ def select_scales(views: Views, noise: Noise, X: Transform, B: Transform, groups
     return Noise(noise.robot_m, noise.robot_rad, tuple(float(v) for v in np.sqrt(square)))
 
 
-def resample(views: Views, noise: Noise, fit: Fit, counts: Array) -> Array:
+def resample(views: BoardViews, noise: Noise, fit: Fit, counts: Array) -> Array:
     """(R, 12 + K) increments of the answer if view i counts `counts[r, i]` times: the replicates of a bootstrap.
 
     One Gauss-Newton step from the answer, which is exact to second order in the replicates' spread.
@@ -289,7 +289,7 @@ def resample(views: Views, noise: Noise, fit: Fit, counts: Array) -> Array:
     return np.array([_minimum(row.reshape(size, size), prior)[0] for row in flat])
 
 
-def mahalanobis(views: Views, noise: Noise, fit: Fit, known: NDArray[np.bool_] | None = None) -> Array:
+def mahalanobis(views: BoardViews, noise: Noise, fit: Fit, known: NDArray[np.bool_] | None = None) -> Array:
     """(N,) squared Mahalanobis distances of the views' increments from the model, with 6 degrees of freedom each.
 
     With `known`, the fit's own uncertainty counts too: it is added to the noise of views not in the fit and

@@ -27,7 +27,7 @@ from service.compute.ground_truth.fusion.overlap import (
     propose_wound,
     vertex_normals,
 )
-from service.compute.ground_truth.fusion.regions import Correction, Region, corrected
+from service.compute.ground_truth.fusion.regions import Region, RegionCorrection, corrected
 from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, place_jacobian
@@ -92,7 +92,7 @@ class Fused:
     ct_offset_m: float
     ct_spread_m: float
     folded: int
-    corrections: tuple[Correction, ...]
+    corrections: tuple[RegionCorrection, ...]
 
     def share(self, source: Source) -> float:
         """Share of the vertices from this source."""
@@ -104,7 +104,7 @@ def fuse(
     scan: Surface,
     up: Array,
     settings: FusionSettings | None = None,
-    corrections: Sequence[Correction] = (),
+    corrections: Sequence[RegionCorrection] = (),
     removed: Region | None = None,
 ) -> Fused:
     """Fuse a CT mesh and a scan.

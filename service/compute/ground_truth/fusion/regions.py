@@ -76,7 +76,7 @@ class Balls:
 
 
 @dataclass(frozen=True, slots=True)
-class Correction:
+class RegionCorrection:
     """A region in which a person decides.
 
     Attributes:
@@ -90,7 +90,7 @@ class Correction:
     by: str
 
 
-def corrected(proposed: Mask, points_m: Array, corrections: Sequence[Correction]) -> Mask:
+def corrected(proposed: Mask, points_m: Array, corrections: Sequence[RegionCorrection]) -> Mask:
     """(N,) the mask after the corrections, of which a later one overrules an earlier one."""
     out = proposed.copy()
     for correction in corrections:

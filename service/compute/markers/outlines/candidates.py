@@ -13,7 +13,7 @@ _OCTAVE = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class CircleCandidate:
     """A circle in pixels of the reduced image, which serves as bounding box and as initial outline."""
 
     x: float
@@ -47,12 +47,12 @@ def edges(gx: NDArray[np.int16], gy: NDArray[np.int16]) -> NDArray[np.bool_]:
 
 def find_candidates(
     image: NDArray[np.uint8], least_radius: float, greatest_radius: float, min_vote: float, limit: int
-) -> list[Candidate]:
+) -> list[CircleCandidate]:
     """Circles with radii in a range (pixels of this image), the most votes first, one for each place and size.
 
     Each octave of radii is searched in a copy where its smallest radius is about eleven pixels.
     """
-    found: list[Candidate] = []
+    found: list[CircleCandidate] = []
     radius = least_radius
     while radius < greatest_radius:
         scale = min(1.0, _LEAST_RADIUS / radius)
@@ -62,7 +62,7 @@ def find_candidates(
         found += _search(np.asarray(level, dtype=np.uint8), radius * scale, top * scale, min_vote, 1 / scale)
         radius = top
     found.sort(key=lambda c: -c.vote)
-    kept: list[Candidate] = []
+    kept: list[CircleCandidate] = []
     for c in found:
         if all(_apart(c, k) for k in kept):
             kept.append(c)
@@ -71,7 +71,7 @@ def find_candidates(
     return kept
 
 
-def _apart(a: Candidate, b: Candidate) -> bool:
+def _apart(a: CircleCandidate, b: CircleCandidate) -> bool:
     near = 0.35 * min(a.radius, b.radius)
     return abs(a.x - b.x) > near or abs(a.y - b.y) > near or not 0.72 < a.radius / b.radius < 1.39
 
@@ -132,7 +132,7 @@ def _keep_best(
 
 def _search(
     image: NDArray[np.uint8], least: float, greatest: float, min_vote: float, to_input: float
-) -> list[Candidate]:
+) -> list[CircleCandidate]:
     gx, gy = colour_gradient(image)
     ys, xs = np.nonzero(edges(gx, gy))
     if len(xs) == 0:
@@ -147,7 +147,7 @@ def _search(
     py, px = np.nonzero(peak)
     strongest = np.argsort(-best[py, px])[:150]
     return [
-        Candidate(
+        CircleCandidate(
             (float(px[k]) - margin + 0.5) * to_input - 0.5,
             (float(py[k]) - margin + 0.5) * to_input - 0.5,
             float(radii[best_index[py[k], px[k]]]) * to_input,

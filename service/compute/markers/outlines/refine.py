@@ -22,7 +22,13 @@ from service.compute.markers.outlines.edges import (
 )
 from service.compute.markers.outlines.limb import LimbFit, fit_limb, masked_median
 from service.compute.markers.outlines.limb_model import LimbProfiles
-from service.compute.markers.records import DEFAULTS, DetectionOptions, Evidence, SphereOutline, outline_from_cone
+from service.compute.markers.records import (
+    DEFAULTS,
+    DetectionOptions,
+    OutlineEvidence,
+    SphereOutline,
+    outline_from_cone,
+)
 from service.core.geometry import Array
 
 # Measured on rendered scenes with exact truth: an outline's remaining error after its noise has averaged out. It
@@ -165,7 +171,7 @@ def _outline(
         return None
     middle = camera.project(best.cone.axis[None])[0]
     colour = _median_colour(image, middle, 0.5 * best.cone.half_angle_rad * camera.fx)
-    evidence = Evidence(
+    evidence = OutlineEvidence(
         best.coverage, best.rms_px, best.sigma_px, best.n_edges, best.systematic_px, best.contrast, colour, score,
         best.covariance,
     )  # fmt: skip

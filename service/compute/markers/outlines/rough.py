@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.markers.colours import ColourModel, given_colour
 from service.compute.markers.cones import Cone, ransac_cone
-from service.compute.markers.outlines.candidates import Candidate
+from service.compute.markers.outlines.candidates import CircleCandidate
 from service.compute.markers.outlines.edges import envelope_edges, profiles, sample
 from service.compute.markers.records import DetectionOptions
 from service.core.geometry import Array
@@ -53,7 +53,7 @@ def examine(
     coarse: NDArray[np.uint8],
     edge_map: NDArray[np.bool_],
     camera: CameraModel,
-    candidate: Candidate,
+    candidate: CircleCandidate,
     options: DetectionOptions,
     rng: np.random.Generator,
 ) -> RoughSphere | None:

@@ -22,7 +22,7 @@ from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOu
 from service.compute.markers.search.anchors import AnchorRegistration, MapOver, register_anchors
 from service.compute.markers.search.predicted import (
     ImageOutlines,
-    Prediction,
+    PredictedSpheres,
     find_spheres,
 )
 from service.compute.registration.identification.identity import Assignment
@@ -71,7 +71,7 @@ class _Task:
     """One image file and the prediction for it. Without a prediction (None), the whole image is searched."""
 
     path: Path
-    expected: Prediction | None = None
+    expected: PredictedSpheres | None = None
 
 
 def detect_file(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
@@ -158,7 +158,7 @@ def locate_outlines(
             return searched_whole([f.outlines for f in found])
         centres = np.vstack([spheres.centres_m, spheres.control_m, first.unlisted_m])
         tasks = [
-            _Task(path, Prediction(inverse(T), centres, spheres.radius_m, first.margin, first.tone))
+            _Task(path, PredictedSpheres(inverse(T), centres, spheres.radius_m, first.margin, first.tone))
             for path, T in zip(image_paths, first.T_scan_camera, strict=True)
         ]
         found = tuple(_counted(map_over(look, tasks), n, progress))

@@ -18,13 +18,13 @@ from service.compute.markers.outlines.edges import envelope_edges, profiles, sam
 from service.compute.markers.outlines.refine import AveragedCone, approach_outlines, measure_outlines, refine_outline
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 from service.compute.markers.search.cone_pose import fit_pose
-from service.compute.registration.identification.pairing import Gate
+from service.compute.registration.identification.pairing import MatchGate
 from service.core.geometry import Array, Transform, apply
 
 # Lengths below are fractions of a sphere's apparent radius, unless the name has a unit.
 NEAR = 0.08  # a prediction this good is refined directly; its region is searched only if that fails
 WIDE = 0.42  # largest search range, for a robot that is off by millimetres
-_GATE = Gate(0.05, 0.04)  # of a whole outline from the image's other spheres; scaled for partial ones
+_GATE = MatchGate(0.05, 0.04)  # of a whole outline from the image's other spheres; scaled for partial ones
 _ROUGH_GATE = 0.12
 _APPROACH_GATE = 0.02  # of approached outlines, on whose agreement the others are predicted
 _LEAST_PART = 0.45  # share of an outline that must be inside the image and not behind another sphere
@@ -62,7 +62,7 @@ def _chromaticity(outlines: Sequence[SphereOutline]) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
+class PredictedSpheres:
     """Expected positions of the spheres `centres_m` (M, 3), scan frame, and their tolerance `margin` in radii."""
 
     T_camera_scan: Transform = field(repr=False)
@@ -103,7 +103,7 @@ class ImageOutlines:
 def find_spheres(
     image_bgr: NDArray[np.uint8],
     camera: CameraModel,
-    expected: Prediction | None,
+    expected: PredictedSpheres | None,
     options: DetectionOptions = DEFAULTS,
 ) -> ImageOutlines:
     """Find outlines in an image (H, W, 3) of the camera's size: where they are predicted, or else in the whole image.
@@ -121,7 +121,10 @@ def find_spheres(
 
 
 def locate_predicted(
-    image_bgr: NDArray[np.uint8], camera: CameraModel, expected: Prediction, options: DetectionOptions = DEFAULTS
+    image_bgr: NDArray[np.uint8],
+    camera: CameraModel,
+    expected: PredictedSpheres,
+    options: DetectionOptions = DEFAULTS,
 ) -> PredictedOutlines:
     """The outlines of the predicted spheres in an image (H, W, 3) of the camera's size.
 
@@ -138,7 +141,7 @@ def locate_predicted(
 
 
 def _attempt(
-    image: NDArray[np.uint8], camera: CameraModel, expected: Prediction, options: DetectionOptions
+    image: NDArray[np.uint8], camera: CameraModel, expected: PredictedSpheres, options: DetectionOptions
 ) -> PredictedOutlines:
     centres, radius_m = expected.centres_m, expected.radius_m
     pose = expected.T_camera_scan
@@ -175,7 +178,11 @@ def _attempt(
 
 
 def _starts(
-    image: NDArray[np.uint8], camera: CameraModel, expected: Prediction, pose: Transform, options: DetectionOptions
+    image: NDArray[np.uint8],
+    camera: CameraModel,
+    expected: PredictedSpheres,
+    pose: Transform,
+    options: DetectionOptions,
 ) -> dict[int, AveragedCone] | None:
     """Cones good to about a pixel for measurement: approached ones, and predictions from these for the others.
 
@@ -282,7 +289,7 @@ def _approach(image: NDArray[np.uint8], camera: CameraModel, cone: Cone, margin:
 
 
 def _approached_pose(
-    image: NDArray[np.uint8], camera: CameraModel, expected: Prediction, shown: dict[int, Cone]
+    image: NDArray[np.uint8], camera: CameraModel, expected: PredictedSpheres, shown: dict[int, Cone]
 ) -> Transform:
     """The image's pose from circles near the predicted ones: from a few spheres, or from all if those disagree."""
     order = _spread(shown)
@@ -315,7 +322,7 @@ def _spread(cones: dict[int, Cone]) -> list[int]:
 
 
 def _agreed_pose(
-    cones: dict[int, Cone], expected: Prediction, start: Transform, gate: float, least: float
+    cones: dict[int, Cone], expected: PredictedSpheres, start: Transform, gate: float, least: float
 ) -> Transform | None:
     """T_camera_scan on which `least` cones (at least three) agree; None if they do not."""
     if len(cones) < _POSE_SPHERES:

@@ -74,7 +74,7 @@ def evaluate(match: Match, data: MatchingData, pairs: Sequence[Pair], progress: 
     Raises:
         DataError: a file of the data set cannot be read.
     """
-    views = Views(data)
+    views = LoadedViews(data)
     scores: list[PairScore] = []
     for number, pair in enumerate(pairs):
         progress("matching", number, len(pairs))
@@ -110,7 +110,7 @@ def score_pair(found: Matches, pair: Pair, first: View, second: View, seconds: f
     )
 
 
-class Views:
+class LoadedViews:
     """Views of a data set with their pictures; those used last stay in memory."""
 
     def __init__(self, data: MatchingData) -> None:

@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from service.compute.camera_model import CameraModel
 from service.compute.descent import gauss_newton
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.identification.pairing import Gate, Sightings, match, sightings
+from service.compute.registration.identification.pairing import MatchGate, Sightings, match, sightings
 from service.core.geometry import Array, Transform, apply, skew, transform
 
 _MOST_DETECTIONS = 18  # per image, the best ones: the number of triples grows with the cube
 _MOST_REFINED = 150
-_CLOSE = Gate(0.1, 0.03)  # of a pose solved from several outlines
+_CLOSE = MatchGate(0.1, 0.03)  # of a pose solved from several outlines
 _CHUNK = 4000  # triples refined at a time
 _TRIPLE_CHI2 = 30.0  # 3 degrees of freedom
 _OUTLINE_CHI2 = 30.0  # 3 degrees of freedom
@@ -127,7 +127,7 @@ def _kabsch(model: Array, image: Array) -> tuple[Array, Array]:
     return R, ci - np.einsum("kij,kj->ki", R, cm)
 
 
-_LOOSE = Gate(0.4, 0.06)  # of a triple's pose
+_LOOSE = MatchGate(0.4, 0.06)  # of a triple's pose
 
 
 def _fitting(

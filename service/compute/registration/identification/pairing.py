@@ -16,15 +16,15 @@ _FLOOR_RAD = 1.2e-4  # error from sphere list and lens, added to an outline's ow
 
 
 @dataclass(frozen=True, slots=True)
-class Gate:
+class MatchGate:
     """Largest deviation of an outline from the predicted sphere that it is matched to."""
 
     place: float  # in units of the sphere's apparent radius
     size: float  # relative
 
 
-ROBOT_GATE = Gate(0.5, 0.12)  # wide enough for a robot that is off by millimetres
-CONTROL_GATE = Gate(0.5, 0.15)  # if a control sphere is farther from its prediction, the registration is wrong
+ROBOT_GATE = MatchGate(0.5, 0.12)  # wide enough for a robot that is off by millimetres
+CONTROL_GATE = MatchGate(0.5, 0.15)  # if a control sphere is farther from its prediction, the registration is wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ def sightings(outlines: Sequence[SphereOutline], radius_m: float, camera: Camera
     )
 
 
-def match(seen: Sightings, centres_camera_m: Array, radius_m: float, gate: Gate) -> list[tuple[int, int, float]]:
+def match(seen: Sightings, centres_camera_m: Array, radius_m: float, gate: MatchGate) -> list[tuple[int, int, float]]:
     """Pair detections with markers that are mutually nearest and within the gate.
 
     The markers' centres (M, 3) are in the camera frame. Returns (detection, marker, angle in radians) of each pair.
@@ -78,7 +78,7 @@ def paired(
     spheres_m: Array,
     radius_m: float,
     camera: CameraModel,
-    gate: Gate = ROBOT_GATE,
+    gate: MatchGate = ROBOT_GATE,
 ) -> dict[int, int]:
     """Outline → sphere (M, 3) of the scan frame, matched by predicted directions and sizes."""
     pairs = match(sightings(outlines, radius_m, camera), apply(T_camera_scan, spheres_m), radius_m, gate)

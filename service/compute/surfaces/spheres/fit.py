@@ -23,7 +23,7 @@ _STEPS = 40
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
+class SphereSamples:
     """Points on the surface near one candidate.
 
     Vertices are measured, not facets: a facet with edge e on a sphere lies up to e²/(8 R) inside it, which would move
@@ -89,7 +89,7 @@ class SphereFit:
     patches: Patches
 
 
-def fit_sphere(samples: Samples, start: Array, radius: float, band: float) -> SphereFit | None:
+def fit_sphere(samples: SphereSamples, start: Array, radius: float, band: float) -> SphereFit | None:
     """Tukey fit with known radius from a centre that is good to `band`; None if too few inliers remain."""
     points, area = samples.points, samples.weight
 

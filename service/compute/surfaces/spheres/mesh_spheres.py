@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from service.compute.surfaces.spheres.candidates import candidates, rough_centre, vote_peaks
-from service.compute.surfaces.spheres.fit import Samples, SphereFit, fit_sphere, sample_weights
+from service.compute.surfaces.spheres.fit import SphereFit, SphereSamples, fit_sphere, sample_weights
 from service.compute.surfaces.spheres.noise import CentreUncertainty, centre_uncertainties
 from service.compute.surfaces.surfels import CHUNK, IntArray, Surfels, surfels
 from service.core.errors import ComputeError, DataError
@@ -176,7 +176,7 @@ def _fits(
         own = weight[near] if len(faces) else sample_weights(points[near], 0.15 * radius)
         own = np.minimum(own, 2 * float(np.median(own)))  # a post's long facets have vertices near the sphere
         nearest = tree.query(points[near])[1]
-        samples = Samples(points[near], patches.normal[nearest], patches.outward[nearest], own)
+        samples = SphereSamples(points[near], patches.normal[nearest], patches.outward[nearest], own)
         fit = fit_sphere(samples, start, radius, 0.1 * radius)
         if fit is not None:
             fits.append(fit)

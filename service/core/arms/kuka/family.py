@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.core.arms.model import ArmModel, Link, Tolerances
+from service.core.arms.model import ArmModel, ArmTolerances, Link
 
 _ALLOWED = frozenset(
     {
@@ -68,5 +68,5 @@ def lbr(
         usual_rad=np.array([0.0, 0.5, 0.0, -1.4, 0.0, 1.2, -1.57]),
         payload_kg=payload_kg,
         # Its joints have no link lengths to get wrong, but springs: the torque sensors yield under load.
-        tolerances=Tolerances(dh=(0.2e-3, 0.2e-3, float(np.radians(0.02)), float(np.radians(0.05)))),
+        tolerances=ArmTolerances(dh=(0.2e-3, 0.2e-3, float(np.radians(0.02)), float(np.radians(0.05)))),
     )

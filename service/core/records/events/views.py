@@ -11,7 +11,7 @@ from service.core.records.base import ArtefactRef, Record
 Matrix4 = tuple[tuple[float, float, float, float], ...]  # T_a_b row-major, metres
 
 
-class View(Record):
+class RecordedView(Record):
     """What the record holds for every photograph, whether taken by robot, by hand or imported."""
 
     step: str
@@ -34,9 +34,10 @@ class FurtherExposure(Record):
     camera: dict[str, Any]  # EXIF settings, counter, time, lens
     trigger_monotonic_s: float
     arrival_monotonic_s: float
+    verdicts: dict[str, bool] = Field(default_factory=dict[str, bool])  # settings; the view's own include them
 
 
-class ViewpointCaptured(View):
+class ViewpointCaptured(RecordedView):
     """One complete exposure of a camera carried by a robot: files, pose, settings, environment."""
 
     kind: Literal["viewpoint_captured"] = "viewpoint_captured"
@@ -53,7 +54,7 @@ class ViewpointCaptured(View):
     ringing_s: float = 0.0  # how long the arm swung after the commanded motion; a loose mount shows here
 
 
-class ViewImported(View):
+class ViewImported(RecordedView):
     """One photograph that was captured earlier. The record proves only when and by whom it was imported."""
 
     kind: Literal["view_imported"] = "view_imported"
@@ -62,7 +63,7 @@ class ViewImported(View):
     modified_utc: str  # modification time in the file system
 
 
-class ViewHeld(View):
+class ViewHeld(RecordedView):
     """One exposure of a hand-held camera. The worker estimates its pose from the image (its answer to the job)."""
 
     kind: Literal["view_held"] = "view_held"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.core.protocol.models import Protocol
-from service.core.records.events import CaptureAsked, Event, View, ViewImported, ViewpointFailed
+from service.core.records.events import CaptureAsked, Event, RecordedView, ViewImported, ViewpointFailed
 from service.core.run.effects.place import is_void_now, require_running, without_effect
 from service.core.run.persistent_map import put
 from service.core.run.state import RunState
@@ -30,7 +30,7 @@ def capture_asked(protocol: Protocol, state: RunState, event: Event, p: CaptureA
     return change(state, p.step, asked=(*state.step.asked, p.what))
 
 
-def view_added(protocol: Protocol, state: RunState, event: Event, p: View) -> RunState:
+def view_added(protocol: Protocol, state: RunState, event: Event, p: RecordedView) -> RunState:
     """Count an image; of two with the same name within an attempt, the later one."""
     if is_void_now(state, event, p.step, p.attempt):
         return without_effect(_among_the_superseded(state, event, p), event)
@@ -50,7 +50,7 @@ def view_added(protocol: Protocol, state: RunState, event: Event, p: View) -> Ru
     )
 
 
-def _among_the_superseded(state: RunState, event: Event, p: View) -> RunState:
+def _among_the_superseded(state: RunState, event: Event, p: RecordedView) -> RunState:
     """Add an image that arrived after its attempt was replaced to the superseded images of that attempt."""
     listed = [
         replace(past, captured=put(past.captured, p.viewpoint, event.seq))

@@ -8,7 +8,7 @@ from service.dataset.formats.colmap.model import write_images, write_model_text
 from service.dataset.formats.meshes import ply
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder, Part
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, PosedView
 
 _IMAGES = "dslr_images_undistorted"
 _README = """The layout of ETH3D's multi-view sets. {mark}
@@ -31,7 +31,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
         )
 
 
-def _depth(dataset: DataSet, view: View) -> bytes:
+def _depth(dataset: DataSet, view: PosedView) -> bytes:
     depth = dataset.pixels.depth_m(view)
     return np.where(depth > 0, depth, np.inf).astype("<f4").tobytes()
 

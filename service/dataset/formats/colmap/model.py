@@ -12,7 +12,7 @@ from service.compute.poses.files.pose_files import HALF_PIXEL
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, inverse
 from service.dataset.posed.folder import ExportFolder, Part
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, PosedView
 
 _MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4, "FULL_OPENCV": 6}
 README = """COLMAP model. {mark}
@@ -81,7 +81,7 @@ def _points(points_m: Array) -> bytes:
     return struct.pack("<Q", len(points_m)) + b"".join(rows)
 
 
-def camera_ids(views: Sequence[View]) -> dict[CameraModel, int]:
+def camera_ids(views: Sequence[PosedView]) -> dict[CameraModel, int]:
     """A number from 1 for each different camera."""
     return {camera: k for k, camera in enumerate(dict.fromkeys(view.camera for view in views), start=1)}
 

@@ -12,7 +12,7 @@ from service.dataset.formats.meshes import mask_png, png
 from service.dataset.formats.radiance.unit_box import unit_box
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder, Part
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, PosedView
 
 
 def write(dataset: DataSet, folder: ExportFolder) -> None:
@@ -35,7 +35,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
         )
 
 
-def _shown(dataset: DataSet, view: View) -> NDArray[np.bool_]:
+def _shown(dataset: DataSet, view: PosedView) -> NDArray[np.bool_]:
     return (dataset.pixels.depth_m(view) > 0) & dataset.pixels.valid(view) & ~dataset.pixels.markers(view)
 
 

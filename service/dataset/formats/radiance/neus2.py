@@ -9,7 +9,7 @@ from service.dataset.formats.meshes import png
 from service.dataset.formats.radiance.unit_box import unit_box
 from service.dataset.posed.exporter import Exporter
 from service.dataset.posed.folder import ExportFolder, Part
-from service.dataset.posed.records import DataSet, View, only_camera
+from service.dataset.posed.records import DataSet, PosedView, only_camera
 
 
 def write(dataset: DataSet, folder: ExportFolder) -> None:
@@ -52,7 +52,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
         folder.file(f"images/{view.name}.png", lambda view=view: _with_alpha(dataset, view), Part("image", view.name))
 
 
-def _with_alpha(dataset: DataSet, view: View) -> bytes:
+def _with_alpha(dataset: DataSet, view: PosedView) -> bytes:
     pixels = dataset.pixels
     shown = (pixels.depth_m(view) > 0) & pixels.valid(view) & ~pixels.markers(view)
     return png(np.dstack([pixels.colours(view), np.where(shown, np.uint8(255), np.uint8(0))]), dataset.mark)

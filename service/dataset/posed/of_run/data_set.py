@@ -28,7 +28,7 @@ from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.posed.of_run.statement import described_run
 from service.dataset.posed.of_run.view_covariances import view_covariances
 from service.dataset.posed.pixels import Photographs
-from service.dataset.posed.records import DataSet, Mesh, View
+from service.dataset.posed.records import DataSet, Mesh, PosedView
 from service.dataset.registered_scan import control_scan
 from service.dataset.registrations import result_of_step
 from service.dataset.summary import RunSummary
@@ -108,7 +108,7 @@ def data_set_of(
     )
 
 
-def specimen_pixels(summary: RunSummary, view: View) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def specimen_pixels(summary: RunSummary, view: PosedView) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """(H, W) pixels between the spheres, which stand around the specimen."""
     return hull_mask(view.camera, view.T_world_camera, np.array(summary.scan_spheres_m()))
 
@@ -132,7 +132,7 @@ def _registered(summary: RunSummary) -> tuple[str, Registration, dict[str, tuple
 
 
 def _pixels(
-    summary: RunSummary, files: dict[str, tuple[Path, str]], views: Sequence[View], mesh: Mesh, *, personal: bool
+    summary: RunSummary, files: dict[str, tuple[Path, str]], views: Sequence[PosedView], mesh: Mesh, *, personal: bool
 ) -> tuple[Photographs, str]:
     """Photographs, depth and masks of the views, and what the masks hold, in words."""
     balls, posts = _markers(summary, views)
@@ -158,12 +158,12 @@ def _photographs(summary: RunSummary, registered: Registration) -> dict[str, tup
     return found
 
 
-def _further_view(one: FurtherView, covariance: Array) -> View:
+def _further_view(one: FurtherView, covariance: Array) -> PosedView:
     suffix = _suffix(one.path)
-    return View(one.name, suffix, one.camera, one.T_scan_camera, covariance, one.taken, one.device)
+    return PosedView(one.name, suffix, one.camera, one.T_scan_camera, covariance, one.taken, one.device)
 
 
-def _in_order(views: Sequence[View]) -> tuple[View, ...]:
+def _in_order(views: Sequence[PosedView]) -> tuple[PosedView, ...]:
     """The views in order of their names. Raises DataError if two have the same name."""
     ordered = tuple(sorted(views, key=lambda view: view.name))
     for one, other in pairwise(ordered):
@@ -177,14 +177,14 @@ def _suffix(photograph: Path) -> str:
         return ".png" if file.read(len(PNG_BEGINS)) == PNG_BEGINS else ".jpg"
 
 
-def _view(name: str, path: Path, registered: Registration, covariance: Array, taken: str) -> View:
+def _view(name: str, path: Path, registered: Registration, covariance: Array, taken: str) -> PosedView:
     suffix = _suffix(path)
     camera = CameraModel.from_record((registered.full_camera or registered.camera).model_dump())
     T_scan_camera = np.array(registered.T_scan_camera[name])
-    return View(name, suffix, camera, T_scan_camera, covariance, taken)
+    return PosedView(name, suffix, camera, T_scan_camera, covariance, taken)
 
 
-def _markers(summary: RunSummary, views: Sequence[View]) -> tuple[tuple[Ball, ...], tuple[Post, ...]]:
+def _markers(summary: RunSummary, views: Sequence[PosedView]) -> tuple[tuple[Ball, ...], tuple[Post, ...]]:
     """All spheres that an image may show, and the posts of the registration spheres."""
     radius_m = metres(summary.protocol.spheres.radius_mm)
     balls, extra = (
@@ -211,7 +211,7 @@ def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ..
     return control_centres(summary.scan_spheres_m(), result_of_step(summary.state, before, SpheresFound).spheres_m)
 
 
-def _posts(balls: Sequence[Ball], mesh: Mesh, views: Sequence[View]) -> tuple[Post, ...]:
+def _posts(balls: Sequence[Ball], mesh: Mesh, views: Sequence[PosedView]) -> tuple[Post, ...]:
     """A post is not recorded: it stands below its sphere, is thinner, and ends on the board, if a scan shows one."""
     eyes = np.mean([view.T_world_camera[:3, 3] for view in views], axis=0)
     up = upwards(mesh, eyes - np.mean(mesh.vertices_m, axis=0))
@@ -247,7 +247,7 @@ def upwards(mesh: Mesh, about: Array) -> Array:
     return mean / np.linalg.norm(mean)
 
 
-def _sees(view: View, mesh: Mesh) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def _sees(view: PosedView, mesh: Mesh) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """Which of some vertices of the mesh are within the image."""
     points = mesh.vertices_m[:: max(1, len(mesh.vertices_m) // _POINTS)]
     camera = view.camera

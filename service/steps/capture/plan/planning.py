@@ -40,7 +40,7 @@ class StepPlan:
     viewpoints: tuple[Viewpoint, ...]  # in order; refused ones last
     refused: Mapping[str, str]
     text: str
-    motions: tuple[noted.PlannedStation, ...]  # where the arm's kinematics are known
+    motions: tuple[noted.NotedStation, ...]  # where the arm's kinematics are known
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,8 +235,8 @@ def _text(plan: MotionPlan) -> str:
     return "; ".join(parts)
 
 
-def _station(plan: MotionPlan, station: str) -> noted.PlannedStation:
-    return noted.PlannedStation(
+def _station(plan: MotionPlan, station: str) -> noted.NotedStation:
+    return noted.NotedStation(
         station=station,
         order=plan.order,
         estimated_s=round(plan.total_s, 1),
@@ -244,9 +244,9 @@ def _station(plan: MotionPlan, station: str) -> noted.PlannedStation:
     )
 
 
-def _view(view: PlannedView) -> noted.PlannedView:
+def _view(view: PlannedView) -> noted.NotedView:
     refused = view.outcome == "refused"
-    return noted.PlannedView(
+    return noted.NotedView(
         viewpoint=view.name,
         outcome=view.outcome,
         reason=view.reason,

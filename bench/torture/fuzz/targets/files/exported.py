@@ -18,12 +18,12 @@ from service.benchmark.matching.result import MethodResult, read_result, write_r
 from service.benchmark.matching.running import open_matching_data, results_in
 from service.benchmark.matching.table import markdown
 from service.benchmark.method import methods
-from service.benchmark.records import RESULT, Effort, Machine, Result, Score, read_results
+from service.benchmark.records import RESULT, BenchmarkResult, ComputingEffort, Machine, Score, read_results
 from service.benchmark.shared_parts import from_unit_box
 from service.benchmark.table import table_markdown
 from service.compute.ground_truth.ply import read_ply, write_ply
 from service.compute.ground_truth.surface import Surface
-from service.compute.matching.scores.evaluate import PairScore, Views
+from service.compute.matching.scores.evaluate import LoadedViews, PairScore
 from service.compute.matching.scores.matches import PRECISION_PX
 from service.compute.matching.scores.pose import PoseError
 from service.core.text.json_text import parse_json
@@ -96,7 +96,7 @@ def _pairs(file: str, data: bytes, folder: Path) -> None:
     shutil.copytree(_written("matching"), place)
     _one(place, file).write_bytes(data)
     found = open_matching_data(place)
-    views = Views(found)
+    views = LoadedViews(found)
     for pair in found.pairs[:4]:
         for end in (pair["first"], pair["second"]):
             views.read(end)
@@ -122,11 +122,11 @@ def _matching_result(data: bytes, folder: Path) -> None:
 
 def _results(_: Path) -> list[bytes]:
     score = Score(**dict.fromkeys(Score.model_fields, 0.4))
-    result = Result(
+    result = BenchmarkResult(
         method="stereo", scenario="dense", dataset_sha256="0" * 64, simulated=True, views=36, width=960, height=640,
         commands=(("python", "-m", "x"),), elsewhere=False,
-        effort=Effort(wall_s=1.0, cpu_s=2.0, peak_memory_mb=300.0), mesh_sha256="1" * 64, faces=100, score=score,
-        failure="", finished_utc="2026-11-24T10:00:00Z",
+        effort=ComputingEffort(wall_s=1.0, cpu_s=2.0, peak_memory_mb=300.0), mesh_sha256="1" * 64, faces=100,
+        score=score, failure="", finished_utc="2026-11-24T10:00:00Z",
         machine=Machine(processor="x", cores=2, memory_gb=8.0, gpu=""),
     )  # fmt: skip
     other = result.model_copy(update={"effort": None, "score": None, "failure": "no mesh", "scenario": "sparse"})

@@ -17,7 +17,7 @@ from service.compute.poses.colmap.convention import (
     to_colmap_pixels,
     to_colmap_pose,
 )
-from service.compute.poses.sfm.model.track_building import Index, Sightings, triangulate, wide_enough
+from service.compute.poses.sfm.model.track_building import Index, TrackedFeatures, triangulate, wide_enough
 from service.compute.poses.sfm.options import Progress, reduction
 from service.core.geometry import Array
 
@@ -33,7 +33,7 @@ class Features:
     pixels: list[Array] = field(repr=False)
     camera: CameraModel
 
-    def of(self, sightings: Sightings) -> Array:
+    def of(self, sightings: TrackedFeatures) -> Array:
         """(O, 2) pixels of the observations."""
         offset = np.concatenate([[0], np.cumsum([len(p) for p in self.pixels])])
         every = np.concatenate([np.empty((0, 2)), *self.pixels])
@@ -43,7 +43,7 @@ class Features:
 def adjust(
     start: Mapping[int, Array],
     features: Features,
-    sightings: Sightings,
+    sightings: TrackedFeatures,
     few: Index,
     settings: Mapping[str, Any],
     progress: Progress,
@@ -93,7 +93,7 @@ def adjust(
 class _Step:
     """One adjustment: its tracks, the limit for observations, and the change of cost at which it stops."""
 
-    sightings: Sightings
+    sightings: TrackedFeatures
     limit_px: float
     rough: bool  # whether the limit is widened to the poses' own error
     tolerance: float
@@ -104,7 +104,7 @@ class _Fitting:
     """The observations within the limit, and their points."""
 
     poses: dict[int, Array]
-    sightings: Sightings
+    sightings: TrackedFeatures
     points: Array
     sigma_px: float
     limit_px: float

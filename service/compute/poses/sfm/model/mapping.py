@@ -24,7 +24,7 @@ from service.compute.poses.colmap.convention import (
     to_colmap_pixels,
 )
 from service.compute.poses.sfm.model.adjustment import Features, adjust
-from service.compute.poses.sfm.model.track_building import Index, Sightings, build_tracks, thinned
+from service.compute.poses.sfm.model.track_building import Index, TrackedFeatures, build_tracks, thinned
 from service.compute.poses.sfm.options import Progress
 from service.core.geometry import Array, align_points
 
@@ -86,7 +86,7 @@ def _written(model: pycolmap.Reconstruction, job: dict[str, Any]) -> dict[str, A
 
 
 def _mapped(
-    job: dict[str, Any], sightings: Sightings, few: Index, matches: list[Any], progress: Progress
+    job: dict[str, Any], sightings: TrackedFeatures, few: Index, matches: list[Any], progress: Progress
 ) -> tuple[dict[int, Array], int]:
     """Poses by image index from the mapper's largest model, and the number of models it produced."""
     workspace = Path(job["workspace"])
@@ -104,7 +104,7 @@ def _mapped(
     return {k - 1: from_colmap_pose(best.image(k).cam_from_world()) for k in ids}, len(models)
 
 
-def _matches_of(sightings: Sightings, few: Index, matches: list[Any], pixels: list[Any]) -> list[Any]:
+def _matches_of(sightings: TrackedFeatures, few: Index, matches: list[Any], pixels: list[Any]) -> list[Any]:
     """The matches between features of the selected tracks."""
     chosen = np.zeros(sightings.count, dtype=np.bool_)
     chosen[few] = True

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from service.compute.descent import gauss_newton
 from service.core.geometry import Array
 
 Index = NDArray[np.int64]
@@ -18,7 +19,7 @@ _ROUNDS = 6  # of reweighting in a triangulation
 
 
 @dataclass(frozen=True, slots=True)
-class Sightings:
+class TrackedFeatures:
     """Assignment of features of images to tracks.
 
     Attributes:
@@ -33,19 +34,19 @@ class Sightings:
     track: Index = field(repr=False)
     count: int
 
-    def kept(self, observations: NDArray[np.bool_], least: int = 2) -> tuple[Sightings, Index]:
+    def kept(self, observations: NDArray[np.bool_], least: int = 2) -> tuple[TrackedFeatures, Index]:
         """The selected observations of tracks that still have at least `least` of them, and these tracks' numbers."""
         length = np.bincount(self.track[observations], minlength=self.count)
         tracks = np.flatnonzero(length >= least)
         number = np.full(self.count, -1, dtype=np.int64)
         number[tracks] = np.arange(len(tracks))
         rows = observations & (number[self.track] >= 0)
-        return Sightings(self.image[rows], self.feature[rows], number[self.track[rows]], len(tracks)), tracks
+        return TrackedFeatures(self.image[rows], self.feature[rows], number[self.track[rows]], len(tracks)), tracks
 
 
 def build_tracks(
     counts: Sequence[int], pairs: Sequence[tuple[int, int]], matches: Sequence[NDArray[np.uint32]]
-) -> Sightings:
+) -> TrackedFeatures:
     """Join features by matches, directly or indirectly. An image that a track meets twice is removed from it.
 
     Args:
@@ -67,11 +68,11 @@ def build_tracks(
     once = often[where] == 1
     order = np.argsort(label[node], kind="stable")
     _, track = np.unique(label[node], return_inverse=True)
-    every = Sightings(image[order], (node - offset[image])[order], track[order], int(track.max(initial=-1)) + 1)
+    every = TrackedFeatures(image[order], (node - offset[image])[order], track[order], int(track.max(initial=-1)) + 1)
     return every.kept(once[order])[0]
 
 
-def thinned(sightings: Sightings, pixels: Array, share: int, pair_share: int, size: tuple[int, int]) -> Index:
+def thinned(sightings: TrackedFeatures, pixels: Array, share: int, pair_share: int, size: tuple[int, int]) -> Index:
     """Select the tracks that a mapper needs: the longest ones of each image and pair, spread over the images.
 
     Args:
@@ -100,7 +101,7 @@ def thinned(sightings: Sightings, pixels: Array, share: int, pair_share: int, si
 
 
 def _of_pairs(
-    sightings: Sightings, rank: Index, keep: NDArray[np.bool_], share: int, n_images: int
+    sightings: TrackedFeatures, rank: Index, keep: NDArray[np.bool_], share: int, n_images: int
 ) -> NDArray[np.bool_]:
     """Tracks that pairs of images need beyond those already kept, so that no weak connection is lost."""
     seen = np.zeros((n_images, sightings.count), dtype=np.bool_)
@@ -120,7 +121,7 @@ def _of_pairs(
     return out
 
 
-def triangulate(poses: Array, plane: Array, sightings: Sightings, sigma: float) -> tuple[Array, Array]:
+def triangulate(poses: Array, plane: Array, sightings: TrackedFeatures, sigma: float) -> tuple[Array, Array]:
     """Scene points (P, 3) by robust triangulation from known poses, and the error of each observation.
 
     First the point nearest to all rays, then Gauss–Newton steps on the reprojection errors; both use Cauchy weights,
@@ -146,19 +147,21 @@ def triangulate(poses: Array, plane: Array, sightings: Sightings, sigma: float) 
         points = _solved(_summed(A, sightings), _summed(np.einsum("oij,oj->oi", A, centre), sightings))
         error = reprojection(poses, points, plane, sightings)[0]
         weight = 1 / (1 + np.minimum(error / sigma, 1e6) ** 2)
-    for _ in range(_ROUNDS // 2):
+
+    def step_at(points: Array) -> Array:
         error, residual, J = reprojection(poses, points, plane, sightings)
         weight = 1 / (1 + np.minimum(error / sigma, 1e6) ** 2)
         JW = weight[:, None, None] * J
-        step = _solved(
+        return _solved(
             _summed(np.einsum("oki,okj->oij", JW, J), sightings),
             _summed(np.einsum("oki,ok->oi", JW, residual), sightings),
         )
-        points = points - step
+
+    points = gauss_newton(points, step_at, lambda at, step: at - step, most=_ROUNDS // 2, settled=0.0)
     return points, reprojection(poses, points, plane, sightings)[0]
 
 
-def reprojection(poses: Array, points: Array, plane: Array, sightings: Sightings) -> tuple[Array, Array, Array]:
+def reprojection(poses: Array, points: Array, plane: Array, sightings: TrackedFeatures) -> tuple[Array, Array, Array]:
     """Length (O,) and components (O, 2) of the reprojection errors, and their derivatives (O, 2, 3) by the points."""
     R = poses[sightings.image, :3, :3]
     c = np.einsum("oji,oj->oi", R, points[sightings.track] - poses[sightings.image, :3, 3])
@@ -173,7 +176,7 @@ def reprojection(poses: Array, points: Array, plane: Array, sightings: Sightings
     return error, residual, np.where(front[:, None, None], d @ np.swapaxes(R, 1, 2), 0.0)
 
 
-def wide_enough(poses: Array, points: Array, sightings: Sightings) -> NDArray[np.bool_]:
+def wide_enough(poses: Array, points: Array, sightings: TrackedFeatures) -> NDArray[np.bool_]:
     """(P,) whether the angle between the rays to a point is large enough."""
     ray = points[sightings.track] - poses[sightings.image, :3, 3]
     ray /= np.linalg.norm(ray, axis=1)[:, None]
@@ -185,7 +188,7 @@ def wide_enough(poses: Array, points: Array, sightings: Sightings) -> NDArray[np
     return np.asarray(widest >= _LEAST_ANGLE_RAD / 2)
 
 
-def _summed(values: Array, sightings: Sightings) -> Array:
+def _summed(values: Array, sightings: TrackedFeatures) -> Array:
     """Sums of (O, …) over the observations of each track."""
     flat = values.reshape(len(values), -1)
     sums = [np.bincount(sightings.track, flat[:, k], minlength=sightings.count) for k in range(flat.shape[1])]

@@ -1,0 +1,35 @@
+"""The one place where simulators convert units: wires and files have other ones than metres and seconds."""
+
+from __future__ import annotations
+
+from typing import overload
+
+from simulators.geometry import Array
+
+
+@overload
+def mm(length_m: float) -> float: ...
+@overload
+def mm(length_m: Array) -> Array: ...
+def mm(length_m: float | Array) -> float | Array:
+    """Millimetres of a length or of lengths in metres."""
+    return 1000.0 * length_m
+
+
+@overload
+def metres(length_mm: float) -> float: ...
+@overload
+def metres(length_mm: Array) -> Array: ...
+def metres(length_mm: float | Array) -> float | Array:
+    """Metres of a length or of lengths in millimetres."""
+    return length_mm / 1000.0
+
+
+def ms(duration_s: float) -> float:
+    """Milliseconds of a duration in seconds."""
+    return 1000.0 * duration_s
+
+
+def seconds(duration_ms: float) -> float:
+    """Seconds of a duration in milliseconds."""
+    return duration_ms / 1000.0
