@@ -40,6 +40,8 @@ _SIMULATORS = {
     "kuka": ("simulators.kuka_controller", "a KUKA controller with our Sunrise application"),
     "camera": ("simulators.sony_camera", "a Sony ILCE-7RM5 over PTP/IP"),
     "canon": ("simulators.canon_camera", "a Canon EOS R5 over PTP/IP"),
+    "gige": ("simulators.gige_camera", "an industrial camera over GigE Vision"),
+    "video": ("simulators.video_camera", "a camera whose video goes into a named pipe"),
     "scanner": ("simulators.scan_station.station", "an Artec export folder"),
     "ct": ("simulators.ct_suite.suite", "a CT scanner that writes a DICOM series"),
     "lightbox": ("simulators.lightbox", "the light and environment box on a pseudo-terminal"),

@@ -19,12 +19,12 @@ import yaml
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand.technician import MISHAP_EVERY, Hand
+from simulators.rig.cameras import CAMERAS, STILL, again, place, section
 from simulators.rig.world_server import World, WorldServer
 from simulators.scene.further_cameras import PLACES, FurtherCamera, further_cameras
 from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
 from simulators.serve import SimulatorError, Termination, announce
 
-CAMERAS = {"Sony ILCE-7RM5": "camera", "Canon EOS R5": "canon"}  # model: its simulator
 _LOAD_KG = 1.6  # camera, lens and mount
 _TAPE_SIGMA_M = 0.003  # accuracy with which a technician measures the scene's centre with a tape
 
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--second-camera-model",
         nargs="+",
-        choices=tuple(CAMERAS),
+        choices=STILL,
         default=(),
         metavar="MODEL",
         help="model of each of these; default: that of the first camera",
@@ -83,6 +83,8 @@ def serve(args: argparse.Namespace) -> None:
         raise SimulatorError("--second-camera needs an arm: leave --hand out")
     if len(args.second_camera_model) > len(args.second_camera):
         raise SimulatorError("--second-camera-model names more cameras than --second-camera places")
+    if args.camera not in STILL and (args.hand or len(args.second_camera_model) < len(args.second_camera)):
+        raise SimulatorError(f"--camera {args.camera} can neither be held nor be a second camera: choose a still one")
     termination = Termination()
     rig = _Rig(args, termination)
     try:
@@ -144,8 +146,8 @@ class _Rig:
                 f"--initial-joints={joints}", "--world", world, "--arm", arm, *self._model(),
             )  # fmt: skip
         camera = self._child(
-            "camera", CAMERAS[self.args.camera], "--port", "0", "--world", world,
-            "--image-width", str(self.args.image_width),
+            "camera", CAMERAS[self.args.camera], *place(self.args.camera, self.args.host, self.folder),
+            "--world", world, "--image-width", str(self.args.image_width),
             "--exposures-log", str(self._exposures_log("camera")),
             *(("--send-to", str(self.folder / "photographs")) if self.args.without_cable else ()),
         )  # fmt: skip
@@ -155,7 +157,7 @@ class _Rig:
         self._child("lightbox", "lightbox", "--link", str(self.folder / "lightbox"), "--world", world)
         self._write_truth()
         rig = self.folder / "rig.yaml"
-        rig.write_text(yaml.safe_dump(self._rig_file(camera["gphoto_port"], hosts), sort_keys=False))
+        rig.write_text(yaml.safe_dump(self._rig_file(camera, hosts), sort_keys=False))
         announce(
             rig=str(rig),
             world=world,
@@ -215,8 +217,7 @@ class _Rig:
         if name in ("camera", *self.further):
             log = self._exposures_log(name)
             taken = len(log.read_text().splitlines()) if log.exists() else 0
-            port = self._ready[name]["gphoto_port"].rpartition(":")[2]
-            words += ["--port", port, "--first-counter", str(taken + 1)]  # these override the first ones
+            words += again(self._ready[name], taken)  # these override the first ones
         with suppress(SimulatorError):  # it is retried
             self._child(name, *words)
 
@@ -248,7 +249,7 @@ class _Rig:
         stem, _, last = first.rpartition(".")
         return [first, f"{stem}.{int(last) + 1}"][: len(self.arms)]
 
-    def _rig_file(self, gphoto_port: str, hosts: list[str]) -> dict[str, Any]:
+    def _rig_file(self, camera: dict[str, Any], hosts: list[str]) -> dict[str, Any]:
         driver = {"ur": "ur", "kuka": "kuka_sunrise"}[self.scene.arm.simulator]
         robots = {arm: {"driver": driver, "host": host} for arm, host in zip(self.arms, hosts, strict=True)}
         rig: dict[str, Any] = {
@@ -257,8 +258,8 @@ class _Rig:
             "hands": self.server.address,
             "devices": {
                 **robots,
-                "camera": self._camera(gphoto_port),
-                **{name: self._camera(self._ready[name]["gphoto_port"]) for name in self.further},
+                "camera": self._camera(camera),
+                **{name: self._camera(self._ready[name]) for name in self.further},
                 "scanner": {"driver": "scan_folder", "folder": "scans", "unit": "mm", "stable_s": 1.0},
                 "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
                 "lightbox": {"driver": "lightbox", "port": "lightbox"},
@@ -280,10 +281,10 @@ class _Rig:
             "lens": self._lens(),
         }
 
-    def _camera(self, gphoto_port: str) -> dict[str, Any]:
+    def _camera(self, ready: dict[str, Any]) -> dict[str, Any]:
         if self.args.without_cable:
             return {"driver": "photo_folder", "folder": "photographs", "stable_s": 1.0}
-        return {"driver": "gphoto", "port": gphoto_port, "capture_timeout_s": self._exposure_s()}
+        return section(ready, self._exposure_s())
 
     def _exposure_s(self) -> float:
         """Longest time that one picture may take: this camera renders it, in up to some microseconds a pixel."""

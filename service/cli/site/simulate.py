@@ -19,7 +19,7 @@ _SIMULATORS = (sys.executable, "-m", "simulators")
 
 
 def simulate_command(context: typer.Context) -> None:
-    """Start a simulated device (ur, kuka, camera, scanner, ct, lightbox) or a whole rig, until it is terminated.
+    """Start a simulated device (ur, kuka, camera, gige and others) or a whole rig, until it is terminated.
 
     It prints one line of JSON with its addresses when it is ready. `orthocapture simulate rig --help` lists options.
     """
