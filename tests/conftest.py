@@ -1,13 +1,28 @@
-"""Settings for all tests: repeatable examples, and one thread of linear algebra per process, as in the program."""
+"""Settings for all tests: repeatable examples, one thread of linear algebra, files in memory, long files first."""
 
 from __future__ import annotations
 
 import os
+import shutil
+from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is imported, here and in child processes
 
+# Each commit of the store waits for the disk, which is half the time of its tests. What a disk loses is simulated
+# (bench.torture.crash), so a file system in memory proves as much, where there is room for the files of whole runs.
+MEMORY, ROOM_BYTES = Path("/dev/shm"), 12 * 2**30
+if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM_BYTES:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+
 # The same examples every time, so that a failure is due to the change. `--hypothesis-profile=default` tries new ones.
 settings.register_profile("repeatable", derandomize=True, database=None)
 settings.load_profile("repeatable")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files with slow tests first, so that none keeps one process busy while all others have ended."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)

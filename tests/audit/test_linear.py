@@ -58,6 +58,7 @@ def held_already(record: LargeRecord) -> Callable[[], object]:
     return lambda: evidence.holds(last)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asked", [audit_show, capture_page])
 def test_twice_as_many_viewpoints_are_twice_the_work(
     records: tuple[LargeRecord, LargeRecord], asked: Callable[[LargeRecord], Callable[[], object]]

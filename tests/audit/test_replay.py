@@ -105,6 +105,7 @@ def referring(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recorded", ["folder", "referring"])
 def test_end_to_end_carries_the_change_to_the_registration(
     recorded: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch

@@ -85,6 +85,7 @@ def test_a_record_that_does_not_verify_gives_no_figure(tmp_path: Path) -> None:
     assert not list((tmp_path / "g").iterdir())
 
 
+@pytest.mark.slow
 def test_a_report_of_36_photographs_can_be_sent_by_post(tmp_path: Path) -> None:
     record_reported_run(tmp_path, registered=True, photographs=36)
     run = read_run(tmp_path / "data", "latest")

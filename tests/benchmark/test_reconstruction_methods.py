@@ -151,6 +151,7 @@ def test_command_lines(name: str) -> None:
     assert [shlex.join(command) for command in methods()[name].commands(PLACE)] == COMMANDS[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STAND_INS)
 @pytest.mark.usefixtures("stand_ins")
 def test_a_method_is_run_and_its_mesh_comes_back_into_the_world(name: str, dataset: DataSet, tmp_path: Path) -> None:
@@ -231,6 +232,7 @@ def test_what_the_method_sees_beyond_the_truth_is_cut_off(dataset: DataSet, tmp_
     assert result.score.outside_percent > 50
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("stand_ins")
 def test_the_table_has_dense_and_sparse_and_what_was_not_run(dataset: DataSet, tmp_path: Path) -> None:
     for scenario in ("dense", "sparse"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import trimesh
 
 from bench.reconstruction.specimen import score_specimen, specimen_of
@@ -43,6 +44,7 @@ def test_faces_on_spheres_and_posts_are_cut_out_and_no_others() -> None:
     assert len(bare.vertices_m) > 0.98 * len(plate().vertices_m)
 
 
+@pytest.mark.slow
 def test_a_missing_sphere_does_not_count_and_an_error_of_the_specimen_does(tmp_path: Path) -> None:
     truth = with_ball(plate())
     for name, z_m in (("right", 0.0), ("off", 0.001)):

@@ -61,6 +61,7 @@ def held(request: pytest.FixtureRequest) -> Iterator[tuple[World, Camera]]:
             camera.close()
 
 
+@pytest.mark.slow
 def test_nothing_comes_while_nobody_presses(held: tuple[World, Camera], tmp_path: Path) -> None:
     assert held[1].released_images(tmp_path, 0.1) == ()
 
@@ -77,6 +78,7 @@ def test_a_press_of_the_button_brings_an_image(held: tuple[World, Camera], tmp_p
     assert released_by_software.counter == image.counter + 1
 
 
+@pytest.mark.slow
 def test_an_image_announced_while_the_camera_is_asked_something_else_is_not_lost(
     held: tuple[World, Camera], tmp_path: Path
 ) -> None:

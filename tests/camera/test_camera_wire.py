@@ -185,6 +185,7 @@ def test_refused_setting() -> None:
     assert again == "400"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "codes"), [("drop", {-1, -7}), ("reset", {-1, -7}), ("stall", {-10})])
 def test_link_lost_in_mid_download_and_a_new_session_works(kind: str, codes: set[int]) -> None:
     with camera_simulator([{"on": "get_object", "kind": kind}]) as camera:
@@ -233,6 +234,7 @@ def world_socket(answer: dict[str, Any]) -> Generator[str]:
             thread.join()
 
 
+@pytest.mark.slow
 def test_pictures_of_the_world_and_their_true_pose(tmp_path: Path) -> None:
     log = tmp_path / "truth.jsonl"
     pose = look_at(np.array([0.0, -0.3, 0.6]), np.zeros(3), np.array([0.0, 0.0, 1.0]))

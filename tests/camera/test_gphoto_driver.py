@@ -106,6 +106,7 @@ def test_shutter_refused_by_a_camera_that_answers(tmp_path: Path) -> None:
         assert camera.capture(tmp_path).counter == 1
 
 
+@pytest.mark.slow
 def test_setting_refused_for_good_and_for_a_moment() -> None:
     # The first set comes from the library itself when it connects (priority mode).
     with rig([{"on": "set", "kind": "reject", "nth": 2, "times": 1}]) as (camera, _):

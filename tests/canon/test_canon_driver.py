@@ -109,6 +109,7 @@ def test_a_setting_refused_in_silence_is_an_error_and_not_what_was_sent() -> Non
     assert (kept.aperture_f, kept.exposure_s, kept.iso) == (22.0, pytest.approx(1 / 60), 400)
 
 
+@pytest.mark.slow
 def test_a_setting_refused_for_a_moment_is_sent_again() -> None:
     with rig([{"on": "set", "kind": "reject", "nth": 2, "times": 2}]) as (camera, _):
         assert camera.apply(PAPER) == PAPER

@@ -42,6 +42,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "data"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", ["--help", "--version", "status latest", "act pause"])
 def test_it_starts_without_numerics(words: str, data: Path) -> None:
     folder = () if words.startswith("--") else ("--data", str(data))

@@ -360,6 +360,7 @@ class Runs(RuleBasedStateMachine):
             self.attempts[step] = attempt
 
 
+@pytest.mark.slow
 class TestRuns(Runs.TestCase):  # type: ignore[misc, name-defined] # hypothesis builds the class at run time
     settings = settings(
         max_examples=80,

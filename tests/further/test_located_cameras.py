@@ -68,6 +68,7 @@ def test_exact_outlines_give_the_exact_mount() -> None:
     assert pose.mean.kept.all()
 
 
+@pytest.mark.slow
 def test_the_mount_is_within_its_stated_covariance() -> None:
     found: list[float] = []
     for seed in range(25):

@@ -36,6 +36,7 @@ def run(tmp_path: Path, ct_centres_m: Array, *more: object) -> Result:
     return CliRunner().invoke(app, words, catch_exceptions=False)
 
 
+@pytest.mark.slow
 def test_the_command_fuses_measures_and_cuts_out_the_spheres(tmp_path: Path) -> None:
     done = run(tmp_path, CENTRES_M, "--cut-posts-mm", "2", "--heat-map", tmp_path / "heat.ply",
                "--picture", tmp_path / "both.png", "--json")  # fmt: skip
@@ -75,6 +76,7 @@ def test_a_sphere_that_moved_in_transport_fails_the_gate_by_name_of_its_distance
     assert (tmp_path / "truth.ply").is_file()
 
 
+@pytest.mark.slow
 def test_a_sphere_that_the_scan_lacks_is_cut_out_of_the_ct(tmp_path: Path) -> None:
     taken_m = np.array([0.018, 0.012, 0.0360])  # on the specimen, as a control sphere
     done = run(tmp_path, np.vstack([CENTRES_M, taken_m]), "--json")

@@ -83,6 +83,7 @@ def turned(arm: RobotArm, by_rad: float) -> Array:
     return joints
 
 
+@pytest.mark.slow
 @both
 def test_a_day_without_trouble(controller: Controller) -> None:
     host = address(71)
@@ -141,6 +142,7 @@ def test_a_stop_latches_until_a_person_confirms_and_nothing_clears_it_by_itself(
         travel(arm, turned(arm, 0.1))
 
 
+@pytest.mark.slow
 @both
 def test_a_moving_arm_that_nobody_looks_at_is_stopped(controller: Controller) -> None:
     host = address(73)
@@ -157,6 +159,7 @@ def test_a_moving_arm_that_nobody_looks_at_is_stopped(controller: Controller) ->
         travel(arm, turned(arm, 0.1))
 
 
+@pytest.mark.slow
 @both
 def test_a_driver_that_stands_still_sends_no_heartbeat_and_the_arm_stops(controller: Controller) -> None:
     host = address(77)
@@ -180,6 +183,7 @@ def test_a_driver_that_stands_still_sends_no_heartbeat_and_the_arm_stops(control
         travel(arm, turned(arm, 0.1))
 
 
+@pytest.mark.slow
 def test_an_arm_whose_brakes_closed_moves_once_they_are_released() -> None:
     host = address(78)
     with simulated_kuka(host, "--speed-up", "4"), opened(host) as arm:

@@ -139,6 +139,7 @@ def last_second(arm: RobotArm) -> tuple[RobotSample, ...]:
     return arm.samples(now_s - 1.0, now_s)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", ["1", "2.5", "2.7"])
 def test_its_samples_are_the_pose_stream(version: str) -> None:
     host = address(91)

@@ -77,6 +77,7 @@ def connected(host: str) -> Generator[Client]:
         client.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stubs", "folders"),
     [

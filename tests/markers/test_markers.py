@@ -99,6 +99,7 @@ def errors_px(
     return axes, radii, ids
 
 
+@pytest.mark.slow
 def test_all_whole_spheres_are_found_to_a_tenth_of_a_pixel_without_bias() -> None:
     made = scene(4)
     everything = np.vstack([REGISTRATION_M, CONTROL_M])
@@ -211,6 +212,7 @@ CONDITIONS = [
 LEAST_FOUND = [3, 3, 3, 3, 2, 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("look", "least"), list(zip(CONDITIONS, LEAST_FOUND, strict=True)), ids=lambda value: getattr(value, "colour", "")
 )

@@ -18,6 +18,7 @@ from tests.support.scenes.sphere_images import CONTROL_M, REGISTRATION_M, exact_
 EVERY = np.vstack([REGISTRATION_M, CONTROL_M])
 
 
+@pytest.mark.slow
 def test_the_chain_finds_spheres_and_places_their_outlines() -> None:
     made = scene(1, width=1200, seed=2)
     image = render(made.camera, made.centres_camera(0, EVERY))

@@ -71,6 +71,7 @@ def scored(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     return out, json.loads(printed)
 
 
+@pytest.mark.slow
 def test_sift_finds_poses_and_fewer_matches_of_difficult_pairs(scored: tuple[Path, Any]) -> None:
     classes = scored[1]["classes"]
     assert len(classes) >= 3

@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 import psutil
+import pytest
 
 from service.cli.run.beside import worker_beside
 from service.core.records.events import JobFailed
@@ -19,6 +20,7 @@ def worker_of(data: Path) -> psutil.Process:
     return found
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_is_replaced_and_the_run_gets_its_answer(tmp_path: Path) -> None:
     told: list[str] = []
     with Store.open(tmp_path) as store:

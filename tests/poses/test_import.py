@@ -77,6 +77,7 @@ def refusal(*words: str) -> str:
     return f"{error['what']} {error['where']} {error['remedy']}"
 
 
+@pytest.mark.slow
 def test_odd_files_are_left_out_by_name_with_the_reason(folder: Path) -> None:
     images = folder / "images"
     first, second = sorted(images.glob("*.JPG"))

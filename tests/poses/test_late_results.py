@@ -287,6 +287,7 @@ def jobs(data: Path, run_id: str) -> dict[str, str]:
     return {str(kind): str(state) for kind, state in found}
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(400)  # five processes, one after another
 def test_a_terminal_that_waits_can_be_left_and_nothing_is_lost(tmp_path: Path) -> None:
     data = tmp_path / "data"

@@ -98,6 +98,7 @@ def test_a_damaged_colmap_model_is_refused_in_words(
         read_poses(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_colmap_model_that_announces_endless_data_is_given_up(tmp_path: Path) -> None:
     """The library would count to four thousand million (found by bench/torture/fuzz)."""
     write_colmap_text(tmp_path, CAMERA, {"view.png": np.eye(4)})

@@ -137,6 +137,7 @@ def test_pieces_in_any_order_make_the_same_model(
         assert np.array_equal(model.tracks.pixels, models[0].tracks.pixels)
 
 
+@pytest.mark.slow
 def test_rough_metric_poses_are_triangulated_and_adjusted(
     camera: CameraModel, views: dict[str, tuple[Path, Transform]], tmp_path: Path
 ) -> None:

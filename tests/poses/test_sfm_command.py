@@ -48,6 +48,7 @@ def rms_m(folder: Path, poses: dict[str, Transform]) -> float:
     return float(np.sqrt(np.mean(np.sum((a - apply(T, s * b)) ** 2, axis=1))))
 
 
+@pytest.mark.slow
 def test_robot_poses_of_two_frames_are_noticed_and_not_believed(
     capture: tuple[Path, dict[str, Transform]], tmp_path: Path
 ) -> None:

@@ -101,6 +101,7 @@ def test_noise_is_estimated_and_covariances_are_honest() -> None:
     assert np.mean(alone) < 0.2 * 5e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", [True, False])
 def test_covariance_is_honest_with_little_texture(robot: bool) -> None:
     """Far fewer tracks than parameters: 30 points in 40 images, of which each image sees some 21."""

@@ -197,6 +197,7 @@ def test_child_that_dies_while_opening() -> None:
         device.open()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("busy", [False, True])
 def test_child_exits_when_its_parent_is_killed(tmp_path: Path, busy: bool) -> None:
     trace = tmp_path / "trace"

@@ -287,6 +287,7 @@ def rare_calls() -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_a_package_longer_than_its_recipe_leaves_the_link_alive(rare_calls: dict[str, Any]) -> None:
     said = rare_calls["forward_kinematics"]
     assert said["long"] == [6, 6]

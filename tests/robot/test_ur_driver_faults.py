@@ -32,6 +32,7 @@ from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 
+@pytest.mark.slow
 def test_protective_stop_is_surfaced_and_cleared_by_a_person_only() -> None:
     host = address(51)
     with faulty(51, {"on": "move", "nth": 2, "kind": "protective_stop", "value": 0.1}), opened(host) as arm:
@@ -65,6 +66,7 @@ def test_protective_stop_is_surfaced_and_cleared_by_a_person_only() -> None:
         travel(arm, turned(arm, 0.1))
 
 
+@pytest.mark.slow
 def test_a_stop_that_came_and_was_released_between_two_motions_is_not_forgotten() -> None:
     host = address(62)
     # The plan causes the stop at a message that only this test sends: nobody queries the arm meanwhile.
@@ -115,6 +117,7 @@ def test_a_motion_ended_at_the_controller_did_not_arrive_and_waits_for_a_person(
         travel(arm, turned(arm, 0.1))
 
 
+@pytest.mark.slow
 def test_what_was_connected_anew_is_let_move_anew() -> None:
     with simulated_ur(address(64), "--speed-up", SPEED_UP), opened(address(64)) as arm:
         travel(arm, turned(arm, 0.1))
@@ -156,6 +159,7 @@ def test_refused_motion_is_an_error_and_the_next_one_works() -> None:
         wait_for(lambda: not arm.is_moving())
 
 
+@pytest.mark.slow
 def test_reconnect_after_the_controller_restarted() -> None:
     host = address(54)
     with contextlib.ExitStack() as stack:
@@ -183,6 +187,7 @@ def test_dropped_link_ends_in_an_error_and_a_reconnect() -> None:
         travel(arm, turned(arm, 0.1))
 
 
+@pytest.mark.slow
 def test_motion_that_ended_on_a_dead_stream_is_not_taken_for_an_arm_at_rest() -> None:
     drop: dict[str, object] = {"on": "move", "kind": "drop", "value": "receivers"}  # no samples; commands still pass
     with faulty(61, drop), opened(address(61), stale_after_s=3.0) as arm:

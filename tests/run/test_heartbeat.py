@@ -114,6 +114,7 @@ class HeldUp(BenchArm):
         return super().samples(start_monotonic_s, end_monotonic_s)
 
 
+@pytest.mark.slow
 def test_an_arm_that_does_not_answer_holds_nothing_up_and_gets_old(tmp_path: Path, active: RunState) -> None:
     arm = HeldUp()
     arm.open()

@@ -132,6 +132,7 @@ def test_names_and_addresses_that_it_has(site: WebSite, host: str) -> None:
 # --- hostile input -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hostile", HOSTILE)
 def test_hostile_names_in_addresses(site: WebSite, run_id: str, hostile: str) -> None:
     browser = site.browser("supervisor")
@@ -151,6 +152,7 @@ def test_hostile_names_in_addresses(site: WebSite, run_id: str, hostile: str) ->
             assert "set-cookie" not in answer.headers, address
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hostile", HOSTILE)
 def test_hostile_words_in_forms_and_queries(site: WebSite, run_id: str, hostile: str) -> None:
     browser = site.browser("administrator")
@@ -225,6 +227,7 @@ def test_a_refused_form_does_not_repeat_what_was_typed(site: WebSite, caplog: py
 # --- anything that the interface's own description allows, and what it does not --------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "role",
     [

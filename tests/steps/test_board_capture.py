@@ -31,6 +31,7 @@ def names(plan: dict[str, Any]) -> list[str]:
     return [pose["viewpoint"] for pose in plan["poses"]]
 
 
+@pytest.mark.slow
 def test_planned_poses_pass_at_the_first_attempt_without_a_cut_board(begin: Callable[[str], Bench]) -> None:
     bench = begin(PROTOCOL)
     room = board_room(bench)

@@ -284,6 +284,7 @@ def measured_run(
     return bench
 
 
+@pytest.mark.slow
 def test_confirming_takes_the_suggested_views_and_the_gate_is_judged_again(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

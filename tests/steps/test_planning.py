@@ -273,6 +273,7 @@ def test_a_person_sees_the_plan_before_confirming(tmp_path: Path) -> None:
     assert preview_plans(protocol, protocol.step("fixation"), rig, partial(layout_of, rig)) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", ["intrinsics", "hand_eye"])
 def test_the_papers_board_images_are_planned_from_files_alone(tmp_path: Path, step: str) -> None:
     lens = "lens: {focal_length_mm: 50, sensor_width_mm: 35.7, image_px: [1920, 1280]}\n"

@@ -137,6 +137,7 @@ def test_the_second_backup_copies_only_what_is_new(tmp_path: Path, data: Path) -
     assert [v for (v,) in rows(tmp_path / "new", viewpoints)] == ["v1", "v2", "v3", "v4"]
 
 
+@pytest.mark.slow
 def test_killed_or_without_power_at_any_point_no_half_backup_looks_whole(tmp_path: Path, small: Path) -> None:
     counted = CrashingFiles()
     back_up(small, tmp_path / "counted", files=counted)
@@ -224,6 +225,7 @@ def test_an_altered_database_is_not_restored(tmp_path: Path, data: Path) -> None
     assert not (tmp_path / "restored" / "orthocapture.sqlite").exists()
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_in_the_restored_folder(tmp_path: Path) -> None:
     _, begun = record_runs(tmp_path)
     assert command("store", "backup", tmp_path / "backup", "--data", tmp_path / "data")[0] == 0

@@ -121,6 +121,7 @@ SQL_TAMPERING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SQL_TAMPERING)
 def test_tampering_with_the_database_is_named(data: Path, name: str) -> None:
     seq, said, statements = SQL_TAMPERING[name]
@@ -232,6 +233,7 @@ def test_an_account_that_nobody_made_is_a_fault(data: Path) -> None:
     assert "account eve (administrator) was made by nobody" in fault.what
 
 
+@pytest.mark.slow
 def test_no_flipped_bit_ends_in_anything_but_a_report_or_an_error_of_ours(data: Path) -> None:
     path = database_path(data)
     with closing(sqlite3.connect(path)) as connection:

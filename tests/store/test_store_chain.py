@@ -317,6 +317,7 @@ with Store.open(Path(sys.argv[1])) as store:
 """
 
 
+@pytest.mark.slow
 def test_four_processes_append_fifty_events_each_to_one_chain(tmp_path: Path) -> None:
     with Store.open(tmp_path) as store:
         run = start_run(store)
@@ -334,6 +335,7 @@ def test_four_processes_append_fifty_events_each_to_one_chain(tmp_path: Path) ->
     assert verify(tmp_path).ok
 
 
+@pytest.mark.slow
 def test_several_processes_may_create_the_same_store_at_once(tmp_path: Path) -> None:
     code = "import sys, pathlib, service.store.store as s; s.Store.open(pathlib.Path(sys.argv[1])).close()"
     openers = [

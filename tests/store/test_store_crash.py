@@ -73,6 +73,7 @@ def sweep(data: Path, crash_at: int | None) -> tuple[CrashingFiles, bool]:
     return files, True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power_lost", [False, True])
 def test_crash_at_every_point_of_a_record(before: Path, tmp_path: Path, *, power_lost: bool) -> None:
     shutil.copytree(before, tmp_path / "whole")
@@ -163,6 +164,7 @@ with Store.open(Path(sys.argv[1])) as store:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_s", [0.0, 0.007, 0.02])
 def test_killed_writer_loses_nothing_that_it_reported(tmp_path: Path, delay_s: float) -> None:
     with Store.open(tmp_path) as store:

@@ -20,6 +20,7 @@ def about(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
     return json.loads(found.read_text())
 
 
+@pytest.mark.slow
 def test_what_is_altered_is_told_with_its_place_or_documented(about: dict[str, object]) -> None:
     assert about["problems"] == []
 

@@ -75,6 +75,7 @@ def test_a_store_that_does_not_say_what_to_do_shows(tmp_path: Path) -> None:
     assert any(fault.startswith("no place or no remedy") for fault in verdict["broken"]), verdict
 
 
+@pytest.mark.slow
 def test_a_motion_that_nobody_confirmed_shows(tmp_path: Path) -> None:
     early, late, stopped = Motions(), Motions(), Motions()
     early.began()

@@ -34,6 +34,7 @@ def test_every_parser_refuses_bad_input_as_people_can_understand(group: str, tmp
     assert all(outcome.inputs > 0 for outcome in outcomes.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(FOUND.glob("*/*")), ids=lambda path: f"{path.parent.name}-{path.name}")
 def test_what_was_found_once_stays_mended(path: Path, tmp_path: Path) -> None:
     (target,) = [one for group in GROUPS for one in targets_of(group) if one.name == path.parent.name]
@@ -80,6 +81,7 @@ def test_a_part_of_a_glb_that_claims_four_gigabytes_is_refused_before_memory_is_
         read_surface_file(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "fault"),
     [

@@ -137,6 +137,7 @@ def test_a_run_ends_signed_whether_or_not_the_authority_answers(
     assert verify(data, run).ok
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["completed", "aborted"])
 def test_the_runner_has_the_end_of_a_run_stamped(tmp_path: Path, authority: TimeStampAuthority, end: str) -> None:
     with Store.open(tmp_path / "data") as store:

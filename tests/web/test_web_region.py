@@ -88,6 +88,7 @@ def test_the_wound_that_the_last_fusion_used_is_outlined(shown: tuple[WebSite, B
     assert drawn_mm == pytest.approx(1e3 * apply(viewing_frame(scene), np.array([*corners, corners[0]])), abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrong",
     [

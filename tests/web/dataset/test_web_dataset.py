@@ -76,6 +76,7 @@ def picture(browser: Browser, run: str, name: str) -> np.ndarray[tuple[int, ...]
     return np.asarray(found, dtype=np.uint8)
 
 
+@pytest.mark.slow
 def test_the_page_shows_every_view_with_its_splits_and_pictures(web: WebSite, run: str, auditor: Browser) -> None:
     dataset = data_set_of(read_run(web.site.data, run).summary())
     page = auditor.get(f"/runs/{run}/dataset").text
@@ -209,6 +210,7 @@ def test_a_name_on_the_page_is_escaped(web: WebSite, run: str, auditor: Browser)
     assert auditor.get(f"/runs/{run}/dataset?split={hostile}").status_code == 422
 
 
+@pytest.mark.slow
 def test_what_cannot_be_made_is_told_and_can_be_tried_again(web: WebSite, auditor: Browser) -> None:
     """The photographs of this run are smaller than its camera says."""
     run = record_reported_run(web.folder, registered=True)
