@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -64,19 +65,28 @@ def plan_shots(scene: Scene, views: int) -> list[Shot]:
     return shots
 
 
-def render_scene(seed: int, width: int, views: int, *, cache: Path = CACHE, workers: int = 1) -> Path:
-    """Render a capture, unless it is cached, and return its folder.
+def render_scene(
+    seed: int,
+    width: int,
+    views: int,
+    *,
+    cache: Path = CACHE,
+    workers: int = 1,
+    planned: Callable[[Scene, int], list[Shot]] = plan_shots,
+    suffix: str = "",
+) -> Path:
+    """Render a capture, unless it is cached, and return its folder, whose name ends with the suffix of its plan.
 
     `images/`, `camera.json` (the true intrinsics), `poses.csv` (true T_world_camera), `robot_poses.csv`
     (T_base_flange as the controller reports it), `joints.csv`, `stations.csv`, `spheres.json` (true centres, scan
     frame), `scan.ply` (millimetres) and `truth.json` (T_world_scan, T_flange_camera, T_world_base).
     """
-    folder = cache / f"scene{seed:02d}_{width}_{views}"
+    folder = cache / f"scene{seed:02d}_{width}_{views}{suffix}"
     if (folder / "truth.json").is_file():
         return folder
     (folder / "images").mkdir(parents=True, exist_ok=True)
     scene = Scene.generate(seed)
-    shots = plan_shots(scene, views)
+    shots = planned(scene, views)
     tasks = [(seed, width, folder / "images" / shot.name, shot, i) for i, shot in enumerate(shots)]
     if workers > 1:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:

@@ -93,7 +93,7 @@ def _described(name: str) -> dict[str, object]:
                 "flags": list(action.option_strings),
                 "metavar": str(action.metavar or ""),
                 "help": action.help or "",
-                "default": "" if action.default in (None, False, "[]") else str(action.default),
+                "default": "" if action.default in (None, False, "[]", ()) else str(action.default),
                 "required": action.required,
                 "flag": action.nargs == 0,
                 "many": action.nargs == "+",

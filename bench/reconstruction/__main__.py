@@ -14,7 +14,8 @@ from pathlib import Path
 
 from bench.machine import REPOSITORY, RESULTS
 from bench.reconstruction.simulated import simulated_data_set
-from bench.scenes import CACHE, render_scene
+from bench.reconstruction.viewpoints import protocol_scene
+from bench.scenes import CACHE
 from service.benchmark.figure import figure_png
 from service.benchmark.method import method_named, methods
 from service.benchmark.records import SCENARIOS, read_results
@@ -34,7 +35,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=CACHE)
     parser.add_argument("--out", default="reconstruction")
     args = parser.parse_args()
-    dataset = simulated_data_set(render_scene(args.scene, args.width, args.views, cache=args.cache))
+    dataset = simulated_data_set(protocol_scene(args.scene, args.width, args.views, args.cache))
     work = WORK / f"scene{args.scene:02d}_{args.width}_{args.views}"
     work.mkdir(parents=True, exist_ok=True)
     for scenario in SCENARIOS:

@@ -19,7 +19,8 @@ import numpy as np
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.reconstruction.simulated import simulated_data_set
-from bench.scenes import CACHE, render_scene
+from bench.reconstruction.viewpoints import protocol_scene
+from bench.scenes import CACHE
 from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.records import BenchmarkResult, Score, read_results
 from service.benchmark.scoring import compare
@@ -92,7 +93,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, help="folder of the results; that of bench.reconstruction otherwise")
     parser.add_argument("--out", default="reconstruction-specimen")
     args = parser.parse_args()
-    folder = render_scene(args.scene, args.width, args.views, cache=args.cache)
+    folder = protocol_scene(args.scene, args.width, args.views, args.cache)
     truth, markers = simulated_data_set(folder).mesh, markers_of(folder)
     work = args.work or WORK / f"scene{args.scene:02d}_{args.width}_{args.views}"
     scored: list[tuple[BenchmarkResult, Score]] = []

@@ -18,7 +18,8 @@ import numpy as np
 
 from bench.machine import RESULTS, commit, machine
 from bench.reconstruction.simulated import simulated_data_set
-from bench.scenes import CACHE, render_scene
+from bench.reconstruction.viewpoints import protocol_scene
+from bench.scenes import CACHE
 from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.fusion.overlap import vertex_normals
 from service.compute.ground_truth.surface import IntArray, Surface
@@ -64,7 +65,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=CACHE)
     parser.add_argument("--out", default="reconstruction-visible")
     args = parser.parse_args()
-    dataset = simulated_data_set(render_scene(args.scene, args.width, args.views, cache=args.cache))
+    dataset = simulated_data_set(protocol_scene(args.scene, args.width, args.views, args.cache))
     count = len(dataset.mesh.vertices_m)
     chosen = np.sort(np.random.default_rng(0).choice(count, min(count, _POINTS), replace=False))
     points, cosine = dataset.mesh.vertices_m[chosen], incidence(dataset, chosen)

@@ -18,14 +18,15 @@ from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.splits import splits
 from service.compute.stereo.fusion import fused
 from service.compute.stereo.guided import guided_depth
-from service.compute.stereo.matching import DepthMap, depth_of_pair
+from service.compute.stereo.matching import depth_of_pair
 from service.compute.stereo.pairs import StereoView, looked_at_m, stereo_pairs
 from service.compute.stereo.rectify import rectified
 from service.compute.stereo.surface import surface_of
 from service.core.errors import ComputeError
-from service.core.geometry import Array, Transform, inverse, look_at
+from service.core.geometry import Array, Transform, look_at
 from service.dataset.posed.pixels import Photographs
 from service.dataset.posed.records import DataSet, Mesh, PosedView
+from tests.support.scenes.depth_of_sphere import depth_of_sphere
 from tests.support.scenes.textured_scene import camera_of_width, render, ring_of_poses, slabs
 
 SCENE = slabs(3)
@@ -132,21 +133,9 @@ def test_images_of_different_things_give_no_depth() -> None:
     assert depth_of_pair(rectified(views[0], views[1], looked_at_m(views)), 0.58) is None
 
 
-def sphere_seen(T_world_camera: Transform, radius_m: float) -> DepthMap:
-    """Exact depth of a sphere at the origin."""
-    camera = CameraModel(200, 200, 300.0, 310.0, 99.5, 98.0)
-    v, u = np.mgrid[:200, :200]
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-    centre = inverse(T_world_camera)[:3, 3]
-    a, b = np.sum(rays**2, axis=-1), rays @ centre
-    root = b**2 - a * (centre @ centre - radius_m**2)
-    depth = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, np.nan)
-    return DepthMap(depth.astype(np.float32), camera, T_world_camera, 1.0)
-
-
 def test_depth_maps_of_a_sphere_become_a_sphere_with_faces_outward() -> None:
     eyes = [np.array(eye) * 0.3 for eye in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))]
-    maps = [sphere_seen(look_at(eye, np.zeros(3), np.array([0.3, 0.5, 0.8])), 0.05) for eye in eyes]
+    maps = [depth_of_sphere(look_at(eye, np.zeros(3), np.array([0.3, 0.5, 0.8])), 0.05) for eye in eyes]
     found = surface_of(fused(maps, 0.002, 1), 1)
     radii = np.linalg.norm(found.vertices_m, axis=1)
     assert np.median(np.abs(radii - 0.05)) < 1e-4
@@ -160,7 +149,7 @@ def test_depth_maps_of_a_sphere_become_a_sphere_with_faces_outward() -> None:
 
 
 def test_a_place_that_too_few_maps_see_is_left_out() -> None:
-    one = sphere_seen(look_at(np.array([0.3, 0, 0]), np.zeros(3), UP), 0.05)
+    one = depth_of_sphere(look_at(np.array([0.3, 0, 0]), np.zeros(3), UP), 0.05)
     with pytest.raises(ComputeError, match="no place is seen by 2 pairs"):
         fused([one], 0.002, 2)
 

@@ -13,7 +13,8 @@ import pytest
 import yaml
 
 from service.core.records.events import ViewpointCaptured
-from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig
+from tests.support.protocols.small_demo import small_demo
+from tests.support.rig.rig import orthocapture, simulated_rig
 from tests.support.runs.ended_run import EndedRun, ended_run, patient
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
@@ -23,8 +24,8 @@ BOARD_POSES = {
     "station": "station_1", "prefix": "b", "count": 24, "tilts_deg": [8, 20, 32, 38],
     "rolls_deg": [0, 12, -12, 180, 168], "distances_m": [0.62, 0.68, 0.74], "above_scene_m": 0.09, "coverage": 0.9,
 }  # fmt: skip
-# With eight views a station, the poses of an arm that repeats to 0.15 mm are not what the demonstration asks for.
-WIDER = {"predicted_target_error_mm": 1.0, "loop_closure_mm": 1.0, "robot_corrected_rms_px": 2.0}
+# With three views a station, the poses of an arm that repeats to 0.15 mm are not what the demonstration asks for.
+WIDER = {"predicted_target_error_mm": 1.5, "robot_corrected_rms_px": 2.0}
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,10 @@ class Run:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Generator[Run]:
     folder = tmp_path_factory.mktemp("kuka")
     protocol, data = folder / "demo.yaml", folder / "data"
-    record = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text(encoding="utf-8"))
+    record = yaml.safe_load(small_demo(protocol).read_text(encoding="utf-8"))
     (calibration,) = (step for step in record["steps"] if step["kind"] == "calibration")
     del calibration["params"]["viewpoints"]
     calibration["params"]["board_poses"] = BOARD_POSES
-    (registration,) = (step for step in record["steps"] if step["kind"] == "registration")
-    registration["params"]["poses"] = ["robot", "robot_corrected"]  # structure from motion knows nothing of the arm
     for gate in (gate for step in record["steps"] for gate in step.get("gates", [])):
         gate["max"] = WIDER.get(gate["measure"], gate.get("max"))
         if gate["max"] is None:

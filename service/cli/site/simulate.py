@@ -8,7 +8,8 @@ import os
 import subprocess
 import sys
 from difflib import get_close_matches
-from typing import Annotated, Any, Literal
+from enum import Enum
+from typing import Annotated, Any
 
 import typer
 
@@ -91,7 +92,7 @@ def _option(option: dict[str, Any]) -> inspect.Parameter:
     flags = option["flags"]
     single: Any = {"int": int, "float": float}.get(option["number"], str)
     if option["choices"]:
-        single = Literal[tuple(option["choices"])]
+        single = Enum("Choice", {choice: choice for choice in option["choices"]})  # typer has no lists of literals
     kind: Any = bool if option["flag"] else list[single] if option["many"] else single | None
     declared = typer.Option(*flags, metavar=None if option["flag"] else option["metavar"] or None, help=words)
     return inspect.Parameter(

@@ -253,6 +253,11 @@ class BenchRig:
         self._open("camera", self.shutter, opened=self.shutter.opened > 0)
         return self.shutter
 
+    def camera_named(self, name: str) -> Camera:
+        if not name:
+            return self.camera()
+        return next(one.camera for one in self.further if one.name == name)
+
     def further_cameras(self) -> tuple[FurtherCamera, ...]:
         for one in self.further:
             shutter = one.camera
