@@ -30,8 +30,7 @@ from drivers.genicam.producer import ProducerCamera
 from drivers.interfaces import CameraSettings, CapturedImage, DeviceIdentity, DeviceReport
 from drivers.photos.frames import FrameFiles, frame_jpeg
 from drivers.plugin import DriverConfig, DriverSpec
-
-_TOLERANCE = 0.02  # of aperture and exposure time, as for photographs
+from drivers.stated_settings import TOLERANCE, differences
 
 
 class GenicamConfig(DriverConfig):
@@ -134,17 +133,7 @@ class GenicamCamera:
         another exposure time.
         """
         stated = CameraSettings(self._config.aperture_f, settings.exposure_s, self._config.iso)
-        differing = [
-            f"{name} {wanted}, not {there}"
-            for name, wanted, there in (
-                ("f-number", settings.aperture_f, stated.aperture_f),
-                ("ISO", settings.iso, stated.iso),
-                ("focus", settings.focus_mode, stated.focus_mode),
-                ("file", settings.image_quality, stated.image_quality),
-            )
-            if (abs(wanted - there) > _TOLERANCE * there if isinstance(wanted, float) and isinstance(there, float)
-                else wanted != there)
-        ]  # fmt: skip
+        differing = differences(settings, stated)
         if differing:
             raise DeviceRefusedError(
                 f"The protocol wants {'; '.join(differing)}",
@@ -157,7 +146,7 @@ class GenicamCamera:
         except LinkError as error:
             raise self._unavailable(str(error)) from error
         now = self.settings()
-        if abs(now.exposure_s - settings.exposure_s) > _TOLERANCE * settings.exposure_s:
+        if abs(now.exposure_s - settings.exposure_s) > TOLERANCE * settings.exposure_s:
             raise DeviceRefusedError(
                 f"The camera exposes for {now.exposure_s:g} s instead of {settings.exposure_s:g} s",
                 where=self._where,
@@ -275,7 +264,7 @@ class GenicamCamera:
         )
 
     def _check_gain(self, gain: float) -> None:
-        if abs(gain - self._config.gain) > _TOLERANCE * max(1.0, abs(self._config.gain)):
+        if abs(gain - self._config.gain) > TOLERANCE * max(1.0, abs(self._config.gain)):
             raise DeviceFaultError(
                 f"It has the gain {gain:g} instead of {self._config.gain:g}",
                 where=self._where,

@@ -99,7 +99,7 @@ class GphotoCamera:
         self._identity = DeviceIdentity(
             kind="camera",
             model=model,
-            serial=self._link.value(profile.serial).lstrip("0"),
+            serial=self._dials.serial(),
             firmware=self._link.value("deviceversion"),
             driver="gphoto",
             driver_version=f"python-gphoto2 {version('gphoto2')}, libgphoto2 {library_version()}",

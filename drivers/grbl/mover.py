@@ -76,7 +76,7 @@ class Mover:
 
     @property
     def _door_is_open(self) -> bool:
-        """Not if it was closed again, and only a person's confirmation is missing."""
+        """False also if it was closed again and only a person's confirmation is missing."""
         return self.status is not None and self.status.state == "Door" and self.status.substate != 0
 
     @property

@@ -20,7 +20,8 @@ from service.store.store import Store
 from service.web.page.run_frame import Banner, robot_banner
 from tests.support.pages.web import web_site
 from tests.support.processes.waiting import until
-from tests.support.rig.bench_rig import BenchArm, BenchLightbox, BenchRig
+from tests.support.rig.bench_lightbox import BenchLightbox
+from tests.support.rig.bench_rig import BenchArm, BenchRig
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 
 RUN = "run"
