@@ -30,7 +30,7 @@ def _math(visitor: Any, node: nodes.Element) -> None:
 
 
 def setup(app: Any) -> None:
-    """Called by Sphinx: the renderer of formulas, and a name for what GitHub draws and we show as text."""
+    """Called by Sphinx: registers the renderer of formulas, and Mermaid diagrams, which this site shows as text."""
     app.add_html_math_renderer("mathml", (_math, None), (_math, None))
     app.add_lexer("mermaid", TextLexer)
 

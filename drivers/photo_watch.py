@@ -250,6 +250,7 @@ class PhotoWatch:
             height=exif.height,
             lens_serial=exif.lens_serial,
             body_serial=exif.body_serial,
+            model=exif.model,
             focus_distance_m=exif.focus_distance_m or 0.0,
             focus_position=exif.focus_position,
             found_at=str(path),

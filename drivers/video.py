@@ -33,10 +33,10 @@ from drivers.errors import (
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
 from drivers.photos.frames import FrameFiles, frame_jpeg
 from drivers.plugin import DriverConfig, DriverSpec
+from drivers.stated_settings import differences
 
 _LOG = logging.getLogger(__name__)
 _MJPEG = cv2.VideoWriter.fourcc(*"MJPG")
-_TOLERANCE = 0.02  # of aperture and exposure time, as for photographs
 _CLOSE_TIMEOUT_S = 2.0
 _CALL_S = 60.0  # usual longest call; opening a pipe waits for its writer
 
@@ -158,18 +158,7 @@ class VideoCamera:
     def apply(self, settings: CameraSettings) -> CameraSettings:
         """Return the stated settings. Raises DeviceRefusedError if the wanted ones differ."""
         stated = self._config.stated
-        pairs = (
-            ("f-number", settings.aperture_f, stated.aperture_f),
-            ("exposure time in s", settings.exposure_s, stated.exposure_s),
-            ("ISO", float(settings.iso), float(stated.iso)),
-        )
-        differing = [
-            f"{name} {wanted:g}, not {there:g}"
-            for name, wanted, there in pairs
-            if abs(wanted - there) > _TOLERANCE * there
-        ]
-        words = ((settings.focus_mode, stated.focus_mode), (settings.image_quality, stated.image_quality))
-        differing += [f"{wanted}, not {there}" for wanted, there in words if wanted != there]
+        differing = differences(settings, stated)
         if differing:
             raise DeviceRefusedError(
                 f"The protocol wants {'; '.join(differing)}, and software cannot set this source",

@@ -98,9 +98,10 @@ class FurtherCameraSection(Record):
     mounted: Literal["fixed", "rigid"]  # fixed: on a stand in the room; rigid: beside the first camera on its mount
     calibration: str  # camera.json from `calibrate intrinsics` for this camera, relative to the rig file
     every: Literal["viewpoint", "station"] = "viewpoint"  # exposes at each viewpoint, or once at each station
-    aperture_f: Annotated[float, Field(gt=0)] | None = None  # None: that of the protocol, as the next two
+    aperture_f: Annotated[float, Field(gt=0)] | None = None  # None: that of the protocol, as the next three
     exposure_s: Annotated[float, Field(gt=0)] | None = None  # exposure time
     iso: Annotated[int, Field(gt=0)] | None = None  # sensitivity
+    image_quality: Literal["JPEG", "RAW+JPEG"] | None = None  # files of an exposure
 
     @model_validator(mode="after")
     def _seen_once(self) -> Self:

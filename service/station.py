@@ -137,6 +137,16 @@ class Station:
         """The rig's first camera. Raises ConfigurationError unless there is exactly one, DeviceError."""
         return cast(Camera, self.device(self._only("camera")))
 
+    def camera_named(self, name: str) -> Camera:
+        """A further camera by its name, or the first one for "". Raises ConfigurationError, DeviceError."""
+        if not name:
+            return self.camera()
+        if name not in self.rig.section.cameras:
+            raise ConfigurationError(
+                f"the rig has no further camera {name!r}", where=str(self.rig.path), remedy="Correct `cameras`"
+            )
+        return self._further(name, self.rig.section.cameras[name]).camera
+
     def further_cameras(self) -> tuple[FurtherCamera, ...]:
         """The rig's further cameras. Raises ConfigurationError if one is no camera, uncalibrated; DeviceError."""
         return tuple(self._further(name, section) for name, section in self.rig.section.cameras.items())

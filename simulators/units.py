@@ -30,6 +30,16 @@ def ms(duration_s: float) -> float:
     return 1000.0 * duration_s
 
 
+def seconds_of_us(duration_us: float) -> float:
+    """Seconds of a duration in microseconds."""
+    return duration_us / 1_000_000.0
+
+
+def nanoseconds(duration_s: float) -> int:
+    """Nanoseconds of a duration in seconds."""
+    return round(duration_s * 1_000_000_000)
+
+
 def seconds(duration_ms: float) -> float:
     """Seconds of a duration in milliseconds."""
     return duration_ms / 1000.0

@@ -108,7 +108,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def tell_runs(data: Path, rig: Rig) -> dict[str, str]:
-    """Create runs of Tina's that stop at the points the pictures show, from the folder's first run."""
+    """Create runs of the technician Tina from the folder's first run; each stops at a point that a picture shows."""
     with Store.open(data) as store:
         source = store.runs()[0].run_id
         events = store.events(source)

@@ -1,8 +1,8 @@
-"""Driver for industrial cameras with GenICam: GigE Vision and USB3 Vision, by the library Aravis.
+"""Driver for industrial cameras with GenICam: by the library Aravis, or by a maker's GenTL producer and harvesters.
 
 Every exposure is one of its own: the camera is told to take a single frame after the call. The exposure time is set
 and read back; aperture and gain stay as rig.yaml states them, because the lens of such a camera is set by hand and a
-protocol's ISO has no meaning to it. Why Aravis: docs/decisions/0020-genicam-by-aravis.md.
+protocol's ISO has no meaning to it. Why two ways: docs/decisions/0020-genicam-by-aravis.md.
 """
 
 from __future__ import annotations
@@ -23,19 +23,26 @@ from drivers.errors import (
     DriverMissingError,
     UnreadableFileError,
 )
-from drivers.genicam.library import AravisCamera, AravisError, LibraryMissingError, NoImageError, version
+from drivers.genicam.aravis import AravisCamera
+from drivers.genicam.link import CameraLink, LibraryMissingError, LinkError, NoImageError
 from drivers.genicam.pixels import picture
+from drivers.genicam.producer import ProducerCamera
 from drivers.interfaces import CameraSettings, CapturedImage, DeviceIdentity, DeviceReport
 from drivers.photos.frames import FrameFiles, frame_jpeg
 from drivers.plugin import DriverConfig, DriverSpec
-
-_TOLERANCE = 0.02  # of aperture and exposure time, as for photographs
+from drivers.stated_settings import TOLERANCE, differences
 
 
 class GenicamConfig(DriverConfig):
     """An industrial camera in rig.yaml."""
 
-    camera: str = Field(min_length=1, description="its IP address, or its name in the list of arv-tool-0.8")
+    camera: str = Field(
+        min_length=1, description="its IP address, or its name in the list of arv-tool-0.8 or of the producer"
+    )
+    producer: str = Field(
+        default="",
+        description='file of a GenTL producer (.cti), for cameras that Aravis does not speak to; "": Aravis',
+    )
     serial: str = Field(default="", description='serial number that it must have; "": any')
     aperture_f: float = Field(gt=0, description="as it is set on the lens")
     iso: int = Field(default=100, gt=0, description="what the protocol calls this gain")
@@ -51,12 +58,12 @@ class GenicamConfig(DriverConfig):
 
 
 class GenicamCamera:
-    """drivers.interfaces.Camera on a GenICam camera. Aravis may crash, so drivers.host gives it its own process."""
+    """drivers.interfaces.Camera on a GenICam camera. Libraries may crash: drivers.host gives it its own process."""
 
     def __init__(self, config: GenicamConfig) -> None:
         self._config = config
         self._where = f"GenICam camera {config.camera}"
-        self._link: AravisCamera | None = None
+        self._link: CameraLink | None = None
         self._identified: DeviceIdentity | None = None
         self._files = FrameFiles("camera", self._where)
         self._taken = 0
@@ -66,19 +73,17 @@ class GenicamCamera:
     def open(self) -> DeviceIdentity:
         """Connect, check the serial number, and set gain and pixel format.
 
-        Raises DriverMissingError without Aravis, DeviceUnavailableError if no such camera answers, DeviceFaultError
-        if it is another one or does not take the settings.
+        Raises DriverMissingError without the library, DeviceUnavailableError if no such camera answers,
+        DeviceFaultError if it is another one or does not take the settings.
         """
         self.close()
         try:
-            link = AravisCamera(self._config.camera)
+            link = self._linked()
         except LibraryMissingError as error:
             raise DriverMissingError(
-                f"{error} is not installed",
-                where=self._where,
-                remedy="Install Aravis 0.8: apt-get install libaravis-0.8-0",
+                f"{error} is not installed", where=self._where, remedy=f"Install it: {error.remedy}"
             ) from error
-        except AravisError as error:
+        except LinkError as error:
             raise self._unavailable(str(error)) from error
         self._link = link
         self._files.reopened()
@@ -87,7 +92,7 @@ class GenicamCamera:
             link.set_pixel_format(self._config.pixel_format)
             link.set_gain(self._config.gain)
             self._check_gain(link.gain)
-        except AravisError as error:
+        except LinkError as error:
             self.close()
             raise DeviceFaultError(
                 f"It does not take a setting: {error}",
@@ -110,12 +115,12 @@ class GenicamCamera:
         link = self._connected()
         try:
             details = {
-                "pixel format": link.text("pixel_format_as_string"),
+                "pixel format": link.pixel_format,
                 "exposure time": f"{link.exposure_s:g} s",
                 "gain": f"{link.gain:g}",
                 "images taken": str(self._taken),
             }
-        except AravisError as error:
+        except LinkError as error:
             raise self._unavailable(str(error)) from error
         return DeviceReport(identity=self._identity(), details=details)
 
@@ -128,17 +133,7 @@ class GenicamCamera:
         another exposure time.
         """
         stated = CameraSettings(self._config.aperture_f, settings.exposure_s, self._config.iso)
-        differing = [
-            f"{name} {wanted}, not {there}"
-            for name, wanted, there in (
-                ("f-number", settings.aperture_f, stated.aperture_f),
-                ("ISO", settings.iso, stated.iso),
-                ("focus", settings.focus_mode, stated.focus_mode),
-                ("file", settings.image_quality, stated.image_quality),
-            )
-            if (abs(wanted - there) > _TOLERANCE * there if isinstance(wanted, float) and isinstance(there, float)
-                else wanted != there)
-        ]  # fmt: skip
+        differing = differences(settings, stated)
         if differing:
             raise DeviceRefusedError(
                 f"The protocol wants {'; '.join(differing)}",
@@ -148,10 +143,10 @@ class GenicamCamera:
         link = self._connected()
         try:
             link.set_exposure_s(settings.exposure_s)
-        except AravisError as error:
+        except LinkError as error:
             raise self._unavailable(str(error)) from error
         now = self.settings()
-        if abs(now.exposure_s - settings.exposure_s) > _TOLERANCE * settings.exposure_s:
+        if abs(now.exposure_s - settings.exposure_s) > TOLERANCE * settings.exposure_s:
             raise DeviceRefusedError(
                 f"The camera exposes for {now.exposure_s:g} s instead of {settings.exposure_s:g} s",
                 where=self._where,
@@ -163,7 +158,7 @@ class GenicamCamera:
         """Return the exposure time that the camera reports, with what rig.yaml states."""
         try:
             exposure_s = self._connected().exposure_s
-        except AravisError as error:
+        except LinkError as error:
             raise self._unavailable(str(error)) from error
         return CameraSettings(self._config.aperture_f, exposure_s, self._config.iso)
 
@@ -220,7 +215,7 @@ class GenicamCamera:
                 where=self._where,
                 remedy="Look at cable and network (packet size, no other traffic), then repeat the exposure",
             ) from error
-        except AravisError as error:
+        except LinkError as error:
             raise self._unavailable(str(error)) from error
         pixels = picture(frame, self._config.pixel_format)
         if pixels is None:
@@ -233,7 +228,12 @@ class GenicamCamera:
 
     # --- the link ---------------------------------------------------------------------------------------------
 
-    def _connected(self) -> AravisCamera:
+    def _linked(self) -> CameraLink:
+        if self._config.producer:
+            return ProducerCamera(self._config.camera, Path(self._config.producer))
+        return AravisCamera(self._config.camera)
+
+    def _connected(self) -> CameraLink:
         if self._link is None:
             raise self._unavailable("It is not open")
         return self._link
@@ -242,11 +242,11 @@ class GenicamCamera:
         return DeviceUnavailableError(
             what,
             where=self._where,
-            remedy="Check power, cable and address (arv-tool-0.8 lists cameras), then open it",
+            remedy="Check power, cable and name (arv-tool-0.8 or the maker's program lists cameras), then open it",
         )
 
-    def _checked_identity(self, link: AravisCamera) -> DeviceIdentity:
-        serial = link.text("device_serial_number")
+    def _checked_identity(self, link: CameraLink) -> DeviceIdentity:
+        serial = link.serial
         if self._config.serial not in ("", serial):
             raise DeviceFaultError(
                 f"It has the serial number {serial}, not {self._config.serial}",
@@ -255,16 +255,16 @@ class GenicamCamera:
             )
         return DeviceIdentity(
             kind="camera",
-            model=f"{link.text('vendor_name')} {link.text('model_name')}",
+            model=f"{link.vendor} {link.model}",
             serial=serial,
             firmware="",
             driver="genicam",
-            driver_version=f"Aravis {version()}",
+            driver_version=link.software,
             address=self._config.camera,
         )
 
     def _check_gain(self, gain: float) -> None:
-        if abs(gain - self._config.gain) > _TOLERANCE * max(1.0, abs(self._config.gain)):
+        if abs(gain - self._config.gain) > TOLERANCE * max(1.0, abs(self._config.gain)):
             raise DeviceFaultError(
                 f"It has the gain {gain:g} instead of {self._config.gain:g}",
                 where=self._where,

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.genicam.library import Frame
+from drivers.genicam.link import Frame
 
 # Name → code on the wire, and OpenCV's conversion to BGR; None: grey. OpenCV's names have the first square of the
 # pattern, GenICam's its first two pixels.

@@ -99,7 +99,7 @@ class GphotoCamera:
         self._identity = DeviceIdentity(
             kind="camera",
             model=model,
-            serial=self._link.value(profile.serial).lstrip("0"),
+            serial=self._dials.serial(),
             firmware=self._link.value("deviceversion"),
             driver="gphoto",
             driver_version=f"python-gphoto2 {version('gphoto2')}, libgphoto2 {library_version()}",
@@ -258,6 +258,7 @@ class GphotoCamera:
             height=exif.height,
             lens_serial=exif.lens_serial,
             body_serial=exif.body_serial,
+            model=exif.model,
             focus_distance_m=exif.focus_distance_m or 0.0,
             focus_position=exif.focus_position,
         )

@@ -22,6 +22,21 @@ class Dials:
         self._white_balance = white_balance
         self.announced: list[AddedFile] = []
 
+    def serial(self) -> str:
+        """The body's serial number, without leading zeros.
+
+        It is one of the first things that a body tells: without it the connection is none, whatever libgphoto2 says,
+        and DeviceUnavailableError is raised.
+        """
+        try:
+            return self._link.value(self._profile.serial).lstrip("0")
+        except DeviceRefusedError as error:
+            raise DeviceUnavailableError(
+                f"The camera connects and then does not tell its settings: {error.what}",
+                where=self._link.where,
+                remedy="Check cable and power, then open the camera again; switch it off and on if need be",
+            ) from error
+
     def refresh(self) -> None:
         """Drain events, so that values are read afresh."""
         self.announced += self._link.refresh()

@@ -44,9 +44,10 @@ class Sent:
     """A line that waits for its answer."""
 
     line: bytes
+    sent_s: float  # host time.monotonic()
     answer: Ok | Refused | None = None  # None: none yet, or none to come
     said: list[Setting | Feedback] = field(default_factory=list[Setting | Feedback])
-    dropped: bool = False  # the controller started anew before it answered
+    dropped: bool = False  # its answer will not come any more: the controller started anew, or it was lost
 
 
 class Link:
@@ -117,7 +118,7 @@ class Link:
 
     def send(self, line: bytes) -> Sent:
         """Send a line and do not wait. Raises DeviceUnavailableError if the line is dead."""
-        sent = Sent(line)
+        sent = Sent(line, time.monotonic())
         with self._writing:
             with self._news:
                 self._waiting.append(sent)
@@ -132,19 +133,28 @@ class Link:
             DeviceTimeoutError, DeviceUnavailableError: there was no answer.
         """
         sent = self.send(line)
+        self.await_answer(sent, timeout_s)
+        return self.answer_to(sent, f" in {timeout_s:g} s")
+
+    def await_answer(self, sent: Sent, timeout_s: float) -> bool:
+        """Wait for the answer to a line; returns whether it came, or never will."""
         with self._news:
-            self._news.wait_for(lambda: sent.answer is not None or sent.dropped or bool(self.death), timeout_s)
-        words = line.decode("ascii")
+            return self._news.wait_for(lambda: sent.answer is not None or sent.dropped or bool(self.death), timeout_s)
+
+    def answer_to(self, sent: Sent, why_none: str) -> tuple[Setting | Feedback, ...]:
+        """What the controller said before its answer to a line; `why_none` ends the sentence that there is none.
+
+        Raises as `request`.
+        """
+        words = sent.line.decode("ascii")
         if isinstance(sent.answer, Refused):
             what, remedy = f"the controller refuses {words}: {sent.answer.words}", "See what it names, then try again"
             raise DeviceRefusedError(what, where=self._where, remedy=remedy)
         if sent.answer is None:
             if self.death:
                 raise self._lost()
-            what = f"no answer to {words}" + (
-                ": the controller started anew" if sent.dropped else f" in {timeout_s:g} s"
-            )
-            raise DeviceTimeoutError(what, where=self._where, remedy=_CABLE)
+            why = ": the controller started anew" if sent.dropped else why_none
+            raise DeviceTimeoutError(f"no answer to {words}{why}", where=self._where, remedy=_CABLE)
         return tuple(sent.said)
 
     @property
@@ -152,6 +162,17 @@ class Link:
         """Number of lines that wait for their answer."""
         with self._news:
             return len(self._waiting)
+
+    def misses_answer(self, within_s: float) -> bool:
+        """Whether the oldest line without an answer was sent longer ago than this."""
+        with self._news:
+            return bool(self._waiting) and time.monotonic() - self._waiting[0].sent_s > within_s
+
+    def forget_unanswered(self) -> None:
+        """Wait for no more of the answers, since they were lost: each later one would count for the line before."""
+        with self._news:
+            _LOG.warning("%s: answers to %d lines were lost", self._where, len(self._waiting))
+            self._drop_waiting()
 
     def close(self) -> None:
         """Close the port."""
@@ -214,14 +235,17 @@ class Link:
                 with self._news:
                     self.version = message.version
                     self._welcomes += 1
-                    for sent in self._waiting:
-                        sent.dropped = True
-                    self._waiting.clear()
-                    self._news.notify_all()
+                    self._drop_waiting()
                 self._asked_s = -1.0
                 self._receive(message, now_s)
             case None:
                 _LOG.debug("%s: a line that is none of GRBL's", self._where)
+
+    def _drop_waiting(self) -> None:
+        for sent in self._waiting:
+            sent.dropped = True
+        self._waiting.clear()
+        self._news.notify_all()
 
     def _answer(self, answer: Ok | Refused) -> None:
         with self._news:

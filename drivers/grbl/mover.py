@@ -76,7 +76,7 @@ class Mover:
 
     @property
     def _door_is_open(self) -> bool:
-        """Not if it was closed again, and only a person's confirmation is missing."""
+        """False also if it was closed again and only a person's confirmation is missing."""
         return self.status is not None and self.status.state == "Door" and self.status.substate != 0
 
     @property
@@ -217,6 +217,11 @@ class Mover:
                 return
         while self._sent and self._sent[0].answer is not None:
             self._sent.popleft()
+        if status.state == "Idle" and link.misses_answer(self._config.answer_timeout_s):
+            if not motion.all_sent:  # it stands, and must not move on by itself
+                self._end(link, "the controller did not answer to a part of the motion")
+                return
+            link.forget_unanswered()
         if status.state == "Idle" and not link.unanswered and asked_s > link.answered_s:
             if not motion.stands_at_its_end(position):
                 self._end(link, "somebody or something stopped the axes")

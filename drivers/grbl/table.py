@@ -21,6 +21,7 @@ from drivers.errors import (
 )
 from drivers.grbl import GrblConfig
 from drivers.grbl.axes import Axes
+from drivers.grbl.homing import home
 from drivers.grbl.link import Link
 from drivers.grbl.mover import REACTION_S, Mover
 from drivers.grbl.setup import Setup, setup_of
@@ -142,26 +143,28 @@ class GrblTable:
         """Permit motion after a person's confirmation, and home the axes if their position is not known.
 
         Raises SafetyStopError or LeaveNeededError for a stop that is active or was seen after that time, and for
-        homing that failed.
+        homing that failed; DeviceUnavailableError if the line is dead.
         """
         link, mover = self._linked(), self._mover
         mover.refuse_while_door_is_open()
         if mover.status is not None and not mover.at_rest(mover.status):
             self.stop()  # still braking: a reset now would lose the position
         mover.latch.let_move(confirmed_by, not_before_monotonic_s)
-        if mover.homed and mover.status is not None and mover.status.state == "Idle":
+        if mover.homed and mover.status is not None and mover.status.state == "Idle" and not link.unanswered:
             return
         mover.resetting = True
         try:
             link.reset(self._config.connect_timeout_s)  # after some alarms it hears nothing else
             if not mover.homed:
-                link.request(b"$H", self._config.homing_timeout_s)
+                home(link, lambda: mover.newest, self._config)
             mover.homed = True
         except DeviceError as error:
             if mover.latch.stop is None:  # not an alarm, which has stopped it already
                 with contextlib.suppress(DeviceError):
                     link.reset(self._config.connect_timeout_s)
                 mover.latch.end(f"homing failed ({error.what})")
+            if isinstance(error, DeviceUnavailableError):  # a confirmation alone would not bring the line back
+                raise
             raise (mover.latch.stop or error) from error
         finally:
             mover.resetting = False
@@ -236,13 +239,14 @@ class GrblTable:
         while not link.death:
             status, asked_s = mover.newest
             rests = status is not None and mover.at_rest(status)
-            current = rests and not link.unanswered and asked_s > max(since_s, link.answered_s)
+            parsed = not link.unanswered or link.misses_answer(self._config.answer_timeout_s)  # or it was lost
+            current = rests and parsed and asked_s > max(since_s, link.answered_s)
             if current and self._shown_since(asked_s):
                 return
             if time.monotonic() > since_s + STOP_S:
                 remedy = "Press the emergency stop of the machine"
                 raise DeviceTimeoutError("the axes do not come to rest", where=self._where, remedy=remedy)
-            if not rests or link.unanswered:  # again and again: a jog that was not parsed yet begins after the others
+            if not rests or not parsed:  # again and again: a jog that was not parsed yet begins after the others
                 link.act(FEED_HOLD if status is not None and status.state == "Run" else JOG_CANCEL)
             time.sleep(0.01)
 

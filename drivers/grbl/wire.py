@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 LONGEST_LINE = 512  # bytes
 STATUS, RESET, JOG_CANCEL, FEED_HOLD = b"?", b"\x18", b"\x85", b"!"  # acted on at once, without an answer
+HOME = b"$H"
+UNLOCKED = "MSG:Caution: Unlocked"  # said at $X, which differs from $H by one bit
 STATES = ("Idle", "Run", "Hold", "Jog", "Alarm", "Door", "Check", "Home", "Sleep")
 ALARMS: Mapping[int, str] = {
     1: "a limit switch was hit; the position is lost",

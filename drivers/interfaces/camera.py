@@ -49,6 +49,7 @@ class CapturedImage:
     body_serial: str = ""
     focus_distance_m: float = 0.0
     focus_position: int | None = None  # of the focus motor, in its own steps; None if the file does not state it
+    model: str = ""  # of the body
     found_at: str = ""  # path at which the file was found; "" if it was downloaded from the camera
 
     @property

@@ -108,7 +108,7 @@ def unchanged(path: Path) -> Generator[None]:
 def scanned_mesh(
     vertices: Array, faces: IntArray, normals: Array | None, unit: MeshUnit, export: ScanExport
 ) -> ScannedMesh:
-    """Check what was read of an export, in the file's unit, and report on it as `read_mesh_file` does.
+    """Check a mesh that was read from an export, in the file's unit, and report on it as `read_mesh_file` does.
 
     Raises UnreadableFileError as `check_mesh` and `credible_unit` do.
     """

@@ -13,7 +13,7 @@ from drivers.meshes.surface_file import read_surface_file
 from service.benchmark.method import Method
 from service.benchmark.records import SCENARIOS, BenchmarkResult, Scenario
 from service.benchmark.running import truth_file
-from service.compute.ground_truth.distances.chamfer import OUTLIER_M, Compared
+from service.compute.ground_truth.distances.chamfer import OUTLIER_M, DistanceSamples
 from service.compute.ground_truth.distances.heat_map import HeatScale, Panel, heat_bar, heat_row
 from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.distances.sampling import sample
@@ -65,7 +65,7 @@ def _panel(out: Path, result: BenchmarkResult | None, title: str, index: PointIn
         return Panel(np.empty((0, 3)), np.empty((0, 3), dtype=np.uint8), None, f"{title}: -")
     surface = _surface(out / f"{result.method}-{result.scenario}" / "mesh.ply")
     samples = sample(surface, SPACING_M, np.random.default_rng(0))
-    compared = Compared(samples, index.nearest(samples.points_m)[0])
+    compared = DistanceSamples(samples, index.nearest(samples.points_m)[0])
     return Panel.of_distances(surface, compared, scale, f"{title}: {result.score.chamfer_mm:.2f} mm")
 
 

@@ -113,7 +113,7 @@ _COMMANDS = {
     "benchmark": _Command("service.cli.benchmark.group:benchmark_app", "Compare methods on an exported data set."),
     "simulate": _Command(
         "service.cli.site.simulate:simulate_command",
-        "Start a simulated device (ur, kuka, camera, scanner, ct, lightbox) or a whole rig, until it is terminated.",
+        "Start a simulated device (ur, kuka, camera, gige and others) or a whole rig, until it is terminated.",
     ),
     "audit": _Command(
         "service.cli.evidence.audit:audit_app",

@@ -6,6 +6,7 @@ import base64
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import cycle
 from typing import Any, Literal
 
 import fast_simplification
@@ -14,10 +15,11 @@ from numpy.typing import NDArray
 
 from service.core.geometry import Array, Transform, apply, inverse, transform
 from service.core.units import metres, mm
+from service.dataset.scene_shapes import frustum_lines, unit_ball
 
 FACES_SHOWN = 60_000
-_FRUSTUM_MM = 50.0
 STYLES = (("#2f86d6", "circle"), ("#d9772b", "diamond"), ("#9a58d1", "square"))  # camera marks, by station
+FURTHER_STYLES = (("#0f9aa8", "x"), ("#b1891a", "cross"))  # of further cameras, one each
 KINDS = {"registration": "#2f9e57", "sphere": "#2f9e57", "control": "#d05fa0"}
 KIND_NAMES = {"registration": "registration spheres", "control": "control spheres", "sphere": "spheres"}
 PROUD = 1.07  # times the radius, so that a drawn sphere covers the scanned one
@@ -25,7 +27,6 @@ BAR_MM = 100.0
 _ROOM_MM = 60.0
 EYE_MM, TOWARDS_MM = (280.0, -1150.0, 850.0), (0.0, 0.0, 210.0)  # the initial view
 _NEAR_EYE_MM, _NEAR_TOWARDS_MM = (150.0, -620.0, 500.0), (0.0, 0.0, 0.0)  # without cameras around the surface
-_ROUND, _FLAT = 10, 6  # meridians and parallels of a sphere
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +90,7 @@ class Scene:
         bases: T_frame_base by station, where known.
         up: unit vector (3,).
         outlines: (K, 3) corners of closed polygons on the surface, by what they surround.
+        further: T_frame_camera of each further camera of the rig, by its name and that of the view.
     """
 
     cameras: Mapping[str, Transform]
@@ -100,6 +102,7 @@ class Scene:
     bases: Mapping[str, Transform] = field(default_factory=dict[str, Transform])
     up: tuple[float, float, float] | None = None
     outlines: Mapping[str, Array] = field(default_factory=dict[str, Array])
+    further: Mapping[str, Mapping[str, Transform]] = field(default_factory=dict[str, Mapping[str, Transform]])
 
 
 def decimated(vertices_m: Array, faces: Any, most: int = FACES_SHOWN) -> tuple[Array, NDArray[np.int64]]:
@@ -163,6 +166,9 @@ def scene_json(scene: Scene) -> str:
         in_view_mm(np.array([T[:3, 3] for T in mine]))
         if station in scene.bases:
             data.append(_base(in_view_mm(scene.bases[station][None, :3, 3]), station, colour))
+    for (name, poses), (colour, symbol) in zip(scene.further.items(), cycle(FURTHER_STYLES), strict=False):
+        in_view_mm(np.array([T[:3, 3] for T in poses.values()]))
+        data += _frusta({view: to_view @ T for view, T in poses.items()}, name, colour, symbol)
     text = json.dumps(
         {"data": data, "layout": _layout(extent, near=not (names or scene.planned))},
         allow_nan=False,
@@ -271,15 +277,23 @@ def _cameras(scene: Scene, station: str, to_view: Transform, colour: str, symbol
         if not mine:
             continue
         title = f"{what} of {station}" if what == "cameras" else f"still to be taken at {station}"
-        title = title if station else what
-        line = {"color": colour, "width": 3}
-        frusta = {"mode": "lines", "name": title, "line": line, "hoverinfo": "skip", "opacity": opacity}
-        out.append({"type": "scatter3d", **frusta, **_xyz(frustum_lines(list(mine.values())))})
-        eyes = mm(np.array([T[:3, 3] for T in mine.values()]))
-        marker = {"size": 5, "color": colour, "symbol": filled}
-        points = {"mode": "markers", "text": list(mine), "hoverinfo": "text", "marker": marker, "showlegend": False}
-        out.append({"type": "scatter3d", **points, **_xyz(eyes)})
+        out += _frusta(mine, title if station else what, colour, filled, opacity)
     return out
+
+
+def _frusta(
+    poses: Mapping[str, Transform], title: str, colour: str, symbol: str, opacity: float = 1.0
+) -> list[dict[str, object]]:
+    """Cameras as small pyramids in the viewing frame, with a mark at each projection centre."""
+    line = {"color": colour, "width": 3}
+    frusta = {"mode": "lines", "name": title, "line": line, "hoverinfo": "skip", "opacity": opacity}
+    eyes = mm(np.array([T[:3, 3] for T in poses.values()]))
+    marker = {"size": 5, "color": colour, "symbol": symbol}
+    points = {"mode": "markers", "text": list(poses), "hoverinfo": "text", "marker": marker, "showlegend": False}
+    return [
+        {"type": "scatter3d", **frusta, **_xyz(frustum_lines(list(poses.values())))},
+        {"type": "scatter3d", **points, **_xyz(eyes)},
+    ]
 
 
 def _base(at: Array, station: str, colour: str) -> dict[str, object]:
@@ -335,32 +349,6 @@ def _layout(extent: _Extent, *, near: bool) -> dict[str, object]:
 def _in_box(ranges: Mapping[str, Sequence[float]], point_mm: Sequence[float]) -> dict[str, float]:
     """A point of the viewing frame in the coordinates of plotly's camera."""
     return {a: metres(p - sum(ends) / 2) for (a, ends), p in zip(ranges.items(), point_mm, strict=True)}
-
-
-def frustum_lines(cameras: Sequence[Transform]) -> Array:
-    """Line segments (N, 3) in mm that draw each camera as a small pyramid, separated by NaN rows."""
-    w, h, z = 0.36 * _FRUSTUM_MM, 0.24 * _FRUSTUM_MM, _FRUSTUM_MM
-    o, a, b, c, d = [0, 0, 0], [-w, -h, z], [w, -h, z], [w, h, z], [-w, h, z]
-    path = metres(np.array([o, a, b, c, d, a, o, b, o, c, o, d], dtype=np.float64))
-    gap = np.full((1, 3), np.nan)
-    return np.vstack([np.vstack([mm(apply(T, path)), gap]) for T in cameras]) if cameras else gap
-
-
-def unit_ball() -> tuple[Array, NDArray[np.int64]]:
-    """A unit sphere: points (V, 3), triangles (F, 3)."""
-    polar = np.linspace(0, np.pi, _FLAT + 1)[1:-1]
-    around = np.linspace(0, 2 * np.pi, _ROUND, endpoint=False)
-    rings = [[np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)] for p in polar for a in around]
-    points = np.array([[0.0, 0.0, 1.0], *rings, [0.0, 0.0, -1.0]])
-    last = len(points) - 1
-    faces: list[list[int]] = []
-    for k in range(_ROUND):
-        nxt = (k + 1) % _ROUND
-        faces += [[0, 1 + k, 1 + nxt], [last, last - _ROUND + nxt, last - _ROUND + k]]
-        for ring in range(_FLAT - 2):
-            a, b = 1 + ring * _ROUND + k, 1 + ring * _ROUND + nxt
-            faces += [[a, a + _ROUND, b], [b, a + _ROUND, b + _ROUND]]
-    return points, np.array(faces)
 
 
 def _xyz(points: Array) -> dict[str, object]:

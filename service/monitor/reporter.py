@@ -78,7 +78,7 @@ class Reporter:
     data: Path
     run_id: str
     devices: Callable[[], OpenDevices]
-    camera: Callable[[], Camera]  # opens it, for the live view that somebody asked for
+    camera: Callable[[str], Camera]  # opens it by its name, for the live view that somebody asked for; "": the first
     alarm: Alarm | None = None
     outcome: str = "its program ended before the run did"  # the final alert's text
     monotonic_s: Callable[[], float] = time.monotonic
@@ -240,15 +240,16 @@ class Reporter:
 
     def _frame(self) -> None:
         """Write a frame of the live view while somebody looks; only when the camera is idle."""
-        if not frames_wanted(self.data, self.run_id) or not self._due("frame", _FRAME_S):
+        wanted = frames_wanted(self.data, self.run_id)
+        if wanted is None or not self._due("frame", _FRAME_S):
             return
         try:
-            jpeg = self.camera().preview()
+            jpeg = self.camera(wanted).preview()
         except OrthocaptureError as error:
             self.tell(f"the live view does not work: {error}")
             self._due_s["frame"] = self.monotonic_s() + _CAMERA_S
             return
-        self._write(lambda: write_frame(self.data, self.run_id, jpeg))
+        self._write(lambda: write_frame(self.data, self.run_id, jpeg, wanted))
 
     def _due(self, what: str, every_s: float) -> bool:
         now_s = self.monotonic_s()

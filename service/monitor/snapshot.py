@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import time
@@ -146,29 +147,29 @@ def read_snapshot(data: Path, run_id: str) -> Snapshot:
 # --- live view: frames are taken only while somebody looks --------------------------------------------------------
 
 
-def ask_for_frames(data: Path, run_id: str) -> None:
-    """Note that somebody is looking at the live view now. Raises OSError."""
+def ask_for_frames(data: Path, run_id: str, camera: str = "") -> None:
+    """Note that somebody is looking at the live view of a camera now; "": the first one. Raises OSError."""
+    _replace(_path(data, run_id, "wanted"), camera.encode())
+
+
+def frames_wanted(data: Path, run_id: str, *, within_s: float = 3.0) -> str | None:
+    """The camera at whose live view somebody has looked within this time, last; "": the first one; None: nobody."""
     path = _path(data, run_id, "wanted")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.touch()
-
-
-def frames_wanted(data: Path, run_id: str, *, within_s: float = 3.0) -> bool:
-    """Whether somebody has looked within this time."""
     try:
-        return time.time() - _path(data, run_id, "wanted").stat().st_mtime < within_s
+        return path.read_text() if time.time() - path.stat().st_mtime < within_s else None
     except OSError:
-        return False
+        return None
 
 
-def write_frame(data: Path, run_id: str, jpeg: bytes) -> None:
-    """Replace the latest frame. Raises OSError."""
-    _replace(_path(data, run_id, "jpg"), jpeg)
+def write_frame(data: Path, run_id: str, jpeg: bytes, camera: str = "") -> None:
+    """Replace the latest frame of a camera. Raises OSError."""
+    _replace(frame_path(data, run_id, camera), jpeg)
 
 
-def frame_path(data: Path, run_id: str) -> Path:
-    """Path of the latest frame, which may not exist; its modification time tells its age."""
-    return _path(data, run_id, "jpg")
+def frame_path(data: Path, run_id: str, camera: str = "") -> Path:
+    """Path of the latest frame of a camera, which may not exist; its modification time tells its age."""
+    named = f"{hashlib.sha256(camera.encode()).hexdigest()[:16]}." if camera else ""
+    return _path(data, run_id, f"{named}jpg")
 
 
 def _replace(path: Path, content: bytes) -> None:

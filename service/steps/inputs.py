@@ -115,28 +115,32 @@ def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[Posed
     return images
 
 
-def raw_files(context: StepContext, images: Iterable[PosedPhotograph]) -> dict[str, str]:
-    """SHA-256 of the raw file of each photograph, by viewpoint.
+def raw_files(context: StepContext, images: Iterable[PosedPhotograph]) -> list[tuple[PosedPhotograph, str]]:
+    """Each photograph with the SHA-256 of its raw file.
 
     Raises:
         ConfigurationError: a photograph has none.
     """
-    wanted = {image.sha256: image for image in images}
-    found: dict[str, str] = {}
-    for step_id in dict.fromkeys(image.step for image in wanted.values()):
+    wanted = list(images)
+    raws: dict[str, str] = {}
+    for step_id in dict.fromkeys(image.step for image in wanted):
         for capture in context.evidence.captures(step_id):
-            image = wanted.get(capture.artefacts[0].sha256)
-            raw = next((ref.sha256 for ref in capture.artefacts if ref.kind == "raw"), None)
-            if image is not None and raw is not None:
-                found[image.viewpoint] = raw
-    missing = [image.viewpoint for image in wanted.values() if image.viewpoint not in found]
+            raw = raw_of(capture.artefacts)
+            if raw is not None:
+                raws[capture.artefacts[0].sha256] = raw
+    missing = [image.viewpoint for image in wanted if image.sha256 not in raws]
     if missing:
         raise ConfigurationError(
             f"{counted(len(missing), 'image')} of {len(wanted)} without a raw file, the first is {missing[0]}",
             where=f"step {context.step.id}",
             remedy="Set `image_quality` of the camera to RAW+JPEG and take the images again, or `measure_on` to jpeg",
         )
-    return found
+    return [(image, raws[image.sha256]) for image in wanted]
+
+
+def raw_of(files: Iterable[ArtefactRef]) -> str | None:
+    """SHA-256 of the raw file among the files of an exposure; None without one."""
+    return next((ref.sha256 for ref in files if ref.kind == "raw"), None)
 
 
 def _photograph(capture: RecordedView, step_id: str, look: hand_view.Answer | None) -> PosedPhotograph:

@@ -307,7 +307,7 @@ def _error(sequence: int | None, code: str, what: str) -> dict[str, object]:
 
 
 def _numbers(line: dict[str, object], name: str, count: int) -> list[float]:
-    """`count` finite numbers, or one that is no list if the count is 0. Raises RefusedError."""
+    """A list of `count` finite numbers, or a single number if `count` is 0. Raises RefusedError."""
     value = line.get(name)
     values = cast("list[object]", value) if count and isinstance(value, list) else [value]
     numbers = [

@@ -23,7 +23,7 @@ REJECTIONS = {
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """The answer: response code, its parameters, a data phase; the socket carries out `wire_fault`."""
+    """The answer: response code, its parameters, and a data phase; the socket applies `wire_fault` to it."""
 
     code: int = OK
     parameters: tuple[int, ...] = ()

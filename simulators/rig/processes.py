@@ -19,13 +19,12 @@ import yaml
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand.technician import MISHAP_EVERY, Hand
+from simulators.rig.cameras import CAMERAS, STILL, again, place, section
 from simulators.rig.world_server import World, WorldServer
-from simulators.scene.second_camera import NAME as SECOND
-from simulators.scene.second_camera import PLACES, SecondCamera
+from simulators.scene.further_cameras import PLACES, FurtherCamera, further_cameras
 from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
 from simulators.serve import SimulatorError, Termination, announce
 
-CAMERAS = {"Sony ILCE-7RM5": "camera", "Canon EOS R5": "canon"}  # model: its simulator
 _LOAD_KG = 1.6  # camera, lens and mount
 _TAPE_SIGMA_M = 0.003  # accuracy with which a technician measures the scene's centre with a tape
 
@@ -50,7 +49,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="no arm: a technician holds the camera, and makes this many mistakes",
     )
     parser.add_argument(
-        "--second-camera", choices=PLACES, help="on a stand in the room, or beside the first one on the arm"
+        "--second-camera",
+        nargs="+",
+        choices=PLACES,
+        default=(),
+        metavar="PLACE",
+        help="fixed on a stand in the room, or stereo beside the first one on the arm; with both, there are three",
+    )
+    parser.add_argument(
+        "--second-camera-model",
+        nargs="+",
+        choices=STILL,
+        default=(),
+        metavar="MODEL",
+        help="model of each of these; default: that of the first camera",
     )
     parser.add_argument(
         "--without-cable", action="store_true", help="with --hand: the camera sends its photographs into a folder"
@@ -69,6 +81,10 @@ def serve(args: argparse.Namespace) -> None:
         raise SimulatorError("--without-cable is for a camera that a person holds: add --hand")
     if args.second_camera and args.hand:
         raise SimulatorError("--second-camera needs an arm: leave --hand out")
+    if len(args.second_camera_model) > len(args.second_camera):
+        raise SimulatorError("--second-camera-model names more cameras than --second-camera places")
+    if args.camera not in STILL and (args.hand or len(args.second_camera_model) < len(args.second_camera)):
+        raise SimulatorError(f"--camera {args.camera} can neither be held nor be a second camera: choose a still one")
     termination = Termination()
     rig = _Rig(args, termination)
     try:
@@ -89,9 +105,14 @@ class _Rig:
         self.children: dict[str, subprocess.Popen[str]] = {}
         self._words: dict[str, tuple[str, ...]] = {}  # command line with which each was started
         self._ready: dict[str, dict[str, Any]] = {}  # ready line of each
-        self.second = SecondCamera.place(scene, args.second_camera) if args.second_camera else None
+        self.further = further_cameras(scene, args.second_camera)
         self.world = World(
-            scene, args.image_width, self.arms, _start_joints(scene), second=self.second, camera_held=bool(args.hand)
+            scene,
+            args.image_width,
+            self.arms,
+            _start_joints(scene),
+            further=self.further,
+            camera_held=bool(args.hand),
         )
         self.hand = args.hand and Hand(
             args.hand, args.scene, self.world.hold, self.world.press_shutter, SCENE_CENTRE_M.copy()
@@ -125,17 +146,18 @@ class _Rig:
                 f"--initial-joints={joints}", "--world", world, "--arm", arm, *self._model(),
             )  # fmt: skip
         camera = self._child(
-            "camera", CAMERAS[self.args.camera], "--port", "0", "--world", world,
-            "--image-width", str(self.args.image_width),
+            "camera", CAMERAS[self.args.camera], *place(self.args.camera, self.args.host, self.folder),
+            "--world", world, "--image-width", str(self.args.image_width),
             "--exposures-log", str(self._exposures_log("camera")),
             *(("--send-to", str(self.folder / "photographs")) if self.args.without_cable else ()),
         )  # fmt: skip
-        if self.second is not None:
-            self._start_second(self.second)
+        models = [*self.args.second_camera_model, *[self.args.camera] * len(self.further)]
+        for (name, further), model in zip(self.further.items(), models, strict=False):
+            self._start_further(name, further, model)
         self._child("lightbox", "lightbox", "--link", str(self.folder / "lightbox"), "--world", world)
         self._write_truth()
         rig = self.folder / "rig.yaml"
-        rig.write_text(yaml.safe_dump(self._rig_file(camera["gphoto_port"], hosts), sort_keys=False))
+        rig.write_text(yaml.safe_dump(self._rig_file(camera, hosts), sort_keys=False))
         announce(
             rig=str(rig),
             world=world,
@@ -145,15 +167,15 @@ class _Rig:
         )
         threading.Thread(target=self._watch, daemon=True).start()
 
-    def _start_second(self, second: SecondCamera) -> None:
-        """Start the second camera's simulator, and write its calibration, which is exact."""
+    def _start_further(self, name: str, further: FurtherCamera, model: str) -> None:
+        """Start a further camera's simulator, and write its calibration, which is exact."""
         self._child(
-            SECOND, CAMERAS[self.args.camera], "--port", "0", "--world", self.server.address, "--camera", SECOND,
-            "--image-width", str(self.args.image_width), "--clock-ahead-s", str(second.clock_ahead_s),
-            "--exposures-log", str(self._exposures_log(SECOND)),
+            name, CAMERAS[model], "--port", "0", "--world", self.server.address, "--camera", name,
+            "--image-width", str(self.args.image_width), "--clock-ahead-s", str(further.clock_ahead_s),
+            "--exposures-log", str(self._exposures_log(name)),
         )  # fmt: skip
-        calibration = second.lens.scaled(self.args.image_width).to_json()
-        (self.folder / f"{SECOND}.json").write_text(json.dumps(calibration, indent=1))
+        calibration = further.lens.scaled(self.args.image_width).to_json()
+        (self.folder / f"{name}.json").write_text(json.dumps(calibration, indent=1))
 
     def _exposures_log(self, camera: str) -> Path:
         return self.folder / ("truth_exposures.jsonl" if camera == "camera" else f"truth_exposures_{camera}.jsonl")
@@ -192,11 +214,10 @@ class _Rig:
         if name in self.arms:
             joints = ",".join(f"{q:.6f}" for q in self.world.joints_rad(name))
             words = [f"--initial-joints={joints}" if w.startswith("--initial-joints") else w for w in words]
-        if name in ("camera", SECOND):
+        if name in ("camera", *self.further):
             log = self._exposures_log(name)
             taken = len(log.read_text().splitlines()) if log.exists() else 0
-            port = self._ready[name]["gphoto_port"].rpartition(":")[2]
-            words += ["--port", port, "--first-counter", str(taken + 1)]  # these override the first ones
+            words += again(self._ready[name], taken)  # these override the first ones
         with suppress(SimulatorError):  # it is retried
             self._child(name, *words)
 
@@ -204,7 +225,7 @@ class _Rig:
         """Start a simulator and wait for its ready line."""
         command = [
             sys.executable, "-m", "simulators", *words, "--parent", str(os.getpid()),
-            "--faults", (self.faults.of(SECOND, "camera") if name == SECOND else self.faults).to_json(),
+            "--faults", (self.faults.of(name, "camera") if name in self.further else self.faults).to_json(),
         ]  # fmt: skip
         with (self.folder / "logs" / f"{name}.log").open("w") as log:
             process = subprocess.Popen(
@@ -228,7 +249,7 @@ class _Rig:
         stem, _, last = first.rpartition(".")
         return [first, f"{stem}.{int(last) + 1}"][: len(self.arms)]
 
-    def _rig_file(self, gphoto_port: str, hosts: list[str]) -> dict[str, Any]:
+    def _rig_file(self, camera: dict[str, Any], hosts: list[str]) -> dict[str, Any]:
         driver = {"ur": "ur", "kuka": "kuka_sunrise"}[self.scene.arm.simulator]
         robots = {arm: {"driver": driver, "host": host} for arm, host in zip(self.arms, hosts, strict=True)}
         rig: dict[str, Any] = {
@@ -237,16 +258,18 @@ class _Rig:
             "hands": self.server.address,
             "devices": {
                 **robots,
-                "camera": self._camera(gphoto_port),
-                **({SECOND: self._camera(self._ready[SECOND]["gphoto_port"])} if self.second else {}),
+                "camera": self._camera(camera),
+                **{name: self._camera(self._ready[name]) for name in self.further},
                 "scanner": {"driver": "scan_folder", "folder": "scans", "unit": "mm", "stable_s": 1.0},
                 "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
                 "lightbox": {"driver": "lightbox", "port": "lightbox"},
             },
         }
-        if self.second is not None:
-            mounted = "fixed" if self.second.fixed else "rigid"
-            rig["cameras"] = {SECOND: {"mounted": mounted, "calibration": f"{SECOND}.json"}}
+        if self.further:
+            rig["cameras"] = {
+                name: {"mounted": "fixed" if one.fixed else "rigid", "calibration": f"{name}.json"}
+                for name, one in self.further.items()
+            }
         if not robots:
             return rig
         return {
@@ -258,10 +281,10 @@ class _Rig:
             "lens": self._lens(),
         }
 
-    def _camera(self, gphoto_port: str) -> dict[str, Any]:
+    def _camera(self, ready: dict[str, Any]) -> dict[str, Any]:
         if self.args.without_cable:
             return {"driver": "photo_folder", "folder": "photographs", "stable_s": 1.0}
-        return {"driver": "gphoto", "port": gphoto_port, "capture_timeout_s": self._exposure_s()}
+        return section(ready, self._exposure_s())
 
     def _exposure_s(self) -> float:
         """Longest time that one picture may take: this camera renders it, in up to some microseconds a pixel."""
@@ -297,12 +320,11 @@ class _Rig:
                 "intrinsics": self.scene.camera_intrinsics(self.args.image_width).to_json(),
                 "scans": [],
                 "ct": [],
+                "further_cameras": {
+                    name: {"T_outer_camera": one.T_outer_camera.tolist(), "clock_ahead_s": one.clock_ahead_s}
+                    for name, one in self.further.items()
+                },
             }
-            if self.second is not None:
-                self._truth["second_camera"] = {
-                    "T_outer_camera": self.second.T_outer_camera.tolist(),
-                    "clock_ahead_s": self.second.clock_ahead_s,
-                }
         self._truth |= {"registration_m": self.scene.registration_m.tolist(), "moved": self.scene.moved}
         (self.folder / "truth.json").write_text(json.dumps(self._truth, indent=1))
 

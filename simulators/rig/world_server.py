@@ -13,8 +13,7 @@ import numpy as np
 
 from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand.technician import Press
-from simulators.scene.second_camera import NAME as SECOND
-from simulators.scene.second_camera import SecondCamera
+from simulators.scene.further_cameras import FurtherCamera
 from simulators.scene.world import RADIUS_M, STATIONS, Scene
 
 # Where the technician holds the camera: nearly above the scene, so that no sphere hides another; and, for a further
@@ -55,7 +54,7 @@ class World:
     board_placed: bool = False
     lens_cleanings: int = 0
     pedal_presses: int = 0
-    second: SecondCamera | None = None
+    further: Mapping[str, FurtherCamera] = field(default_factory=dict[str, FurtherCamera])  # by name
     camera_held: bool = False  # in the technician's hands, instead of on the arm
     T_world_held: Array = field(default_factory=HELD_CAMERAS["above"].copy)  # where it is held
     shutter_presses: int = 0  # number of presses of the camera's own button
@@ -83,10 +82,10 @@ class World:
         """The arm that carries the camera: if there are two, the one at the current station."""
         return self.arms[STATIONS.index(self.station) % len(self.arms)]
 
-    def view(self, *, second: bool = False) -> dict[str, Any]:
-        """Return what a camera sees now and what the light box measures, as JSON data.
+    def view(self, name: str = "") -> dict[str, Any]:
+        """Return what a camera sees now and what the light box measures, as JSON data; "": the first camera.
 
-        Raises LookupError if there is no second camera and its view is asked for.
+        Raises LookupError if there is no further camera of this name.
         """
         with self._lock:
             board = self.scene.board_placement(self.board_placements) if self.board_placed else None
@@ -95,10 +94,11 @@ class World:
                 q = self._joints.get(self.camera_arm, self.start_joints_rad)
                 camera = self.scene.true_camera(q, self.station)
             lens = self.scene.camera_intrinsics(self.image_width)
-            if second:
-                if self.second is None:
-                    raise LookupError("there is no second camera")
-                camera, lens = self.second.pose(camera), self.second.lens.scaled(self.image_width)
+            if name:
+                if name not in self.further:
+                    raise LookupError(f"there is no camera {name!r}")
+                one = self.further[name]
+                camera, lens = one.pose(camera), one.lens.scaled(self.image_width)
             return {
                 "T_world_camera": camera.tolist(),
                 "intrinsics": lens.to_json(),
@@ -271,7 +271,7 @@ def _rigid(rows: object) -> Array:
 def _operation(server: WorldServer, request: dict[str, Any]) -> dict[str, Any]:
     match request.get("op"):
         case "view":
-            return server.world.view(second=request.get("camera") == SECOND)
+            return server.world.view(str(request.get("camera", "")))
         case "act":
             return server.act(request)
         case "shutter":

@@ -41,7 +41,7 @@ Operation = Callable[[codec.Request, bytes], Reply]
 
 
 class Operations:
-    """The operations of one camera by their codes; each has a name, by which fault plans know it."""
+    """The operations of one camera by their codes; each has a name, by which fault plans refer to it."""
 
     def __init__(self, body: CameraBody, faults: FaultPlan, operations: Mapping[int, tuple[str, Operation]]) -> None:
         self._camera = body

@@ -12,6 +12,6 @@ from tests.support.pages.browser import chromium
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """Chromium, started once for each file: some tests outside of it start their own."""
+    """Chromium, started once for each file, because some tests elsewhere start their own."""
     with chromium() as running:
         yield running

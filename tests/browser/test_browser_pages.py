@@ -6,7 +6,6 @@ import contextlib
 import re
 import threading
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -162,7 +161,7 @@ class Desk:
     def address(self, path: str) -> str:
         return path.format(**self.names)
 
-    @contextmanager
+    @contextlib.contextmanager
     def attending(self, path: str) -> Generator[str]:
         """Yield the address; the run in progress to which it belongs is driven meanwhile, alone on its rig."""
         address = self.address(path)
@@ -389,7 +388,7 @@ def actions(desk: Desk, run_id: str) -> list[str]:
     return [p.action for p in payloads if isinstance(p, OperatorAction) and p.action != "skip"]
 
 
-@contextmanager
+@contextlib.contextmanager
 def plain_page(browser: Browser, url: str) -> Generator[Page]:
     """A browser with scripts disabled."""
     context = browser.new_context(

@@ -12,6 +12,7 @@ import pytest
 
 from drivers.errors import (
     DeviceRefusedError,
+    DeviceUnavailableError,
 )
 from drivers.interfaces import Camera, CameraSettings
 from simulators.faults import FaultPlan
@@ -39,6 +40,21 @@ def test_identity_and_report(camera: Camera) -> None:
     assert report.free_bytes is not None
     assert report.free_bytes > 1e9
     assert report.problems == ()
+
+
+def test_a_connection_that_breaks_while_it_begins_is_unavailable_and_no_refused_setting(tmp_path: Path) -> None:
+    """libgphoto2 takes the camera for open, and says "Bad parameters" when a setting is read."""
+    plan = [{"device": "camera", "on": "set_event_mode", "kind": "drop"}]
+    with camera_simulator(plan, name="canon") as simulator:
+        camera = driver(simulator.gphoto_port)
+        try:
+            with pytest.raises(DeviceUnavailableError, match="does not tell its settings"):
+                camera.open()
+            camera.open()
+            camera.apply(PAPER)
+            assert camera.capture(tmp_path).counter == 1
+        finally:
+            camera.close()
 
 
 def test_settings_are_applied_and_read_back(camera: Camera) -> None:

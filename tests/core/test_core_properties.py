@@ -377,10 +377,7 @@ def _quick_run(choose: Callable[[AskOperator], str]) -> Log:
         decision = log.decision
         match decision:
             case AskOperator():
-                if choose(decision) == "sign":
-                    log.sign()
-                else:
-                    log.confirm()
+                (log.sign if choose(decision) == "sign" else log.confirm)()
             case RunStep(step, attempt, begin):
                 figures = {"views": 3.0, "sharp": 0.5, "rms_mm": 0.05}
                 done = StepStarted(step=step, attempt=attempt)

@@ -17,7 +17,7 @@ from service.core.errors import ConfigurationError, DataError
 from service.dataset.posed.exporter import exporter, exporters, write_data_set
 from service.dataset.posed.folder import ExportFolder, export_folder
 from service.dataset.posed.pixels import cropped_data_set, undistorted_data_set
-from service.dataset.posed.records import DataSet, Pixels, View
+from service.dataset.posed.records import DataSet, Pixels, PosedView
 from tests.support.scenes.posed import posed_data_set, scene
 
 
@@ -31,26 +31,26 @@ class CutAfter:
     def __init__(self, inner: Pixels, reads: int) -> None:
         self._inner, self.left, self.read = inner, reads, list[str]()
 
-    def picture(self, view: View) -> bytes:
+    def picture(self, view: PosedView) -> bytes:
         if self.left == 0:
             raise PowerCutError
         self.left -= 1
         self.read.append(view.name)
         return self._inner.picture(view)
 
-    def colours(self, view: View) -> NDArray[np.uint8]:
+    def colours(self, view: PosedView) -> NDArray[np.uint8]:
         return self._inner.colours(view)
 
-    def depth_m(self, view: View) -> NDArray[np.float32]:
+    def depth_m(self, view: PosedView) -> NDArray[np.float32]:
         return self._inner.depth_m(view)
 
-    def normal(self, view: View) -> NDArray[np.float32]:
+    def normal(self, view: PosedView) -> NDArray[np.float32]:
         return self._inner.normal(view)
 
-    def valid(self, view: View) -> NDArray[np.bool_]:
+    def valid(self, view: PosedView) -> NDArray[np.bool_]:
         return self._inner.valid(view)
 
-    def markers(self, view: View) -> NDArray[np.bool_]:
+    def markers(self, view: PosedView) -> NDArray[np.bool_]:
         return self._inner.markers(view)
 
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from service.core.geometry import Array, apply, inverse
 from service.dataset.posed.exporter import exporter, write_data_set
-from service.dataset.posed.records import DataSet, View
+from service.dataset.posed.records import DataSet, PosedView
 from tests.support.scenes.posed import posed_data_set, scene
 
 
@@ -49,7 +49,7 @@ def pose_of(position: Any, orientation: Any) -> Array:
     return T
 
 
-def in_time(dataset: DataSet) -> list[View]:
+def in_time(dataset: DataSet) -> list[PosedView]:
     return [dataset.views[k] for k in (0, 2, 1, 3)]
 
 

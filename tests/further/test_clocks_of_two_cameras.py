@@ -54,6 +54,27 @@ def test_whole_seconds_are_no_better_than_seconds() -> None:
     assert found.sigma_s == pytest.approx(1 / 6**0.5 / 2)
 
 
+def test_two_models_are_no_better_known_than_their_delays() -> None:
+    alike = [pair(n, f"2026:11:21 10:0{n}:00.000", f"2026:11:21 10:0{n}:02.500", 1.0) for n in range(4)]
+    models = [
+        capture.model_copy(
+            update={
+                "further": tuple(
+                    one.model_copy(update={"camera": {**one.camera, "model": "B"}}) for one in capture.further
+                )
+            }
+        )
+        for capture in alike
+    ]
+    same, unlike = clock_offset(alike, "second"), clock_offset(models, "second")
+    assert same is not None
+    assert unlike is not None
+    assert (same.unlike, unlike.unlike) == (False, True)
+    assert unlike.offset_s == same.offset_s
+    assert same.sigma_s < 0.01
+    assert unlike.sigma_s >= 0.1
+
+
 def test_zones_are_compared() -> None:
     found = clock_offset([pair(0, "2026:11:21 10:00:00.000+01:00", "2026:11:21 09:00:01.000+00:00", 1.0)], "second")
     assert found is not None

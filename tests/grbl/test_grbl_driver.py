@@ -206,6 +206,95 @@ def test_homing_without_a_switch_fails_and_says_so(tmp_path: Path) -> None:
         travel(arm, -10)
 
 
+def losing(answers: int, after: bytes) -> Callable[[bytes, bool], bytes]:
+    """A line on which so many `ok` are lost, from when the host has sent these bytes."""
+    seen, left = bytearray(), [answers]
+
+    def spoil(data: bytes, sent: bool) -> bytes:
+        if sent:
+            seen.extend(data)
+            return data
+        if after not in seen or not left[0]:
+            return data
+        spoilt = data.replace(b"ok\r\n", b"", left[0])
+        left[0] -= (len(data) - len(spoilt)) // 4
+        return spoilt
+
+    return spoil
+
+
+def test_a_cable_that_is_pulled_while_it_homes_is_unavailable_and_not_a_question_of_leave(tmp_path: Path) -> None:
+    """With a question alone a person could confirm for ever: only opening it again brings the line back."""
+    with table(tmp_path, *fault(on="$H", kind="unplug", value=0.5)) as port, opened(port) as arm:
+        with pytest.raises(DeviceUnavailableError, match="connection is lost"):
+            let_move(arm)
+        wait_for(port.exists)
+        arm.open()
+        with pytest.raises(LeaveNeededError):
+            move(arm, -10)
+        let_move(arm)
+        travel(arm, -10)
+
+
+@pytest.mark.parametrize("lost", ["answer", "command"])
+def test_homing_without_an_answer_is_noticed_long_before_its_longest_time(tmp_path: Path, lost: str) -> None:
+    plan = fault(on="$H", kind="drop") if lost == "command" else ()
+    tap = losing(1, b"$H\n") if lost == "answer" else losing(0, b"")
+    with (
+        table(tmp_path, *plan) as port,
+        Tap(port, tmp_path, tap) as tapped,
+        opened(tapped.port, homing_timeout_s=3600.0) as arm,
+    ):
+        with pytest.raises(LeaveNeededError, match=r"homing failed.*reports that it does not home"):
+            let_move(arm)
+        with pytest.raises(LeaveNeededError):
+            move(arm, -10)
+        let_move(arm)
+        travel(arm, -10)
+        assert tapped.sent.count(b"$H") == 2, "only the controller's answer says that the position is known"
+
+
+def test_a_command_to_home_that_arrives_as_the_one_to_unlock_does_not_count(tmp_path: Path) -> None:
+    """The two differ by one bit, and the controller says ok to both."""
+    spoilt: list[bytes] = []
+
+    def spoil(data: bytes, sent: bool) -> bytes:
+        if sent and b"$H\n" in data and not spoilt:
+            spoilt.append(data)
+            return data.replace(b"$H\n", b"$X\n")
+        return data
+
+    with table(tmp_path) as port, Tap(port, tmp_path, spoil) as tap, opened(tap.port) as arm:
+        with pytest.raises(LeaveNeededError, match="unlocks"):
+            let_move(arm)
+        with pytest.raises(LeaveNeededError):
+            move(arm, -10)
+        let_move(arm)
+        travel(arm, -10)
+        assert tap.sent.count(b"$H") == 2
+
+
+def test_a_lost_answer_to_a_piece_of_a_motion_costs_a_moment(tmp_path: Path) -> None:
+    with table(tmp_path) as port, Tap(port, tmp_path, losing(1, b"$J=")) as tap, opened(tap.port) as arm:
+        let_move(arm)
+        travel(arm, -20)
+        travel(arm, -40)
+        np.testing.assert_allclose(degrees(arm), [-40], atol=0.02)
+
+
+def test_axes_that_ran_dry_do_not_move_on_by_themselves(tmp_path: Path) -> None:
+    with table(tmp_path) as port, Tap(port, tmp_path, losing(3, b"$J=")) as tap, opened(tap.port) as arm:
+        let_move(arm)
+        with pytest.raises(LeaveNeededError, match="did not answer to a part"):
+            travel(arm, -300)
+        stood = degrees(arm)
+        arm.stop()
+        np.testing.assert_allclose(degrees(arm), stood)
+        let_move(arm)
+        travel(arm, -60)
+        np.testing.assert_allclose(degrees(arm), [-60], atol=0.02)
+
+
 @pytest.mark.parametrize(("setting", "words"), [("22=0", r"\$22=1"), ("13=1", r"\$13=0")])
 def test_settings_with_which_positions_would_be_wrong_are_refused(tmp_path: Path, setting: str, words: str) -> None:
     with table(tmp_path, "--setting", setting) as port, pytest.raises(DeviceFaultError, match=words), opened(port):

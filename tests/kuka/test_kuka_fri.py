@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import socket
+import struct
 import time
 from collections.abc import Generator
 from pathlib import Path
@@ -21,6 +23,7 @@ from drivers.host.hosted_device import hosted
 from drivers.interfaces import RobotArm, RobotSample, SettleCriteria
 from drivers.kuka import KukaConfig
 from drivers.kuka.fri.listener import Listener
+from drivers.kuka.fri.protobuf import fields, message_field, number_field
 from drivers.kuka.fri.sample import unpack
 from drivers.kuka.fri.wire import FriError, Monitoring, decode, reply
 from service.core.arms.known import arm_model
@@ -75,6 +78,32 @@ def test_a_spoilt_message_is_refused_or_read_but_never_breaks_the_process(
         return
     with contextlib.suppress(FriError):
         assert isinstance(decode(bytes(raw)), Monitoring)
+
+
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [
+        (4, number_field(3, 1 << 16)),  # the period
+        (1, number_field(2, 1 << 32)),  # the counter
+        (3, message_field(1, b"\x09" + struct.pack("<d", math.nan) + 6 * (b"\x09" + bytes(8)))),  # the joints
+        (3, message_field(1, 7 * (b"\x09" + struct.pack("<d", 7.0)))),
+    ],
+    ids=["period", "counter", "no number", "beyond a turn"],
+)
+def test_a_message_without_checksum_with_numbers_that_no_arm_has_is_refused(part: int, change: bytes) -> None:
+    """The listening process died of the first two, and the poses of the last two were taken."""
+    row = next(one for one in MONITOR if not one["framed"] and one["state"] == "MONITORING_READY")
+    whole = [(number, value) for number, value in fields(bytes.fromhex(row["hex"]))]
+    spoilt = b"".join(
+        message_field(number, value + change if number == part else value)
+        for number, value in whole
+        if isinstance(value, bytes)
+    )
+    listener = Listener()
+    assert listener.take(spoilt, CONTROLLER, 1.0) == (None, None)
+    _, sample = listener.take(bytes.fromhex(row["hex"]), CONTROLLER, 1.01)
+    assert sample is not None
+    assert (sample.received, sample.refused, unpack(sample.pack())) == (1, 1, sample)
 
 
 def monitor(sequence: int, row: dict[str, Any] = MONITOR[0]) -> bytes:

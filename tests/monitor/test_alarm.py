@@ -151,7 +151,7 @@ def test_the_reporter_tells_of_the_robots_stop_and_of_the_end(hook: tuple[type[H
     arm.open()
     devices = OpenDevices(robots={"robot": arm})
     alarm = Alarm(section(webhook={"url": url}, waits_after_s=0), "run", "bench")
-    reporter = Reporter(tmp_path, "run", lambda: devices, BenchRig().camera, alarm)
+    reporter = Reporter(tmp_path, "run", lambda: devices, BenchRig().camera_named, alarm)
     reporter.attend("working", "capture", 1)
     reporter.attend("asking", "capture", 1, asks="confirm", words="Capture: a confirmation is awaited")
     until(lambda: len(kind.taken) == 1, "no alert", 20)

@@ -342,7 +342,7 @@ class Typed:
         self.log = at_failed_capture()
         self.master, self.slave = pty.openpty()
         self.screen = io.StringIO()
-        reporter = Reporter(folder, "run", OpenDevices, BenchRig().camera)
+        reporter = Reporter(folder, "run", OpenDevices, BenchRig().camera_named)
         display = Display(Console(file=self.screen, width=500), reporter)
         self.operator = TerminalOperator(
             "Ada", self.log.protocol, display, SimulatedHands(None), descriptor=self.slave, people=people

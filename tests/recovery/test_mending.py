@@ -86,7 +86,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 def automatic_run(bench: Bench, world: _World) -> RunState:
     """The run with --auto-confirm, with the simulated world as the technician's hands."""
     protocol, _ = recorded_run(bench.store, bench.run_id)
-    reporter = Reporter(bench.data, bench.run_id, OpenDevices, bench.rig.camera)
+    reporter = Reporter(bench.data, bench.run_id, OpenDevices, bench.rig.camera_named)
     host, port = world.server_address[:2]
     operator = AutomaticOperator(
         "Ada", protocol, Display(Console(file=io.StringIO()), reporter), SimulatedHands(f"{host!s}:{port}")

@@ -250,14 +250,17 @@ def two_station_protocol(folder: Path) -> Path:
     return path
 
 
-def test_two_controllers_are_found_and_used(tmp_path: Path) -> None:
+@pytest.mark.parametrize("arm", ["UR10e", "LBR Med 14"])
+def test_two_controllers_are_found_and_used(tmp_path: Path, arm: str) -> None:
+    """An arm at each station, both running at once."""
     data = tmp_path / "data"
-    with simulated_rig(tmp_path, *SMALL, "--arms", "2", host=OWN_HOST) as ready:
+    with simulated_rig(tmp_path, *SMALL, "--arms", "2", "--arm", arm, host=OWN_HOST) as ready:
         answer = orthocapture("doctor", "--rig", ready["rig"], "--json")
         assert answer.returncode == 0, answer.stdout + answer.stderr
         devices = json.loads(answer.stdout)["devices"]
         assert devices["robot_1"]["identity"]["address"] != devices["robot_2"]["identity"]["address"]
         assert all(devices[name]["ok"] for name in ("robot_1", "robot_2", "camera", "lightbox"))
+        assert {devices[name]["identity"]["model"] for name in ("robot_1", "robot_2")} == {arm}
 
         protocol = two_station_protocol(tmp_path)
         answer = orthocapture(

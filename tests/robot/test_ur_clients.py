@@ -1,4 +1,4 @@
-"""The simulated controller with clients for which it was not written: ur_rtde, and RTDE after UR's guide."""
+"""The simulated controller with clients for which it was not written: ur_rtde, and one after UR's guide."""
 
 from __future__ import annotations
 

@@ -20,7 +20,8 @@ from service.store.store import Store
 from service.web.page.run_frame import Banner, robot_banner
 from tests.support.pages.web import web_site
 from tests.support.processes.waiting import until
-from tests.support.rig.bench_rig import BenchArm, BenchLightbox, BenchRig
+from tests.support.rig.bench_lightbox import BenchLightbox
+from tests.support.rig.bench_rig import BenchArm, BenchRig
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 
 RUN = "run"
@@ -31,7 +32,7 @@ class Bench:
 
     def __init__(self, folder: Path, robots: Mapping[str, RobotArm]) -> None:
         self.folder = folder
-        self.reporter = Reporter(folder, RUN, lambda: OpenDevices(robots=robots), BenchRig().camera)
+        self.reporter = Reporter(folder, RUN, lambda: OpenDevices(robots=robots), BenchRig().camera_named)
 
     @property
     def told(self) -> Snapshot:
@@ -209,7 +210,7 @@ def test_the_runner_says_what_it_is_about_to_do(tmp_path: Path) -> None:
 def test_the_signal_tower_shows_how_the_run_stands(tmp_path: Path, arm: BenchArm) -> None:
     box = BenchLightbox()
     devices = OpenDevices(robots={"robot": arm}, lightboxes={"box": box})
-    reporter = Reporter(tmp_path, RUN, lambda: devices, BenchRig().camera)
+    reporter = Reporter(tmp_path, RUN, lambda: devices, BenchRig().camera_named)
     reporter.attend("working", "capture", 1)
     reporter.attend("asking", "capture", 1, asks="recovery", words="Capture: no link")
     assert read_snapshot(tmp_path, RUN).standing == "stopped"

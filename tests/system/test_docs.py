@@ -263,7 +263,7 @@ RUN_ELSEWHERE = {
         "tests/kuka/test_kuka_run.py::test_it_comes_to_its_end_with_every_view"
     ),
     'orthocapture simulate rig --scene 7 --dir rig --camera "Canon EOS R5"': (
-        "tests/canon/test_canon_run.py::test_it_comes_to_its_end_with_every_view"
+        "tests/further/test_second_camera_whole_run.py::test_it_comes_to_its_end_with_every_view"
     ),
     "orthocapture simulate canon": "tests/canon/test_canon_driver.py::test_identity_and_report",
     "orthocapture simulate kuka": "tests/kuka/test_kuka_driver.py::test_a_day_without_trouble",

@@ -4,34 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Generator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from service.cli.run.demo import true_errors_mm
 from service.core.records.events import OperatorAction
-from service.dataset.summary import RunSummary, summarise
-from service.run_start import recorded_run
-from service.store.store import Store
 from tests.support.protocols.shortened import shortened
 from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig
+from tests.support.runs.ended_run import EndedRun, ended_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 WIDTH, SLICE_MM = "960", 1.0
 
 
-@dataclass(frozen=True)
-class Whole:
-    """The run that the tests of this file share."""
-
-    data: Path
-    summary: RunSummary
-    true_mm: dict[str, float]
-
-
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Generator[Whole]:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Generator[EndedRun]:
     folder = tmp_path_factory.mktemp("whole")
     data = folder / "data"
     protocol = REPOSITORY / "protocols" / "exvivo_spine.yaml"
@@ -43,13 +30,11 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Generator[Whole]:
             "--json", timeout_s=1400,
         )  # fmt: skip
     assert answer.returncode == 0, answer.stdout[-2000:] + answer.stderr[-3000:]
-    with Store.open(data, create=False) as store:
-        run_id = store.find_run("latest")
-        summary = summarise(store, run_id, recorded_run(store, run_id)[0])
-        yield Whole(data, summary, true_errors_mm(summary, Path(rig["truth"])))
+    with ended_run(data, Path(rig["truth"])) as ended:
+        yield ended
 
 
-def test_it_comes_to_its_end_without_a_person(whole: Whole) -> None:
+def test_it_comes_to_its_end_without_a_person(whole: EndedRun) -> None:
     state = whole.summary.state
     assert state.status == "completed"
     assert {step.phase for step in state.steps.values()} == {"passed"}
@@ -60,7 +45,7 @@ def test_it_comes_to_its_end_without_a_person(whole: Whole) -> None:
     assert {action.action for action in actions} <= {"confirm", "sign"}
 
 
-def test_every_kind_of_view_is_there(whole: Whole) -> None:
+def test_every_kind_of_view_is_there(whole: EndedRun) -> None:
     captured = {name: len(step.captured) for name, step in whole.summary.state.steps.items() if step.captured}
     assert captured["intrinsics"] >= 15
     assert captured["hand_eye"] >= 12
@@ -72,7 +57,7 @@ def test_every_kind_of_view_is_there(whole: Whole) -> None:
 _VIEWS = (("viewpoint_capture", 8), ("control_capture", 2))
 
 
-def test_errors_are_those_of_a_good_data_set(whole: Whole) -> None:
+def test_errors_are_those_of_a_good_data_set(whole: EndedRun) -> None:
     rows = {row.poses: row for row in whole.summary.table()}
     assert {"robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid"} <= set(rows)
     # The arm's errors remain; everything else is fitted to the images, which are small here.
@@ -82,7 +67,7 @@ def test_errors_are_those_of_a_good_data_set(whole: Whole) -> None:
         assert whole.true_mm[source] < 0.1
 
 
-def test_the_evidence_verifies(whole: Whole) -> None:
+def test_the_evidence_verifies(whole: EndedRun) -> None:
     answer = orthocapture("audit", "verify", "latest", "--data", str(whole.data), "--json", timeout_s=300)
     assert answer.returncode == 0, answer.stdout
     assert json.loads(answer.stdout)["ok"] is True

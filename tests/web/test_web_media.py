@@ -132,9 +132,9 @@ def test_what_is_no_picture_has_no_thumbnail(shown: Shown) -> None:
 
 def test_live_frames_come_only_while_somebody_asks_and_never_old_ones(shown: Shown) -> None:
     data = shown.site.site.data
-    assert not frames_wanted(data, shown.run)
+    assert frames_wanted(data, shown.run) is None
     assert shown.browser.get(f"{shown.address}/live-view").status_code == 204
-    assert frames_wanted(data, shown.run)
+    assert frames_wanted(data, shown.run) == ""
     write_frame(data, shown.run, b"\xff\xd8frame")
     answer = shown.browser.get(f"{shown.address}/live-view")
     assert (answer.status_code, answer.content) == (200, b"\xff\xd8frame")

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import trimesh
 
+from bench.torture.faults.place.ct_suite import Suite
 from bench.torture.faults.place.disk import FaultyDisk, JumpingClock
 from bench.torture.faults.place.material import SCAN, ct_folder, mirrored_ct, other_ct, scan_folder, spoilt_ct
 from bench.torture.faults.place.newer_rigs import Film, pendant
@@ -266,6 +267,31 @@ def _kuka_stop(trial: Trial) -> None:
     trial.stopped()
 
 
+# --- a CT suite that sends -------------------------------------------------------------------------------------
+
+
+def _suite(trial: Trial) -> Suite:
+    assert trial.suite is not None
+    return trial.suite
+
+
+def _killed_in_between(trial: Trial) -> None:
+    _suite(trial).send()
+    _suite(trial).kill_receiver()
+
+
+def _send_again(trial: Trial) -> None:
+    """What a person does at the CT suite, once the receiver can be reached."""
+    if trial.case.spoil is not None and trial.case.spoil.column.startswith("away_"):
+        trial.await_return()
+    _suite(trial).send_again()
+
+
+def _listen_and_send(trial: Trial) -> None:
+    _suite(trial).listen()
+    _suite(trial).send_again()
+
+
 ACTS: Mapping[str, Callable[[Trial], None]] = {
     "nothing": lambda _trial: None,
     "slider": lambda trial: _slider(trial, float(trial.case.value["fraction"])),
@@ -283,6 +309,11 @@ ACTS: Mapping[str, Callable[[Trial], None]] = {
     "clock": _jump,
     "lock": _lock,
     "data_away": _data_away,
+    "send": lambda trial: _suite(trial).send(),
+    "send_cut": lambda trial: _suite(trial).cut(),
+    "send_spoilt": lambda trial: _suite(trial).send_spoilt(str(trial.case.value["kind"])),
+    "send_two": lambda trial: _suite(trial).send_two(),
+    "receiver_killed": _killed_in_between,
     "unplug": lambda trial: trial.simulators.stop(("lightbox",)),
     "camera_off": lambda trial: trial.simulators.stop(("camera",)),
     "film": lambda trial: _film(trial).run(str(trial.case.value["how"])),
@@ -301,6 +332,9 @@ MENDS: Mapping[str, Callable[[Trial], None]] = {
     "kuka_release": lambda trial: pendant(trial, "release"),
     "scan": _whole_scan,
     "ct": _whole_ct,
+    "send": _send_again,
+    "listen": _listen_and_send,
+    "send_afresh": lambda trial: _suite(trial).send_afresh(),
     "share_back": _share_back,
     "disk": _mend_disk,
     "data_back": _data_back,

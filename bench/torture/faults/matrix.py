@@ -49,6 +49,17 @@ _CAMERA: dict[str, tuple[str, int, int, int]] = {
     "ptpip/file": ("a packet of a file", 1, 2, 1),
     "ptpip/request": ("a request to the camera", 1, 6, 1),
 }
+# What Sony's bodies do not have, and the files: an EOS tells everything as an answer to the polling of its events.
+_CANON: dict[str, tuple[str, int, int, int]] = {
+    "ptpip/remote_mode": ("the answer to the remote mode", -1, 1, 1),
+    "ptpip/event_mode": ("the answer to the event mode", -1, 1, 1),
+    "ptpip/events": ("a packet of the camera's events", 1, 4, 1),
+    "ptpip/eos_set": ("the answer to a setting", -1, 2, 1),
+    "ptpip/press": ("the answer to the full press of the shutter", 1, 2, 1),
+    "ptpip/let_go": ("the answer to its release", 1, 1, 1),
+    "ptpip/file_info": ("the description of a file", 1, 1, 1),
+    "ptpip/file": ("a packet of a file", 1, 2, 1),
+}
 _TABLE: dict[str, tuple[str, int, int, int]] = {
     "grbl/welcome": ("the controller's welcome", -1, 1, 1),
     "grbl/setting": ("a setting", -1, 20, 1),
@@ -56,6 +67,8 @@ _TABLE: dict[str, tuple[str, int, int, int]] = {
     "grbl/answer": ("the answer to a piece of a motion", 1, 3, 1),
     "grbl/query": ("a request for a report", 1, 20, 1),
     "grbl/jog": ("a piece of a motion", 1, 3, 1),
+    "grbl/home": ("the command to home", -1, 1, 1),
+    "grbl/homed": ("the answer to homing", -1, 1, 1),
 }
 _KUKA: dict[str, tuple[str, int, int, int]] = {
     "lines/hello": ("the application's greeting", -1, 1, 1),
@@ -64,6 +77,20 @@ _KUKA: dict[str, tuple[str, int, int, int]] = {
     "lines/done": ("the end of a motion", 1, 1, 1),
     "lines/request": ("a request to the application", 1, 1, 1),
     "lines/beat": ("a sign of life", 1, 20, 1),
+}
+# Datagrams, a hundred a second; forty of them are spoilt, of those that nobody waits for.
+_FRI: dict[str, tuple[str, int, int, int]] = {
+    "fri/message": ("each of 40 messages of FRI", 1, 20, 40),
+    "fri/reply": ("each of 40 replies to FRI", 1, 20, 40),
+}
+_LISTEN: dict[str, tuple[str, int, int, int]] = {
+    "dicom/associate": ("the request of an association", -1, 1, 1),
+    "dicom/accept": ("the answer to it", -1, 1, 1),
+    "dicom/command": ("the head of a slice", -1, 30, 1),
+    "dicom/slice": ("a slice", -1, 30, 1),
+    "dicom/stored": ("the answer to a slice", -1, 30, 1),
+    "dicom/release": ("the end of an association", -1, 1, 1),
+    "dicom/released": ("the answer to its end", -1, 1, 1),
 }
 _LIGHTBOX: dict[str, tuple[str, int, int, int]] = {
     "serial/identity": ("the box's identity", -1, 1, 1),
@@ -75,18 +102,30 @@ _LIGHTBOX: dict[str, tuple[str, int, int, int]] = {
 # Messages that the protocol cannot refuse, or that cannot be reordered because the sender waits for the answer.
 _NO_REFUSAL = {"rtde/controller", "rtde/stream", "rtde/command", "dashboard/welcome", "script/script"} | {
     "ptpip/event", "ptpip/request", "serial/request", "grbl/welcome", "grbl/status", "grbl/query", "grbl/jog",
-    "lines/state", "lines/done", "lines/request", "lines/beat",
+    "lines/state", "lines/done", "lines/request", "lines/beat", "grbl/home", "fri/message", "fri/reply",
+    "dicom/associate", "dicom/command", "dicom/slice", "dicom/release", "dicom/released",
 }  # fmt: skip
 
 
-def _wires(device: str, scene: Scene, kinds: dict[str, tuple[str, int, int, int]]) -> Iterator[Case]:
+def _wires(device: str, scene: Scene, kinds: dict[str, tuple[str, int, int, int]], act: str = "") -> Iterator[Case]:
     for place, (what, after, nth, times) in kinds.items():
         kind = place.split("/")[1]
         for column, happens in COLUMNS.items():
             if column == "reject" and place in _NO_REFUSAL:
                 continue
-            spoil = Spoil(kind, column, nth, times)
-            yield Case(f"{device}/{place}/{column}", scene, f"{what} {happens}", spoil, after)
+            spoil = Spoil(kind, column, nth, 1 if column.startswith("away_") else times)
+            # With noise libgphoto2 hangs at an EOS until its process is killed, a minute for each attempt.
+            patience = 1 if scene == "canon" and column in ("noise", "mutated") else 3
+            yield Case(
+                f"{device}/{place}/{column}",
+                scene,
+                f"{what} {happens}",
+                spoil,
+                after,
+                act=act,
+                mend=act,
+                patience=patience,
+            )
 
 
 def _robot_itself() -> Iterator[Case]:
@@ -238,6 +277,19 @@ def _files() -> Iterator[Case]:
     yield Case("ct/series/none", "ct", "there is no series", act="no_export", mend="ct")
 
 
+def _listen_itself() -> Iterator[Case]:
+    def case(name: str, what: str, act: str, mend: str, **value: object) -> Case:
+        return Case(f"listen/itself/{name}", "listen", what, act=act, mend=mend, value=value)
+
+    yield case("sender_killed", "the sender dies in the middle of a series", "send_cut", "send")
+    yield case("sender_killed_on", "the same, and nobody sends again", "send_cut", "")
+    yield case("receiver_killed", "the receiver is killed in the middle of a series", "receiver_killed", "listen")
+    yield case("disk_full", "the disk is full", "send", "listen", full=True)
+    yield case("slice_missing", "a slice is missing in what is sent", "send_spoilt", "send_afresh", kind="drop")
+    yield case("slice_cut", "a slice that is sent ends early", "send_spoilt", "send_afresh", kind="truncate")
+    yield case("two_series", "two series are sent at once", "send_two", "send_afresh")
+
+
 # Calls of each kind that a capture makes after its first image is recorded: the disk fails at each of them.
 _CALLS = {"write": 6, "sync_file": 6, "rename": 5, "make_read_only": 4, "sync_directory": 8, "commit": 6, "append": 1}
 
@@ -279,14 +331,18 @@ def cases() -> dict[str, Case]:
         *_more_of_the_robot(),
         *_wires("camera", "camera", _CAMERA),
         *_camera_itself(),
+        *_wires("canon", "canon", _CANON),
         *_wires("lightbox", "lightbox", _LIGHTBOX),
         Case("lightbox/itself/unplugged", "lightbox", "the serial cable is unplugged", after=1, act="unplug"),
         *_wires("table", "table", _TABLE),
         *_table_itself(),
         *_wires("kuka", "kuka", _KUKA),
+        *_wires("kuka", "fri", _FRI),
         *_kuka_itself(),
         *_video_itself(),
         *_files(),
+        *_wires("listen", "listen", _LISTEN, act="send"),
+        *_listen_itself(),
         *_store(),
     ]
     return {case.name: case for case in found}

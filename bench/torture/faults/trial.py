@@ -18,6 +18,7 @@ from bench.torture.faults.acts import ACTS, MENDS, SEAMS
 from bench.torture.faults.case import Case
 from bench.torture.faults.judgement import rules
 from bench.torture.faults.judgement.verdict import Verdict, errors_of, first_words, listed, masked, policy_of
+from bench.torture.faults.place.ct_suite import Suite
 from bench.torture.faults.place.disk import FaultyDisk, JumpingClock
 from bench.torture.faults.place.laboratory import (
     CT,
@@ -49,8 +50,10 @@ from tests.support.rig.bench_rig import BenchArm, BenchCamera
 STATIONS: dict[str, dict[str, Any]] = {
     "table": {"station": TABLE_STATION, "camera_m": 0.0},
     "kuka": {"station": KUKA_STATION},
+    "fri": {"station": KUKA_STATION},
 }
 _UNSIGNED = "the record could not be signed"
+_IMPORTS = ("scan", "ct", "listen")  # scenes without views, whose jobs are worked on here
 _SESSIONS = 3  # programs that drive the run in turn, if an error ends them
 
 
@@ -86,6 +89,7 @@ class Trial:
         self.words: list[str] = []
         self.verdict = Verdict(case.name)
         self.film: Film | None = None
+        self.suite: Suite | None = None
         self._eye: Motions = Motions()
 
     # --- the rig ------------------------------------------------------------------------------------------
@@ -111,18 +115,21 @@ class Trial:
     def _laboratory(self) -> Laboratory:
         devices = {
             "arm": self._arm_devices,
-            "camera": self._camera_devices,
+            "camera": lambda: self._camera_devices("camera"),
+            "canon": lambda: self._camera_devices("canon"),
             "lightbox": self._lightbox_devices,
             "scan": self._scan_devices,
             "ct": self._ct_devices,
+            "listen": self._listen_devices,
             "table": lambda: {"robot": table_rig(self, self._plan())},
             "kuka": lambda: {"robot": kuka_rig(self, self._plan())},
+            "fri": lambda: {"robot": kuka_rig(self, self._plan(), fri=True)},
             "video": lambda: {"camera": video_rig(self)},
         }
         scene = self.case.scene
         rig = write_rig(self.folder, devices[scene]() if scene in devices else {}, **STATIONS.get(scene, {}))
-        self.arm = arm = None if scene in ("arm", "table", "kuka") else BenchArm()
-        self.shutter = shutter = None if scene in ("camera", "video") else BenchCamera(picture=exposed)
+        self.arm = arm = None if scene in ("arm", "table", "kuka", "fri") else BenchArm()
+        self.shutter = shutter = None if scene in ("camera", "canon", "video") else BenchCamera(picture=exposed)
         if arm is not None:
             arm.on_move = self._eye.began
         elif scene == "arm":
@@ -148,8 +155,8 @@ class Trial:
         limits = {"connect_timeout_s": 2.0, "watchdog_s": 1.0, "stale_after_s": 2.0}
         return {"robot": {"driver": "ur", "host": host, **limits}}
 
-    def _camera_devices(self) -> dict[str, Any]:
-        words = ("camera", "--port", "0", "--fast", "--image-width", "96", *self._plan(), *self.case.options)
+    def _camera_devices(self, body: str) -> dict[str, Any]:
+        words = (body, "--port", "0", "--fast", "--image-width", "96", *self._plan(), *self.case.options)
         ready = self.simulators.start(*words)
         port, near_port = int(ready["port"]), 15740
         self.wired(Wire("camera", "ptpip", (self._near_host, near_port), ("127.0.0.1", port)))
@@ -174,6 +181,10 @@ class Trial:
             "scanner": {"driver": "scan_folder", "folder": str(scans), "stable_s": 0.5},
             "ct": {"driver": "dicom_folder", "folder": str(self.scene_folder), "stable_s": 0.5},
         }
+
+    def _listen_devices(self) -> dict[str, Any]:
+        self.suite = Suite(self)
+        return self.suite.rig(full=bool(self.case.value.get("full")))
 
     # --- the run ------------------------------------------------------------------------------------------
 
@@ -201,7 +212,7 @@ class Trial:
             logging.getLogger(chatty).setLevel(logging.WARNING)
 
     def _begin(self, store: Store, station: Laboratory) -> str:
-        text = {"scan": SCAN, "ct": CT, "table": TABLE}.get(self.case.scene, PROTOCOL)
+        text = {"scan": SCAN, "ct": CT, "listen": CT, "table": TABLE}.get(self.case.scene, PROTOCOL)
         distance_m = self.case.value.get("distance_m", 0.5 if self.case.scene == "arm" else 0.6)
         source = text.replace("DISTANCE", str(distance_m)).encode()
         loaded = parse_protocol(source, params_models(), name="faults.yaml")
@@ -287,7 +298,9 @@ class Trial:
 
     def _look(self, state: RunState) -> None:
         self._arm_now(len(state.steps["capture"].captured) if "capture" in state.steps else 0)
-        if state.current and self.case.scene in ("scan", "ct"):
+        if self.suite is not None:
+            self.suite.look()
+        if state.current and self.case.scene in _IMPORTS:
             self._work()
 
     def _arm_now(self, captured: int) -> None:
@@ -304,7 +317,7 @@ class Trial:
 
     def _prepare(self, step: str) -> None:
         """Prepare a step, as a technician does."""
-        if self.case.scene == "ct" and step == "scan":
+        if self.case.scene in ("ct", "listen") and step == "scan":
             scan_folder(self.folder / "scans", self.material, FIVE)
 
     def _mend(self) -> None:
@@ -312,9 +325,9 @@ class Trial:
         if mend is not None:
             mend(self)
         elif self.proxy is not None and self.case.spoil is not None and self.case.spoil.column.startswith("away_"):
-            self._await_return()
+            self.await_return()
 
-    def _await_return(self) -> None:
+    def await_return(self) -> None:
         """Wait until the device is back, unless it never comes back."""
         assert self.proxy is not None
         assert self.case.spoil is not None
@@ -329,7 +342,7 @@ class Trial:
 
     def _work(self) -> None:
         """Work on jobs in this process, as a worker process does."""
-        if self.case.scene not in ("scan", "ct"):
+        if self.case.scene not in _IMPORTS:
             return
         if not database_path(self.data).exists():
             return
@@ -357,8 +370,12 @@ class Trial:
         if not verdict.end:
             verdict.end = f"the run is {status or 'stopped'}"
             verdict.broken.append(f"{verdict.end}, but no way on is listed")
-        views = VIEWS if self.case.scene not in ("scan", "ct") else ()
-        logs = (self.folder / "program.log", self.folder / "said.log")
+        views = VIEWS if self.case.scene not in _IMPORTS else ()
+        logs = (self.folder / "program.log", self.folder / "said.log", self.folder / "received.log")
+        if self.suite is not None:
+            column = self.case.spoil.column if self.case.spoil else ""
+            self.suite.check(content=column not in ("corrupt", "mutated"))
+            verdict.broken += self.suite.faults
         verdict.broken += rules.broken(events, self._eye, self.data, views, status, logs)
 
 

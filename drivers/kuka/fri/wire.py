@@ -6,6 +6,7 @@ and a CRC-32 behind it; which form a controller speaks shows in its messages.
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from drivers.kuka.fri.protobuf import ProtobufError, doubles, fields, message_fi
 JOINTS = 7
 _MONITORING, _REPLY = 0x245142, 0x34001  # identifiers of the messages of an LBR
 _FRAME = struct.Struct("<I")
+_COUNTERS, _LONGEST_PERIOD_MS = 1 << 32, 1 << 16
+_FULL_TURN = 2 * math.pi  # more than any joint of an LBR turns
 
 
 class FriError(ValueError):
@@ -82,18 +85,23 @@ def decode(datagram: bytes) -> Monitoring:
         commanded = doubles(monitor[3], 1) if 3 in monitor else None
         joints = doubles(monitor.get(1, b""), 1)
         stamp = _numbers(monitor, 15)
+        sequence, period_ms = header.get(2, 0), connection.get(3, 0)
         session, quality = Session(connection.get(1, 0)), Quality(connection.get(2, 0))
     except (ProtobufError, ValueError) as error:
         raise error if isinstance(error, FriError) else FriError(str(error)) from error
+    if sequence >= _COUNTERS or period_ms >= _LONGEST_PERIOD_MS:
+        raise FriError(f"the message has the number {sequence} and the period {period_ms} ms")
+    if not all(abs(q) <= _FULL_TURN for q in (*joints, *(commanded or ()))):  # NaN is none either
+        raise FriError(f"the message has joints that no arm has: {joints}")
     if session is not Session.IDLE and (len(joints) != JOINTS or 1 not in stamp):
         raise FriError(f"the message has {len(joints)} joints and {'a' if stamp else 'no'} time")
     return Monitoring(
         framed=framed,
-        sequence=header.get(2, 0),
+        sequence=sequence,
         reflected=header.get(3, 0),
         session=session,
         quality=quality,
-        period_ms=connection.get(3, 0),
+        period_ms=period_ms,
         answer_every=max(1, connection.get(4, 1)),
         joints_rad=joints,
         commanded_rad=commanded if commanded and len(commanded) == JOINTS else None,

@@ -17,6 +17,7 @@ from service.audit.report.sections.course import (
     steps_section,
 )
 from service.audit.report.sections.facts import facts
+from service.audit.report.sections.further_cameras import further_cameras_section
 from service.audit.report.sections.notes import notes_section
 from service.audit.report.sections.origin import devices_section, software_section
 from service.audit.report.sections.photographs import pictures_section
@@ -82,6 +83,7 @@ def _sections(
         accuracy_section(summary, true_error_mm),
         later_section(summary),
         budget_section(summary),
+        further_cameras_section(run),
         steps_section(run),
         people_section(run),
         notes_section(run, with_pictures=with_pictures),

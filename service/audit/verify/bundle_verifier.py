@@ -764,7 +764,7 @@ def ed25519_fits(raw: bytes, signature: bytes, message: bytes) -> bool:
 
 
 def in_use(item: Mapping[str, Any], key: Mapping[str, Any]) -> bool:
-    """Whether a key was the one in use where the site's chain was; a replaced one still vouches for its successor."""
+    """Whether a key was in use when an item was signed. A key's last act is to sign the key that replaces it."""
     at, replaced = item.get("site_seq"), key["replaced_seq"]
     if not isinstance(at, int):
         return False

@@ -8,7 +8,8 @@ import os
 import subprocess
 import sys
 from difflib import get_close_matches
-from typing import Annotated, Any, Literal
+from enum import Enum
+from typing import Annotated, Any
 
 import typer
 
@@ -18,7 +19,7 @@ _SIMULATORS = (sys.executable, "-m", "simulators")
 
 
 def simulate_command(context: typer.Context) -> None:
-    """Start a simulated device (ur, kuka, camera, scanner, ct, lightbox) or a whole rig, until it is terminated.
+    """Start a simulated device (ur, kuka, camera, gige and others) or a whole rig, until it is terminated.
 
     It prints one line of JSON with its addresses when it is ready. `orthocapture simulate rig --help` lists options.
     """
@@ -91,7 +92,7 @@ def _option(option: dict[str, Any]) -> inspect.Parameter:
     flags = option["flags"]
     single: Any = {"int": int, "float": float}.get(option["number"], str)
     if option["choices"]:
-        single = Literal[tuple(option["choices"])]
+        single = Enum("Choice", {choice: choice for choice in option["choices"]})  # typer has no lists of literals
     kind: Any = bool if option["flag"] else list[single] if option["many"] else single | None
     declared = typer.Option(*flags, metavar=None if option["flag"] else option["metavar"] or None, help=words)
     return inspect.Parameter(

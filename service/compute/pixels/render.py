@@ -25,7 +25,7 @@ _GRAZING = -1e-4  # cosine of the steepest ray: beyond, a plane's depth is not d
 
 
 @dataclass(frozen=True, slots=True)
-class SeenRows:
+class SurfaceRows:
     """Some rows of an image.
 
     Attributes:
@@ -40,8 +40,8 @@ class SeenRows:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """A whole image: `depth_m` (H, W) and `normal` (H, W, 3) as in SeenRows."""
+class SurfaceImage:
+    """A whole image: `depth_m` (H, W) and `normal` (H, W, 3) as in SurfaceRows."""
 
     depth_m: Float32s
     normal: Float32s
@@ -52,7 +52,7 @@ class Seen:
         return self.depth_m > 0
 
 
-def seen_rows(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Iterator[SeenRows]:
+def seen_rows(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Iterator[SurfaceRows]:
     """The mesh as the camera at T_world_camera (4, 4) sees it, from the first rows of the image to the last.
 
     Raises:
@@ -70,7 +70,7 @@ def seen_rows(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) 
         yield _on_planes(planes.take(face, axis=0, mode="wrap"), rays, begin, end)
 
 
-def _on_planes(planes: NDArray[np.float64], rays: PixelRays, begin: int, end: int) -> SeenRows:
+def _on_planes(planes: NDArray[np.float64], rays: PixelRays, begin: int, end: int) -> SurfaceRows:
     """Depth and normal of the rays of some rows on the planes (N, 4) of the faces that they hit."""
     plane = planes.reshape(end - begin, rays.width, 4)
     xy = rays.xy(begin, end)
@@ -84,10 +84,10 @@ def _on_planes(planes: NDArray[np.float64], rays: PixelRays, begin: int, end: in
     normal = plane[..., :3].astype(np.float32)
     if np.count_nonzero(hidden & (plane[..., 3] < 0)):
         normal[hidden] = 0.0
-    return SeenRows(begin, depth, normal)
+    return SurfaceRows(begin, depth, normal)
 
 
-def seen(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Seen:
+def seen(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> SurfaceImage:
     """The whole image at once: 16 bytes for each pixel, 1 GB at 60 million.
 
     Raises:
@@ -98,7 +98,7 @@ def seen(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Se
     for rows in seen_rows(surface, camera, T_world_camera):
         depth[rows.first : rows.first + len(rows.depth_m)] = rows.depth_m
         normal[rows.first : rows.first + len(rows.depth_m)] = rows.normal
-    return Seen(depth, normal)
+    return SurfaceImage(depth, normal)
 
 
 def depth_map(surface: RayMesh, camera: CameraModel, T_world_camera: Transform) -> Float32s:

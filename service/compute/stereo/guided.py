@@ -23,7 +23,7 @@ _FEWEST = 2000  # pixels that agree; a pair with fewer does not show the same
 def guided_depth(pair: Rectified, guess: RayMesh, distance_m: float) -> DepthMap | None:
     """Depth of the left image of a pair, searched around a guessed surface; None if too little agrees.
 
-    One image is drawn as the other camera would see it if the guess were true; what is left is matched.
+    One image is drawn as the other camera would see it if the guess were true, and then matched with the other.
     """
     left, right = pair.left_camera, pair.right_camera
     forward = _disparity_of(guess, left, pair.T_world_left, pair)

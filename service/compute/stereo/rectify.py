@@ -1,6 +1,6 @@
-"""Rectification of a pair by hand: rows along the baseline, both principal points moved to what is looked at.
+"""Rectification of a pair: rows along the baseline, and both principal points moved to the surface that is seen.
 
-`cv2.stereoRectify` gives absurd images for steep pairs, because it keeps the principal points together.
+It replaces `cv2.stereoRectify`, which keeps the principal points together and so gives absurd images for steep pairs.
 """
 
 from __future__ import annotations

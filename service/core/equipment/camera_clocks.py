@@ -11,6 +11,7 @@ from statistics import fmean, stdev
 from service.core.equipment.recorded_devices import recorded_optics
 from service.core.records.events import FurtherExposure, ViewpointCaptured
 
+_UNLIKE_S = 0.1  # sigma of the difference between two models' delays, from the command to the exposure
 _FORMS = ("%Y:%m:%d %H:%M:%S.%f%z", "%Y:%m:%d %H:%M:%S.%f", "%Y:%m:%d %H:%M:%S%z", "%Y:%m:%d %H:%M:%S")
 
 
@@ -20,13 +21,16 @@ class ClockOffset:
 
     Attributes:
         offset_s: of the further camera's clock minus the first one's.
-        sigma_s: of the mean: by the scatter of the photographs, or by the resolution of their times if that is more.
+        sigma_s: of the mean: by the scatter of the photographs, or by the resolution of their times if that is more;
+            for cameras of two models, with what their delays may differ by.
         photographs: pairs of them that state their times alike.
+        unlike: whether the cameras are of two models.
     """
 
     offset_s: float
     sigma_s: float
     photographs: int
+    unlike: bool = False
 
 
 def clock_offset(captures: Sequence[ViewpointCaptured], device: str) -> ClockOffset | None:
@@ -34,7 +38,8 @@ def clock_offset(captures: Sequence[ViewpointCaptured], device: str) -> ClockOff
 
     Between the two exposures at a viewpoint the host's clock tells how much time passed. What the time that both
     photographs state differs from that is the offset. A difference between the cameras' delays, from the command to
-    the exposure, is part of it.
+    the exposure, is part of it. Two bodies of one model have the same delay. Those of two models may differ by some
+    tenths of a second, which no number of photographs averages out.
     """
     pairs = [(c, exposure) for c in captures for exposure in c.further if exposure.device == device]
     found = [offset for capture, exposure in pairs if (offset := _of_pair(capture, exposure)) is not None]
@@ -43,7 +48,9 @@ def clock_offset(captures: Sequence[ViewpointCaptured], device: str) -> ClockOff
     offsets = [offset for offset, _ in found]
     coarse_s = max(resolution for _, resolution in found) / math.sqrt(6)  # two rounded times, each r / sqrt(12)
     scatter_s = stdev(offsets) if len(offsets) > 1 else 0.0
-    return ClockOffset(fmean(offsets), max(coarse_s, scatter_s) / math.sqrt(len(offsets)), len(offsets))
+    sigma_s = max(coarse_s, scatter_s) / math.sqrt(len(offsets))
+    unlike = any(recorded_optics(capture.camera).model != recorded_optics(one.camera).model for capture, one in pairs)
+    return ClockOffset(fmean(offsets), math.hypot(sigma_s, _UNLIKE_S if unlike else 0.0), len(offsets), unlike)
 
 
 def _of_pair(capture: ViewpointCaptured, exposure: FurtherExposure) -> tuple[float, float] | None:

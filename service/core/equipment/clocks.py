@@ -125,10 +125,10 @@ def clock_readings(events: Sequence[Event]) -> tuple[ClockReading, ...]:
             note = "" if clock.synchronised else "not set by the network"
             host = [ClockReading("host", "NTP", clock.offset_s, HOST_LIMIT_S, event.at_utc, note)]
     reports = {name: _report(event) for name, event in opened.items()}
-    kinds = Counter(report.identity.kind for report in reports.values())
-    # A capture does not say which of several cameras or arms it came from.
     further = {exposure.device for capture in both for exposure in capture.further}
-    of_captures = {name for name, report in reports.items() if kinds[report.identity.kind] == 1}
+    # A capture does not say from which of several arms, or of several first cameras, it came.
+    kinds = Counter(report.identity.kind for name, report in reports.items() if name not in further)
+    of_captures = {n for n, report in reports.items() if n not in further and kinds[report.identity.kind] == 1}
     found: list[ClockReading] = []
     for name, event in opened.items():
         since = (first[name], newest) if name in first and newest is not None and name in of_captures else None
@@ -144,6 +144,8 @@ def _against_the_first(device: str, captures: Sequence[ViewpointCaptured], at_ut
     if found is None:
         return []
     note = f"± {found.sigma_s:.3f} s, by {counted(found.photographs, 'pair')} of photographs"
+    if found.unlike:
+        note += "; two models, whose delays from command to exposure differ"
     return [ClockReading(device, "first camera", found.offset_s, DEVICE_LIMIT_S, at_utc, note)]
 
 

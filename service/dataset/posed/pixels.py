@@ -93,11 +93,11 @@ class Photographs:
         return seen(self._surface, view.camera, view.T_world_camera).normal
 
     def valid(self, view: PosedView) -> NDArray[np.bool_]:
-        """All pixels."""
+        """(H, W) which pixels the photograph has: all of them."""
         return np.ones((view.camera.height, view.camera.width), dtype=np.bool_)
 
     def markers(self, view: PosedView) -> NDArray[np.bool_]:
-        """Spheres and posts."""
+        """(H, W) which pixels show a sphere or a post."""
         return marker_mask(view.camera, view.T_world_camera, self._balls, self._posts)
 
 

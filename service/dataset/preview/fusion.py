@@ -25,7 +25,7 @@ _PARTS = ((Source.CT, "CT", "#d65e00"), (Source.BLEND, "blend", "#f0e442"), (Sou
 
 @dataclass(frozen=True, slots=True)
 class VertexFigures:
-    """Of points on the mesh: colours for the source and for the standard deviation."""
+    """Colours of points on the mesh, for their source and for their standard deviation."""
 
     sources: MeshColours
     sigmas: MeshColours

@@ -42,6 +42,7 @@ class Arguments(JobRecord):
         sphere_covariance_m2: (3, 3) of each centre.
         radius_m: of the spheres.
         colour: of the spheres, if the protocol states it.
+        developed: file of the job `develop` by viewpoint, in which the outlines are measured; None: in the images.
     """
 
     device: str
@@ -53,6 +54,7 @@ class Arguments(JobRecord):
     sphere_covariance_m2: tuple[Matrix, ...]
     radius_m: float
     colour: str | None = None
+    developed: dict[str, Hash] | None = None
 
 
 class Answer(JobRecord):
@@ -62,6 +64,9 @@ class Answer(JobRecord):
         device: name of the camera in rig.yaml.
         mounted: fixed in the room, or rigid beside the first camera.
         camera: its intrinsics.
+        calibration: file with them.
+        outlines: file with the outlines of its images, by viewpoint.
+        measured_on: whether these were measured in its JPEGs or in its developed raw files.
         T_outer_camera: None if its images do not tell; `why` says the reason.
         covariance: (6, 6) of it, m and rad.
         views: on which it rests.
@@ -74,6 +79,9 @@ class Answer(JobRecord):
     device: str
     mounted: Literal["fixed", "rigid"]
     camera: Camera
+    calibration: Hash = ""
+    outlines: Hash = ""
+    measured_on: Literal["jpeg", "raw"] = "jpeg"
     T_outer_camera: Matrix | None = None
     covariance: Matrix | None = None
     why: str = ""

@@ -95,8 +95,7 @@ def expose(context: StepContext, exposure: Exposure, *, was_busy: bool = False) 
         raise
     verdicts = {
         "still": pose.spread.within(settle_criteria(context)),
-        "settings": settings_agree(image.exif, wanted)
-        and all(settings_agree(one.image.exif, one.wanted) for one in further),
+        "settings": settings_agree(image.exif, wanted) and all(map(_as_wanted, further)),
     }
     return Shot(
         viewpoint=exposure.viewpoint,
@@ -116,6 +115,10 @@ def _during(robot: RobotArm, image: CapturedImage, wanted: CameraSettings) -> tu
     """The pose stream during an exposure."""
     began_s = image.trigger_monotonic_s
     return robot.samples(began_s, began_s + wanted.exposure_s + 0.3)
+
+
+def _as_wanted(further: FurtherImage) -> bool:
+    return settings_agree(further.image.exif, further.wanted)
 
 
 def record_shot(context: StepContext, shot: Shot) -> None:
@@ -140,6 +143,7 @@ def _further_exposure(context: StepContext, further: FurtherImage) -> FurtherExp
         camera=camera_record(further.image),
         trigger_monotonic_s=further.image.trigger_monotonic_s,
         arrival_monotonic_s=further.image.arrival_monotonic_s,
+        verdicts={"settings": _as_wanted(further)},
     )
 
 
@@ -306,6 +310,7 @@ def camera_record(image: CapturedImage) -> dict[str, object]:
         "height": image.height,
         "lens_serial": image.lens_serial,
         "body_serial": image.body_serial,
+        "model": image.model,
         "focus_distance_m": image.focus_distance_m,
         "focus_position": image.focus_position,
     }

@@ -40,6 +40,7 @@ def settings_of(camera: FurtherCamera, wanted: CameraSettings) -> CameraSettings
         aperture_f=section.aperture_f or wanted.aperture_f,
         exposure_s=section.exposure_s or wanted.exposure_s,
         iso=section.iso or wanted.iso,
+        image_quality=section.image_quality or wanted.image_quality,
     )
 
 

@@ -19,10 +19,11 @@ from service.core.records.events import Record, RecordedView
 from service.core.run.state import JobState
 from service.core.units import metres, rad_of_mrad
 from service.jobs.calibration import calibrate
-from service.jobs.capture import live_summary, live_view
+from service.jobs.capture import further_view, live_summary, live_view
 from service.jobs.looks import image_of
 from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Point, PosedPhotograph
 from service.jobs.surfaces import coverage_points, locate_spheres
+from service.steps.capture.further_looks import describe_further, look_at_further
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.capture.spoilt import ImageSharpness, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.context import JobRequest, StepContext
@@ -86,7 +87,7 @@ class LiveAnalysis:
             references = {"spheres_m": shared.taken["spheres_m"]}
             request = JobRequest.of(coverage_points.KIND, arguments, references, LIVE)
             context.evidence.enqueue(request, "specimen")
-        analysis.told = {job.job for job in analysis._jobs("live_view") if job.status != "enqueued"}
+        analysis.told = {job.job for kind in _DESCRIBED for job in analysis._jobs(kind) if job.status != "enqueued"}
         return analysis
 
     def look(self) -> None:
@@ -108,6 +109,7 @@ class LiveAnalysis:
             references = {**self.shared.taken, **mounted.references, "earlier": looks}
             request = JobRequest.of(live_view.KIND, arguments, references, LIVE)
             self.context.evidence.enqueue(request, sha256)
+        look_at_further(self.context, self.shared.spheres_m, self.shared.radius_m, self.shared.taken)
         self._tell()
 
     def summary(
@@ -255,7 +257,7 @@ class LiveAnalysis:
         while True:
             self.context.checkpoint()
             self.look()
-            waiting = [j for kind in ("live_view", "coverage_points") for j in self._jobs(kind)]
+            waiting = [j for kind in (*_DESCRIBED, "coverage_points") for j in self._jobs(kind)]
             left = sum(job.status == "enqueued" for job in waiting)
             if not left:
                 return
@@ -266,10 +268,11 @@ class LiveAnalysis:
             self.context.wait(0.1)
 
     def _tell(self) -> None:
-        for job in self._jobs("live_view"):
-            if job.status != "enqueued" and job.job not in self.told:
-                self.told.add(job.job)
-                self.context.tell(describe_view(job))
+        for kind, describe in _DESCRIBED.items():
+            for job in self._jobs(kind):
+                if job.status != "enqueued" and job.job not in self.told:
+                    self.told.add(job.job)
+                    self.context.tell(describe(job))
 
 
 def seen_words(seen: float, expected: float | None) -> str:
@@ -296,6 +299,9 @@ def describe_view(job: JobState) -> str:
     if answer.reason:
         parts.append(answer.reason)
     return f"{answer.viewpoint}: {', '.join(parts)}"
+
+
+_DESCRIBED = {live_view.KIND.name: describe_view, further_view.KIND.name: describe_further}
 
 
 @dataclass(frozen=True, slots=True)

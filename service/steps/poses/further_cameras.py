@@ -11,6 +11,8 @@ from service.core.run.state import JobState
 from service.jobs.records import ImageFile
 from service.jobs.registration import further_camera
 from service.steps.context import JobRequest, JobResult, StepContext
+from service.steps.inputs import raw_of
+from service.steps.poses.developed import Exposed, developed
 from service.steps.poses.sources import most_preferred
 
 _SHARED = ("spheres_m", "sphere_covariance_m2", "radius_m", "colour")  # arguments of the search for outlines
@@ -20,7 +22,12 @@ _OF_LENS = ("intrinsics_covariance",)
 
 
 def locate_further_cameras(
-    context: StepContext, images_of: Iterable[str], outlines: JobRequest, registered: Mapping[str, JobState]
+    context: StepContext,
+    images_of: Iterable[str],
+    outlines: JobRequest,
+    registered: Mapping[str, JobState],
+    *,
+    on_raw: bool,
 ) -> Mapping[str, JobResult]:
     """Locate each further camera that exposed in these capture steps; the worker's answers, by the camera's name.
 
@@ -29,10 +36,11 @@ def locate_further_cameras(
         images_of: capture steps.
         outlines: the search for spheres in the first camera's images, which has the arguments on the spheres.
         registered: the finished job of each registration of those images.
+        on_raw: measure in developed raw files, for a camera that wrote one with every image.
     """
     exposures = sorted(_exposures(context, images_of), key=lambda exposure: exposure[1].device)
     requests = {
-        device: _request([*group], outlines, registered)
+        device: _request(context, [*group], outlines, registered, on_raw=on_raw)
         for device, group in groupby(exposures, lambda exposure: exposure[1].device)
     }
     return dict(zip(requests, context.evidence.run_jobs(*requests.values()), strict=True)) if requests else {}
@@ -50,12 +58,17 @@ def _exposures(context: StepContext, images_of: Iterable[str]) -> list[tuple[str
 
 
 def _request(
-    exposures: Sequence[tuple[str, FurtherExposure]], outlines: JobRequest, registered: Mapping[str, JobState]
+    context: StepContext,
+    exposures: Sequence[tuple[str, FurtherExposure]],
+    outlines: JobRequest,
+    registered: Mapping[str, JobState],
+    *,
+    on_raw: bool,
 ) -> JobRequest:
     """The job for one camera; its newest calibration counts."""
     last = exposures[-1][1]
     recorded = outlines.arguments
-    arguments = {
+    arguments: dict[str, object] = {
         "device": last.device,
         "mounted": last.mounted,
         "images": [
@@ -65,6 +78,10 @@ def _request(
         "calibration": last.calibration.sha256,
         **{name: recorded[name] for name in _SHARED if name in recorded},
     }
+    raws = [(viewpoint, one, raw_of(one.artefacts)) for viewpoint, one in exposures]
+    taken = [Exposed(viewpoint, one.artefacts[0].sha256, raw) for viewpoint, one, raw in raws if raw is not None]
+    if on_raw and len(taken) == len(exposures):
+        arguments["developed"] = developed(context, taken)
     if last.mounted == "rigid":
         job = registered[most_preferred(registered)]
         first = {name: Reference(job.job, f"result/{name}").record() for name in _OF_REGISTRATION}

@@ -12,6 +12,7 @@ from service.core.equipment.clocks import clock_offset_words, clock_readings
 from service.steps.notes import deidentified
 from service.web.audit.frame import CurrentAudit, audit_frame
 from service.web.page.rendering import render
+from service.web.record.images import further_cameras_of
 from service.web.security.guards import requires
 
 router = APIRouter(tags=["audit"])
@@ -48,4 +49,5 @@ def devices_page(request: Request, audit: CurrentAudit, run_id: str) -> Response
         trouble_count=trouble_count,
         clocks=clocks,
         readings=readings,
+        further=further_cameras_of(log),
     )

@@ -29,10 +29,12 @@ from service.web.page.charts import Dots
 from service.web.page.rendering import render
 from service.web.page.run_frame import RunFrame, run_frame
 from service.web.page.run_words import gate_word, limit, measure_name
+from service.web.record.images import further_cameras_of
 from service.web.security.guards import requires
 from service.web.site import CurrentSite, Site
 
 if TYPE_CHECKING:
+    from service.dataset.further_cameras import KnownFurtherCamera
     from service.web.calibration.board_advice import PoseAdvice
 
 router = APIRouter(tags=["calibration"])
@@ -54,6 +56,7 @@ class CalibrationPage:
         depends: acceptances on which the calibration depends.
         regions: parts of the image without corners: name, empty cells, all cells.
         poses: of the board that would help most.
+        further: cameras of the rig that are calibrated by themselves.
     """
 
     run_id: str
@@ -65,6 +68,7 @@ class CalibrationPage:
     depends: list[AcceptedGate]
     regions: list[tuple[str, int, int]]
     poses: tuple[PoseAdvice, ...]
+    further: tuple[KnownFurtherCamera, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +103,7 @@ def calibration(request: Request, site: CurrentSite, run_id: RunId) -> HTMLRespo
         depends=_depends(log, found),
         regions=regions,
         poses=poses,
+        further=further_cameras_of(log),
     )
     return _rendered(request, "calibration/calibration.html.j2", shown, frame)
 

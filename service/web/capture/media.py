@@ -6,6 +6,7 @@ import base64
 import gzip
 import re
 import time
+from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,8 +25,9 @@ from service.notes import NOTE_PHOTOGRAPH
 from service.run_record import RunRecord
 from service.store.database.tables import artefacts
 from service.store.files.artefacts import to_artefact
-from service.web.record.images import Capture, find_capture
+from service.web.record.images import Capture, find_capture, further_of
 from service.web.record.pictures import IMAGE_WIDTHS, PICTURES, cached, nearest_width, reduced_jpeg, safe_name
+from service.web.record.rig_cameras import rig_cameras
 from service.web.security.guards import requires
 from service.web.site import CurrentSite, Site
 
@@ -109,6 +111,7 @@ class ImageQuery(BaseModel):
         seq: event of the image; None for the valid image.
         width: wanted width in pixels; the copy has the nearest width on offer.
         marked: whether outlines of the spheres are drawn over it.
+        device: a further camera, whose image is shown; "" for the first one.
     """
 
     step: str = Field("", pattern=r"^[0-9A-Za-z_-]{0,64}$")
@@ -116,6 +119,7 @@ class ImageQuery(BaseModel):
     seq: int | None = Field(None, ge=1, le=2**53)
     width: int = Field(1280, ge=64, le=4096)
     marked: bool = False
+    device: str = Field("", max_length=64)
 
 
 @router.get(
@@ -137,12 +141,23 @@ def viewpoint_image(
     if capture is None:
         raise HTTPException(404, f"there is no image of viewpoint {viewpoint} in this run")
     size = nearest_width(wanted.width, IMAGE_WIDTHS)
-    source = mark_source(log, capture) if wanted.marked else ""
-    ref = capture.payload.artefacts[0]
+    ref = _photograph(log, capture, wanted.device)
+    source = mark_source(log, capture, wanted.device) if wanted.marked else ""
     tag = f'"{ref.sha256}-{size}{f"-{source}" if source else ""}"'
     if request.headers.get("if-none-match") == tag:
         return Response(status_code=304, headers={"ETag": tag, "Cache-Control": _ASK_AGAIN})
-    return _picture(_reduced(site, ref, size, log, capture, source), tag, _ASK_AGAIN)
+    marks = _Marks(log, capture, wanted.device, source)
+    return _picture(_reduced(site, ref, size, marks), tag, _ASK_AGAIN)
+
+
+def _photograph(log: RunRecord, capture: Capture, device: str) -> ArtefactRef:
+    """The photograph of a camera at a viewpoint. HTTP 404 if it did not expose there."""
+    if not device:
+        return capture.payload.artefacts[0]
+    for one in further_of(log, capture):
+        if one.exposure.device == device:
+            return one.exposure.artefacts[0]
+    raise HTTPException(404, f"{device} took no image at viewpoint {capture.payload.viewpoint}")
 
 
 @router.get(
@@ -152,11 +167,13 @@ def viewpoint_image(
     responses={204: {"description": "no frame yet"}},
     response_class=FileResponse,
 )
-def live_view(site: CurrentSite, run_id: RunId) -> Response:
-    """The camera's newest frame. Each request keeps the frames coming; an old frame is not shown as live."""
+def live_view(site: CurrentSite, run_id: RunId, camera: Annotated[str, Query(max_length=64)] = "") -> Response:
+    """A camera's newest frame. Each request keeps the frames coming; an old frame is not shown as live."""
+    if camera and camera not in rig_cameras(site.run(run_id)):
+        raise HTTPException(404, "the rig of this run has no further camera of this name")
     site.run(run_id)
-    ask_for_frames(site.data, run_id)
-    path = frame_path(site.data, run_id)
+    ask_for_frames(site.data, run_id, camera)
+    path = frame_path(site.data, run_id, camera)
     headers = {"Cache-Control": "no-store"}
     try:
         age_s = time.time() - path.stat().st_mtime
@@ -182,22 +199,25 @@ def recorded_file(site: Site, run_id: str, sha256: str) -> ArtefactRef:
     return to_artefact(row).ref
 
 
-def mark_source(log: RunRecord, capture: Capture) -> str:
+def mark_source(log: RunRecord, capture: Capture, device: str = "") -> str:
     """A key of what would be drawn over an image, which changes when better outlines are known; "" for nothing."""
     from service.web.record.outlines import outlines_of  # noqa: PLC0415 - the matching of spheres, not needed to start
 
-    found = outlines_of(log, capture)
+    found = outlines_of(log, capture, device)
     return "" if found is None else found.source
 
 
-def _reduced(
-    site: Site,
-    ref: ArtefactRef,
-    width: int,
-    log: RunRecord | None = None,
-    capture: Capture | None = None,
-    source: str = "",
-) -> Path:
+@dataclass(frozen=True, slots=True)
+class _Marks:
+    """What is drawn over an image; `source` changes with it, and is "" for nothing."""
+
+    log: RunRecord
+    capture: Capture
+    device: str
+    source: str
+
+
+def _reduced(site: Site, ref: ArtefactRef, width: int, drawn: _Marks | None = None) -> Path:
     """The cached copy. HTTP 415 if the file is not a picture; the original is hashed again when a copy is made."""
     if ref.media_type not in PICTURES:
         raise HTTPException(415, f"{safe_name(ref.original_name, ref.sha256)} is not a picture")
@@ -205,10 +225,11 @@ def _reduced(
     def make() -> bytes:
         from service.web.record.outlines import marks_of  # noqa: PLC0415 - as above
 
-        marks = marks_of(log, capture) if log is not None and capture is not None and source else ()
+        marks = marks_of(drawn.log, drawn.capture, drawn.device) if drawn is not None and drawn.source else ()
         path = site.store.artefact_path(ref.sha256, verify=True)
         return reduced_jpeg(path, width, marks, upright=ref.kind == NOTE_PHOTOGRAPH)
 
+    source = "" if drawn is None else drawn.source
     try:
         return cached(site.data, f"{ref.sha256} {width} {source}", ".jpg", make)
     except OSError as error:

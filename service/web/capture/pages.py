@@ -21,10 +21,12 @@ from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.record.board_images import BoardUse, board_uses
 from service.web.record.images import Capture, captures_of
+from service.web.record.rig_cameras import rig_cameras
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
 if TYPE_CHECKING:
+    from service.web.capture.cameras import CameraImage, SheetImage
     from service.web.capture.plan_drawing import PlanDrawing
     from service.web.capture.view import StepViewpoint, Verdict, ViewpointRedo, ViewState
 
@@ -46,6 +48,7 @@ class CaptureQuery(BaseModel):
     views: int = Field(0, ge=0, le=100_000)  # page of the table; 0: the one that shows where the run is
     replaced: bool = False  # list replaced images too
     plain: bool = False  # without the outlines of spheres
+    device: str = Field("", max_length=64)  # a further camera, whose images are shown; "": the first one
 
 
 Wanted = Annotated[CaptureQuery, Query()]
@@ -66,8 +69,8 @@ class ViewTable:
 class ContactSheet:
     """A page of the contact sheet."""
 
-    captures: list[Capture]  # on this page
-    uses: Mapping[str, BoardUse]  # of board images, by SHA-256
+    images: list[SheetImage]  # on this page
+    devices: list[str]  # further cameras that took images in this step
     replaced: int  # images of the step that no longer count
     page: int
     pages: int
@@ -78,7 +81,8 @@ class ChosenImage:
     """The large image; `capture` is None where the step has none to show."""
 
     capture: Capture | None
-    verdicts: list[Verdict]
+    camera: CameraImage | None  # the camera whose image is large
+    cameras: list[CameraImage]  # all that exposed at this viewpoint
     sums: list[Verdict]  # of all images up to this one
     registered: bool  # the spheres have the numbers of the registration
 
@@ -134,6 +138,7 @@ class CapturePage:
     log: RunRecord
     steps: list[Step]  # that take images with the robot
     held: bool  # a person holds the camera in another step
+    further_cameras: tuple[str, ...]  # of the rig
     images: StepImages | None  # None where no step takes images with the robot
 
 
@@ -166,6 +171,7 @@ def _shown(site: Site, person: Person, run_id: str, wanted: CaptureQuery) -> Cap
         log=log,
         steps=capture_view.capture_steps(log.protocol),
         held=any(s.by_hand for s in log.protocol.steps),
+        further_cameras=rig_cameras(log),
         images=None if step is None else _of_step(site, person, log, step, wanted),
     )
 
@@ -184,7 +190,7 @@ def _of_step(site: Site, person: Person, log: RunRecord, step: Step, wanted: Cap
         step=step,
         table=_table(views, view, wanted.views),
         sheet=_sheet(log, step, captures, wanted),
-        image=_image(log, step, chosen, captures),
+        image=_image(log, step, chosen, captures, wanted.device),
         drawings=_drawings(log, views, name),
         view=view,
         redo=None if view is None else capture_view.redo_of(log, step, view, person.account),
@@ -230,31 +236,43 @@ def _table(views: list[StepViewpoint], view: StepViewpoint | None, page: int) ->
 
 def _sheet(log: RunRecord, step: Step, captures: Sequence[Capture], wanted: CaptureQuery) -> ContactSheet:
     """A page of the contact sheet: images with something wrong first, then newest first."""
+    from service.web.capture.cameras import devices_in, sheet_image  # noqa: PLC0415
+
     valid = [c for c in captures if c.replaced is None]
     uses = board_uses(log.state, log.events, step.id)
     listed = sorted(
         captures if wanted.replaced else valid, key=lambda c: _is_problem(c, uses.get(c.sha256))
     )  # stable
-    pages = max(1, -(-len(listed) // SHEET))
+    devices = devices_in(log, captures)
+    device = wanted.device if wanted.device in devices else ""
+    images = [image for c in listed[::-1] if (image := sheet_image(log, c, uses, device)) is not None]
+    pages = max(1, -(-len(images) // SHEET))
     page = min(wanted.page, pages)
     return ContactSheet(
-        captures=listed[::-1][(page - 1) * SHEET : page * SHEET],
-        uses=uses,
+        images=images[(page - 1) * SHEET : page * SHEET],
+        devices=devices,
         replaced=len(captures) - len(valid),
         page=page,
         pages=pages,
     )
 
 
-def _image(log: RunRecord, step: Step, chosen: Capture | None, captures: Sequence[Capture]) -> ChosenImage:
+def _image(
+    log: RunRecord, step: Step, chosen: Capture | None, captures: Sequence[Capture], device: str
+) -> ChosenImage:
     """The large image, with what is known about it."""
     from service.web.capture import view as capture_view  # noqa: PLC0415
+    from service.web.capture.cameras import camera_images  # noqa: PLC0415
     from service.web.record.known_spheres import best_registration  # noqa: PLC0415
 
     valid = [c for c in captures if c.replaced is None]
+    cameras: list[CameraImage] = []
+    if chosen is not None:
+        cameras = camera_images(log, chosen, capture_view.verdicts_of(log, step, chosen, valid), valid)
     return ChosenImage(
         capture=chosen,
-        verdicts=[] if chosen is None else capture_view.verdicts_of(log, step, chosen, valid),
+        camera=next((one for one in cameras if one.device == device), cameras[0] if cameras else None),
+        cameras=cameras,
         sums=[] if chosen is None else capture_view.summary_of(step, chosen),
         registered=best_registration(log) is not None and (chosen is None or chosen.replaced is None),
     )

@@ -14,13 +14,13 @@ from service.core.gates.verdict import limits
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import OperatorAction, ViewpointCaptured
 from service.core.run.actions import refuse
-from service.core.run.state import StepState
+from service.core.run.state import JobState, StepState
 from service.core.units import mm, mrad
-from service.jobs.capture import live_summary, live_view
+from service.jobs.capture import further_view, live_summary, live_view
 from service.run_record import RunRecord
 from service.steps.notes import suggested_views
 from service.web.record.board_images import board_use, board_uses, calibration_in
-from service.web.record.images import Capture, captures_of, last_failures, stated_camera
+from service.web.record.images import Capture, StatedCamera, captures_of, last_failures, stated_camera
 from service.web.record.planned_poses import Vector, nominal_T_flange_camera, place, planned_viewpoints
 
 ViewState = Literal["done", "departs", "unused", "next", "open", "again", "failed", "skipped", "left_out"]
@@ -50,7 +50,7 @@ TONES: Mapping[ViewState, str] = {
 _EDGE_PX = 4.0
 _EDGE_FACTOR = 1.5  # of the median of the step's images
 _CLIPPED = 0.01
-_FEWEST_SPHERES = 3
+FEWEST_SPHERES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +183,7 @@ def _place(log: RunRecord, capture: Capture) -> tuple[Vector, Vector] | tuple[No
 def verdicts_of(log: RunRecord, step: Step, capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
     """Sharp, exposed, spheres, pose, settings: in words, with the figures behind them."""
     of_board = capture.payload.artefacts[0].kind == "board_image"
-    found = [_board(log, step, capture)] if of_board else _found(capture, others)
+    found = [_board(log, step, capture)] if of_board else looked_at(capture.live, [o.live for o in others])
     return [*found, *_taken(log.protocol, capture)]
 
 
@@ -198,16 +198,17 @@ def _board(log: RunRecord, step: Step, capture: Capture) -> Verdict:
     return Verdict("Board", use.used, use.word, use.why)
 
 
-def _found(capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
-    """What the live numbers say."""
-    live = capture.live
+def looked_at(
+    live: JobState | None, others: Sequence[JobState | None], fewest: int = FEWEST_SPHERES
+) -> list[Verdict]:
+    """What the job says that looked at an image; `others`: those of the same camera's images."""
     measures = {} if live is None else dict(live.measures)
     waiting = live is not None and live.status == "enqueued"
     unknown = "being looked at" if waiting else "not measured"
     out: list[Verdict] = []
 
     edge = measures.get("edge_width_px")
-    known = [o.live.measures["edge_width_px"] for o in others if o.live and "edge_width_px" in o.live.measures]
+    known = [job.measures["edge_width_px"] for job in others if job and "edge_width_px" in job.measures]
     guide = max(_EDGE_PX, _EDGE_FACTOR * median(known)) if known else _EDGE_PX
     sharp = None if edge is None else edge <= guide
     words = {None: unknown, True: "Sharp", False: "Soft"}
@@ -221,14 +222,15 @@ def _found(capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
     out.append(Verdict("Exposure", exposed, words[exposed], figures, f"guide ≤ {100 * _CLIPPED:.0f} %"))
 
     spheres, expected = measures.get("spheres_seen"), measures.get("spheres_expected")
-    seen = None if spheres is None else spheres >= max(_FEWEST_SPHERES, expected or 0)
+    seen = None if spheres is None else spheres >= max(fewest, expected or 0)
     words = {None: unknown, True: "All seen", False: "Some missing"}
     figures = "" if spheres is None else f"{spheres:.0f} seen"
     if expected is not None:
         figures += f", {expected:.0f} expected whole in the image"
     reason = "" if live is None else live.message
     if live is not None and live.status == "finished":
-        reason = live_view.KIND.read_answer(live.result).reason or live.message
+        kind = live_view.KIND if live.kind == live_view.KIND.name else further_view.KIND
+        reason = kind.read_answer(live.result).reason or live.message
     out.append(Verdict("Spheres", seen, words[seen], f"{figures}; {reason}".strip("; ") if reason else figures))
 
     return out
@@ -248,16 +250,19 @@ def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
         limit = f"limit {mm(protocol.settle.position_peak_to_peak_m):.3g} mm peak to peak"
         out.append(Verdict("Pose", still, words[still], figures, limit))
 
-    settings = payload.verdicts.get("settings")
-    words = {None: "not judged", True: "As wanted", False: "Differ"}
-    camera = stated_camera(payload)
-    figures = _settings(camera.aperture_f, camera.exposure_s, camera.iso)
     demanded = protocol.camera
     limit = ""
     if demanded is not None:
         limit = f"wanted {_settings(demanded.aperture_f, demanded.exposure_s, demanded.iso)}"
-    out.append(Verdict("Settings", settings, words[settings], figures, limit))
+    out.append(settings_verdict(stated_camera(payload), payload.verdicts.get("settings"), limit))
     return out
+
+
+def settings_verdict(camera: StatedCamera, passed: bool | None, limit: str = "") -> Verdict:
+    """Whether a photograph was taken with the settings that it should have."""
+    words = {None: "not judged", True: "As wanted", False: "Differ"}
+    figures = _settings(camera.aperture_f, camera.exposure_s, camera.iso)
+    return Verdict("Settings", passed, words[passed], figures, limit)
 
 
 def _small(value: float) -> str:

@@ -13,6 +13,7 @@ from service.web.dataset.previews import CurrentPreviews
 from service.web.dataset.view import data_set_view
 from service.web.page.rendering import render
 from service.web.page.run_frame import run_frame
+from service.web.record.images import further_cameras_of
 from service.web.scene.pages import FRAME_HEADERS, Theme
 from service.web.security.guards import requires
 from service.web.site import CurrentSite
@@ -54,6 +55,7 @@ def data_set_page(
         making=None if unfit else previews.making(run_id),
         benchmark=benchmark_of(site.data, log.events),
         benchmark_folder=site.data / FOLDER,
+        further=further_cameras_of(log),
         shown=None if preview is None else data_set_view(preview, split, view),
     )
 

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
 
-from service.core.records.events import RecordedView, ViewpointFailed
+from service.core.records.events import FurtherExposure, RecordedView, ViewpointCaptured, ViewpointFailed
 from service.core.run.state import JobState, StepState, Superseded
-from service.jobs.capture import live_view
+from service.jobs.capture import further_view, live_view
 from service.jobs.looks import image_of
 from service.run_record import RunRecord
+
+if TYPE_CHECKING:
+    from service.dataset.further_cameras import KnownFurtherCamera
 
 
 class StatedCamera(BaseModel):
@@ -33,7 +37,7 @@ class StatedCamera(BaseModel):
     height: int | None = None
 
 
-def stated_camera(view: RecordedView) -> StatedCamera:
+def stated_camera(view: RecordedView | FurtherExposure) -> StatedCamera:
     """What the photograph of a view states about the camera."""
     return StatedCamera.model_validate(view.camera)
 
@@ -57,6 +61,36 @@ class Capture:
     def sha256(self) -> str:
         """SHA-256 of the photograph."""
         return self.payload.artefacts[0].sha256
+
+
+@dataclass(frozen=True, slots=True)
+class FurtherCapture:
+    """The image that a further camera took at a viewpoint; `live` is the job that looked at it."""
+
+    exposure: FurtherExposure
+    live: JobState | None
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the photograph."""
+        return self.exposure.artefacts[0].sha256
+
+
+def further_of(log: RunRecord, capture: Capture) -> list[FurtherCapture]:
+    """The images of further cameras at the viewpoint of a capture."""
+    if not isinstance(capture.payload, ViewpointCaptured) or not capture.payload.further:
+        return []
+    live = live_jobs(log.state.steps[capture.payload.step])
+    return [FurtherCapture(one, live.get(one.artefacts[0].sha256)) for one in capture.payload.further]
+
+
+def further_cameras_of(log: RunRecord) -> tuple[KnownFurtherCamera, ...]:
+    """The further cameras of a run, by its valid images."""
+    from service.dataset.further_cameras import known_further_cameras  # noqa: PLC0415 - numpy, not needed to start
+
+    seqs = sorted(seq for step in log.state.steps.values() for seq in step.captured.values())
+    payloads = (log.events[seq - 1].payload for seq in seqs)
+    return known_further_cameras(log.protocol, log.state, (p for p in payloads if isinstance(p, RecordedView)))
 
 
 def captures_of(log: RunRecord, step: str) -> list[Capture]:
@@ -114,10 +148,10 @@ def find_capture(
 
 
 def live_jobs(state: StepState) -> Mapping[str, JobState]:
-    """The newest `live_view` job of each photograph, by SHA-256, finished or not."""
+    """The newest job that looked at each photograph of any camera, by SHA-256, finished or not."""
     found: dict[str, JobState] = {}
     for job in sorted(state.jobs.values(), key=lambda j: j.enqueued_seq):
-        if job.kind == live_view.KIND.name:
+        if job.kind in (live_view.KIND.name, further_view.KIND.name):
             found[image_of(job).sha256] = job
     return found
 

@@ -10,13 +10,16 @@ import numpy as np
 from service.compute.camera_model import CameraModel
 from service.compute.markers.archive import outline_from_record
 from service.compute.markers.records import SphereOutline
+from service.compute.poses.files.camera_files import read_camera_json
 from service.compute.registration.identification.pairing import CONTROL_GATE, paired
 from service.core.geometry import Transform, inverse
 from service.core.jobs.references import jobs_of
 from service.core.units import metres
-from service.jobs.capture import live_view
+from service.dataset.further_cameras import further_pose
+from service.dataset.registrations import further_cameras
+from service.jobs.capture import further_view, live_view
 from service.run_record import RunRecord
-from service.web.record.images import Capture
+from service.web.record.images import Capture, further_of
 from service.web.record.known_spheres import Sphere, best_registration, ct_spheres, scan_spheres
 from service.web.record.live_files import LiveOutlines, read_live_outlines, read_outlines
 from service.web.record.pictures import DrawnOutline
@@ -30,6 +33,7 @@ class OutlineSource:
         source: version of the outlines, which changes with what would be drawn.
         artefact: file with the outlines.
         T_camera_scan: of the frame of `spheres`; None while it is not known.
+        live: the artefact is a file of the job `live_view`, which holds one image; others hold all, by viewpoint.
     """
 
     source: str
@@ -41,8 +45,13 @@ class OutlineSource:
     live: bool
 
 
-def outlines_of(log: RunRecord, capture: Capture) -> OutlineSource | None:
-    """The registration's outlines of a valid image, else what the live numbers found, else None."""
+def outlines_of(log: RunRecord, capture: Capture, device: str = "") -> OutlineSource | None:
+    """The registration's outlines of a valid image, else what the live numbers found, else None.
+
+    `device`: a further camera, whose image it is; "" for the first one.
+    """
+    if device:
+        return _of_further(log, capture, device)
     registered = best_registration(log)
     if registered is not None and capture.replaced is None:
         T = registered.record.T_scan_camera.get(capture.payload.viewpoint)
@@ -66,9 +75,29 @@ def outlines_of(log: RunRecord, capture: Capture) -> OutlineSource | None:
     return OutlineSource(f"live-{sha256[:16]}", sha256, ct_spheres(log), camera, camera, None, True)
 
 
-def marks_of(log: RunRecord, capture: Capture) -> tuple[DrawnOutline, ...]:
+def _of_further(log: RunRecord, capture: Capture, device: str) -> OutlineSource | None:
+    """The outlines in the image of a further camera, as the registration measured them, or as it arrived."""
+    mine = next((one for one in further_of(log, capture) if one.exposure.device == device), None)
+    located = further_cameras(log.protocol, log.state).get(device)
+    registered, viewpoint = best_registration(log), capture.payload.viewpoint
+    if capture.replaced is None and located is not None and located.outlines and registered is not None:
+        camera = CameraModel.from_record(located.camera.plain())
+        T_scan_camera = further_pose(located, registered.record.T_scan_camera.get(viewpoint))
+        placed = None if T_scan_camera is None else inverse(T_scan_camera)
+        source = f"{located.outlines[:16]}-{registered.name}"
+        return OutlineSource(source, located.outlines, scan_spheres(log), camera, camera, placed, live=False)
+    if mine is None or mine.live is None or mine.live.status != "finished":
+        return None
+    sha256 = mine.live.artefacts[0].sha256
+    answer = further_view.KIND.read_answer(mine.live.result)
+    camera = read_camera_json(log.store.artefact_path(mine.exposure.calibration.sha256))
+    placed = None if answer.T_ct_camera is None else inverse(np.array(answer.T_ct_camera))
+    return OutlineSource(f"live-{sha256[:16]}", sha256, ct_spheres(log), camera, camera, placed, live=False)
+
+
+def marks_of(log: RunRecord, capture: Capture, device: str = "") -> tuple[DrawnOutline, ...]:
     """Outlines with numbers: registration spheres 0, 1, 2 …, control spheres C0, C1 …, and what is neither."""
-    found = outlines_of(log, capture)
+    found = outlines_of(log, capture, device)
     if found is None:
         return ()
     path = log.store.artefact_path(found.artefact)

@@ -28,6 +28,7 @@ from service.steps import step_kinds
 from service.store.files.space_used import forecast_of
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
+from service.web.record.rig_cameras import rig_cameras
 from service.web.run.notes import PageNote, notes_of
 from service.web.run.view import run_view
 from service.web.run.view_records import RunView, Viewer
@@ -62,6 +63,7 @@ class RunPage:
         depends: acceptances on which the run's results depend.
         result_table: rows of the evaluation.
         result_note: what some of these rows share.
+        further_cameras: of the rig, for the live view.
     """
 
     view: RunView
@@ -79,6 +81,7 @@ class RunPage:
     depends: tuple[AcceptedGate, ...]
     result_table: list[Row]
     result_note: str
+    further_cameras: tuple[str, ...]
 
 
 @router.get("/runs/{run_id}", name="run", dependencies=[Depends(requires("read"))])
@@ -132,6 +135,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         depends=accepted_gates(log.protocol, log.state),
         result_table=evaluated(log.protocol, log.state),
         result_note=shared_adjustment_note(log.protocol, log.state),
+        further_cameras=rig_cameras(log),
     )
 
 

@@ -15,14 +15,16 @@ from service.compute.evaluation.closure import Alignment
 from service.core.geometry import Array, Transform, inverse
 from service.core.records.events import ArtefactRef, RecordedView, ViewpointCaptured
 from service.core.units import metres, mm
+from service.dataset.further_cameras import further_poses
 from service.dataset.registered_scan import registered_scan
 from service.dataset.registrations import registrations
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
+from service.jobs.capture import further_view
 from service.jobs.records import Point
 from service.jobs.registration.register import Registration
 from service.jobs.surfaces import fuse
 from service.run_record import RunRecord
-from service.web.record.images import captures_of
+from service.web.record.images import captures_of, further_of
 from service.web.record.known_spheres import (
     ShownRegistration,
     Sphere,
@@ -99,6 +101,7 @@ def _registered(log: RunRecord, registered: ShownRegistration) -> KnownScene:
         radius_m=metres(log.protocol.spheres.radius_mm),
         bases=bases,
         outlines={"wound of the last fusion": np.array(wound)} if (wound := _wound(log)) else {},
+        further=further_poses(log.protocol, log.state, _all_captures(log), record.T_scan_camera),
     )
     words = registered.name.replace("_", " ")
     return KnownScene(
@@ -163,6 +166,7 @@ def _live(log: RunRecord) -> KnownScene | None:
         radius_m=metres(log.protocol.spheres.radius_mm),
         planned=planned,
         bases=T_ct_base,
+        further=_live_further(log),
     )
     step = last_step(log, "ct_surface")
     meshes = [ref for ref in log.state.steps[step].artefacts if ref.kind == "ct_mesh"] if step else []
@@ -174,6 +178,22 @@ def _live(log: RunRecord) -> KnownScene | None:
         (f"{away} images of a station whose position is not known yet.",) if away else (),
         meshes[-1] if meshes else None,
     )
+
+
+def _live_further(log: RunRecord) -> dict[str, dict[str, Transform]]:
+    """T_ct_camera of further cameras, each by its image alone; of one that stands still, the newest."""
+    found: dict[str, dict[str, Transform]] = {}
+    for step in log.protocol.steps:
+        for capture in captures_of(log, step.id):
+            for one in further_of(log, capture) if capture.replaced is None else ():
+                answer = None
+                if one.live is not None and one.live.status == "finished":
+                    answer = further_view.KIND.read_answer(one.live.result)
+                if answer is not None and answer.T_ct_camera is not None:
+                    name, fixed = one.exposure.device, one.exposure.mounted == "fixed"
+                    view = name if fixed else f"{capture.payload.viewpoint}, {name}"
+                    found.setdefault(name, {})[view] = np.array(answer.T_ct_camera)
+    return found
 
 
 def _to_come(log: RunRecord) -> list[tuple[str, str, Transform]]:

@@ -9,8 +9,10 @@ import numpy as np
 
 from service.core.geometry import Array
 from service.core.units import deg, mm
+from service.dataset.further_cameras import KnownFurtherCamera
 from service.dataset.scene_view import viewing_frame
 from service.run_record import RunRecord
+from service.web.record.images import further_cameras_of
 from service.web.scene.data import MeshFacts, mesh_facts, predicted_error_mm, scene_of
 
 Vector = tuple[float, float, float]
@@ -60,6 +62,7 @@ class SceneTables:
     cameras: tuple[CameraRow, ...]
     spheres: tuple[SphereRow, ...]
     stations: tuple[StationRow, ...]
+    further: tuple[KnownFurtherCamera, ...]
     mesh: MeshFacts | None
     error_at_spheres_mm: tuple[float, float] | None  # predicted, least and most
 
@@ -70,7 +73,8 @@ def scene_tables(log: RunRecord, data: Path) -> SceneTables:
     T_view = viewing_frame(now.scene)
     down, centre = -T_view[2, :3], -T_view[:3, :3].T @ T_view[:3, 3]
     rows: list[CameraRow] = []
-    for poses, planned in ((now.scene.cameras, False), (now.scene.planned, True)):
+    beside = [(poses, False) for poses in now.scene.further.values()]
+    for poses, planned in ((now.scene.cameras, False), (now.scene.planned, True), *beside):
         for name, T in poses.items():
             tilt = deg(float(np.arccos(np.clip(T[:3, 2] @ down, -1, 1))))
             away = mm(float(np.linalg.norm(T[:3, 3] - centre)))
@@ -95,7 +99,8 @@ def scene_tables(log: RunRecord, data: Path) -> SceneTables:
         errors = predicted_error_mm(now.registered, np.array([s.centre_m for s in now.spheres]))
         error = (float(errors.min()), float(errors.max()))
     facts = mesh_facts(now, log, data)
-    return SceneTables(now.frame, now.how, now.missing, tuple(rows), tuple(spheres), tuple(stations), facts, error)
+    cameras, about = tuple(rows), further_cameras_of(log)
+    return SceneTables(now.frame, now.how, now.missing, cameras, tuple(spheres), tuple(stations), about, facts, error)
 
 
 def _mm(point_m: Array) -> Vector:

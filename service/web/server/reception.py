@@ -1,4 +1,4 @@
-"""Before the application: how long a request may take to arrive and an answer to be taken, and whose it is."""
+"""Runs before the application: limits how long requests may take to arrive and answers to be read, per client."""
 
 from __future__ import annotations
 

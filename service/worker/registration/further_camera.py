@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -11,8 +11,10 @@ import numpy as np
 
 from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
 from service.compute.camera_model import CameraModel
-from service.compute.markers.archive import outline_from_record
+from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.detectors import options_for
+from service.compute.markers.developed import remeasure_file
+from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.image_files import detect_all
 from service.compute.poses.files.camera_files import read_camera_json
 from service.compute.registration.further_camera import (
@@ -46,23 +48,35 @@ def further_camera(context: JobContext[job.Arguments]) -> JobAnswer:
     spheres = ScanSpheres(
         np.array(arguments.spheres_m), arguments.radius_m, covariance_m2=np.array(arguments.sphere_covariance_m2)
     )
-    views, left_out = _views(context, _Lens.of(camera, read_camera_covariance(calibration)), spheres)
-    answer = job.Answer(device=arguments.device, mounted=arguments.mounted, camera=camera_record(camera))
+    lens = _Lens.of(camera, read_camera_covariance(calibration))
+    outlines = _outlines(context, camera)
+    views, left_out = _views(outlines, lens, spheres)
+    records = {name: [outline_record(outline) for outline in found] for name, found in outlines.items()}
+    kept = context.keep_json(records, kind="outlines", name=f"{arguments.device}_outlines.json")
+    answer = job.Answer(
+        device=arguments.device,
+        mounted=arguments.mounted,
+        camera=camera_record(camera),
+        calibration=arguments.calibration,
+        outlines=kept.sha256,
+        measured_on="jpeg" if arguments.developed is None else "raw",
+    )
     try:
         pose = _pose(context, views, spheres)
     except ComputeError as error:
         return JobAnswer(
             {"views": 0.0, "excluded": float(len(arguments.images))},
-            answer=answer.model_copy(update={"why": str(error), "excluded": left_out}),
+            (kept,),
+            answer.model_copy(update={"why": str(error), "excluded": left_out}),
         )
     answer = answer.model_copy(update=_stated(pose, left_out))
     measures = {"views": float(len(answer.views)), "excluded": float(len(answer.excluded))}
     measures |= {"consistency_mm": mm(pose.mean.rms_m), "consistency_mrad": mrad(pose.mean.rms_rad)}
     single = {name: {"T_scan_camera": v.T_scan_camera.tolist(), "rms_px": v.rms_px} for name, v in views.items()}
-    kept = context.keep_json(
+    stated = context.keep_json(
         {**answer.plain(), "single_views": single}, kind="further_camera", name=f"{arguments.device}.json"
     )
-    return JobAnswer(measures, (kept,), answer)
+    return JobAnswer(measures, (stated, kept), answer)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,26 +118,38 @@ def _lens_errors(
     return found
 
 
-def _views(
-    context: JobContext[job.Arguments], lens: _Lens, spheres: ScanSpheres
-) -> tuple[dict[str, SightedPose], dict[str, str]]:
-    """The pose from each image, and the images without one with the reason."""
+def _outlines(context: JobContext[job.Arguments], camera: CameraModel) -> dict[str, tuple[SphereOutline, ...]]:
+    """The outlines in every image, by viewpoint; measured in the developed raw files where there are any."""
     arguments = context.arguments
-    files = [context.input(image.sha256) for image in arguments.images]
+    files, options = [context.input(image.sha256) for image in arguments.images], options_for(arguments.colour)
     found = detect_all(
         files,
-        lens.camera,
-        options_for(arguments.colour),
+        camera,
+        options,
         min(len(files), os.cpu_count() or 1),
         lambda done, total: context.progress(f"spheres in images of {arguments.device}", done, total),
     )
+    by_name = {image.viewpoint: outlines for image, outlines in zip(arguments.images, found, strict=True)}
+    if arguments.developed is None:
+        return by_name
+    raw = {name: context.input(sha256) for name, sha256 in arguments.developed.items()}
+    return {
+        name: tuple(o for o in remeasure_file(raw[name], camera, outlines, options) if o is not None)
+        for name, outlines in by_name.items()
+    }
+
+
+def _views(
+    outlines: Mapping[str, Sequence[SphereOutline]], lens: _Lens, spheres: ScanSpheres
+) -> tuple[dict[str, SightedPose], dict[str, str]]:
+    """The pose from each image, and the images without one with the reason."""
     views: dict[str, SightedPose] = {}
     left_out: dict[str, str] = {}
-    for image, outlines in zip(arguments.images, found, strict=True):
+    for name, found in outlines.items():
         try:
-            views[image.viewpoint] = sighted_pose(outlines, lens.camera, spheres, lens.covariance)
+            views[name] = sighted_pose(found, lens.camera, spheres, lens.covariance)
         except ComputeError as error:
-            left_out[image.viewpoint] = error.what
+            left_out[name] = error.what
     return views, left_out
 
 

@@ -8,7 +8,7 @@ import os
 import select
 import threading
 import tty
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -63,10 +63,18 @@ def table(folder: Path, *options: str) -> Generator[Path]:
 
 
 class Tap:
-    """A line between the host and a serial port, which keeps what the host sent."""
+    """A line between the host and a serial port, which keeps what the host sent.
 
-    def __init__(self, far_end: Path, folder: Path) -> None:
+    Args:
+        far_end: the port. folder: gets the host's end.
+        spoil: what becomes of bytes on their way; its second argument says whether the host sent them.
+    """
+
+    def __init__(
+        self, far_end: Path, folder: Path, spoil: Callable[[bytes, bool], bytes] = lambda data, _sent: data
+    ) -> None:
         self.sent = b""
+        self._spoil = spoil
         self._far = serial.Serial(str(far_end), timeout=0)
         self._ends = os.openpty()
         tty.setraw(self._ends[1])
@@ -92,6 +100,6 @@ class Tap:
             while not self._stop.is_set():
                 for ready in select.select([near, far], [], [], 0.05)[0]:
                     data = os.read(ready, 4096)
-                    os.write(far if ready == near else near, data)
                     if ready == near:
                         self.sent += data
+                    os.write(far if ready == near else near, self._spoil(data, ready == near))

@@ -95,7 +95,7 @@ def planned_board_shots(scene: Scene, wanted: BoardPoses, solve: Sequence[str]) 
 
 
 def _joints(scene: Scene, layout: StationLayout) -> Callable[[Array], Array | None]:
-    """The joints with which the scene's arm takes a T_base_camera; None out of reach."""
+    """The joints with which the scene's arm takes a T_base_camera; None if it is out of reach."""
     mount = nominal_hand_eye()
     if scene.arm.name == ARM_MODEL.name:
         return lambda T: joints_for(ARM_MODEL, flange_target(T, mount), _NEAR)

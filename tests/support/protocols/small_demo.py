@@ -15,10 +15,15 @@ _NEEDS_TIME = ("ground_truth", "specimen_release", "layout_check")
 _ARC = {"tilt_deg": 28, "azimuth_from_deg": -50, "azimuth_to_deg": 50, "count": VIEWS // 2, "distance_m": 0.66}
 
 
-def small_demo(path: Path, *registration_gates: dict[str, Any]) -> Path:
-    """Write the protocol to a file; the registration is also judged by these gates."""
+def small_demo(path: Path, *registration_gates: dict[str, Any], raw: bool = False) -> Path:
+    """Write the protocol to a file; the registration is also judged by these gates.
+
+    `raw`: the cameras write raw files as well, in which the outlines are measured.
+    """
     document = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text(encoding="utf-8"))
     steps = [step for step in document["steps"] if step["id"] not in _NEEDS_TIME]
+    if raw:
+        document["camera"]["image_quality"] = "RAW+JPEG"
     for step in steps:
         for gate in step.get("gates", []):
             if gate["measure"] == "slice_spacing_mm":
@@ -31,5 +36,7 @@ def small_demo(path: Path, *registration_gates: dict[str, Any]) -> Path:
         if step["id"] == "registration":
             step["params"]["poses"] = ["robot", "robot_corrected"]
             step["gates"] += registration_gates
+            if raw:
+                step["params"]["measure_on"] = "raw"
     path.write_text(yaml.safe_dump({**document, "steps": steps}, sort_keys=False, allow_unicode=True), "utf-8")
     return path

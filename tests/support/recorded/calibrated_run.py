@@ -20,6 +20,7 @@ from service.core.protocol.models import parse_protocol
 from service.core.records.events import (
     ArtefactRef,
     DeviceOpened,
+    FurtherExposure,
     StepMeasured,
     StepPassed,
     StepStarted,
@@ -79,13 +80,13 @@ VIEWS = 10
 _NAMES = [f"b{i:03d}" for i in range(VIEWS)]
 
 
-def begin_calibrated_run(site: WebSite, known: Mapping[str, Uncertainty] | None = None) -> str:
+def begin_calibrated_run(site: WebSite, known: Mapping[str, Uncertainty] | None = None, rig_text: str = RIG) -> str:
     """Begin a run that is calibrated and in its next step, with no image yet; returns its id.
 
     `known` has the uncertainties of the calibration's measures.
     """
     rig = site.folder / "small.yaml"
-    rig.write_text(RIG)
+    rig.write_text(rig_text)
     loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="calibrated.yaml")
     store = site.store
     run_id = start_run(store, loaded, load_rig(rig), operator="grace", auto_confirm=False)
@@ -152,8 +153,12 @@ def capture(
     kind: str = "image",
     shade: int = 0,
     name: str = "DSC00001.JPG",
+    further: Mapping[str, bool] | None = None,
 ) -> str:
-    """Record one exposure; returns the photograph's hash."""
+    """Record one exposure; returns the photograph's hash.
+
+    `further`: further cameras that expose as well, by name; whether with the settings that they should have.
+    """
     pixels = np.full((600, 900, 3), 40 + 5 * shade, np.uint8)
     cv2.putText(pixels, viewpoint, (40, 300), cv2.FONT_HERSHEY_SIMPLEX, 4, (255, 255, 255), 8)
     ref = _put(site, cv2.imencode(".jpg", pixels)[1].tobytes(), kind, "image/jpeg", name)
@@ -178,9 +183,35 @@ def capture(
         environment={"light_lux": 800.0, "temperature_c": 21.5},
         verdicts={"still": True, "settings": True},
     )  # fmt: skip
-    row = NewArtefact(ref, "camera", step, 1, viewpoint)
-    site.store.record(run_id, [payload], actor="runner", artefacts=[row])
+    rows = [NewArtefact(ref, "camera", step, 1, viewpoint)]
+    for device, as_wanted in (further or {}).items():
+        exposure, kept = _further(site, device, viewpoint, payload, as_wanted=as_wanted)
+        payload = payload.model_copy(update={"further": (*payload.further, exposure)})
+        rows += [NewArtefact(one, device, step, 1, viewpoint) for one in kept]
+    site.store.record(run_id, [payload], actor="runner", artefacts=rows)
     return ref.sha256
+
+
+def _further(
+    site: WebSite, device: str, viewpoint: str, first: ViewpointCaptured, *, as_wanted: bool
+) -> tuple[FurtherExposure, list[ArtefactRef]]:
+    """What a further camera exposed, and its files."""
+    pixels = np.full((400, 600, 3), 90, np.uint8)
+    cv2.putText(pixels, f"{device} {viewpoint}", (20, 200), cv2.FONT_HERSHEY_SIMPLEX, 2, (255, 255, 255), 4)
+    image = _put(site, cv2.imencode(".jpg", pixels)[1].tobytes(), "further_image", "image/jpeg", "IMG_0001.JPG")
+    lens = b'{"width": 600, "height": 400, "fx": 800, "fy": 800, "cx": 300, "cy": 200}'
+    calibration = _put(site, lens, "camera_calibration", "application/json", f"{device}.json")
+    exposure = FurtherExposure(
+        device=device,
+        mounted="fixed",
+        artefacts=(image,),
+        calibration=calibration,
+        camera={**first.camera, "lens": "RF 35mm", "iso": 100 if as_wanted else 400, "width": 600, "height": 400},
+        trigger_monotonic_s=2.0,
+        arrival_monotonic_s=3.0,
+        verdicts={"settings": as_wanted},
+    )
+    return exposure, [image, calibration]
 
 
 def _put(site: WebSite, data: bytes, kind: str, media_type: str, name: str) -> ArtefactRef:

@@ -22,7 +22,6 @@ from drivers.interfaces import (
     Device,
     DeviceIdentity,
     DeviceReport,
-    EnvironmentReading,
     Lightbox,
     Payload,
     RobotArm,
@@ -32,7 +31,6 @@ from drivers.interfaces import (
     Scanner,
     SettleCriteria,
     SettleReport,
-    TowerLight,
 )
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, from_rotation_vector, to_rotation_vector, transform
@@ -45,6 +43,7 @@ from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, LensSection, OpticsSection
 from service.runner.operator import AnswerBy
 from service.steps.context import FurtherCamera, LeaveToMove, StationLayout
+from tests.support.rig.bench_lightbox import BenchLightbox
 
 TRAVEL_S = 0.02
 _RATE_HZ = 500.0
@@ -234,34 +233,6 @@ class BenchCamera:
 
 
 @dataclass
-class BenchLightbox:
-    """A light box with a pedal."""
-
-    presses: int = 0
-    tower: bool = True
-    shown: list[TowerLight] = field(default_factory=list[TowerLight])
-
-    def open(self) -> DeviceIdentity:
-        return self.report().identity
-
-    def close(self) -> None:
-        pass
-
-    def report(self) -> DeviceReport:
-        return DeviceReport(DeviceIdentity("lightbox", "Bench box", "L-1", "1", "bench", "1", "memory"))
-
-    def read(self) -> EnvironmentReading:
-        return EnvironmentReading(812.0, 21.5, False, time.monotonic())
-
-    def pedal_presses(self) -> int:
-        return self.presses
-
-    def show_tower(self, light: TowerLight) -> bool:
-        self.shown.append(light)
-        return self.tower
-
-
-@dataclass
 class BenchRig:
     """service.steps.context.Devices with these in-memory devices."""
 
@@ -281,6 +252,11 @@ class BenchRig:
             return self.card
         self._open("camera", self.shutter, opened=self.shutter.opened > 0)
         return self.shutter
+
+    def camera_named(self, name: str) -> Camera:
+        if not name:
+            return self.camera()
+        return next(one.camera for one in self.further if one.name == name)
 
     def further_cameras(self) -> tuple[FurtherCamera, ...]:
         for one in self.further:

@@ -29,6 +29,7 @@ KUKA_STATION: dict[str, Any] = {
     "robot": "robot", "scene_centre_m": [0.55, 0.0, 0.0], "approach_azimuth_deg": 180,
 }  # fmt: skip
 _FRAME_S = 0.04
+_FRI, _FRI_SPOILT = 30200, 30201  # where the driver listens, and where the controller sends
 
 
 def table_rig(trial: Trial, plan: list[str]) -> dict[str, Any]:
@@ -47,12 +48,16 @@ def table_rig(trial: Trial, plan: list[str]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def kuka_rig(trial: Trial, plan: list[str]) -> dict[str, Any]:
-    """A KUKA arm; returns its section of the rig file."""
-    near = trial.arm_host[:-1] + "2"
+def kuka_rig(trial: Trial, plan: list[str], *, fri: bool = False) -> dict[str, Any]:
+    """A KUKA arm, with its poses from FRI if asked for; returns its section of the rig file."""
+    near, listens = trial.arm_host[:-1] + "2", trial.arm_host[:-1] + "3"
     eye = PlaceEye()
     trial.simulators.start("kuka", "--host", trial.arm_host, "--speed-up", "3", "--world", eye.address, *plan)
-    trial.wired(Wire("kuka", "kuka", (near, 30010), (trial.arm_host, 30010)))
+    told = (b'"port":%d' % _FRI, b'"port":%d' % _FRI_SPOILT) if fri else (b"", b"")
+    trial.wired(
+        Wire("kuka", "kuka", (near, 30010), (trial.arm_host, 30010), told),
+        *([Wire("kuka", "fri", (listens, _FRI_SPOILT), (listens, _FRI))] if fri else []),
+    )
     trial.watch(eye)
     host = near if trial.proxy else trial.arm_host
     return {
@@ -61,6 +66,7 @@ def kuka_rig(trial: Trial, plan: list[str]) -> dict[str, Any]:
         "connect_timeout_s": 4.0,
         "answer_timeout_s": 2.0,
         "stale_after_s": 4.0,
+        **({"fri_port": _FRI, "fri_host": listens} if fri else {}),
     }
 
 

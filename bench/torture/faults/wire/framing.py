@@ -85,12 +85,19 @@ _GRBL = {b"<": "status", b"$": "setting", b"G": "welcome", b"o": "answer", b"e":
 _AT_ONCE = b"\x18?!~\x85"  # commands of one byte
 
 
-class Grbl(_Buffered):
-    """GRBL's lines, and the commands of one byte between them."""
+class Talk:
+    """The current operation of a connection, after which its answers are named."""
 
-    def __init__(self, *, answers: bool) -> None:
+    def __init__(self) -> None:
+        self.operation = ""
+
+
+class Grbl(_Buffered):
+    """GRBL's lines, and the commands of one byte between them; the answer to homing has a name of its own."""
+
+    def __init__(self, talk: Talk, *, answers: bool) -> None:
         super().__init__()
-        self._answers = answers
+        self._talk, self._answers = talk, answers
 
     def feed(self, data: bytes) -> list[Message]:
         """Add bytes; returns the lines and commands that are now complete."""
@@ -108,8 +115,14 @@ class Grbl(_Buffered):
 
     def _kind(self, line: bytes) -> str:
         if self._answers:
-            return _GRBL.get(line[:1], "")
-        return "jog" if line.startswith(b"$J=") else "line"
+            kind = _GRBL.get(line[:1], "")
+            if kind == "welcome":
+                self._talk.operation = ""
+            if kind == "answer" and self._talk.operation == "home":
+                self._talk.operation, kind = "", "homed"
+            return kind
+        self._talk.operation = "home" if line.startswith(b"$H") else ""
+        return "jog" if line.startswith(b"$J=") else self._talk.operation or "line"
 
 
 class JsonLines(_Buffered):
@@ -150,17 +163,16 @@ _OPERATIONS = {
     0x1002: "session",
     0x1008: "file_info",
     0x1009: "file",
+    0x9110: "eos_set",
+    0x9114: "remote_mode",
+    0x9115: "event_mode",
+    0x9116: "events",
+    0x9128: "press",
+    0x9129: "let_go",
     0x9205: "set",
     0x9207: "release",
     0x9209: "properties",
 }
-
-
-class PtpTalk:
-    """The current operation on a command connection, after which its answers are named."""
-
-    def __init__(self) -> None:
-        self.operation = ""
 
 
 class PtpIp(_Buffered):
@@ -169,7 +181,7 @@ class PtpIp(_Buffered):
     An answer without data is named after its operation, and so is each data packet of an answer with data.
     """
 
-    def __init__(self, talk: PtpTalk, *, answers: bool) -> None:
+    def __init__(self, talk: Talk, *, answers: bool) -> None:
         super().__init__()
         self._talk, self._answers = talk, answers
         self._with_data = False
@@ -201,6 +213,36 @@ class PtpIp(_Buffered):
         return {2: "connect", 4: "event_connect", EVENT: "event"}.get(kind, "")
 
 
+_PDUS = {1: "associate", 2: "accept", 5: "release", 6: "released"}
+
+
+class Dicom(_Buffered):
+    """PDUs of DICOM's upper layer: type, a byte, length (big-endian u32), content; data are named by their kind."""
+
+    def __init__(self, *, answers: bool) -> None:
+        super().__init__()
+        self._answers = answers
+
+    def feed(self, data: bytes) -> list[Message]:
+        """Add bytes; returns the PDUs that are now complete."""
+        self._buffer += data
+        found: list[Message] = []
+        while len(self._buffer) >= 6:
+            size = 6 + int.from_bytes(self._buffer[2:6], "big")
+            if len(self._buffer) < size:
+                break
+            message, self._buffer = self._buffer[:size], self._buffer[size:]
+            found.append((self._kind(message), message))
+        return found
+
+    def _kind(self, message: bytes) -> str:
+        if message[0] != 4 or len(message) < 12:
+            return _PDUS.get(message[0], "")
+        if self._answers:
+            return "stored"
+        return "command" if message[11] & 1 else "slice"
+
+
 # --- saying no ------------------------------------------------------------------------------------------------
 
 _ACCESS_DENIED = 0x200F
@@ -214,10 +256,16 @@ def refused(device: str, kind: str, message: bytes) -> bytes:  # noqa: PLR0911 -
         if struct.unpack_from("<I", message, 4)[0] == RESPONSE:
             return message[:8] + struct.pack("<H", _ACCESS_DENIED) + message[10:14] + bytes(len(message) - 14)
         raise KeyError(kind)
+    if device == "ct":
+        if kind == "accept":
+            return bytes([3, 0, 0, 0, 0, 4, 0, 1, 1, 1])
+        status = bytes.fromhex("0000000902000000")  # (0000,0900), two bytes
+        at = message.index(status) + len(status)
+        return message[:at] + b"\x00\xa7" + message[at + 2 :]
     if device == "lightbox":
         return b"ERR 2 refused\r\n"
     if device == "table":
-        return {"answer": b"error:9\r\n", "setting": b"error:8\r\n"}[kind]
+        return {"answer": b"error:9\r\n", "homed": b"error:5\r\n", "setting": b"error:8\r\n"}[kind]
     if device == "kuka":
         if kind == "hello":
             return b'{"is":"err","seq":null,"motion":null,"code":"taken","what":"another client is connected"}\n'

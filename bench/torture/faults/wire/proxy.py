@@ -20,18 +20,19 @@ from typing import Any, Literal
 from bench.torture.faults.wire.framing import (
     RESPONSE,
     START_DATA,
+    Dicom,
     Framer,
     Grbl,
     JsonLines,
     Lines,
     PtpIp,
-    PtpTalk,
     Rtde,
     Script,
+    Talk,
     denied,
     refused,
 )
-from bench.torture.faults.wire.streams import Pipe, Stream
+from bench.torture.faults.wire.streams import Datagrams, Pipe, Stream
 
 Column = Literal[
     "drop", "stall", "truncate", "corrupt", "duplicate", "reorder", "reject",
@@ -55,20 +56,25 @@ class Spoil:
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """One TCP port or pseudo-terminal: the driver's end and the simulator's address."""
+    """One TCP port or pseudo-terminal: the driver's end and the simulator's address.
 
-    device: Literal["robot", "camera", "lightbox", "table", "kuka"]
-    protocol: Literal["rtde", "dashboard", "script", "ptpip", "serial", "grbl", "kuka"]
+    Of FRI, whose messages the controller begins, `listen` is where it sends them, and `upstream` the driver's port.
+    `rewrite` is replaced in requests, as by a router that translates addresses.
+    """
+
+    device: Literal["robot", "camera", "lightbox", "table", "kuka", "ct"]
+    protocol: Literal["rtde", "dashboard", "script", "ptpip", "serial", "grbl", "kuka", "fri", "dicom"]
     listen: tuple[str, int] | str
     upstream: tuple[str, int] | str
+    rewrite: tuple[bytes, bytes] = (b"", b"")
 
 
 @dataclass(eq=False)
 class _Link:
     """One connection through the proxy."""
 
-    close: Callable[[], None]
-    talk: PtpTalk = field(default_factory=PtpTalk)
+    close: Callable[[], object]
+    talk: Talk = field(default_factory=Talk)
     stalled: set[bool] = field(default_factory=set[bool])  # directions in which nothing passes any more
     held: dict[bool, bytes] = field(default_factory=dict[bool, bytes])  # until the next message has passed
     refusing: bool = False
@@ -106,6 +112,8 @@ class Proxy:
         for wire in self._wires:
             if isinstance(wire.listen, str):
                 self._plug_in_terminal(wire)
+            elif wire.protocol == "fri":
+                await self._plug_in_datagrams(wire)
             else:
                 handler = self._handler(wire)
                 server = await asyncio.start_server(handler, *wire.listen, reuse_address=True)
@@ -138,6 +146,23 @@ class Proxy:
             self._begin(self._pump(wire, link, near_pipe, far_pipe, answers=False)),
             self._begin(self._pump(wire, link, far_pipe, near_pipe, answers=True)),
         ]
+
+    async def _plug_in_datagrams(self, wire: Wire) -> None:
+        assert not isinstance(wire.listen, str)
+        assert not isinstance(wire.upstream, str)
+        controller, driver = Datagrams(), Datagrams()
+        driver.peer = wire.upstream
+        link = _Link(lambda: (controller.close(), driver.close()))
+
+        async def from_controller(data: bytes) -> None:
+            await self._pass(wire, link, "message", data, driver, answers=True)
+
+        async def from_driver(data: bytes) -> None:
+            await self._pass(wire, link, "reply", data, controller, answers=False)
+
+        await controller.open(wire.listen, lambda data: self._begin(from_controller(data)))
+        await driver.open((wire.listen[0], 0), lambda data: self._begin(from_driver(data)))
+        self._links.add(link)
 
     def _unplug_terminals(self) -> None:
         for _, _, path in self._terminals:
@@ -209,10 +234,19 @@ class Proxy:
     # --- messages ---------------------------------------------------------------------------------------
 
     async def _pass(
-        self, wire: Wire, link: _Link, kind: str, message: bytes, target: Stream | Pipe, *, answers: bool
+        self,
+        wire: Wire,
+        link: _Link,
+        kind: str,
+        message: bytes,
+        target: Stream | Pipe | Datagrams,
+        *,
+        answers: bool,
     ) -> None:
         if answers in link.stalled:
             return
+        if wire.rewrite[0] and not answers:
+            message = message.replace(*wire.rewrite)
         spoilt = self._spoilt(wire, link, kind, message, answers=answers)
         if self._slow and self._spoil is not None and kind == self._spoil.kind:
             await asyncio.sleep(SLOW_S)
@@ -247,6 +281,9 @@ class Proxy:
                 return self._corrupted(message)
             case "noise":
                 return self._rng.randbytes(len(message))
+            case "duplicate" if wire.protocol == "fri":  # in a datagram of its own
+                link.held[answers] = message
+                return message
             case "duplicate":
                 return message + message
             case "reorder":
@@ -310,10 +347,12 @@ def _framer(wire: Wire, link: _Link, *, answers: bool) -> Framer:  # noqa: PLR09
         case "ptpip":
             return PtpIp(link.talk, answers=answers)
         case "grbl":
-            return Grbl(answers=answers)
+            return Grbl(link.talk, answers=answers)
         case "kuka":
             return JsonLines(answers=answers)
-        case "serial":
+        case "dicom":
+            return Dicom(answers=answers)
+        case _:  # the light box
             words = {"*idn": "identity", "light": "light", "temp": "temperature", "shutter": "shutter"}
             return Lines({**words, "pedal": "pedal", "#": "banner"}) if answers else Lines({}, "request")
 

@@ -1,4 +1,4 @@
-"""Terminals and TCP connections as byte streams for the proxy."""
+"""Terminals and TCP connections as byte streams, and UDP ports, for the proxy."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import contextlib
 import os
 import socket
 import struct
+from collections.abc import Callable
 
 
 class Pipe:
@@ -60,3 +61,35 @@ class Stream:
         with contextlib.suppress(OSError):
             link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._writer.transport.abort()
+
+
+class Datagrams(asyncio.DatagramProtocol):
+    """A UDP port that sends to `peer`: set, or else whoever sent last."""
+
+    def __init__(self) -> None:
+        self.peer: tuple[str, int] | None = None
+        self._follows = True
+        self._take: Callable[[bytes], object] = lambda _data: None
+        self._transport: asyncio.DatagramTransport | None = None
+
+    async def open(self, address: tuple[str, int], take: Callable[[bytes], object]) -> None:
+        """Listen at an address, and hand each datagram to `take`. Raises OSError."""
+        self._take, self._follows = take, self.peer is None
+        loop = asyncio.get_running_loop()
+        self._transport, _ = await loop.create_datagram_endpoint(lambda: self, local_addr=address)
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        """Take a datagram."""
+        if self._follows:
+            self.peer = addr
+        self._take(data)
+
+    async def write(self, data: bytes) -> None:
+        """Send a datagram."""
+        if self._transport is not None and self.peer is not None:
+            self._transport.sendto(data, self.peer)
+
+    def close(self) -> None:
+        """Close the port."""
+        if self._transport is not None:
+            self._transport.abort()

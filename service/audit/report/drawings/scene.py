@@ -9,6 +9,7 @@ import base64
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import cycle
 
 import cv2
 import numpy as np
@@ -21,6 +22,8 @@ from service.core.geometry import Array, Transform, apply
 from service.core.text.counts import counted
 from service.core.units import metres, mm
 from service.dataset import scene_view
+from service.dataset.further_cameras import further_poses
+from service.dataset.scene_shapes import frustum_lines, unit_ball
 from service.dataset.summary import RunSummary
 
 _FACES = 16_000
@@ -77,6 +80,7 @@ def report_scene(summary: RunSummary, *, turning: bool) -> SceneBlock | None:
         spheres=[scene_view.SceneSphere(str(i), "registration", centre) for i, centre in enumerate(spheres)],
         radius_m=metres(summary.protocol.spheres.radius_mm),
         mesh=scene_view.SceneMesh(points_m, triangles, error_mm),
+        further=further_poses(summary.protocol, summary.state, summary.captures(), registered.T_scan_camera),
     )
     geometry = _geometry(scene)
     text = (
@@ -150,7 +154,7 @@ def _add_mesh(parts: _Parts, mesh: scene_view.SceneMesh | None, to_view: Transfo
 
 
 def _add_spheres(parts: _Parts, scene: scene_view.Scene, to_view: Transform) -> None:
-    ball, faces = scene_view.unit_ball()
+    ball, faces = unit_ball()
     radius_mm = mm(scene.radius_m)
     for sphere in scene.spheres:
         centre = _in_view_mm(np.array(sphere.centre_m), to_view)[0]
@@ -166,10 +170,17 @@ def _add_cameras(parts: _Parts, scene: scene_view.Scene, to_view: Transform) -> 
     for number, station in enumerate(sorted(set(scene.stations.values()))):
         colour = scene_view.STYLES[number % len(scene_view.STYLES)][0]
         mine = [to_view @ T for name, T in scene.cameras.items() if scene.stations[name] == station]
-        path = scene_view.frustum_lines(mine).astype(np.float32)
-        pairs = np.stack([path[:-1], path[1:]], axis=1)
-        parts.add_lines(pairs[np.isfinite(pairs).all(axis=(1, 2))], colour)
+        _add_frustums(parts, mine, colour)
         parts.legend.append((colour, f"cameras of {station}".replace("_", " ") if station else "cameras"))
+    for (name, poses), (colour, _) in zip(scene.further.items(), cycle(scene_view.FURTHER_STYLES), strict=False):
+        _add_frustums(parts, [to_view @ T for T in poses.values()], colour)
+        parts.legend.append((colour, name))
+
+
+def _add_frustums(parts: _Parts, cameras: Sequence[Transform], colour: str) -> None:
+    path = frustum_lines(cameras).astype(np.float32)
+    pairs = np.stack([path[:-1], path[1:]], axis=1)
+    parts.add_lines(pairs[np.isfinite(pairs).all(axis=(1, 2))], colour)
 
 
 def _add_scale_bar(parts: _Parts) -> None:
@@ -285,10 +296,17 @@ def _rows(scene: scene_view.Scene) -> tuple[tuple[str, ...], ...]:
     head = ("what", "name", "station", "x_mm", "y_mm", "z_mm", "axis_x", "axis_y", "axis_z")
     rows: list[tuple[str, ...]] = [head]
     for name, T in sorted(scene.cameras.items()):
-        rows.append(("camera", name, scene.stations[name], *_numbers(mm(T[:3, 3]), 4), *_numbers(T[:3, 2], 6)))
+        rows.append(("camera", name, scene.stations[name], *_place(T)))
+    for device, poses in sorted(scene.further.items()):
+        rows += [(device, name, "", *_place(pose)) for name, pose in sorted(poses.items())]
     for sphere in scene.spheres:
         rows.append(("sphere", sphere.label, "", *_numbers(mm(np.array(sphere.centre_m)), 4), "", "", ""))
     return tuple(rows)
+
+
+def _place(T: Transform) -> tuple[str, ...]:
+    """A camera's position and optical axis."""
+    return (*_numbers(mm(T[:3, 3]), 4), *_numbers(T[:3, 2], 6))
 
 
 def _numbers(values: Array, digits: int) -> tuple[str, ...]:

@@ -6,11 +6,13 @@ their hashes, which are their names in the evidence.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Column, Heading, Paragraph, Pictures, Section, Table, TableCell
 from service.audit.report.drawings.pictures import LARGE_PX, THUMBNAIL_PX, picture
 from service.audit.report.drawings.scene import report_scene
-from service.core.records.events import RecordedView
+from service.core.records.events import FurtherExposure, RecordedView, ViewpointCaptured
 
 
 def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
@@ -40,10 +42,13 @@ def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
         if views:
             sheet = tuple(picture(run, view.artefacts[0].sha256, _caption(view), THUMBNAIL_PX) for _, view in views)
             blocks += [Heading(f"Contact sheet: {step.title}"), Pictures(sheet, 5)]
-        originals += [
-            (str(seq), view.viewpoint, view.artefacts[0].original_name, view.artefacts[0].sha256)
-            for seq, view in views
-        ]
+        further = _further(views)
+        for device, mine in further.items():
+            sheet = tuple(picture(run, one.artefacts[0].sha256, caption, THUMBNAIL_PX) for _, caption, one in mine)
+            blocks += [Heading(f"Contact sheet: {step.title}, {device}"), Pictures(sheet, 5)]
+        shown = [(seq, view.viewpoint, view.artefacts[0]) for seq, view in views]
+        shown += [(seq, f"{name}, {one.device}", one.artefacts[0]) for m in further.values() for seq, name, one in m]
+        originals += [(str(seq), name, ref.original_name, ref.sha256) for seq, name, ref in shown]
     if originals:
         columns = (
             Column("event", 0.5, "number"),
@@ -57,6 +62,15 @@ def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
         )
         blocks += [Heading("Originals"), Paragraph(text), Table(columns, tuple(originals), small=True)]
     return Section("Pictures", tuple(blocks) or (Paragraph("No photograph was taken."),))
+
+
+def _further(views: Sequence[tuple[int, RecordedView]]) -> dict[str, list[tuple[int, str, FurtherExposure]]]:
+    """The images of each further camera: event, viewpoint, exposure."""
+    found: dict[str, list[tuple[int, str, FurtherExposure]]] = {}
+    for seq, view in views:
+        for one in view.further if isinstance(view, ViewpointCaptured) else ():
+            found.setdefault(one.device, []).append((seq, view.viewpoint, one))
+    return found
 
 
 def _caption(capture: RecordedView) -> str:

@@ -51,7 +51,7 @@ def inverted(poses: Array) -> Array:
 
 
 def check_setup(hands: Array, boards: Array, point_m: Array, setup: Setup) -> None:
-    """Raise ComputeError unless robot and image poses fit; its message names the reading that does, if any.
+    """Raise ComputeError unless robot and image poses fit; its message names another reading of them that fits.
 
     Args:
         hands: (N, 4, 4) T_base_flange, or T_flange_base for a camera beside the robot.

@@ -70,7 +70,7 @@ class Direction:
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
+class DistanceSamples:
     """Samples of one surface, with the distance (N,) of each to the other's samples, infinite beyond the limit."""
 
     samples: Samples = field(repr=False)
@@ -91,8 +91,8 @@ class ChamferScore:
     pred_to_gt: Direction
     gt_to_pred: Direction
     thresholds_m: tuple[float, ...]
-    pred: Compared = field(repr=False)
-    gt: Compared = field(repr=False)
+    pred: DistanceSamples = field(repr=False)
+    gt: DistanceSamples = field(repr=False)
 
     @property
     def chamfer_m(self) -> float:
@@ -126,7 +126,7 @@ def chamfer(pred: Surface, gt: Surface, settings: ChamferSettings | None = None)
     floor_a, floor_b = _floor(pred, a, index_a, rng), _floor(gt, b, index_b, rng)
     forth = _direction(_Way(pred, a, gt, b, to_b, nearest_b), floor_b, chosen, rng)
     back = _direction(_Way(gt, b, pred, a, to_a, nearest_a), floor_a, chosen, rng)
-    return ChamferScore(forth, back, chosen.thresholds_m, Compared(a, to_b), Compared(b, to_a))
+    return ChamferScore(forth, back, chosen.thresholds_m, DistanceSamples(a, to_b), DistanceSamples(b, to_a))
 
 
 @dataclass(frozen=True, slots=True)

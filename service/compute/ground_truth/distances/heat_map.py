@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.ground_truth.distances.chamfer import ChamferScore, Compared
+from service.compute.ground_truth.distances.chamfer import ChamferScore, DistanceSamples
 from service.compute.ground_truth.distances.sampling import normals_of
 from service.compute.ground_truth.surface import Surface
 from service.core.geometry import Array
@@ -59,7 +59,7 @@ class Panel:
     title: str
 
     @classmethod
-    def of_distances(cls, surface: Surface, compared: Compared, scale: HeatScale, title: str) -> Panel:
+    def of_distances(cls, surface: Surface, compared: DistanceSamples, scale: HeatScale, title: str) -> Panel:
         """The samples of a surface in the colours of their distances."""
         points = compared.samples.points_m
         everything = np.arange(len(points))

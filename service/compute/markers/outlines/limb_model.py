@@ -145,7 +145,7 @@ def _mixed(channels: Array32) -> Array32:
 
 
 @dataclass(frozen=True, slots=True)
-class _Shown:
+class _BeforeBlur:
     """The model before interpolation and the colours' blur.
 
     Attributes:
@@ -159,7 +159,7 @@ class _Shown:
     share: Array32
 
 
-def _shown(p: Array, blur: Array, model: LimbModel) -> _Shown:
+def _shown(p: Array, blur: Array, model: LimbModel) -> _BeforeBlur:
     """Predict grey values: the light of sphere and surroundings, blurred by lens and pixel, then gamma-encoded."""
     s = blur.astype(np.float32)[:, None, None]
     R = model.radius.astype(np.float32)[:, None, None]
@@ -194,7 +194,7 @@ def _shown(p: Array, blur: Array, model: LimbModel) -> _Shown:
         + (e * s * density)[:, None] * by_outer
     )
     mixed[:, :, 5] = _mixed(value)
-    return _Shown(mixed, slope, S)
+    return _BeforeBlur(mixed, slope, S)
 
 
 def _limb_light(u: Array32, x: Array32, s: Array32, R: Array32) -> tuple[Array32, Array32]:

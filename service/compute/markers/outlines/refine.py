@@ -239,7 +239,7 @@ def _measure(
     sampling: _Sampling,
     options: DetectionOptions,
 ) -> list[_SubpixelCone | None]:
-    """Cones near `starts`."""
+    """Measure the cones near `starts`."""
     unit, step = sampling.unit, sampling.step
     cones = [s.cone for s in starts]
     radius = np.array([c.half_angle_rad for c in cones]) * camera.fx / unit

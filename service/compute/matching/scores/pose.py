@@ -36,7 +36,7 @@ class PoseError:
 
     @property
     def worst_deg(self) -> float:
-        """The error that counts: the larger one."""
+        """The larger of the two errors, which is the one that counts."""
         return max(self.rotation_deg, self.translation_deg)
 
 

@@ -108,7 +108,7 @@ _TF_BYTES = 8 + 4 + 4 + 56  # least size of a TransformStamped
 
 @dataclass(frozen=True, slots=True)
 class StampedImage:
-    """A compressed image: its file as it is."""
+    """A compressed image: the unchanged file, with its time stamp."""
 
     stamp_ns: int
     frame: str

@@ -299,8 +299,8 @@ def _read(T_world_scan: Transform, s: float, station: _Station) -> _Reading:
 def _polish(reading: _Reading, station: _Station) -> _Reading:
     """Least squares on the directions of all matched spheres, alternating with matching until nothing changes.
 
-    The residuals are those of `ObservedCones` in radii, but written out: with other rounding, recorded results could
-    not be computed again to their last digits, on which the noise estimated from nearly exact outlines depends.
+    The residuals are those of `ObservedCones` in radii. They are written out here to keep their rounding: the noise
+    estimated from nearly exact outlines depends on the last digits, and a replay must reproduce recorded results.
     """
     seen, poses, radius_m, metric = station.seen, station.poses, station.radius_m, station.metric
     for _ in range(4):

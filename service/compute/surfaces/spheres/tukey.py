@@ -17,7 +17,7 @@ _LEAST_SPREAD = (
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Which samples count.
+    """Which samples have a weight in a fit.
 
     Attributes:
         half_width: residual beyond which a sample has no weight, m.

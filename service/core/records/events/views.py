@@ -34,6 +34,7 @@ class FurtherExposure(Record):
     camera: dict[str, Any]  # EXIF settings, counter, time, lens
     trigger_monotonic_s: float
     arrival_monotonic_s: float
+    verdicts: dict[str, bool] = Field(default_factory=dict[str, bool])  # settings; the view's own include them
 
 
 class ViewpointCaptured(RecordedView):

@@ -16,6 +16,7 @@ from service.core.equipment.camera_clocks import clock_offset
 from service.core.geometry import Array, Transform
 from service.core.records.events import ViewpointCaptured
 from service.core.units import mm, mrad
+from service.dataset.further_cameras import pose_sigmas
 from service.dataset.registrations import further_cameras
 from service.dataset.summary import RunSummary
 from service.jobs.registration.further_camera import Answer
@@ -168,17 +169,18 @@ def _stated(captures: Sequence[ViewpointCaptured], located: Answer) -> dict[str,
         "clock_offset_s": None if clock is None else clock.offset_s,
         "clock_offset_sigma_s": None if clock is None else clock.sigma_s,
         "clock_offset_of": "its clock minus that of the first camera",
+        "measured_on": located.measured_on,
         "images_left_out": located.excluded,
     }
     if located.T_outer_camera is None or located.covariance is None:
         return {**said, "not_located": located.why}
-    variances = np.diag(np.array(located.covariance))
+    sigma_m, sigma_rad = pose_sigmas(located)
     return {
         **said,
         "T_scan_camera" if located.mounted == "fixed" else "T_first_camera": located.T_outer_camera,
         "covariance": located.covariance,
-        "sigma_mm": mm(float(np.sqrt(variances[:3].sum()))),
-        "sigma_mrad": mrad(float(np.sqrt(variances[3:].sum()))),
+        "sigma_mm": mm(sigma_m),
+        "sigma_mrad": mrad(sigma_rad),
         "consistency_mm": located.consistency_mm,
         "consistency_mrad": located.consistency_mrad,
         "images": len(located.views),

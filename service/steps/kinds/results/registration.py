@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
-from service.compute.images.develop_parameters import PARAMETERS
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.jobs.keys import arguments_name
 from service.core.protocol.step_params import RepeatedStep, StepParams
@@ -21,7 +20,7 @@ from service.core.records.events import ComputedBy, Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
 from service.jobs.records import Mounting, PosedPhotograph
-from service.jobs.registration import detect_spheres, develop, further_camera, register
+from service.jobs.registration import detect_spheres, further_camera, register
 from service.jobs.registration.register import Registration
 from service.jobs.surfaces import locate_spheres
 from service.jobs.words import term
@@ -35,6 +34,7 @@ from service.steps.inputs import (
     raw_files,
 )
 from service.steps.measures import Count, ErrorMm, Measure, MeasureRecord, Px, Ratio, RegistrationMeasures
+from service.steps.poses.developed import Exposed, developed
 from service.steps.poses.further_cameras import locate_further_cameras
 from service.steps.poses.registration_jobs import RegistrationJobs, registration_jobs
 from service.steps.poses.sources import DEFAULT_SOURCES, PLANNED, Source, WantedRegistrations, decisive, posed
@@ -67,7 +67,8 @@ class Params(StepParams):
     # Grounding DINO and SAM 2, and in "vote" it and the classical one must agree.
     detector: detect_spheres.DetectorName = "classical"
     # Where outlines are measured once they are found. "raw" develops the raw file of each image first, which needs
-    # the extra `raw` on the worker, and RAW+JPEG as the camera's `image_quality`.
+    # the extra `raw` on the worker, and RAW+JPEG as the camera's `image_quality`. Further cameras that write no raw
+    # files are measured in their JPEGs.
     measure_on: Literal["jpeg", "raw"] = "jpeg"
     reduced: tuple[str, ...] = ()  # such as 1920x1080: lower resolutions, for the paper's comparison
     reduced_poses: tuple[Literal["colmap", "glomap"], ...] = ("colmap",)  # sources of poses for the reduced images
@@ -155,7 +156,10 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         context.progress(_words(found), len(found.arrived.keys() & set(waited)), len(waited))
         if all(name in found.arrived for name in waited):
             return _with_further_cameras(
-                _outcome(found), locate_further_cameras(context, params.images_of, outlines, found.arrived)
+                _outcome(found),
+                locate_further_cameras(
+                    context, params.images_of, outlines, found.arrived, on_raw=params.measure_on == "raw"
+                ),
             )
         for task in found.due:
             context.evidence.enqueue(task.request, task.name)
@@ -186,7 +190,8 @@ def _search(context: StepContext, params: Params) -> JobRequest:
         detector=params.detector,
     ).model_copy(update={**mounted.mounting.set_fields(), **known})
     if params.measure_on == "raw":
-        arguments = arguments.model_copy(update={"developed": _developed(context, images)})
+        taken = [Exposed(image.viewpoint, image.sha256, raw) for image, raw in raw_files(context, images)]
+        arguments = arguments.model_copy(update={"developed": developed(context, taken)})
     references = {
         **mounted.references,
         "camera": calibration.reference("camera"),
@@ -196,23 +201,6 @@ def _search(context: StepContext, params: Params) -> JobRequest:
     if lens is not None:
         references["intrinsics_covariance"] = calibration.reference("details/intrinsics/covariance")
     return JobRequest.of(detect_spheres.KIND, arguments, references)
-
-
-def _developed(context: StepContext, images: list[PosedPhotograph]) -> dict[str, str]:
-    """The developed raw file of each image, by viewpoint."""
-    raws = raw_files(context, images)
-    parameters = develop.Parameters.model_validate(asdict(PARAMETERS))
-    requests = [
-        JobRequest.of(
-            develop.KIND,
-            develop.Arguments(
-                viewpoint=image.viewpoint, raw=raws[image.viewpoint], jpeg=image.sha256, parameters=parameters
-            ),
-        )
-        for image in images
-    ]
-    results = context.evidence.run_jobs(*requests)
-    return {image.viewpoint: result.artefacts[0].sha256 for image, result in zip(images, results, strict=True)}
 
 
 def _mounting(context: StepContext, params: Params, images: list[PosedPhotograph]) -> CameraMounting:

@@ -24,6 +24,7 @@
   let peaking = true;
   let at = { x: 0.5, y: 0.5 }; // what is magnified, as shares of the frame
   let best = 0;
+  let camera = ""; // whose frames; "": the first one
   let frame = null; // the newest: width, height, luma
 
   const say = (text) => { if (word.textContent !== text) word.textContent = text; };
@@ -140,7 +141,7 @@
     if (!open) return;
     const began = performance.now();
     try {
-      const response = await fetch(panel.dataset.live, { cache: "no-store" });
+      const response = await fetch(`${panel.dataset.live}?camera=${encodeURIComponent(camera)}`, { cache: "no-store" });
       if (response.status === 200) {
         const address = URL.createObjectURL(await response.blob());
         picture.src = address;
@@ -203,6 +204,15 @@
     best = 0;
     draw();
   });
+  const choices = panel.querySelectorAll("[data-live-camera]");
+  choices.forEach((button) => button.addEventListener("click", () => {
+    camera = button.dataset.liveCamera;
+    choices.forEach((other) => other.setAttribute("aria-pressed", String(other === button)));
+    best = 0; // another lens
+    frame = null;
+    view.classList.add("without-frame");
+    say("Waiting for a frame…");
+  }));
   document.addEventListener("visibilitychange", () => { if (document.hidden && open) set(false); });
 
   // On the guided screen it belongs to the step at which the lens is focused.

@@ -1,33 +1,25 @@
 """The calls of Aravis (libaravis 0.8) that the driver needs: GenICam over GigE Vision and USB3 Vision.
 
 Aravis is called by ctypes: the library comes with the operating system, and its Python package would have to be
-compiled. Every call that can fail raises AravisError with the library's message.
+compiled. Every call that can fail raises LinkError.
 """
 
 from __future__ import annotations
 
 import ctypes
 import ctypes.util
-from dataclasses import dataclass
 from typing import Any
 
+from drivers.genicam.link import Frame, LibraryMissingError, LinkError, NoImageError
 from service.core.units import seconds_of_us, us
 
 LIBRARIES = ("aravis-0.8", "gobject-2.0", "glib-2.0")
 _SUCCESS = 0  # of ArvBufferStatus
+# Of the same: nothing of an image is in the buffer. Where a process may open packet sockets (as root), Aravis reads
+# one that sees all traffic of the machine until its filter is set; a foreign packet ends the wait for the image.
+_NOTHING_IN_IT = (1, 8)
+_TRIES = 5  # exposures
 _POINTER, _TEXT, _REAL = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_double
-
-
-class AravisError(Exception):
-    """A call failed; the message is the library's."""
-
-
-class LibraryMissingError(Exception):
-    """A library of Aravis is not installed."""
-
-
-class NoImageError(Exception):
-    """No whole image came in time."""
 
 
 class _Error(ctypes.Structure):
@@ -36,24 +28,13 @@ class _Error(ctypes.Structure):
     _fields_ = (("domain", ctypes.c_uint32), ("code", ctypes.c_int), ("message", _TEXT))
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """One image as the camera sent it: its number, size in px, pixel format by its GenICam code, and bytes."""
-
-    number: int
-    width: int
-    height: int
-    code: int
-    data: bytes
-
-
 class AravisCamera:
-    """A connected camera. Not thread-safe; calls may block, and a fault of the library ends the process."""
+    """A connected camera; drivers.genicam.link.CameraLink."""
 
     def __init__(self, name: str) -> None:
         """Connect to a camera by IP address or by the name that `arv-tool-0.8` lists.
 
-        Raises LibraryMissingError or AravisError.
+        Raises LibraryMissingError or LinkError.
         """
         self._aravis, self._gobject, self._glib = (_library(name) for name in LIBRARIES)
         self._camera: int | None = self._call("arv_camera_new", _POINTER, name.encode(), of=(_TEXT,))
@@ -64,10 +45,30 @@ class AravisCamera:
         if camera is not None:
             self._unref(camera)
 
-    def text(self, what: str) -> str:
-        """The text that `arv_camera_get_…` gives, such as `model_name`."""
-        value = self._of_camera(f"arv_camera_get_{what}", _TEXT)
-        return value.decode("utf-8", "replace") if value else ""
+    @property
+    def software(self) -> str:
+        """Name and version of the library."""
+        return f"Aravis {version()}"
+
+    @property
+    def vendor(self) -> str:
+        """Name of the camera's maker."""
+        return self._text("vendor_name")
+
+    @property
+    def model(self) -> str:
+        """Name of the model."""
+        return self._text("model_name")
+
+    @property
+    def serial(self) -> str:
+        """Serial number."""
+        return self._text("device_serial_number")
+
+    @property
+    def pixel_format(self) -> str:
+        """Pixel format by its GenICam name."""
+        return self._text("pixel_format_as_string")
 
     @property
     def exposure_s(self) -> float:
@@ -92,18 +93,36 @@ class AravisCamera:
         self._of_camera("arv_camera_set_pixel_format_from_string", None, name.encode(), of=(_TEXT,))
 
     def acquire(self, timeout_s: float) -> Frame:
-        """Expose and receive one image. Raises NoImageError or AravisError."""
+        """Expose and receive one image; if foreign traffic was taken for it, expose again.
+
+        Raises NoImageError or LinkError.
+        """
+        for _ in range(_TRIES):
+            frame = self._acquired(timeout_s)
+            if frame is not None:
+                return frame
+        raise NoImageError("other traffic of this machine is taken for images")
+
+    def _acquired(self, timeout_s: float) -> Frame | None:
+        """One image; None if there is nothing of an image in the buffer."""
         timeout_us = ctypes.c_uint64(round(us(timeout_s)))
         buffer = self._of_camera("arv_camera_acquisition", _POINTER, timeout_us, of=(ctypes.c_uint64,))
         if not buffer:
             raise NoImageError("no image came")
         try:
             status = self._of_buffer(buffer, "status", ctypes.c_int)
+            if status in _NOTHING_IN_IT:
+                return None
             if status != _SUCCESS:
                 raise NoImageError(f"an image is incomplete (Aravis' status {status})")
             return self._frame(buffer)
         finally:
             self._unref(buffer)
+
+    def _text(self, what: str) -> str:
+        """The text that `arv_camera_get_…` gives."""
+        value = self._of_camera(f"arv_camera_get_{what}", _TEXT)
+        return value.decode("utf-8", "replace") if value else ""
 
     def _frame(self, buffer: int) -> Frame:
         size = ctypes.c_size_t()
@@ -125,7 +144,7 @@ class AravisCamera:
 
     def _of_camera(self, name: str, gives: Any, *arguments: Any, of: tuple[Any, ...] = ()) -> Any:
         if self._camera is None:
-            raise AravisError("the camera is not connected")
+            raise LinkError("the camera is not connected")
         return self._call(name, gives, self._camera, *arguments, of=(_POINTER, *of))
 
     def _call(self, name: str, gives: Any, *arguments: Any, of: tuple[Any, ...]) -> Any:
@@ -139,7 +158,7 @@ class AravisCamera:
             free = self._glib.g_error_free
             free.restype, free.argtypes = None, (ctypes.POINTER(_Error),)
             free(error)
-            raise AravisError(message)
+            raise LinkError(message)
         return value
 
     def _unref(self, thing: int) -> None:
@@ -159,4 +178,4 @@ def _library(name: str) -> ctypes.CDLL:
     try:
         return ctypes.CDLL(found or f"lib{name}.so.0")
     except OSError as error:
-        raise LibraryMissingError(f"lib{name}") from error
+        raise LibraryMissingError(f"lib{name}", "apt-get install libaravis-0.8-0") from error

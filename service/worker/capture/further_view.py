@@ -1,0 +1,53 @@
+"""Job `further_view`: an image of a further camera; its spheres, its sharpness, and whether it locates the camera."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from service.compute.capture.live import clipped_fraction, expected_spheres, sharpness
+from service.compute.images.files import read_image_of
+from service.compute.images.quality import image_quality
+from service.compute.markers.archive import outline_record
+from service.compute.markers.detect import detect_spheres
+from service.compute.poses.files.camera_files import read_camera_json
+from service.compute.registration.further_camera import sighted_pose
+from service.compute.scene import ScanSpheres
+from service.core.errors import ComputeError
+from service.core.geometry import inverse
+from service.jobs.capture import further_view as job
+from service.jobs.records import matrix
+from service.worker.job import JobAnswer, JobContext
+
+
+def further_view(context: JobContext[job.Arguments]) -> JobAnswer:
+    """Find the spheres in the image, and locate the camera by them if there are enough."""
+    cv2.setNumThreads(1)  # the capture goes on in parallel
+    arguments, image = context.arguments, context.arguments.image
+    camera = read_camera_json(context.input(arguments.calibration))
+    pixels = read_image_of(context.input(image.sha256), camera)
+    outlines = detect_spheres(pixels, camera)
+    quality = sharpness(pixels, outlines, camera)
+    whole = image_quality(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
+    measures = {
+        "image_edge_px": whole.edge_px,
+        "outlines": float(len(outlines)),
+        "outline_coverage": quality.coverage,
+        "outline_rms_px": quality.rms_px,
+        "edge_width_px": quality.edge_px,
+        "clipped_fraction": clipped_fraction(pixels),
+        "spheres_seen": 0.0,
+    }
+    answer = job.Answer(viewpoint=image.viewpoint, device=arguments.device, black=whole.black)
+    spheres = ScanSpheres(np.array(arguments.spheres_m), arguments.radius_m)
+    try:
+        seen = sighted_pose(outlines, camera, spheres, None)
+    except ComputeError as error:
+        answer = answer.model_copy(update={"reason": error.what})
+    else:
+        expected = expected_spheres(inverse(seen.T_scan_camera), spheres.centres_m, spheres.radius_m, camera)
+        measures |= {"spheres_seen": float(seen.spheres), "spheres_expected": float(len(expected))}
+        answer = answer.model_copy(update={"T_ct_camera": matrix(seen.T_scan_camera)})
+    records = {image.viewpoint: [outline_record(outline) for outline in outlines]}
+    kept = context.keep_json(records, kind="further_view", name=f"{image.viewpoint}.{arguments.device}.json")
+    return JobAnswer({name: value for name, value in measures.items() if np.isfinite(value)}, (kept,), answer)

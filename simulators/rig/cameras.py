@@ -1,0 +1,45 @@
+"""The cameras that a simulated rig may have: which simulator each is, where it is found, and its part of rig.yaml."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from simulators.gige_camera.registers import SERIAL
+
+CAMERAS = {"Sony ILCE-7RM5": "camera", "Canon EOS R5": "canon", "GigE Vision": "gige", "video": "video"}
+STILL = ("Sony ILCE-7RM5", "Canon EOS R5")  # with a button; a person can hold them, and they can be second cameras
+_LENS = {"aperture_f": 22.0, "lens": "50 mm", "focal_length_mm": 50.0}  # set by hand, as the protocols want it
+_LONGEST_FRAME_S = 30.0  # this camera renders its images
+_VIDEO_LATENCY_S = 2.0  # twice what the simulator holds a frame back at most, and a frame
+
+
+def place(model: str, host: str, folder: Path) -> tuple[str, ...]:
+    """The words of the command line that say where the simulator is to be found."""
+    match CAMERAS[model]:
+        case "gige":
+            return "--host", host
+        case "video":
+            return "--pipe", str(folder / "video")
+        case _:
+            return "--port", "0"
+
+
+def again(ready: dict[str, Any], taken: int) -> tuple[str, ...]:
+    """The words with which a camera that died is found where it was, and counts on."""
+    port = str(ready.get("gphoto_port", "")).rpartition(":")[2]
+    return (*(("--port", port) if port else ()), "--first-counter", str(taken + 1))
+
+
+def section(ready: dict[str, Any], exposure_s: float) -> dict[str, Any]:
+    """The camera with this ready line in rig.yaml; one picture may take this long, since it is rendered."""
+    match ready["simulator"]:
+        case "gige":
+            found = {"driver": "genicam", "camera": ready["host"], "serial": SERIAL}
+            return {**found, **_LENS, "frame_timeout_s": min(exposure_s, _LONGEST_FRAME_S)}
+        case "video":
+            found = {"driver": "video", "port": "video", "model": "simulated microscope", "exposure_s": 1 / 15}
+            timing = {"latency_s": _VIDEO_LATENCY_S, "frame_timeout_s": min(exposure_s, _LONGEST_FRAME_S)}
+            return {**found, **_LENS, **timing}
+        case _:
+            return {"driver": "gphoto", "port": ready["gphoto_port"], "capture_timeout_s": exposure_s}

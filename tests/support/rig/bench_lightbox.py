@@ -1,0 +1,36 @@
+"""The light box of the in-memory rig for tests of the runner."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from drivers.interfaces import DeviceIdentity, DeviceReport, EnvironmentReading, TowerLight
+
+
+@dataclass
+class BenchLightbox:
+    """A light box with a pedal."""
+
+    presses: int = 0
+    tower: bool = True
+    shown: list[TowerLight] = field(default_factory=list[TowerLight])
+
+    def open(self) -> DeviceIdentity:
+        return self.report().identity
+
+    def close(self) -> None:
+        pass
+
+    def report(self) -> DeviceReport:
+        return DeviceReport(DeviceIdentity("lightbox", "Bench box", "L-1", "1", "bench", "1", "memory"))
+
+    def read(self) -> EnvironmentReading:
+        return EnvironmentReading(812.0, 21.5, False, time.monotonic())
+
+    def pedal_presses(self) -> int:
+        return self.presses
+
+    def show_tower(self, light: TowerLight) -> bool:
+        self.shown.append(light)
+        return self.tower
