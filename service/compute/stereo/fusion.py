@@ -1,8 +1,5 @@
 """Fusion of depth maps in a truncated signed distance field, kept in blocks near the surface.
 
-Distances are across the surface, not along the rays: a steep surface is as thick in the field as a level one. Along
-the rays, the truncation would leave it thinner than a voxel, and a hole.
-
 Source: Curless and Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996.
 """
 
@@ -16,13 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.stereo.matching import DepthMap
-from service.compute.stereo.slopes import Slopes, slopes_of
 from service.core.errors import ComputeError
 from service.core.geometry import Array, inverse
 
 SIDE = 8  # voxels of a block's edge
-TRUNCATION = 4.0  # voxels, across the surface
-_BEHIND = 6.0  # voxels, along the ray: a steep plane is not believed farther behind its surface
+TRUNCATION = 4.0  # voxels
 _STEP = 2  # every so many pixels of a map say where blocks are needed
 _AT_ONCE = 4000  # blocks
 _MOST_BLOCKS = 400_000
@@ -82,9 +77,10 @@ def _blocks(maps: Sequence[DepthMap], voxel_m: float, least_maps: int) -> Ints:
     reach = TRUNCATION * voxel_m
     found: list[Ints] = []
     for one in maps:
-        few = one.thinned(_STEP)
-        points, normals = few.points_m(1), slopes_of(few).normals(few)
-        keys = [_key(np.floor((points + k * reach * normals) / edge).astype(np.int64)) for k in (-1.0, 0.0, 1.0)]
+        points = one.points_m(_STEP)
+        toward = points - one.T_world_camera[:3, 3]
+        toward *= reach / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-12)
+        keys = [_key(np.floor((points + k * toward) / edge).astype(np.int64)) for k in (-1.0, 0.0, 1.0)]
         found.append(np.unique(np.concatenate(keys)))
     if not found:
         return np.empty((0, 3), dtype=np.int64)
@@ -116,25 +112,22 @@ def _integrate(out: Field, one: DepthMap) -> None:
     chosen = np.flatnonzero(inside)
     grid = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     local = (grid * out.voxel_m) @ T[:3, :3].T
-    slopes = slopes_of(one)
     for begin in range(0, len(chosen), _AT_ONCE):
         part = chosen[begin : begin + _AT_ONCE]
         corner = out.blocks[part] * edge @ T[:3, :3].T + T[:3, 3]
-        _add(out, one, slopes, part, (corner[:, None, :] + local[None]).astype(np.float32))
+        _add(out, one, part, (corner[:, None, :] + local[None]).astype(np.float32))
 
 
-def _add(out: Field, one: DepthMap, slopes: Slopes, part: Ints, camera: NDArray[np.float32]) -> None:
+def _add(out: Field, one: DepthMap, part: Ints, camera: NDArray[np.float32]) -> None:
     """Add a map to some blocks, whose voxels (P, SIDE³, 3) are in the map's frame."""
     flat = camera.reshape(-1, 3)
     z = flat[:, 2]
     u = flat[:, 0] / z * np.float32(one.camera.fx) + np.float32(one.camera.cx)
     v = flat[:, 1] / z * np.float32(one.camera.fy) + np.float32(one.camera.cy)
-    across = _sampled(slopes.across, u, v)
-    along = (_sampled(one.depth_m, u, v) - z) / np.float32(out.voxel_m)
-    distance = along * across
-    said = ((distance > -TRUNCATION) & (along > -_BEHIND)).reshape(len(part), -1)
+    distance = (_sampled(one.depth_m, u, v) - z) / np.float32(out.voxel_m)
+    said = (distance > -TRUNCATION).reshape(len(part), -1)
     value = np.minimum(distance, np.float32(TRUNCATION)).reshape(len(part), -1)
-    weight = np.where(said, (across**2 * np.float32(one.weight)).reshape(len(part), -1), np.float32(0))
+    weight = np.where(said, np.float32(one.weight), np.float32(0))
     before = out.weight[part]
     after = before + weight
     mean = out.distance[part]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -44,13 +44,6 @@ class DepthMap:
         of = self.camera
         camera = np.stack([(u - of.cx) / of.fx * z, (v - of.cy) / of.fy * z, z], axis=1)
         return camera @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
-
-    def thinned(self, step: int) -> DepthMap:
-        """Every `step`-th pixel of every `step`-th row, as a map of its own."""
-        depth, of = np.ascontiguousarray(self.depth_m[::step, ::step]), self.camera
-        height, width = depth.shape
-        camera = CameraModel(width, height, of.fx / step, of.fy / step, of.cx / step, of.cy / step)
-        return replace(self, depth_m=depth, camera=camera)
 
 
 def depth_of_pair(pair: Rectified, distance_m: float) -> DepthMap | None:
