@@ -15,7 +15,10 @@ from service.core.units import seconds_of_us, us
 
 LIBRARIES = ("aravis-0.8", "gobject-2.0", "glib-2.0")
 _SUCCESS = 0  # of ArvBufferStatus
-_NO_PACKET_SOCKET = 1  # of ArvGvStreamOption
+# Of the same: nothing of an image is in the buffer. Where a process may open packet sockets (as root), Aravis reads
+# one that sees all traffic of the machine until its filter is set; a foreign packet ends the wait for the image.
+_NOTHING_IN_IT = (1, 8)
+_TRIES = 5  # exposures
 _POINTER, _TEXT, _REAL = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_double
 
 
@@ -35,7 +38,6 @@ class AravisCamera:
         """
         self._aravis, self._gobject, self._glib = (_library(name) for name in LIBRARIES)
         self._camera: int | None = self._call("arv_camera_new", _POINTER, name.encode(), of=(_TEXT,))
-        self._use_udp_sockets()
 
     def close(self) -> None:
         """Disconnect."""
@@ -91,31 +93,31 @@ class AravisCamera:
         self._of_camera("arv_camera_set_pixel_format_from_string", None, name.encode(), of=(_TEXT,))
 
     def acquire(self, timeout_s: float) -> Frame:
-        """Expose and receive one image. Raises NoImageError or LinkError."""
+        """Expose and receive one image; if foreign traffic was taken for it, expose again.
+
+        Raises NoImageError or LinkError.
+        """
+        for _ in range(_TRIES):
+            frame = self._acquired(timeout_s)
+            if frame is not None:
+                return frame
+        raise NoImageError("other traffic of this machine is taken for images")
+
+    def _acquired(self, timeout_s: float) -> Frame | None:
+        """One image; None if there is nothing of an image in the buffer."""
         timeout_us = ctypes.c_uint64(round(us(timeout_s)))
         buffer = self._of_camera("arv_camera_acquisition", _POINTER, timeout_us, of=(ctypes.c_uint64,))
         if not buffer:
             raise NoImageError("no image came")
         try:
             status = self._of_buffer(buffer, "status", ctypes.c_int)
+            if status in _NOTHING_IN_IT:
+                return None
             if status != _SUCCESS:
                 raise NoImageError(f"an image is incomplete (Aravis' status {status})")
             return self._frame(buffer)
         finally:
             self._unref(buffer)
-
-    def _use_udp_sockets(self) -> None:
-        """Images over GigE Vision come by a UDP socket, as from any program.
-
-        Where a process may open packet sockets, Aravis would read one. Until its filter is set, that sees all traffic
-        of the machine, which is taken for an image.
-        """
-        is_gige = self._aravis.arv_camera_is_gv_device
-        is_gige.restype, is_gige.argtypes = ctypes.c_int, (_POINTER,)
-        if is_gige(self._camera):
-            choose = self._aravis.arv_camera_gv_set_stream_options
-            choose.restype, choose.argtypes = None, (_POINTER, ctypes.c_int)
-            choose(self._camera, _NO_PACKET_SOCKET)
 
     def _text(self, what: str) -> str:
         """The text that `arv_camera_get_…` gives."""
