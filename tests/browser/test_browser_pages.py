@@ -23,6 +23,7 @@ from tests.support.pages.browser import (
     Served,
     accessibility_faults,
     chromium,
+    press_until,
     screen,
     served,
 )
@@ -291,15 +292,15 @@ def test_a_locked_screen_is_unlocked_by_keys_and_cannot_be_escaped(desk: Desk) -
     page = shown.page
     with desk.attending("/runs/{listing}") as address:
         shown.go(address)
-        page.get_by_role("button", name="Lock").focus()
-        page.keyboard.press("Enter")
-        expect(page.get_by_label("PIN", exact=True)).to_be_focused()
+        pin = page.get_by_label("PIN", exact=True)
+        press_until(page.get_by_role("button", name="Lock"), pin.is_visible)
+        expect(pin).to_be_focused()
         assert accessibility_faults(page) == []
         page.keyboard.press("Escape")
-        expect(page.get_by_label("PIN", exact=True)).to_be_visible()
+        expect(pin).to_be_visible()
         page.keyboard.type(PIN)
         page.keyboard.press("Enter")
-        expect(page.get_by_label("PIN", exact=True)).to_be_hidden()
+        expect(pin).to_be_hidden()
 
 
 def test_nothing_moves_on_the_page_for_who_wants_no_motion(desk: Desk) -> None:
@@ -327,10 +328,7 @@ def test_a_motion_is_confirmed_with_a_held_key_only(desk: Desk) -> None:
         page.wait_for_timeout(800)
         page.keyboard.up("Enter")
         assert "confirm" not in actions(desk, desk.site.moving)
-        page.keyboard.down("Enter")
-        page.wait_for_timeout(2500)
-        page.keyboard.up("Enter")
-        expect(go).to_have_count(0, timeout=20_000)
+        press_until(go, lambda: go.count() == 0, hold_ms=2500)
         assert actions(desk, desk.site.moving).count("confirm") == 1
 
 

@@ -11,7 +11,7 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Locator, Page, expect, sync_playwright
 
 from service.people.roles import Role
 from service.people.sessions import People
@@ -272,3 +272,19 @@ def accessibility_faults(page: Page) -> list[str]:
         for violation in found["violations"]
         for node in violation["nodes"]
     ]
+
+
+def press_until(button: Locator, done: Callable[[], bool], *, hold_ms: float = 0, within_s: float = 20.0) -> None:
+    """Press Enter on a button, or hold it, and wait; once more if the page took the focus for a step that came up."""
+    keyboard = button.page.keyboard
+    for _ in range(3):
+        button.focus()
+        keyboard.down("Enter")
+        button.page.wait_for_timeout(hold_ms)
+        keyboard.up("Enter")
+        deadline_s = time.monotonic() + within_s
+        while time.monotonic() < deadline_s:
+            if done():
+                return
+            button.page.wait_for_timeout(100)
+    raise AssertionError(f"pressed three times in vain: {button}")
