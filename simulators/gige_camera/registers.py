@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 import threading
-from pathlib import Path
+from importlib.resources import files
 
 VENDOR, MODEL, VERSION, SERIAL = "Orthocapture", "GE-1", "1.0", "22334455"
 
@@ -53,7 +53,7 @@ class Registers:
     """The memory, big-endian; thread-safe."""
 
     def __init__(self, host: str, width: int, height: int) -> None:
-        description = (Path(__file__).parent / "camera.xml").read_bytes()
+        description = files("simulators.gige_camera").joinpath("camera.xml").read_bytes()
         padded = description + bytes(-len(description) % 4)
         self._memory = bytearray(_DESCRIPTION) + padded
         self._lock = threading.Lock()

@@ -102,6 +102,15 @@ def _small_zip(folder: Path) -> bytes:
     return (folder / "small.zip").read_bytes()
 
 
+def _unpacked(folder: Path) -> Path:
+    """A bundle of its own with the members; copied, because the folder may be on another file system."""
+    bundle = folder / "bundle"
+    bundle.mkdir()
+    for member in MEMBERS:
+        shutil.copyfile(_recorded().unpacked / member, bundle / member)
+    return bundle
+
+
 def _zips(folder: Path) -> list[bytes]:
     return [_small_zip(folder)]
 
@@ -119,10 +128,7 @@ def _members(_: Path) -> list[bytes]:
 def _member(data: bytes, folder: Path) -> None:
     name, _, content = data.partition(b"\n")
     known = name.decode(errors="replace")
-    bundle = folder / "bundle"
-    bundle.mkdir()
-    for member in MEMBERS:
-        os.link(_recorded().unpacked / member, bundle / member)
+    bundle = _unpacked(folder)
     target = bundle / (known if known in MEMBERS else "events.jsonl")
     target.unlink()
     target.write_bytes(content)
@@ -141,10 +147,7 @@ def _token(data: bytes, folder: Path) -> None:
     )
     for certificates in (None, known.certificates):
         timestamp_findings([known.stamped], [stamp], certificates)
-    bundle = folder / "bundle"
-    bundle.mkdir()
-    for member in MEMBERS:
-        os.link(known.unpacked / member, bundle / member)
+    bundle = _unpacked(folder)
     record = {"run_id": stamp.run_id, "seq": stamp.seq, "authority": "x", "token": stamp.token}
     line = bundle_verifier.canonical(record) + b"\n"
     manifest = json.loads((bundle / "manifest.json").read_bytes())
