@@ -60,6 +60,7 @@ def test_settings_are_set_and_survive_a_session(camera: RunningCamera, widget: s
     assert vendor_session(camera.gphoto_port, ["value", widget]) == [value]
 
 
+@pytest.mark.slow
 def test_the_focal_position_is_read_and_moved_by_hand_in_manual_focus_only(camera: RunningCamera) -> None:
     """Read-only, 0 to 100; `manualfocus` moves it by steps on the client's own scale."""
     before, refused, *_ = vendor_session(
@@ -132,6 +133,7 @@ def test_capture_raw_and_jpeg_share_a_stem_and_the_log_has_the_bytes_that_were_s
     assert lines[0]["size"] == single["size"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("announce", "complete"), [("event", False), ("property", True)])
 def test_end_of_capture_by_event_or_by_property(announce: str, complete: bool) -> None:
     with camera_simulator((), "--announce", announce) as camera:

@@ -118,6 +118,7 @@ def test_setting_refused_for_good_and_for_a_moment() -> None:
         camera.apply(CameraSettings(22.0, 1 / 15, 100, "Automatic"))
 
 
+@pytest.mark.slow
 def test_camera_killed_and_started_again(tmp_path: Path) -> None:
     with camera_simulator() as simulator:
         camera = driver(simulator.gphoto_port)

@@ -49,6 +49,7 @@ def test_truncated_jpeg_is_named_and_earlier_files_are_untouched(tmp_path: Path,
     assert third.counter == 3
 
 
+@pytest.mark.slow
 def test_busy_camera_is_asked_again(tmp_path: Path, body: str) -> None:
     with rig(body, [{"on": "shutter", "kind": "busy", "times": 2}]) as (camera, _):
         assert camera.capture(tmp_path).counter == 1

@@ -65,6 +65,7 @@ def test_the_command_fuses_measures_and_cuts_out_the_spheres(tmp_path: Path) -> 
     assert np.all(np.linalg.norm(np.asarray(heat.vertices), axis=1) < spread + 0.2)
 
 
+@pytest.mark.slow
 def test_a_sphere_that_moved_in_transport_fails_the_gate_by_name_of_its_distance(tmp_path: Path) -> None:
     moved = CENTRES_M.copy()
     moved[0] += [0.0008, 0.0, 0.0]

@@ -124,6 +124,7 @@ def fused(bench: Bench) -> tuple[RunState, dict[str, Any], np.ndarray[Any, Any]]
     return state, dict(columns), points
 
 
+@pytest.mark.slow
 def test_a_run_with_a_ct_and_a_scan_makes_the_ground_truth(bench: Bench) -> None:
     state, columns, points = fused(bench)
     measures = state.steps["ground_truth"].measures
@@ -147,6 +148,7 @@ def test_a_run_with_a_ct_and_a_scan_makes_the_ground_truth(bench: Bench) -> None
     bench.must_verify()
 
 
+@pytest.mark.slow
 def test_the_screen_shows_sources_and_sigmas_and_the_recorded_distances(bench: Bench, tmp_path: Path) -> None:
     state, columns, points = fused(bench)
     loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="truth.yaml")
@@ -195,6 +197,7 @@ def unpacked(packed: dict[str, str]) -> np.ndarray[Any, Any]:
     return np.frombuffer(base64.b64decode(packed["bdata"]), dtype=packed["dtype"])
 
 
+@pytest.mark.slow
 def test_a_region_that_a_person_drew_is_used_with_the_name(bench: Bench) -> None:
     corners = ((-0.022, 0.012, 0.03), (-0.016, 0.012, 0.03), (-0.016, 0.018, 0.03), (-0.022, 0.018, 0.03))
     drawn = RegionDrawn(step="ground_truth", source="ct", corners_m=corners, seen_along=(0.0, 0.0, 1.0))

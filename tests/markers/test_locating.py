@@ -180,6 +180,7 @@ def test_an_image_that_shows_nothing_is_searched_whole(captured: Captured, tmp_p
     assert located.count("predicted") == N - 1
 
 
+@pytest.mark.slow
 def test_poses_of_other_images_predict_nothing(captured: Captured) -> None:
     made, paths, whole = captured
     turned = np.roll(made.T_world_camera, 3, axis=0)

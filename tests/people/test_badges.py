@@ -117,6 +117,7 @@ def test_where_the_site_does_not_allow_it_the_right_one_signs_nothing(
     assert accepting.state().steps["capture"].accepted is None
 
 
+@pytest.mark.slow
 def test_a_supervisor_accepts_by_badge_on_the_technicians_screen(web: WebSite) -> None:
     allow(web, "{badge: true}")
     assert enrol(web, "emmy", EMMYS_BADGE, by="administrator") == 303

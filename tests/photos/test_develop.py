@@ -144,6 +144,7 @@ def test_without_rawpy_the_message_names_the_extra(pair: tuple[Path, Path], monk
         develop(pair[0], None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift_px", [(0.25, -0.4), (3.0, -2.0), (-11.3, 7.6)])
 def test_shifts_are_found_to_hundredths_of_a_pixel(shift_px: tuple[float, float]) -> None:
     grey = np.asarray(cv2.cvtColor(leaves(), cv2.COLOR_RGB2GRAY), dtype=np.uint8)

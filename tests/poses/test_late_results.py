@@ -335,6 +335,7 @@ def _left_while_it_waits(
     assert verify(data, run_id).ok
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_what_was_left_is_computed_by_the_next_worker(tmp_path: Path) -> None:
     with Store.open(tmp_path / "data") as store:

@@ -104,6 +104,7 @@ def test_an_error_that_nobody_foresaw_fails_the_job_with_its_traceback_and_the_w
     assert ends[1].traceback == ""
 
 
+@pytest.mark.slow
 def test_a_worker_computes_side_by_side_and_ends_when_nothing_is_left(store: Store, tmp_path: Path) -> None:
     run = start_run(store)
     for name in ("a", "b", "c"):

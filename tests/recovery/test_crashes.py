@@ -115,6 +115,7 @@ def _die_before_recording(bench: Bench, monkeypatch: pytest.MonkeyPatch, nth: in
     monkeypatch.setattr(bench.store, "record", dying)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nth", [1, 3, 4])
 def test_killed_between_exposure_and_record_leaves_an_orphan_and_no_viewpoint_is_lost_or_doubled(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, nth: int

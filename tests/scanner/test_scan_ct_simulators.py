@@ -200,6 +200,7 @@ def test_ct_spheres_are_where_they_are_to_a_tenth_of_a_voxel(ct: Ct) -> None:
         assert abs(fit.radius_m - RADIUS_M) < 0.1e-3
 
 
+@pytest.mark.slow
 def test_ct_surface_lies_on_the_specimen(ct: Ct) -> None:
     vertices, _ = surface(ct.volume.hounsfield, ct.volume.T_ct_voxel, -475)
     world = apply(ct.T_world_ct, vertices)

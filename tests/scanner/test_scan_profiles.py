@@ -168,6 +168,7 @@ def test_a_view_of_zivid_becomes_a_mesh(tmp_path: Path) -> None:
     spheres_are_found(scan, 0.1)
 
 
+@pytest.mark.slow
 def test_a_view_of_photoneo_keeps_its_normals_and_drops_its_zero_points(tmp_path: Path) -> None:
     points = seen_mm(1032, 772)
     normals = np.broadcast_to([0.0, 0.6, -0.8], points.shape)

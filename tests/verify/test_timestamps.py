@@ -52,6 +52,7 @@ def ask(authority: TimeStampAuthority) -> Authority:
     return Authority(authority.url, authority.certificates, timeout_s=30)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_stamped_once_and_verified_with_and_without_certificates(
     data: Path, recorded: tuple[Path, str], authority: TimeStampAuthority, tmp_path: Path
 ) -> None:
@@ -155,6 +156,7 @@ def test_the_runner_has_the_end_of_a_run_stamped(tmp_path: Path, authority: Time
     assert (report.faults, report.timestamps) == ((), 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("behaviour", ["asleep", "dripping"])
 def test_an_authority_that_is_slow_delays_the_end_no_longer_than_allowed(
     tmp_path: Path, authority: TimeStampAuthority, behaviour: str

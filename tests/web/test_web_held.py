@@ -58,6 +58,7 @@ def test_the_page_says_where_to_go_and_what_became_of_the_images(
     assert "way-arrow" in answer.text
 
 
+@pytest.mark.slow
 def test_the_buttons_ask_the_step(shown: tuple[WebSite, Browser, Bench]) -> None:
     _, browser, bench = shown
     for what in ("release", "finish"):

@@ -157,6 +157,7 @@ def test_a_report_leaves_in_both_forms(web: WebSite, supervisor: Browser) -> Non
         assert fetched.content[:14].lower().startswith(begins)
 
 
+@pytest.mark.slow
 def test_a_data_set_without_registration_says_why_not(web: WebSite, supervisor: Browser) -> None:
     run = web.record_run()
     page = ended(web, supervisor, run, "dataset")
@@ -164,6 +165,7 @@ def test_a_data_set_without_registration_says_why_not(web: WebSite, supervisor: 
     assert "no evaluated registration" in page
 
 
+@pytest.mark.slow
 def test_a_data_set_leaves_with_all_that_belongs_to_it(
     web: WebSite, supervisor: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
