@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
+from service.compute.images.quality import image_quality
 from service.compute.markers.outlines.edges import profiles, sample
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.identification.identity import Assignment, identify
@@ -146,6 +147,23 @@ def sharpness(image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], c
 def clipped_fraction(image_bgr: NDArray[np.uint8]) -> float:
     """Share of the pixels of an image (H, W, 3) with a clipped channel, estimated from every sixteenth pixel."""
     return float(np.mean(image_bgr[::4, ::4].max(axis=2) >= _FULL_SCALE))
+
+
+def image_measures(
+    image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], camera: CameraModel
+) -> tuple[dict[str, float], bool]:
+    """Measures of an image (H, W, 3) as it arrives, by name, some NaN; and whether it is black."""
+    quality = sharpness(image_bgr, outlines, camera)
+    whole = image_quality(np.asarray(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
+    measures = {
+        "image_edge_px": whole.edge_px,
+        "outlines": float(len(outlines)),
+        "outline_coverage": quality.coverage,
+        "outline_rms_px": quality.rms_px,
+        "edge_width_px": quality.edge_px,
+        "clipped_fraction": clipped_fraction(image_bgr),
+    }
+    return measures, whole.black
 
 
 def _fewer_points(outline: SphereOutline) -> SphereOutline:

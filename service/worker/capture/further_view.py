@@ -5,9 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from service.compute.capture.live import clipped_fraction, expected_spheres, sharpness
+from service.compute.capture.live import expected_spheres, image_measures
 from service.compute.images.files import read_image_of
-from service.compute.images.quality import image_quality
 from service.compute.markers.archive import outline_record
 from service.compute.markers.detect import detect_spheres
 from service.compute.poses.files.camera_files import read_camera_json
@@ -27,18 +26,9 @@ def further_view(context: JobContext[job.Arguments]) -> JobAnswer:
     camera = read_camera_json(context.input(arguments.calibration))
     pixels = read_image_of(context.input(image.sha256), camera)
     outlines = detect_spheres(pixels, camera)
-    quality = sharpness(pixels, outlines, camera)
-    whole = image_quality(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
-    measures = {
-        "image_edge_px": whole.edge_px,
-        "outlines": float(len(outlines)),
-        "outline_coverage": quality.coverage,
-        "outline_rms_px": quality.rms_px,
-        "edge_width_px": quality.edge_px,
-        "clipped_fraction": clipped_fraction(pixels),
-        "spheres_seen": 0.0,
-    }
-    answer = job.Answer(viewpoint=image.viewpoint, device=arguments.device, black=whole.black)
+    measures, black = image_measures(pixels, outlines, camera)
+    measures["spheres_seen"] = 0.0
+    answer = job.Answer(viewpoint=image.viewpoint, device=arguments.device, black=black)
     spheres = ScanSpheres(np.array(arguments.spheres_m), arguments.radius_m)
     try:
         seen = sighted_pose(outlines, camera, spheres, None)

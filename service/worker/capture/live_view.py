@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from service.compute.capture.live import LiveView, clipped_fraction, expected_spheres, sharpness
+from service.compute.capture.live import LiveView, expected_spheres, image_measures
 from service.compute.images.files import read_image
-from service.compute.images.quality import image_quality
 from service.compute.markers.search.predicted import NEAR, PredictedSpheres, find_spheres, tone_of
 from service.compute.planning.coverage import covered_fraction
 from service.core.errors import ComputeError
@@ -33,17 +32,8 @@ def live_view(context: JobContext[job.Arguments]) -> JobAnswer:
     (T_base_camera,) = robot_camera_poses(arguments, [image])
     pixels = read_image(context.input(image.sha256))
     outlines = find_spheres(pixels, scene.camera, _prediction(scene, mine, known, T_base_camera)).outlines
-    quality = sharpness(pixels, outlines, scene.camera)
-    whole = image_quality(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
+    measures, black = image_measures(pixels, outlines, scene.camera)
     view = LiveView(image.viewpoint, T_base_camera, outlines)
-    measures = {
-        "image_edge_px": whole.edge_px,
-        "outlines": float(len(outlines)),
-        "outline_coverage": quality.coverage,
-        "outline_rms_px": quality.rms_px,
-        "edge_width_px": quality.edge_px,
-        "clipped_fraction": clipped_fraction(pixels),
-    }
     reason, T_base_scan, visible = "", known, scene.seen_from(None)
     try:
         station = solve_station([*(record.view for record in mine), view], known, arguments, scene)
@@ -59,7 +49,7 @@ def live_view(context: JobContext[job.Arguments]) -> JobAnswer:
             measures["specimen_coverage"] = covered_fraction(masks, scene.limits.min_views)
     record = LiveRecord(image.viewpoint, image.station, view, T_base_scan, visible)
     ref = context.keep_json(record.plain(image.sha256), kind="live_view", name=f"{image.viewpoint}.live.json")
-    answer = job.Answer(viewpoint=image.viewpoint, station=image.station, reason=reason, black=whole.black)
+    answer = job.Answer(viewpoint=image.viewpoint, station=image.station, reason=reason, black=black)
     return JobAnswer({k: v for k, v in measures.items() if np.isfinite(v)}, (ref,), answer)
 
 

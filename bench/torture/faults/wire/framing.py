@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from typing import Protocol
+from abc import ABC, abstractmethod
+from typing import ClassVar, Protocol
 
 Message = tuple[str, bytes]  # kind and bytes; an empty kind is always passed on
 
@@ -30,6 +31,31 @@ class _Buffered:
         return left
 
 
+class _Sized(_Buffered, ABC):
+    """Messages whose first bytes state their size."""
+
+    shortest: ClassVar[int]  # bytes of a header, which no message is shorter than
+
+    def feed(self, data: bytes) -> list[Message]:
+        """Add bytes; returns the messages that are now complete."""
+        self._buffer += data
+        found: list[Message] = []
+        while len(self._buffer) >= self.shortest:
+            size = self._size(self._buffer)
+            if size < self.shortest or len(self._buffer) < size:
+                break
+            message, self._buffer = self._buffer[:size], self._buffer[size:]
+            found.append((self._kind(message), message))
+        return found
+
+    @abstractmethod
+    def _size(self, header: bytes) -> int:
+        """Bytes of the message that begins with this header, the header included."""
+
+    @abstractmethod
+    def _kind(self, message: bytes) -> str: ...
+
+
 _RTDE_ANSWERS = {
     "V": "version",
     "v": "controller",
@@ -41,27 +67,23 @@ _RTDE_ANSWERS = {
 }
 
 
-class Rtde(_Buffered):
+class Rtde(_Sized):
     """RTDE frames of port 30004: size with header (big-endian u16), type, payload."""
+
+    shortest = 3
 
     def __init__(self, *, answers: bool) -> None:
         super().__init__()
         self._answers = answers
 
-    def feed(self, data: bytes) -> list[Message]:
-        """Add bytes; returns the frames that are now complete."""
-        self._buffer += data
-        found: list[Message] = []
-        while len(self._buffer) >= 3:
-            size = int.from_bytes(self._buffer[:2], "big")
-            if size < 3 or len(self._buffer) < size:
-                break
-            message, self._buffer = self._buffer[:size], self._buffer[size:]
-            kind = _RTDE_ANSWERS.get(chr(message[2]), "")
-            if not self._answers:
-                kind = "command" if kind == "stream" else ""
-            found.append((kind, message))
-        return found
+    def _size(self, header: bytes) -> int:
+        return int.from_bytes(header[:2], "big")
+
+    def _kind(self, message: bytes) -> str:
+        kind = _RTDE_ANSWERS.get(chr(message[2]), "")
+        if self._answers:
+            return kind
+        return "command" if kind == "stream" else ""
 
 
 class Lines(_Buffered):
@@ -175,30 +197,24 @@ _OPERATIONS = {
 }
 
 
-class PtpIp(_Buffered):
+class PtpIp(_Sized):
     """PTP/IP packets: length with header, type (little-endian u32 each), body.
 
     An answer without data is named after its operation, and so is each data packet of an answer with data.
     """
+
+    shortest = 8
 
     def __init__(self, talk: Talk, *, answers: bool) -> None:
         super().__init__()
         self._talk, self._answers = talk, answers
         self._with_data = False
 
-    def feed(self, data: bytes) -> list[Message]:
-        """Add bytes; returns the packets that are now complete."""
-        self._buffer += data
-        found: list[Message] = []
-        while len(self._buffer) >= 8:
-            size, kind = struct.unpack_from("<II", self._buffer)
-            if size < 8 or len(self._buffer) < size:
-                break
-            message, self._buffer = self._buffer[:size], self._buffer[size:]
-            found.append((self._named(kind, message), message))
-        return found
+    def _size(self, header: bytes) -> int:
+        return int.from_bytes(header[:4], "little")
 
-    def _named(self, kind: int, message: bytes) -> str:
+    def _kind(self, message: bytes) -> str:
+        kind = int.from_bytes(message[4:8], "little")
         if not self._answers:
             if kind == REQUEST:
                 self._talk.operation = _OPERATIONS.get(struct.unpack_from("<H", message, 12)[0], "")
@@ -216,24 +232,17 @@ class PtpIp(_Buffered):
 _PDUS = {1: "associate", 2: "accept", 5: "release", 6: "released"}
 
 
-class Dicom(_Buffered):
+class Dicom(_Sized):
     """PDUs of DICOM's upper layer: type, a byte, length (big-endian u32), content; data are named by their kind."""
+
+    shortest = 6
 
     def __init__(self, *, answers: bool) -> None:
         super().__init__()
         self._answers = answers
 
-    def feed(self, data: bytes) -> list[Message]:
-        """Add bytes; returns the PDUs that are now complete."""
-        self._buffer += data
-        found: list[Message] = []
-        while len(self._buffer) >= 6:
-            size = 6 + int.from_bytes(self._buffer[2:6], "big")
-            if len(self._buffer) < size:
-                break
-            message, self._buffer = self._buffer[:size], self._buffer[size:]
-            found.append((self._kind(message), message))
-        return found
+    def _size(self, header: bytes) -> int:
+        return 6 + int.from_bytes(header[2:6], "big")
 
     def _kind(self, message: bytes) -> str:
         if message[0] != 4 or len(message) < 12:
