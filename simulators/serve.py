@@ -25,6 +25,11 @@ def announce(**fields: object) -> None:
     sys.stdout.flush()
 
 
+def told() -> bool:
+    """Wait for a line on stdin. Returns False at its end: nobody is there to tell any more."""
+    return bool(sys.stdin.readline())
+
+
 class Termination:
     """Set by SIGTERM or SIGINT. Create it in the main thread."""
 

@@ -18,7 +18,7 @@ from simulators.ct_suite.volume import Grid, grid_around, voxelise
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, from_euler, inverse
 from simulators.scene.world import Scene, parse_moved
-from simulators.serve import SimulatorError, Termination, announce
+from simulators.serve import SimulatorError, Termination, announce, told
 from simulators.units import metres, mm
 
 log = logging.getLogger(__name__)
@@ -34,6 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--folder", type=Path, required=True, help="where the series is delivered")
     parser.add_argument("--once", action="store_true", help="end after one series")
+    parser.add_argument(
+        "--when-told", action="store_true", help="compute the first export, and write it when a line comes on stdin"
+    )
     parser.add_argument("--voxel-mm", type=float, default=0.4, help="edge of the cubic voxels")
     parser.add_argument(
         "--control-spheres",
@@ -54,7 +57,7 @@ def serve(args: argparse.Namespace) -> None:
     args.folder.mkdir(parents=True, exist_ok=True)
     scene = Scene.generate(args.scene, args.moved)
     if args.once:
-        announce(**_scan(scene, args))
+        _scan(scene, args, announce_it=True)
         return
     termination = Termination()
     asked = False
@@ -65,11 +68,11 @@ def serve(args: argparse.Namespace) -> None:
         asked = True
 
     signal.signal(signal.SIGUSR1, ask)
-    announce(**_scan(scene, args))
+    _scan(scene, args, announce_it=True)
     while not termination.wait(0.2):
         if asked:
             asked = False
-            _scan(scene, args)
+            _scan(scene, args, announce_it=False)
 
 
 def true_frames(seed: int) -> tuple[Array, Array]:
@@ -81,10 +84,12 @@ def true_frames(seed: int) -> tuple[Array, Array]:
     return T_world_gantry @ inverse(T_ct_gantry), T_world_gantry
 
 
-def _scan(scene: Scene, args: argparse.Namespace) -> dict[str, object]:
+def _scan(scene: Scene, args: argparse.Namespace, *, announce_it: bool) -> None:
     T_world_ct, T_world_gantry = true_frames(scene.seed)
     grid = grid_around(scene, T_world_gantry, metres(args.voxel_mm), control_spheres=args.control_spheres)
     volume = voxelise(scene, grid, control_spheres=args.control_spheres)
+    if announce_it and args.when_told and not told():
+        return
     folder: Path = args.folder
     series = generate_uid(entropy_srcs=[str(scene.seed), str(args.voxel_mm), str(time.time_ns())])
     T_ct_grid = inverse(T_world_ct) @ grid.T_world_grid
@@ -92,12 +97,13 @@ def _scan(scene: Scene, args: argparse.Namespace) -> dict[str, object]:
     target = folder / f"series_{number:02d}"
     target.mkdir()
     write_series(target, volume, grid, T_ct_grid, series, implicit=args.implicit_vr, faults=args.faults)
-    return {
-        "folder": str(folder),
-        "series": str(series),
-        "slices": len(volume),
-        "truth": {"T_world_ct": T_world_ct.tolist()},
-    }
+    if announce_it:
+        announce(
+            folder=str(folder),
+            series=str(series),
+            slices=len(volume),
+            truth={"T_world_ct": T_world_ct.tolist()},
+        )
 
 
 def write_series(

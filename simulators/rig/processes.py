@@ -20,6 +20,7 @@ from simulators.faults import FaultPlan
 from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand.technician import MISHAP_EVERY, Hand
 from simulators.rig.cameras import CAMERAS, STILL, again, place, section
+from simulators.rig.deliveries import Deliveries
 from simulators.rig.world_server import World, WorldServer
 from simulators.scene.further_cameras import PLACES, FurtherCamera, further_cameras
 from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
@@ -73,6 +74,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="restart a device that died after S seconds; default: end the rig",
     )
+    parser.add_argument(
+        "--ahead", action="store_true", help="compute what the CT and the scanner deliver before it is asked for"
+    )
 
 
 def serve(args: argparse.Namespace) -> None:
@@ -118,8 +122,10 @@ class _Rig:
             args.hand, args.scene, self.world.hold, self.world.press_shutter, SCENE_CENTRE_M.copy()
         )
         self.server = WorldServer(self.world, self._act)
-        self._deliveries = threading.Lock()
-        self._delivery: subprocess.Popen[str] | None = None  # the newest; it may have ended
+        self._deliveries = Deliveries(
+            self.folder / "logs", self._delivery_options, ahead=args.ahead, running=lambda: not termination.is_set()
+        )
+        self._writing = threading.Lock()
         self._truth: dict[str, Any] = {}
 
     @property
@@ -166,6 +172,7 @@ class _Rig:
             scan_folder=str(self.folder / "scans"),
         )
         threading.Thread(target=self._watch, daemon=True).start()
+        self._deliveries.prepare_after("start")
 
     def _start_further(self, name: str, further: FurtherCamera, model: str) -> None:
         """Start a further camera's simulator, and write its calibration, which is exact."""
@@ -181,9 +188,9 @@ class _Rig:
         return self.folder / ("truth_exposures.jsonl" if camera == "camera" else f"truth_exposures_{camera}.jsonl")
 
     def stop(self) -> None:
-        processes = [*self.children.values(), *([self._delivery] if self._delivery is not None else [])]
-        for process in processes:
+        for process in self.children.values():
             process.terminate()
+        processes = [*self.children.values(), *self._deliveries.stop()]
         for process in processes:
             try:
                 process.wait(timeout=10)
@@ -333,42 +340,42 @@ class _Rig:
     def _act(self, request: Mapping[str, Any]) -> dict[str, Any]:
         match request.get("action"):
             case "hand_scan":
-                return self._deliver("scanner", "scans", ["--spray"] if self.world.spray else [])
+                return self._deliver("scanner", "scans")
             case "read":
                 if self.hand:
                     self.hand.read(str(request.get("words", "")))
                 return {"ok": True}
             case "ct_scan":
-                return self._deliver("ct", "ct", ["--voxel-mm", str(self.args.ct_voxel_mm)])
+                answer = self._deliver("ct", "ct")
             case "move_sphere":
                 answer = self.world.act(request)
-                with self._deliveries:
+                with self._writing:
                     self._write_truth()
-                return answer
             case _:
-                return self.world.act(request)
+                answer = self.world.act(request)
+        self._deliveries.prepare_after(str(request.get("action")))
+        return answer
 
-    def _deliver(self, simulator: str, folder: str, options: list[str]) -> dict[str, Any]:
+    def _deliver(self, simulator: str, told_as: str) -> dict[str, Any]:
         """Let the scanner or the CT deliver one export of the scene in its current state."""
+        report = self._deliveries.deliver(simulator)
+        if report["ok"]:
+            with self._writing:
+                self._truth[told_as].append(report.pop("truth"))
+                self._write_truth()
+        return report
+
+    def _delivery_options(self, simulator: str) -> tuple[str, ...]:
+        """The command line with which a simulator exports the scene in its current state."""
+        folder, only = {
+            "scanner": ("scans", ("--spray",) if self.world.spray else ()),
+            "ct": ("ct", ("--voxel-mm", str(self.args.ct_voxel_mm))),
+        }[simulator]
         spheres = "--control-spheres" if self.world.control_spheres else "--no-control-spheres"
-        command = [
-            sys.executable, "-m", "simulators", simulator, "--scene", str(self.scene.seed), "--once",
-            "--parent", str(os.getpid()), "--folder", str(self.folder / folder), spheres,
-            "--moved", json.dumps(self.scene.moved), *options,
-            "--faults", self.faults.to_json(),
-        ]  # fmt: skip
-        with self._deliveries:
-            self._delivery = process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-            )
-            printed, errors = process.communicate()
-            (self.folder / "logs" / f"{simulator}.log").write_text(errors)
-            if process.returncode != 0:
-                return {"ok": False, "error": errors.strip().splitlines()[-1] if errors else "it failed"}
-            report = json.loads(printed.splitlines()[0])
-            self._truth["scans" if simulator == "scanner" else "ct"].append(report.pop("truth"))
-            self._write_truth()
-        return {"ok": True, **report}
+        return (
+            "--scene", str(self.scene.seed), "--folder", str(self.folder / folder), spheres,
+            "--moved", json.dumps(self.scene.moved), *only, "--faults", self.faults.to_json(),
+        )  # fmt: skip
 
 
 def _start_joints(scene: Scene) -> Array:

@@ -22,7 +22,7 @@ from simulators.geometry import Array, Ints, apply, inverse, transform
 from simulators.scan_station.formats import encode
 from simulators.scene.parts import Part, sphere_mesh, vertex_normals
 from simulators.scene.world import RADIUS_M, Scene, parse_moved
-from simulators.serve import SimulatorError, Termination, announce
+from simulators.serve import SimulatorError, Termination, announce, told
 from simulators.units import metres, mm
 
 log = logging.getLogger(__name__)
@@ -52,6 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--folder", type=Path, required=True, help="folder to export to")
     parser.add_argument("--once", action="store_true", help="end after one export")
+    parser.add_argument(
+        "--when-told", action="store_true", help="compute the first export, and write it when a line comes on stdin"
+    )
     parser.add_argument("--spray", action="store_true", help="the specimen is coated with scanning spray")
     parser.add_argument(
         "--control-spheres",
@@ -234,6 +237,8 @@ def _export(scene: Scene, args: argparse.Namespace, *, announce_it: bool) -> Non
         spacing_m=metres(args.spacing_mm),
         nth=nth,
     )
+    if announce_it and args.when_told and not told():
+        return
     vertices = mm(scan.vertices_m) if args.unit == "mm" else scan.vertices_m
     name = f"scan_{nth:02d}.{args.format}"
     files = encode(args.format, name, vertices, scan.faces, scan.normals if args.normals else None)

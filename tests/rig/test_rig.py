@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+import trimesh
 import yaml
 
 from service.core.records.events import ViewpointCaptured
@@ -154,6 +155,41 @@ def test_files_world_and_hands(tmp_path: Path) -> None:
             assert station.robot("station_1") is station.robot("station_2")
         finally:
             station.close()
+
+
+def test_what_is_computed_ahead_is_written_when_asked_for_and_shows_the_scene_as_it_is_then(tmp_path: Path) -> None:
+    options = (*SMALL, "--ahead", "--ct-voxel-mm", "3")
+    with simulated_rig(tmp_path, *options, host=OWN_HOST) as ready, Hands(ready["world"]) as hands:
+
+        def ahead(simulator: str) -> list[int]:
+            processes = psutil.Process().children(recursive=True)
+            lines = {process.pid: process.cmdline() for process in processes if process.is_running()}
+            return [pid for pid, line in lines.items() if line[3:4] == [simulator] and "--when-told" in line]
+
+        until(lambda: len(ahead("ct")) == 1, "the CT is not computed ahead")
+        assert list(Path(ready["ct_folder"]).iterdir()) == []
+        answer = hands.act("ct_scan")
+        assert answer["ok"] is True
+        assert len(list(Path(ready["ct_folder"]).glob("series_01/*.dcm"))) == answer["slices"]
+        assert ahead("ct") == []
+
+        until(lambda: len(ahead("scanner")) == 1, "the scan is not computed ahead")
+        hands.act("remove_control_spheres")
+        answer = hands.act("hand_scan")
+        assert answer["ok"] is True
+        assert ahead("scanner") == []
+        truth = json.loads(Path(ready["truth"]).read_text())
+        assert (len(truth["ct"]), len(truth["scans"])) == (1, 1)
+        scan = trimesh.load_mesh(Path(ready["scan_folder"]) / answer["export"], process=False)
+        T_world_scan = np.array(truth["scans"][0]["T_world_scan"])
+        points_m = trimesh.transform_points(1e-3 * np.asarray(scan.vertices), T_world_scan)
+        away_m = np.linalg.norm(points_m[:, None] - np.array(truth["control_m"]), axis=2)
+        assert away_m.min() > 0.012  # the spheres, whose radius is 15 mm, had been taken away
+        hands.act("spray")
+        until(lambda: len(ahead("scanner")) == 1, "the scan with spray is not computed ahead")
+    # Its end leaves no export behind that nobody asked for.
+    assert ahead("scanner") == []
+    assert len(list(Path(ready["scan_folder"]).iterdir())) == 1
 
 
 def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:

@@ -203,7 +203,8 @@ def _simulated_rig(folder: Path, scene: int, image_width: int, host: str) -> Gen
     folder.mkdir(parents=True)
     command = [
         sys.executable, "-m", "simulators", "rig", "--scene", str(scene), "--dir", str(folder),
-        "--image-width", str(image_width), "--speed-up", "10", "--ct-voxel-mm", "1.0", "--host", host,
+        "--image-width", str(image_width), "--speed-up", "10", "--ct-voxel-mm", "1.0", "--ahead",
+        "--host", host,
         "--parent", str(os.getpid()),
     ]  # fmt: skip
     log = folder / "rig.log"
