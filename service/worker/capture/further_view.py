@@ -16,7 +16,7 @@ from service.core.errors import ComputeError
 from service.core.geometry import inverse
 from service.jobs.capture import further_view as job
 from service.jobs.records import matrix
-from service.worker.job import JobAnswer, JobContext
+from service.worker.job import JobAnswer, JobContext, finite
 
 
 def further_view(context: JobContext[job.Arguments]) -> JobAnswer:
@@ -40,4 +40,4 @@ def further_view(context: JobContext[job.Arguments]) -> JobAnswer:
         answer = answer.model_copy(update={"T_ct_camera": matrix(seen.T_scan_camera)})
     records = {image.viewpoint: [outline_record(outline) for outline in outlines]}
     kept = context.keep_json(records, kind="further_view", name=f"{image.viewpoint}.{arguments.device}.json")
-    return JobAnswer({name: value for name, value in measures.items() if np.isfinite(value)}, (kept,), answer)
+    return JobAnswer(finite(measures), (kept,), answer)
