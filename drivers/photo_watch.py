@@ -237,22 +237,12 @@ class PhotoWatch:
         exif, arrival_s = seen.exif, self._monotonic()
         counter = _COUNTER.search(path.stem)
         quality = "RAW+JPEG" if len(files) > 1 else "JPEG"
-        return CapturedImage(
-            files=files,
-            counter=int(counter[1]) if counter else 0,
-            exif_time=exif.taken,
-            exif=exif.settings(focus_mode=exif.focus_mode, image_quality=quality),
-            lens=exif.lens,
-            focal_length_mm=exif.focal_length_mm or 0.0,
+        return exif.exposure_of(
+            files,
+            int(counter[1]) if counter else 0,
+            exif.settings(focus_mode=exif.focus_mode, image_quality=quality),
             trigger_monotonic_s=arrival_s,
             arrival_monotonic_s=arrival_s,
-            width=exif.width,
-            height=exif.height,
-            lens_serial=exif.lens_serial,
-            body_serial=exif.body_serial,
-            model=exif.model,
-            focus_distance_m=exif.focus_distance_m or 0.0,
-            focus_position=exif.focus_position,
             found_at=str(path),
         )
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import time
+from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -45,14 +47,16 @@ class ScanFolderConfig(DriverConfig):
 class ScanFolder:
     """drivers.interfaces.Scanner on a folder, which it polls and reads but never changes."""
 
-    def __init__(self, config: ScanFolderConfig) -> None:
+    def __init__(self, config: ScanFolderConfig, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._config = config
         self._profile: ScanProfile | None = None
-        self._watch = ExportWatch(config.folder, config.stable_s)
+        self._watch = ExportWatch(config.folder, config.stable_s, monotonic)
         if config.profile:
             self._profile = profile_named(config.profile)
             check = partial(check_export, self._profile)
-            self._watch = ExportWatch(config.folder, config.stable_s, suffixes=self._profile.suffixes, check=check)
+            self._watch = ExportWatch(
+                config.folder, config.stable_s, monotonic, suffixes=self._profile.suffixes, check=check
+            )
 
     def open(self) -> DeviceIdentity:
         """Check that the folder exists and start watching it; raises DeviceUnavailableError if it does not."""

@@ -5,17 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import os
-import select
 import signal
 import socket
 import time
-import tty
-from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
 from simulators.faults import Fault, FaultPlan
+from simulators.serial_line import Terminal
 from simulators.serve import SimulatorError, Termination, announce
 
 log = logging.getLogger(__name__)
@@ -83,39 +80,21 @@ class Lightbox:
     def __init__(self, faults: FaultPlan, world: World | None, link: Path | None, *, tower: bool = True) -> None:
         self._faults = faults
         self._world = world
-        self._link = link
-        self._ends: tuple[int, int] | None = None
+        self._line = Terminal(link)
         self._heard = b""
         self._shutter = 0
         self._pressed = 0
         self._tower = "OFF" if tower else None
 
     def plug_in(self) -> str:
-        """Create the pseudo-terminal and its link and send the banner; returns the path of the terminal."""
-        master, slave = os.openpty()
-        # The slave stays open here, so that the terminal survives while no client holds it.
-        tty.setraw(slave)
-        name = os.ttyname(slave)
-        os.set_blocking(master, False)
-        self._ends, self._heard = (master, slave), b""
-        if self._link is not None:
-            self._link.parent.mkdir(parents=True, exist_ok=True)
-            temporary = self._link.with_name(f".{self._link.name}.{os.getpid()}")
-            temporary.unlink(missing_ok=True)
-            temporary.symlink_to(name)
-            temporary.replace(self._link)
-        self._send(BANNER)
+        """Plug the line in and send the banner; returns the path of the terminal."""
+        name, self._heard = self._line.plug_in(), b""
+        self._line.send(BANNER)
         return name
 
     def unplug(self) -> None:
-        """Simulate a pulled cable: the terminal disappears."""
-        if self._ends is None:
-            return
-        for end in self._ends:
-            os.close(end)
-        self._ends = None
-        if self._link is not None and self._link.is_symlink():
-            self._link.unlink()
+        """Pull the cable: the terminal disappears."""
+        self._line.unplug()
 
     def press_pedal(self) -> None:
         """Press the pedal once, without a rig."""
@@ -123,13 +102,7 @@ class Lightbox:
 
     def serve_once(self, timeout_s: float) -> None:
         """Answer the requests that arrive within `timeout_s`."""
-        if self._ends is None:
-            return
-        master = self._ends[0]
-        ready, _, _ = select.select([master], [], [], timeout_s)
-        if not ready:
-            return
-        self._heard = (self._heard + os.read(master, 4096))[-4096:]
+        self._heard = (self._heard + self._line.receive(timeout_s))[-4096:]
         while b"\n" in self._heard:
             line, self._heard = self._heard.split(b"\n", 1)
             request = line.decode("ascii", "replace").strip()
@@ -144,13 +117,7 @@ class Lightbox:
             if self._spoiled(fault, answer):
                 return
             answer = b"ERR 3 sensor fault\r\n" if fault.kind == "reject" else answer
-        self._send(answer)
-
-    def _send(self, data: bytes) -> None:
-        """Send bytes; what the client does not read is lost, as on any line without flow control."""
-        if self._ends is not None:
-            with suppress(BlockingIOError):
-                os.write(self._ends[0], data)
+        self._line.send(answer)
 
     def _spoiled(self, fault: Fault, answer: bytes) -> bool:
         """Apply the fault; returns whether it replaces the answer."""
@@ -159,15 +126,15 @@ class Lightbox:
             case "drop":
                 return True
             case "truncate":
-                self._send(answer[: len(answer) // 2])
+                self._line.send(answer[: len(answer) // 2])
                 return True
             case "corrupt":
-                self._send(b"\xff\x00\x9e" + answer[3:] + b"\x80\xfe\n")
+                self._line.send(b"\xff\x00\x9e" + answer[3:] + b"\x80\xfe\n")
                 return True
             case "stall":
                 time.sleep(seconds)
             case "banner":
-                self._send(BANNER)
+                self._line.send(BANNER)
             case "unplug":
                 self.unplug()
                 time.sleep(seconds)

@@ -1,16 +1,19 @@
-"""Shared by all simulator processes: the ready line, SIGTERM, ending with the parent, and the error type."""
+"""Shared by all simulator processes: the ready line, signals, sockets, ending with the parent, the error type."""
 
 from __future__ import annotations
 
 import json
 import os
 import signal
+import socket
 import sys
 import threading
 import time
+from collections.abc import Callable
 from types import FrameType
 
 _PARENT_POLL_S = _SLICE_S = 0.5
+_REQUEST_POLL_S = 0.2
 
 Json = None | bool | int | float | str | list["Json"] | dict[str, "Json"]
 
@@ -61,6 +64,33 @@ class Termination:
             self._event.wait(slice_s)
             remaining_s -= slice_s
         return True
+
+
+class Request:
+    """Made by SIGUSR1. Create it in the main thread, before the ready line."""
+
+    def __init__(self) -> None:
+        self._made = False
+        signal.signal(signal.SIGUSR1, self._handle)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        self._made = True
+
+    def serve(self, termination: Termination, action: Callable[[], object]) -> None:
+        """Do `action` at each request until the termination is set."""
+        while not termination.wait(_REQUEST_POLL_S):
+            if self._made:
+                self._made = False
+                action()
+
+
+def listening(host: str, port: int) -> socket.socket:
+    """A listening socket. Raises SimulatorError."""
+    try:
+        return socket.create_server((host, port), backlog=8)
+    except OSError as error:
+        raise SimulatorError(f"cannot listen on {host}:{port}: {error.strerror}") from error
 
 
 def end_with(parent: int) -> None:

@@ -18,7 +18,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from bench.machine import REPOSITORY
-from drivers.dicom_folder import DicomFolder, DicomFolderConfig
+from drivers.dicom_folder import DicomFolderConfig
+from drivers.dicom_folder.folder import DicomFolder
 from drivers.errors import UnreadableFileError
 from drivers.photos.photo_file import read_exif
 from service.compute.camera_model import CameraModel

@@ -30,8 +30,8 @@ from service.compute.poses.files.pose_files import read_poses_csv
 from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
 from service.compute.poses.sfm.estimate import SfmModel, SfmWorkspace, reconstruct
 from service.compute.poses.sfm.options import Effort, Mapper, options_for
-from service.compute.registration.cost import residuals
 from service.compute.registration.joint_poses import with_joint_pose_covariance
+from service.compute.registration.least_squares.cost import residuals
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.scene import PosedImages, ScanSpheres
 from service.compute.surfaces.spheres.mesh_spheres import locate_spheres

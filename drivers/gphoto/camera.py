@@ -245,22 +245,12 @@ class GphotoCamera:
         exif = read_exif(files[0].path)
         if not exif.make.upper().startswith(self._profile.exif_make.upper()):
             raise self._stale(f"{files[0].camera_name} says that it was taken by {exif.make or 'an unknown'} camera")
-        image = CapturedImage(
-            files=tuple(files),
-            counter=_parse(added[0].name)[1],
-            exif_time=exif.taken,
-            exif=exif.settings(focus_mode=focus, image_quality=quality),
-            lens=exif.lens,
-            focal_length_mm=exif.focal_length_mm or 0.0,
+        image = exif.exposure_of(
+            tuple(files),
+            _parse(added[0].name)[1],
+            exif.settings(focus_mode=focus, image_quality=quality),
             trigger_monotonic_s=trigger_s,
             arrival_monotonic_s=arrival_s,
-            width=exif.width,
-            height=exif.height,
-            lens_serial=exif.lens_serial,
-            body_serial=exif.body_serial,
-            model=exif.model,
-            focus_distance_m=exif.focus_distance_m or 0.0,
-            focus_position=exif.focus_position,
         )
         self._check_new(image)
         self._clock_offset_s = _clock_offset_s(exif.taken, trigger_s)

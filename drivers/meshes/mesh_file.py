@@ -10,10 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.interfaces import Array, Mesh, ScanExport, ScannedMesh
@@ -186,6 +183,9 @@ def _components(a: IntArray, b: IntArray, n: int) -> int:
     """Number of connected components of these edges, given by their end vertices `a` and `b` out of `n`."""
     if len(a) == 0:
         return 0
+    from scipy.sparse import coo_matrix  # noqa: PLC0415 - half a second, for those who read a mesh
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
     graph = coo_matrix((np.ones(len(a), dtype=np.int8), (a, b)), shape=(n, n))
     _, labels = connected_components(graph, directed=False)
     return len(np.unique(labels[a]))
@@ -207,6 +207,8 @@ def parse_mesh(path: Path) -> tuple[Array, IntArray, Array | None]:
         UnreadableFileError: not a mesh of the format that the name says, or no faces.
         OSError: the file cannot be opened.
     """
+    import trimesh  # noqa: PLC0415 - half a second, for those who read a mesh
+
     suffix = path.suffix.lower()[1:]
     # The geometry does not need the materials, which travel with the export as companions.
     options: dict[str, Any] = {"skip_materials": True} if suffix == "obj" else {}

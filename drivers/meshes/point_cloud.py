@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import trimesh
 
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import Array
@@ -115,6 +114,8 @@ def ply_points(path: Path) -> tuple[Array, Array | None]:
 
     Raises OSError, or one of PARSE_ERRORS if the file is damaged.
     """
+    import trimesh  # noqa: PLC0415 - half a second, for those who read a cloud
+
     with path.open("rb") as stream:
         loaded = cast("Any", trimesh.load(stream, file_type="ply", process=False))
     points = np.array(loaded.vertices, dtype=np.float64)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.errors import UnreadableFileError
-from drivers.interfaces import CameraSettings
+from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage
 from service.core.errors import DataError
 from service.core.picture_files import TruncatedPictureError, check_jpeg
 
@@ -53,6 +53,36 @@ class ExifRecord:
                 remedy="Use files as they left the camera; editing programs often remove EXIF",
             )
         return CameraSettings(self.aperture_f, self.exposure_s, self.iso, focus_mode, image_quality)
+
+    def exposure_of(
+        self,
+        files: tuple[CapturedFile, ...],
+        counter: int,
+        settings: CameraSettings,
+        *,
+        trigger_monotonic_s: float,
+        arrival_monotonic_s: float,
+        found_at: str = "",
+    ) -> CapturedImage:
+        """The exposure that these files are, with what its EXIF data states."""
+        return CapturedImage(
+            files=files,
+            counter=counter,
+            exif_time=self.taken,
+            exif=settings,
+            lens=self.lens,
+            focal_length_mm=self.focal_length_mm or 0.0,
+            trigger_monotonic_s=trigger_monotonic_s,
+            arrival_monotonic_s=arrival_monotonic_s,
+            width=self.width,
+            height=self.height,
+            lens_serial=self.lens_serial,
+            body_serial=self.body_serial,
+            model=self.model,
+            focus_distance_m=self.focus_distance_m or 0.0,
+            focus_position=self.focus_position,
+            found_at=found_at,
+        )
 
 
 # The library's own look-up functions crash the process on images without EXIF, so keys are looked up by name.

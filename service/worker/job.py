@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -66,6 +67,11 @@ class JobContext(Generic[A]):
     def keep_bytes(self, data: bytes, *, kind: str, media_type: str, name: str) -> ArtefactRef:
         """Store an artefact."""
         return self.store.put_bytes(data, kind=kind, media_type=media_type, original_name=name)
+
+
+def finite(measures: Mapping[str, float]) -> dict[str, float]:
+    """The measures that are numbers: what could not be measured is NaN or infinite, and left out of an answer."""
+    return {name: value for name, value in measures.items() if math.isfinite(value)}
 
 
 RecordedContext = JobContext[Mapping[str, Any]]  # with arguments as plain data, references resolved

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 import logging
-import signal
 import time
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +16,7 @@ from simulators.ct_suite.volume import Grid, grid_around, voxelise
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, from_euler, inverse
 from simulators.scene.world import Scene, parse_moved
-from simulators.serve import SimulatorError, Termination, announce, told
+from simulators.serve import Request, SimulatorError, Termination, announce, told
 from simulators.units import metres, mm
 
 log = logging.getLogger(__name__)
@@ -59,20 +57,9 @@ def serve(args: argparse.Namespace) -> None:
     if args.once:
         _scan(scene, args, announce_it=True)
         return
-    termination = Termination()
-    asked = False
-
-    def ask(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        del number, frame
-        asked = True
-
-    signal.signal(signal.SIGUSR1, ask)
+    termination, another = Termination(), Request()
     _scan(scene, args, announce_it=True)
-    while not termination.wait(0.2):
-        if asked:
-            asked = False
-            _scan(scene, args, announce_it=False)
+    another.serve(termination, lambda: _scan(scene, args, announce_it=False))
 
 
 def true_frames(seed: int) -> tuple[Array, Array]:

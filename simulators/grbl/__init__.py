@@ -12,7 +12,7 @@ from pathlib import Path
 from simulators.grbl.carrier import Carrier
 from simulators.grbl.controller import Controller
 from simulators.grbl.machine import Machine
-from simulators.grbl.terminal import Terminal
+from simulators.serial_line import Terminal
 from simulators.serve import SimulatorError, Termination, announce
 from simulators.world_link import WorldLink
 

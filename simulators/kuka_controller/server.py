@@ -16,7 +16,7 @@ import numpy as np
 
 from simulators.kuka_controller.controller import MODES, SAFETY, Controller, End, RefusedError
 from simulators.kuka_controller.fri import Session
-from simulators.serve import SimulatorError, Termination
+from simulators.serve import SimulatorError, Termination, listening
 from simulators.units import seconds
 from simulators.world_link import WorldLink
 
@@ -73,15 +73,11 @@ class Server:
         self._listen(address[0], pendant_port, pendant=True)
 
     def _listen(self, host: str, port: int, *, pendant: bool) -> None:
-        listener = socket.socket()
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listener.bind((host, port))
-        except OSError as error:
-            listener.close()
+            listener = listening(host, port)
+        except SimulatorError:
             self.close()
-            raise SimulatorError(f"cannot listen on {host}:{port}: {error.strerror}") from error
-        listener.listen(4)
+            raise
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ, pendant)
 

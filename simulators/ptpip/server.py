@@ -13,7 +13,7 @@ from simulators.faults import Fault, FaultPlan
 from simulators.ptpip import codec
 from simulators.ptpip.codec import PacketType
 from simulators.ptpip.reply import Reply, Responder
-from simulators.serve import SimulatorError
+from simulators.serve import listening
 
 _GUID = bytes.fromhex("53494d554c415445444f52544f434150")
 _STALL_S = 5.0
@@ -83,10 +83,7 @@ class PtpIpServer:
         self._next_number = 1
         self._lock = threading.Lock()
         self._stopping = threading.Event()
-        try:
-            self._listener = socket.create_server((host, port), backlog=8)
-        except OSError as error:
-            raise SimulatorError(f"cannot listen on {host}:{port}: {error.strerror}") from error
+        self._listener = listening(host, port)
         self.address: tuple[str, int] = self._listener.getsockname()[:2]
         self._acceptor = threading.Thread(target=self._accept, name="ptpip-accept", daemon=True)
 

@@ -20,7 +20,7 @@ from simulators.faults import FaultPlan
 from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand.technician import MISHAP_EVERY, Hand
 from simulators.rig.cameras import CAMERAS, STILL, again, place, section
-from simulators.rig.deliveries import Deliveries
+from simulators.rig.export_processes import ExportProcesses
 from simulators.rig.world_server import World, WorldServer
 from simulators.scene.further_cameras import PLACES, FurtherCamera, further_cameras
 from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
@@ -122,7 +122,7 @@ class _Rig:
             args.hand, args.scene, self.world.hold, self.world.press_shutter, SCENE_CENTRE_M.copy()
         )
         self.server = WorldServer(self.world, self._act)
-        self._deliveries = Deliveries(
+        self._exports = ExportProcesses(
             self.folder / "logs", self._delivery_options, ahead=args.ahead, running=lambda: not termination.is_set()
         )
         self._writing = threading.Lock()
@@ -172,7 +172,7 @@ class _Rig:
             scan_folder=str(self.folder / "scans"),
         )
         threading.Thread(target=self._watch, daemon=True).start()
-        self._deliveries.prepare_after("start")
+        self._exports.prepare_after("start")
 
     def _start_further(self, name: str, further: FurtherCamera, model: str) -> None:
         """Start a further camera's simulator, and write its calibration, which is exact."""
@@ -190,7 +190,7 @@ class _Rig:
     def stop(self) -> None:
         for process in self.children.values():
             process.terminate()
-        processes = [*self.children.values(), *self._deliveries.stop()]
+        processes = [*self.children.values(), *self._exports.stop()]
         for process in processes:
             try:
                 process.wait(timeout=10)
@@ -353,12 +353,12 @@ class _Rig:
                     self._write_truth()
             case _:
                 answer = self.world.act(request)
-        self._deliveries.prepare_after(str(request.get("action")))
+        self._exports.prepare_after(str(request.get("action")))
         return answer
 
     def _deliver(self, simulator: str, told_as: str) -> dict[str, Any]:
         """Let the scanner or the CT deliver one export of the scene in its current state."""
-        report = self._deliveries.deliver(simulator)
+        report = self._exports.deliver(simulator)
         if report["ok"]:
             with self._writing:
                 self._truth[told_as].append(report.pop("truth"))

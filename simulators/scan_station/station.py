@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 import logging
-import signal
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -22,7 +20,7 @@ from simulators.geometry import Array, Ints, apply, inverse, transform
 from simulators.scan_station.formats import encode
 from simulators.scene.parts import Part, sphere_mesh, vertex_normals
 from simulators.scene.world import RADIUS_M, Scene, parse_moved
-from simulators.serve import SimulatorError, Termination, announce, told
+from simulators.serve import Request, SimulatorError, Termination, announce, told
 from simulators.units import metres, mm
 
 log = logging.getLogger(__name__)
@@ -80,20 +78,9 @@ def serve(args: argparse.Namespace) -> None:
     if args.once:
         _export(scene, args, announce_it=True)
         return
-    termination = Termination()
-    asked = False
-
-    def ask(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        del number, frame
-        asked = True
-
-    signal.signal(signal.SIGUSR1, ask)
+    termination, another = Termination(), Request()
     _export(scene, args, announce_it=True)
-    while not termination.wait(0.2):
-        if asked:
-            asked = False
-            _export(scene, args, announce_it=False)
+    another.serve(termination, lambda: _export(scene, args, announce_it=False))
 
 
 def scan_scene(scene: Scene, *, spray: bool, control_spheres: bool, spacing_m: float, nth: int = 1) -> Scan:

@@ -8,7 +8,7 @@ import socket
 import time
 from collections.abc import Callable
 
-from simulators.serve import SimulatorError, Termination
+from simulators.serve import SimulatorError, Termination, listening
 from simulators.ur_controller import fields
 from simulators.ur_controller.controller import Controller
 from simulators.ur_controller.links import LineLink, Link, RtdeLink, ScriptLink
@@ -40,15 +40,11 @@ class Server:
         self._listen(host, SCRIPT_PORT, lambda s: ScriptLink(s, self))
 
     def _listen(self, host: str, port: int, make: Callable[[socket.socket], Link]) -> None:
-        listener = socket.socket()
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listener.bind((host, port))
-        except OSError as error:
-            listener.close()
+            listener = listening(host, port)
+        except SimulatorError:
             self.close()
-            raise SimulatorError(f"cannot listen on {host}:{port}: {error.strerror}") from error
-        listener.listen(8)
+            raise
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ, make)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Generator
-from html import unescape
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,7 @@ from service.cli.main import app
 from service.core.records.events import FilesKept, StepStarted
 from service.store.records import NewArtefact
 from service.web.page.rendering import local_time
+from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.recorded.reported_run import record_reported_run
 
@@ -24,10 +24,6 @@ def web(tmp_path: Path) -> Generator[tuple[WebSite, str]]:
     run_id = record_reported_run(tmp_path, person="grace")
     with web_site(tmp_path) as site:
         yield site, run_id
-
-
-def words(html: str) -> str:
-    return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", " ", html)))
 
 
 def read(web: tuple[WebSite, str], page: str = "") -> str:

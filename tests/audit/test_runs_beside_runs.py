@@ -20,6 +20,7 @@ from service.core.records.events import DeviceOpened
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.home.time_charts import TimePoint, time_chart
+from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.recorded.reported_run import record_reported_run
 
@@ -40,10 +41,6 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Generator[Two]:
     bad = record_reported_run(folder, error_mm=0.9, person="grace", acceptable=True)
     with web_site(folder) as web:
         yield Two(web, good, bad)
-
-
-def words(html: str) -> str:
-    return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", " ", html)))
 
 
 def typed(*arguments: str) -> Result:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Generator
-from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewJob
 from service.web.record.board_images import board_uses
+from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.record.core import EYE
 from tests.support.record.store import enqueue
@@ -29,10 +29,6 @@ REASON = "no board of 16 × 23 inner corners in the image (searched at widths [1
 def web(tmp_path: Path) -> Generator[WebSite]:
     with web_site(tmp_path) as site:
         yield site
-
-
-def words(html: str) -> str:
-    return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", " ", html)))
 
 
 def begin(web: WebSite) -> str:

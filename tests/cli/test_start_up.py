@@ -43,9 +43,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", ["--help", "--version", "status latest", "act pause"])
+@pytest.mark.parametrize("words", ["--help", "--version", "status latest", "act pause", "resume --help"])
 def test_it_starts_without_numerics(words: str, data: Path) -> None:
-    folder = () if words.startswith("--") else ("--data", str(data))
+    folder = () if "--" in words else ("--data", str(data))
     said = subprocess.run(
         [sys.executable, "-c", LOADED, *words.split(), *folder],
         cwd=REPOSITORY,
@@ -66,3 +66,16 @@ def test_the_list_of_commands_says_what_each_says_itself() -> None:
         listed = group.get_command(context, name)
         _, command, _ = group.resolve_command(context, [name])
         assert " ".join((command.help or "").split("\n\n")[0].split()) == listed.help
+
+
+def test_the_drivers_of_a_rig_are_declared_without_numerics() -> None:
+    program = """
+import json, sys
+from importlib.metadata import entry_points
+kinds = {point.load().kind for point in entry_points(group="orthocapture.drivers")}
+print(json.dumps([sorted(kinds), sorted(name for name in sys.modules if "." not in name)]))
+"""
+    said = subprocess.run([sys.executable, "-c", program], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    kinds, modules = json.loads(said.stdout)
+    assert {"scanner", "ct"} <= set(kinds)
+    assert not {"scipy", "trimesh", "pydicom"} & set(modules)

@@ -16,7 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from drivers.dicom_folder import DicomFolder, DicomFolderConfig
+from drivers.dicom_folder import DicomFolderConfig
+from drivers.dicom_folder.folder import DicomFolder
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import Array, CtLabels
 from tests.support.ct.ct_labels import LABELS, LPS_FROM_RAS, write_nifti, write_seg

@@ -12,7 +12,8 @@ import pytest
 from numpy.typing import NDArray
 from pydicom.uid import generate_uid
 
-from drivers.dicom_folder import DicomFolder, DicomFolderConfig
+from drivers.dicom_folder import DicomFolderConfig
+from drivers.dicom_folder.folder import DicomFolder
 from drivers.interfaces import CtSource
 from service.audit.record.run import read_run
 from service.audit.report.content import report_content

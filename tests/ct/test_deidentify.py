@@ -14,7 +14,8 @@ from nibabel.nifti1 import Nifti1Extension
 from pydicom.dataset import Dataset
 from pydicom.uid import UID, ExplicitVRLittleEndian, ImplicitVRLittleEndian, RLELossless, generate_uid
 
-from drivers.dicom_folder import DicomFolder, DicomFolderConfig
+from drivers.dicom_folder import DicomFolderConfig
+from drivers.dicom_folder.folder import DicomFolder
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import CleanFile
 from tests.support.ct.ct_labels import LABELS, write_nifti, write_seg

@@ -24,7 +24,8 @@ from pydicom.uid import (
 )
 from scipy.spatial.transform import Rotation
 
-from drivers.dicom_folder import DRIVER, DicomFolder, DicomFolderConfig
+from drivers.dicom_folder import DRIVER, DicomFolderConfig
+from drivers.dicom_folder.folder import DicomFolder
 from drivers.errors import DeviceUnavailableError, UnreadableFileError
 from drivers.interfaces import Array, CtSeries
 from tests.support.ct.ct_series import SHAPE, SPACING_MM, Change, pixels, write_series

@@ -15,7 +15,8 @@ from highdicom.legacy import LegacyConvertedEnhancedCTImage
 from pydicom.dataset import Dataset
 from pydicom.uid import ExplicitVRLittleEndian, RLELossless, generate_uid
 
-from drivers.dicom_folder import DicomFolder, DicomFolderConfig
+from drivers.dicom_folder import DicomFolderConfig
+from drivers.dicom_folder.folder import DicomFolder
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import Array, CtSeries
 from tests.support.ct.ct_series import SHAPE, hospital, pixels, write_series
@@ -147,7 +148,8 @@ def test_a_missing_decoder_is_named_with_what_to_install(tmp_path: Path, name: s
         "import sys\n"
         "for package in ('gdcm', 'pylibjpeg', 'jpeg_ls'): sys.modules[package] = None\n"
         "from pathlib import Path\n"
-        "from drivers.dicom_folder import DicomFolder, DicomFolderConfig\n"
+        "from drivers.dicom_folder import DicomFolderConfig\n"
+        "from drivers.dicom_folder.folder import DicomFolder\n"
         "ct = DicomFolder(DicomFolderConfig(folder=Path(sys.argv[1]), stable_s=0))\n"
         "print(*ct.series()[0].problems)\n"
     )

@@ -20,7 +20,8 @@ from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, MRImageStorage, 
 from pynetdicom import AE
 from pynetdicom.association import Association
 
-from drivers.dicom_folder import DicomFolder, DicomFolderConfig
+from drivers.dicom_folder import DicomFolderConfig
+from drivers.dicom_folder.folder import DicomFolder
 from drivers.dicom_receiver import Receiver, ReceiverConfig
 from drivers.errors import DeviceRefusedError, DeviceUnavailableError
 from tests.support.ct.ct_series import SHAPE, hospital, pixels, write_series

@@ -19,6 +19,7 @@ from service.dataset.posed.exporter import exporter, write_data_set
 from service.dataset.posed.of_run.data_set import data_set_of
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite
 from tests.support.recorded.reported_run import record_reported_run
 
@@ -38,7 +39,7 @@ def test_report_data_set_and_bundle_say_it(accepted_run: tuple[Path, str]) -> No
     assert any(isinstance(event.payload, RunCompleted) for event in run.events)
     text = "0.9 mm, allowed ≤ 0.35; accepted by Emmy (supervisor): the pilot does not need it"
     shown = render_html(report_content(run, verify(data, run_id), with_scene=False, with_pictures=False))
-    plain = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", shown))
+    plain = words(shown)
     assert plain.index("gate accepted") < plain.index("redo")  # listed first among the deviations
     assert plain.count("Depends on an accepted gate: Evaluate: best_mean_radial_error_mm " + text) >= 2
     write_data_set(data_set_of(run.summary()), exporter("plain"), folder / "dataset")

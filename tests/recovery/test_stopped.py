@@ -13,6 +13,7 @@ from service.core.protocol.models import Protocol
 from service.core.records.events import GateVerdict, StepFailed, StepMeasured, StepNote, StepStarted
 from service.core.run.decide import AskOperator, decide, evaluate_gates
 from service.web.page.run_words import needs, stopped_words
+from tests.support.pages.browsed_run import words
 from tests.support.pages.shown_site import skip
 from tests.support.pages.web import WebSite, web_site
 from tests.support.runs.attended import attended
@@ -35,8 +36,7 @@ def driven(web: WebSite, run: Bench) -> Generator[None]:
 
 def plain(page: str) -> str:
     """The words of a page."""
-    words = re.sub(r"<(svg|script|dialog).*?</\1>", "", page, flags=re.DOTALL)
-    return " ".join(re.sub(r"<[^>]+>", " ", words).split())
+    return words(re.sub(r"<(svg|script|dialog).*?</\1>", "", page, flags=re.DOTALL)).strip()
 
 
 def at_the_capture(web: WebSite) -> Bench:

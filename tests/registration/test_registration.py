@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from service.compute.markers.cones import cone_of_sphere
 from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import Cost, PointCost, residuals, residuals_and_derivative
 from service.compute.registration.identification.identity import Assignment
+from service.compute.registration.least_squares.cost import Cost, PointCost, residuals, residuals_and_derivative
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
 from service.compute.scene import PosedImages, ScanSpheres

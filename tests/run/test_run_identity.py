@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import re
 import zipfile
 from collections.abc import Generator
-from html import unescape
 from pathlib import Path
 
 import cv2
@@ -27,6 +25,7 @@ from service.core.records.entered import NoteTaken
 from service.core.records.events import PAYLOAD, RunAborted, RunStarted
 from service.store.signatures.signing import checkpoint
 from service.store.verification.verify import verify
+from tests.support.pages.browsed_run import words
 from tests.support.pages.web import Browser, WebSite, web_site
 
 ENTERED = {
@@ -47,10 +46,6 @@ def web(tmp_path: Path) -> Generator[WebSite]:
 def typed(*arguments: str) -> Result:
     """Run a command line to its end."""
     return CliRunner().invoke(app, list(arguments))
-
-
-def words(html: str) -> str:
-    return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", " ", html)))
 
 
 def jpeg(width: int = 640, height: int = 480) -> bytes:

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from drivers.dicom_folder import DicomFolder, DicomFolderConfig
+from drivers.dicom_folder import DicomFolderConfig
+from drivers.dicom_folder.folder import DicomFolder
 from drivers.errors import IncompleteExportError
 from drivers.interfaces import Array, CtVolume, ScannedMesh
 from drivers.meshes.mesh_file import read_mesh_file

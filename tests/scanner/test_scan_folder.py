@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import time
+import os
 from pathlib import Path
 
 import numpy as np
@@ -207,7 +207,8 @@ def test_a_companion_that_links_out_of_the_folder_is_refused(tmp_path: Path) -> 
 
 
 def test_an_export_counts_when_it_has_stopped_changing(tmp_path: Path) -> None:
-    scanner = ScanFolder(ScanFolderConfig(folder=tmp_path, stable_s=0.15))
+    now_s = 0.0
+    scanner = ScanFolder(ScanFolderConfig(folder=tmp_path, stable_s=5.0), monotonic=lambda: now_s)
     assert scanner.open().kind == "scanner"
     data = write(tmp_path, "template.ply").read_bytes()
     (tmp_path / "template.ply").unlink()
@@ -217,12 +218,13 @@ def test_an_export_counts_when_it_has_stopped_changing(tmp_path: Path) -> None:
     path.write_bytes(data)
     assert scanner.exports() == ()
     assert "waiting" in scanner.report().problems[0]
-    time.sleep(0.1)
+    now_s = 3.0
     path.write_bytes(data)  # written again: the waiting time restarts
+    os.utime(path, (1.0, 1.0))
     scanner.exports()
-    time.sleep(0.1)
+    now_s = 7.9
     assert scanner.exports() == ()
-    time.sleep(0.1)
+    now_s = 8.1
     (export,) = scanner.exports()
     assert scanner.report().problems == ()
     assert scanner.read(export).source == export
@@ -235,12 +237,13 @@ def test_an_export_counts_when_it_has_stopped_changing(tmp_path: Path) -> None:
 def test_an_obj_without_a_newline_at_its_end_counts_once_it_is_stable(tmp_path: Path) -> None:
     whole = write(tmp_path, "template.obj").read_bytes().rstrip()
     (tmp_path / "template.obj").unlink()
-    scanner = ScanFolder(ScanFolderConfig(folder=tmp_path, stable_s=0.15))
+    now_s = 0.0
+    scanner = ScanFolder(ScanFolderConfig(folder=tmp_path, stable_s=5.0), monotonic=lambda: now_s)
     path = tmp_path / "scan.obj"
     path.write_bytes(whole)
     assert scanner.exports() == ()
     assert "waiting" in scanner.report().problems[0]
-    time.sleep(0.2)
+    now_s = 5.1
     (export,) = scanner.exports()
     assert scanner.read(export).findings["faces"] == len(SPHERE.faces)
 

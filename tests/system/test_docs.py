@@ -189,7 +189,7 @@ RUN_ELSEWHERE = {
         "tests/system/test_documents.py::test_make_targets_do_what_the_documents_say",
     ),
     "orthocapture import FOLDER --data runs": (
-        "tests/poses/test_import.py::test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere"
+        "tests/imports/test_import.py::test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere"
     ),
     "orthocapture simulate rig --scene 7 --dir rig --second-camera stereo": (
         "tests/further/test_second_camera_whole_run.py::test_the_extrinsics_are_true_within_their_covariance"
@@ -254,7 +254,7 @@ RUN_ELSEWHERE = {
         "tests/dataset/test_mcap.py::test_rosbags_opens_the_folder_as_a_recording_of_ros"
     ),
     "orthocapture import-ros bag --out files --base base_link --flange tool0 --camera-frame camera_optical": (
-        "tests/poses/test_import_ros.py::test_a_recording_calibrates_a_hand_eye_as_its_files_would"
+        "tests/imports/test_import_ros.py::test_a_recording_calibrates_a_hand_eye_as_its_files_would"
     ),
     "orthocapture develop DSC00001.ARW --out developed": (
         "tests/photos/test_develop.py::test_the_command_writes_a_tiff_and_its_record"

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 import shutil
-from html import unescape
 from pathlib import Path
 
 import pytest
 
 from service.core.protocol.models import load_protocol
 from service.steps import params_models
+from tests.support.pages.browsed_run import words as page_words
 from tests.support.pages.web import Browser, web_site
 
 PROTOCOLS = Path(__file__).parents[2] / "protocols"
@@ -23,7 +23,7 @@ def plain(text: str) -> str:
 def words(browser: Browser, address: str) -> str:
     answer = browser.get(address)
     assert answer.status_code == 200, answer.text
-    return plain(unescape(re.sub(r"<[^>]+>", " ", answer.text)))
+    return page_words(answer.text).strip()
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in PROTOCOLS.glob("*.yaml")))

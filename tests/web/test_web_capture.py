@@ -6,10 +6,8 @@ import base64
 import json
 import re
 from collections.abc import Generator
-from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,47 +22,29 @@ from service.web.capture.plan_drawing import WIDTH, plan_drawing
 from service.web.capture.view import StepViewpoint
 from service.web.page.charts import LEVELS, dots, heat_map, vector_field
 from service.web.record.planned_poses import StationPlan
-from tests.support.pages.web import Browser, WebSite, web_site
+from tests.support.pages.browsed_run import BrowsedRun, words
+from tests.support.pages.web import web_site
 from tests.support.record.core import EYE
 from tests.support.recorded.calibrated_run import VIEWS, begin_calibrated_run, capture
 from tests.support.runs.recorded_run import record_run
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A run that is being captured, and the technician who controls it."""
-
-    site: WebSite
-    browser: Browser
-    run: str
-
-    def page(self, address: str = "capture", **query: Any) -> str:
-        answer = self.browser.get(f"/runs/{self.run}/{address}", params=query)
-        assert answer.status_code == 200, answer.text
-        return words(answer.text)
-
-
-def words(html: str) -> str:
-    """The text of a page, without its tags."""
-    return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", " ", html)))
-
-
 @pytest.fixture
-def shown(tmp_path: Path) -> Generator[Shown]:
+def shown(tmp_path: Path) -> Generator[BrowsedRun]:
     with web_site(tmp_path) as site:
         run = begin_calibrated_run(site)
         browser = site.browser("technician")
         site.take_control(run, browser)
-        yield Shown(site, browser, run)
+        yield BrowsedRun(site, browser, run)
 
 
 # --- capture -----------------------------------------------------------------------------------------------------
 
 
-def test_the_plan_shows_how_every_viewpoint_stands(shown: Shown) -> None:
+def test_the_plan_shows_how_every_viewpoint_stands(shown: BrowsedRun) -> None:
     store = shown.site.store
-    assert "To do 3" in shown.page()
-    assert "No image of this step has been taken yet" in shown.page()
+    assert "To do 3" in shown.words()
+    assert "No image of this step has been taken yet" in shown.words()
     capture(shown.site, shown.run, "capture", "v1_001", EYE, shade=1)
     plan = {"views": [{"viewpoint": f"v1_{i:03d}", "outcome": o, "reason": r} for i, o, r in
                       ((1, "feasible", ""), (2, "feasible", ""), (3, "refused", "too near to the table"),
@@ -72,7 +52,7 @@ def test_the_plan_shows_how_every_viewpoint_stands(shown: Shown) -> None:
     note = StepNote(step="capture", attempt=1, note="motion_plan", data={"stations": [plan]})
     failed = ViewpointFailed(step="capture", attempt=1, viewpoint="v1_004", error="E", message="no <file> arrived")
     store.record(shown.run, [note, failed], actor="runner")
-    page = shown.page()
+    page = shown.words()
     for said in ("Done 1", "Next 1", "Failed 1", "Left out by the plan 1", "too near to the table", "1 of 4"):
         assert said in page, said
     assert "no <file> arrived" in page  # escaped in the page, otherwise it would be parsed as a tag
@@ -82,7 +62,7 @@ def test_a_run_of_a_thousand_viewpoints_is_shown_in_pages_and_drawn_without_over
     record = LargeRecord(tmp_path, 1200, 2000)
     record.close()
     with web_site(tmp_path) as site:
-        shown = Shown(site, site.browser("technician"), record.run_id)
+        shown = BrowsedRun(site, site.browser("technician"), record.run_id)
         html = shown.browser.get(f"/runs/{record.run_id}/capture").text
         assert "3 of 1200" in words(html)
         assert "All 1200 viewpoints as a table" in words(html)
@@ -100,17 +80,17 @@ def test_a_run_of_a_thousand_viewpoints_is_shown_in_pages_and_drawn_without_over
         assert "Page 4 of 6" in words(chosen)
 
 
-def test_an_image_is_judged_in_words_with_the_figures_behind_them(shown: Shown) -> None:
+def test_an_image_is_judged_in_words_with_the_figures_behind_them(shown: BrowsedRun) -> None:
     capture(shown.site, shown.run, "capture", "v1_001", EYE, shade=1)
-    page = shown.page(viewpoint="v1_001")
+    page = shown.words(viewpoint="v1_001")
     for said in ("Still", "σ 0.0020 mm", "limit 0.02 mm", "As wanted", "f/22 · 1/50 s · ISO 100", "not measured"):
         assert said in page, said
-    board = shown.page(step="calibration", viewpoint="b003")
+    board = shown.words(step="calibration", viewpoint="b003")
     assert re.search(r"Found corners 0\.\d{3} px rms", board)
     assert "registration sphere" not in board
 
 
-def test_a_viewpoint_is_redone_with_a_reason_and_its_image_stays(shown: Shown) -> None:
+def test_a_viewpoint_is_redone_with_a_reason_and_its_image_stays(shown: BrowsedRun) -> None:
     old = capture(shown.site, shown.run, "capture", "v1_001", EYE, shade=1)
     html = shown.browser.get(f"/runs/{shown.run}/capture?viewpoint=v1_001").text
     assert 'data-hold="1500"' in html, "the step runs: the robot drives there at once"
@@ -119,9 +99,9 @@ def test_a_viewpoint_is_redone_with_a_reason_and_its_image_stays(shown: Shown) -
         f"/runs/{shown.run}/actions", verb="redo", step="capture", viewpoint="v1_001", reason=reason
     )
     assert sent.status_code == 303
-    assert "To be redone 1" in shown.page()
+    assert "To be redone 1" in shown.words()
     new = capture(shown.site, shown.run, "capture", "v1_001", EYE, shade=9)
-    assert "Show 1 replaced" in shown.page()
+    assert "Show 1 replaced" in shown.words()
     listed = shown.browser.get(f"/runs/{shown.run}/capture?replaced=true").text
     assert old in listed
     assert new in listed
@@ -130,7 +110,7 @@ def test_a_viewpoint_is_redone_with_a_reason_and_its_image_stays(shown: Shown) -
     assert reason in words(listed)
 
 
-def test_who_looks_on_sees_everything_and_has_no_controls(shown: Shown) -> None:
+def test_who_looks_on_sees_everything_and_has_no_controls(shown: BrowsedRun) -> None:
     capture(shown.site, shown.run, "capture", "v1_001", EYE, shade=1)
     for role in ("auditor", "supervisor"):
         html = shown.site.browser(role).get(f"/runs/{shown.run}/capture?viewpoint=v1_001").text
@@ -138,7 +118,7 @@ def test_who_looks_on_sees_everything_and_has_no_controls(shown: Shown) -> None:
         assert "Still" in html
 
 
-def test_parts_are_pieces_of_the_page(shown: Shown) -> None:
+def test_parts_are_pieces_of_the_page(shown: BrowsedRun) -> None:
     capture(shown.site, shown.run, "capture", "v1_001", EYE, shade=1)
     whole = shown.browser.get(f"/runs/{shown.run}/capture").text
     for address in re.findall(r'data-part="([^"]+/capture/parts/[^"]+)"', whole):
@@ -150,16 +130,16 @@ def test_parts_are_pieces_of_the_page(shown: Shown) -> None:
     assert re.findall(r'<template data-part="(\w+)">', together) == ["image", "plan", "sheet"]
 
 
-def test_a_step_takes_many_images_page_by_page(shown: Shown) -> None:
+def test_a_step_takes_many_images_page_by_page(shown: BrowsedRun) -> None:
     for i in range(65):
         capture(shown.site, shown.run, "capture", f"x{i:03d}", EYE, shade=i % 40)
-    assert "Page 1 of 2" in shown.page()
+    assert "Page 1 of 2" in shown.words()
     second = shown.browser.get(f"/runs/{shown.run}/capture?page=2").text
     assert second.count('loading="lazy"') == 5
-    assert "Page 2 of 2" in shown.page(page=99)
+    assert "Page 2 of 2" in shown.words(page=99)
 
 
-def test_hostile_queries_are_harmless(shown: Shown) -> None:
+def test_hostile_queries_are_harmless(shown: BrowsedRun) -> None:
     for query in ("viewpoint=<script>", "step=../../x", "viewpoint=%00", "seq=999999", "step=calibration&seq=1"):
         answer = shown.browser.get(f"/runs/{shown.run}/capture?{query}")
         assert answer.status_code == 200
@@ -193,8 +173,8 @@ def unpacked(array: dict[str, str]) -> np.ndarray:
     return np.frombuffer(base64.b64decode(array["bdata"]), "<" + array["dtype"])
 
 
-def test_before_a_registration_the_3d_view_shows_what_is_planned(shown: Shown) -> None:
-    page = shown.page("scene")
+def test_before_a_registration_the_3d_view_shows_what_is_planned(shown: BrowsedRun) -> None:
+    page = shown.words("scene")
     assert "v1_004 to do" in page
     assert "nothing has been registered with the images yet" in page
     assert "of the robot base at station_1" in page
@@ -260,8 +240,8 @@ def test_nothing_in_a_figure_ends_its_element() -> None:
 # --- calibration -------------------------------------------------------------------------------------------------
 
 
-def test_a_calibration_is_told_in_px_and_mm_with_what_to_add(shown: Shown) -> None:
-    page = shown.page("calibration")
+def test_a_calibration_is_told_in_px_and_mm_with_what_to_add(shown: BrowsedRun) -> None:
+    page = shown.words("calibration")
     for said in (
         "Hand-eye, held out",
         "mm median",
@@ -274,8 +254,8 @@ def test_a_calibration_is_told_in_px_and_mm_with_what_to_add(shown: Shown) -> No
     assert re.search(r"6 \d+° -?\d+° \d+° \d+ ± 0\.\d{4}", page), "six poses are suggested"
 
 
-def test_a_certificate_names_lens_hash_chain_and_what_ends_it(shown: Shown) -> None:
-    page = shown.page("calibration/certificate")
+def test_a_certificate_names_lens_hash_chain_and_what_ends_it(shown: BrowsedRun) -> None:
+    page = shown.words("calibration/certificate")
     log = shown.site.site.run(shown.run)
     state = log.state.steps["calibration"]
     for said in ("L-17", "B-4", "UR10e", "20231", "Simulated", "f/22", state.artefacts[0].sha256, state.passed_sha256,

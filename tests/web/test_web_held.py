@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Generator, Mapping
-from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ from typer.testing import CliRunner
 from drivers.photo_watch import PhotoWatch, PhotoWatchConfig
 from service.cli.main import app
 from service.core.records.events import CaptureAsked, DeviceOpened
+from tests.support.pages.browsed_run import words
 from tests.support.pages.web import Browser, WebSite, password_of, web_site
 from tests.support.runs.bench_run import Bench
 from tests.support.runs.held_run import left_held_run
@@ -34,11 +33,6 @@ def last_answer(bench: Bench) -> Mapping[str, Any]:
     """The worker's answer about the last image."""
     jobs = [job for job in bench.state().steps["capture"].jobs.values() if job.kind == "hand_view"]
     return max(jobs, key=lambda job: job.enqueued_seq).result
-
-
-def words(html: str) -> str:
-    """The text of a page, without its tags."""
-    return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", " ", html)))
 
 
 def test_the_page_says_where_to_go_and_what_became_of_the_images(

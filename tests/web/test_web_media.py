@@ -19,7 +19,8 @@ from service.core.records.events import FilesKept
 from service.monitor.snapshot import frame_path, frames_wanted, write_frame
 from service.store.records import NewArtefact
 from service.web.record.pictures import DrawnOutline, cached, draw_marks, nearest_width, reduced_jpeg, safe_name
-from tests.support.pages.web import Browser, WebSite, web_site
+from tests.support.pages.browsed_run import BrowsedRun
+from tests.support.pages.web import web_site
 from tests.support.record.core import EYE
 from tests.support.recorded.calibrated_run import begin_calibrated_run, capture
 
@@ -27,12 +28,9 @@ HOSTILE = '../../etc/pass"wd\r\nSet-Cookie: a=b; .jpg'
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A run with one image, and a person who looks at it."""
+class RunWithImage(BrowsedRun):
+    """A run with one image."""
 
-    site: WebSite
-    browser: Browser
-    run: str
     sha256: str
 
     @property
@@ -41,14 +39,14 @@ class Shown:
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> Generator[Shown]:
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Generator[RunWithImage]:
     with web_site(tmp_path_factory.mktemp("media")) as site:
         run = begin_calibrated_run(site)
         sha256 = capture(site, run, "capture", "v1_001", EYE, name=HOSTILE, shade=20)
-        yield Shown(site, site.browser("auditor"), run, sha256)
+        yield RunWithImage(site, site.browser("auditor"), run, sha256)
 
 
-def test_a_file_comes_as_recorded_under_a_harmless_name(shown: Shown) -> None:
+def test_a_file_comes_as_recorded_under_a_harmless_name(shown: RunWithImage) -> None:
     answer = shown.browser.get(f"{shown.address}/files/{shown.sha256}")
     assert answer.content == shown.site.store.artefact_path(shown.sha256).read_bytes()
     assert answer.headers["content-disposition"].startswith("attachment")
@@ -62,13 +60,13 @@ def test_a_file_comes_as_recorded_under_a_harmless_name(shown: Shown) -> None:
     assert shown.browser.get(f"{shown.address}/files/{shown.sha256}", headers=again).status_code == 304
 
 
-def test_a_run_shows_its_own_files_only(shown: Shown) -> None:
+def test_a_run_shows_its_own_files_only(shown: RunWithImage) -> None:
     other = shown.site.begin_run().run_id
     assert shown.browser.get(f"/runs/{other}/files/{shown.sha256}").status_code == 404
     assert shown.browser.get(f"/runs/{other}/files/{shown.sha256}?thumbnail=160").status_code == 404
 
 
-def test_an_altered_file_is_not_handed_out(shown: Shown) -> None:
+def test_an_altered_file_is_not_handed_out(shown: RunWithImage) -> None:
     sha256 = capture(shown.site, shown.run, "capture", "v1_002", EYE, shade=21)
     path = shown.site.store.artefact_path(sha256)
     path.chmod(stat.S_IWUSR | stat.S_IRUSR)
@@ -97,13 +95,13 @@ def test_an_altered_file_is_not_handed_out(shown: Shown) -> None:
         "files/{sha256}?thumbnail=641",
     ],
 )
-def test_what_is_not_there_is_refused(shown: Shown, tail: str) -> None:
+def test_what_is_not_there_is_refused(shown: RunWithImage, tail: str) -> None:
     answer = shown.browser.get(f"{shown.address}/{tail.format(sha256=shown.sha256)}")
     assert answer.status_code in (404, 422)
     assert "Traceback" not in answer.text
 
 
-def test_pictures_are_made_small_once(shown: Shown, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_are_made_small_once(shown: RunWithImage, monkeypatch: pytest.MonkeyPatch) -> None:
     address = f"{shown.address}/files/{shown.sha256}?thumbnail=150"
     first = shown.browser.get(address)
     assert picture_size(first.content) == (160, 107)
@@ -113,7 +111,7 @@ def test_pictures_are_made_small_once(shown: Shown, monkeypatch: pytest.MonkeyPa
     assert not list((shown.site.site.data / "cache").rglob("*.part"))
 
 
-def test_an_image_is_found_by_its_viewpoint_and_says_when_it_changed(shown: Shown) -> None:
+def test_an_image_is_found_by_its_viewpoint_and_says_when_it_changed(shown: RunWithImage) -> None:
     address = f"{shown.address}/images/v1_001?step=capture&width=640&marked=1"
     answer = shown.browser.get(address)
     assert picture_size(answer.content) == (640, 427)
@@ -122,7 +120,7 @@ def test_an_image_is_found_by_its_viewpoint_and_says_when_it_changed(shown: Show
     assert answer.headers["cache-control"] == "private, no-cache"
 
 
-def test_what_is_no_picture_has_no_thumbnail(shown: Shown) -> None:
+def test_what_is_no_picture_has_no_thumbnail(shown: RunWithImage) -> None:
     ref = shown.site.store.put_bytes(b"<svg/>", kind="plan", media_type="image/svg+xml", original_name="a.svg")
     kept = FilesKept(step="capture", attempt=1, device="ct", note="n", artefacts=(ref,))
     shown.site.store.record(shown.run, [kept], actor="runner", artefacts=[NewArtefact(ref, "ct", "capture", 1)])
@@ -130,7 +128,7 @@ def test_what_is_no_picture_has_no_thumbnail(shown: Shown) -> None:
     assert "attachment" in shown.browser.get(f"{shown.address}/files/{ref.sha256}").headers["content-disposition"]
 
 
-def test_live_frames_come_only_while_somebody_asks_and_never_old_ones(shown: Shown) -> None:
+def test_live_frames_come_only_while_somebody_asks_and_never_old_ones(shown: RunWithImage) -> None:
     data = shown.site.site.data
     assert frames_wanted(data, shown.run) is None
     assert shown.browser.get(f"{shown.address}/live-view").status_code == 204
@@ -143,7 +141,7 @@ def test_live_frames_come_only_while_somebody_asks_and_never_old_ones(shown: Sho
     assert shown.browser.get(f"{shown.address}/live-view").status_code == 204
 
 
-def test_plotlys_script_is_public_and_kept_by_browsers(shown: Shown) -> None:
+def test_plotlys_script_is_public_and_kept_by_browsers(shown: RunWithImage) -> None:
     stranger = shown.site.browser()
     plain = stranger.get("/vendor/plotly.js", headers={"accept-encoding": "identity"})
     packed = stranger.get("/vendor/plotly.js", headers={"accept-encoding": "gzip"})

@@ -54,7 +54,6 @@ from service.run_start import (
 from service.runner.loop import Runner
 from service.station import Station, layout_of
 from service.steps import params_models
-from service.steps.capture.plan.preview import preview_board_poses, preview_plans
 from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.timestamps import stamp_end
 from service.store.store import Store
@@ -192,6 +191,9 @@ def open_devices(station: Station) -> OpenDevices:
 
 def _preview(protocol: Protocol, rig: Rig, step: str) -> str:
     """What a capture step will do, in words, for the person who is asked to confirm it."""
+    # Planning takes half a second to load, which a run that is answered on the screen does without.
+    from service.steps.capture.plan.preview import preview_board_poses, preview_plans  # noqa: PLC0415
+
     try:
         plans = preview_plans(protocol, protocol.step(step), rig, partial(layout_of, rig))
         board = preview_board_poses(protocol, protocol.step(step), rig, partial(layout_of, rig))

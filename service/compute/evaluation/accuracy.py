@@ -9,9 +9,9 @@ import numpy as np
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import residuals
 from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.normal_equations import (
+from service.compute.registration.least_squares.cost import residuals
+from service.compute.registration.least_squares.normal_equations import (
     compress,
     inverse_symmetric,
     marginalise,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.problem import linearise, with_outlines
+from service.compute.registration.least_squares.problem import linearise, with_outlines
 from service.compute.registration.result import Solution
 from service.core.geometry import Array
 

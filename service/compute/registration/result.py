@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from service.compute.registration.normal_equations import Blocks, Marginal
-from service.compute.registration.problem import Linearised, Problem, State
+from service.compute.registration.least_squares.normal_equations import Blocks, Marginal
+from service.compute.registration.least_squares.problem import Linearised, Problem, State
 from service.core.geometry import Array, Transform, skew
 
 

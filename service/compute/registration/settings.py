@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from service.compute.registration.cost import Cost
+from service.compute.registration.least_squares.cost import Cost
 from service.core.geometry import Array
 
 

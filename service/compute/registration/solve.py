@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from service.compute.descent import halved_gauss_newton
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import Cost
 from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.normal_equations import (
+from service.compute.registration.least_squares.cost import Cost
+from service.compute.registration.least_squares.normal_equations import (
     Blocks,
     compress,
     inverse_symmetric,
@@ -23,17 +23,17 @@ from service.compute.registration.normal_equations import (
     pose_errors,
     solve_symmetric,
 )
-from service.compute.registration.problem import Linearised, Problem, State, assemble, linearise
-from service.compute.registration.result import OutlineResidual, RegistrationResult, Solution
-from service.compute.registration.settings import RegistrationSettings
-from service.compute.registration.start import starting_state
-from service.compute.registration.variance_components import (
+from service.compute.registration.least_squares.problem import Linearised, Problem, State, assemble, linearise
+from service.compute.registration.least_squares.start import starting_state
+from service.compute.registration.least_squares.variance_components import (
     PoseNoise,
     estimate,
     given_pose_noise,
     no_pose_noise,
     unknown_pose_noise,
 )
+from service.compute.registration.result import OutlineResidual, RegistrationResult, Solution
+from service.compute.registration.settings import RegistrationSettings
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, inverse

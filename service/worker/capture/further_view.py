@@ -10,13 +10,13 @@ from service.compute.images.files import read_image_of
 from service.compute.markers.archive import outline_record
 from service.compute.markers.detect import detect_spheres
 from service.compute.poses.files.camera_files import read_camera_json
-from service.compute.registration.further_camera import sighted_pose
+from service.compute.registration.further_cameras.pose import sighted_pose
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import inverse
 from service.jobs.capture import further_view as job
 from service.jobs.records import matrix
-from service.worker.job import JobAnswer, JobContext
+from service.worker.job import JobAnswer, JobContext, finite
 
 
 def further_view(context: JobContext[job.Arguments]) -> JobAnswer:
@@ -40,4 +40,4 @@ def further_view(context: JobContext[job.Arguments]) -> JobAnswer:
         answer = answer.model_copy(update={"T_ct_camera": matrix(seen.T_scan_camera)})
     records = {image.viewpoint: [outline_record(outline) for outline in outlines]}
     kept = context.keep_json(records, kind="further_view", name=f"{image.viewpoint}.{arguments.device}.json")
-    return JobAnswer({name: value for name, value in measures.items() if np.isfinite(value)}, (kept,), answer)
+    return JobAnswer(finite(measures), (kept,), answer)

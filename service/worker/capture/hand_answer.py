@@ -18,7 +18,7 @@ from service.jobs.records import Matrix, Point, matrices, matrix
 from service.worker.capture.hand_guide import HandGuide
 from service.worker.capture.held_images import HandheldImage
 from service.worker.capture.scene import CaptureScene
-from service.worker.job import JobAnswer, JobContext
+from service.worker.job import JobAnswer, JobContext, finite
 
 _SAME_M, _SAME_RAD = 0.02, np.deg2rad(3.0)  # an image nearer than this to another one repeats it
 _H = TypeVar("_H", bound=HeldArguments)
@@ -75,7 +75,7 @@ def answer_to(
     answer = _result(guide, why)
     if arguments.rough:
         answer = _refined(answer, guide, used)
-    return JobAnswer({k: v for k, v in measures.items() if np.isfinite(v)}, (ref,), answer)
+    return JobAnswer(finite(measures), (ref,), answer)
 
 
 def _level(found: NewImage, earlier: Sequence[HandheldImage]) -> Transform | None:

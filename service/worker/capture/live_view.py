@@ -17,7 +17,7 @@ from service.core.units import mm
 from service.jobs.capture import live_view as job
 from service.worker.capture.live_station import LiveRecord, LiveStation, last_known, read_records, solve_station
 from service.worker.capture.scene import CaptureScene, live_scene
-from service.worker.job import JobAnswer, JobContext
+from service.worker.job import JobAnswer, JobContext, finite
 from service.worker.poses.robot_poses import robot_camera_poses
 
 
@@ -50,7 +50,7 @@ def live_view(context: JobContext[job.Arguments]) -> JobAnswer:
     record = LiveRecord(image.viewpoint, image.station, view, T_base_scan, visible)
     ref = context.keep_json(record.plain(image.sha256), kind="live_view", name=f"{image.viewpoint}.live.json")
     answer = job.Answer(viewpoint=image.viewpoint, station=image.station, reason=reason, black=black)
-    return JobAnswer({k: v for k, v in measures.items() if np.isfinite(v)}, (ref,), answer)
+    return JobAnswer(finite(measures), (ref,), answer)
 
 
 def _prediction(

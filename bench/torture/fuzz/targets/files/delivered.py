@@ -14,7 +14,8 @@ import trimesh
 
 from bench.torture.fuzz.mutations import BYTES, TEXT
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
-from drivers.dicom_folder import DicomFolder, DicomFolderConfig
+from drivers.dicom_folder import DicomFolderConfig
+from drivers.dicom_folder.folder import DicomFolder
 from drivers.meshes.mesh_file import read_mesh_file
 from drivers.meshes.point_cloud import is_point_cloud, read_point_cloud
 from drivers.photos.photo_file import check_jpeg_complete, read_exif, taken_utc_s
@@ -234,7 +235,7 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target("cloud_text", "drivers.meshes.point_cloud:read_point_cloud", _cloud(".xyz"), _clouds, TEXT),
     Target("cloud_ply", "drivers.meshes.point_cloud:read_point_cloud", _cloud(".ply"), _cloud_plys, (*BYTES, *TEXT)),
-    Target("dicom", "drivers.dicom_folder:DicomFolder", _series, _slices, (*BYTES, *TEXT), pace=0.5),
+    Target("dicom", "drivers.dicom_folder.folder:DicomFolder", _series, _slices, (*BYTES, *TEXT), pace=0.5),
     Target(
         "image_features",
         "service.compute.poses.sfm.features:ImageFeatures.from_bytes",

@@ -11,8 +11,9 @@ import numpy as np
 from bench.torture.fuzz.mutations import BYTES, TEXT
 from bench.torture.fuzz.targets.files.delivered import ROWS, SLICES, write_slices
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
-from drivers.dicom_folder import DicomFolder, DicomFolderConfig
+from drivers.dicom_folder import DicomFolderConfig
 from drivers.dicom_folder.deidentify import deidentify
+from drivers.dicom_folder.folder import DicomFolder
 from drivers.dicom_receiver.staging import Staging
 from service.compute.camera_model import CameraModel
 from service.compute.poses.ros.messages import (

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from service.compute.registration.normal_equations import Blocks, marginalise
+from service.compute.registration.least_squares.normal_equations import Blocks, marginalise
 from service.core.geometry import Array
 
 _FACTOR = (0.02, 1e4)  # range for the outlines' variance

@@ -129,7 +129,7 @@ def test_faults_of_the_link_and_of_the_camera(way: dict[str, str], tmp_path: Pat
 
 
 def test_a_camera_that_dies_and_one_that_comes_back(producer: Path, tmp_path: Path) -> None:
-    """With harvesters; with Aravis, tests/camera/test_genicam_driver.py does so."""
+    """With harvesters; with Aravis, tests/industrial/test_genicam_driver.py does so."""
     with ExitStack() as until_the_end:
         with industrial_camera(FAULTY):
             way = {"producer": str(producer)}

@@ -9,10 +9,10 @@ import numpy as np
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
+from service.compute.registration.further_cameras.pose_covariances import of_inverse, of_product
+from service.compute.registration.further_cameras.rigid_mean import RigidMean, rigid_mean
 from service.compute.registration.identification.identity import Assignment, identify_each
 from service.compute.registration.identification.pairing import paired
-from service.compute.registration.pose_covariances import of_inverse, of_product
-from service.compute.registration.rigid_mean import RigidMean, rigid_mean
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.compute.registration.identification.identity import Assignment
-from service.compute.registration.problem import Problem, State
+from service.compute.registration.least_squares.problem import Problem, State
 from service.compute.scene import PosedImages
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, transform

@@ -1,4 +1,4 @@
-"""What the scanner and the CT of a simulated rig deliver: exports of the scene as it is, computed ahead if wanted."""
+"""The processes that export what scanner and CT of a simulated rig deliver: when asked, or computed ahead."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NICE = 10  # of an export that is computed ahead: whatever somebody waits for g
 _NEXT = {"start": "ct", "ct_scan": "scanner", "spray": "scanner"}  # what is usually asked for after these
 
 
-class Deliveries:
+class ExportProcesses:
     """Exports of the scanner (`scanner`) and of the CT (`ct`), each computed by a process of its own.
 
     With `ahead`, the next export is computed while the rig is used for other things, and written when it is asked

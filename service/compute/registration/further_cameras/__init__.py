@@ -1,0 +1,1 @@
+"""The poses of further cameras from the spheres they see: the robust mean over their images, with covariances."""

@@ -1,0 +1,1 @@
+"""The registration as a least-squares problem: residuals, start, normal equations, variance components."""
