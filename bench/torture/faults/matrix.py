@@ -83,8 +83,8 @@ _FRI: dict[str, tuple[str, int, int, int]] = {
     "fri/message": ("each of 40 messages of FRI", 1, 20, 40),
     "fri/reply": ("each of 40 replies to FRI", 1, 20, 40),
 }
+# A camera that rig.yaml names by its address is not searched for.
 _GIGE: dict[str, tuple[str, int, int, int]] = {
-    "gvcp/discovery": ("the answer to the search for the camera", -1, 1, 1),
     "gvcp/description": ("a piece of the camera's description", -1, 5, 1),
     "gvcp/register": ("the value of a register", 1, 3, 1),
     "gvcp/written": ("the answer to the taking of control", -1, 1, 1),
@@ -115,7 +115,7 @@ _NO_REFUSAL = {"rtde/controller", "rtde/stream", "rtde/command", "dashboard/welc
     "ptpip/event", "ptpip/request", "serial/request", "grbl/welcome", "grbl/status", "grbl/query", "grbl/jog",
     "lines/state", "lines/done", "lines/request", "lines/beat", "grbl/home", "fri/message", "fri/reply",
     "dicom/associate", "dicom/command", "dicom/slice", "dicom/release", "dicom/released",
-    "gvcp/discovery", "gvcp/request", "gvsp/leader", "gvsp/payload", "gvsp/trailer",
+    "gvcp/request", "gvsp/leader", "gvsp/payload", "gvsp/trailer",
 }  # fmt: skip
 
 
@@ -349,6 +349,8 @@ def _store() -> Iterator[Case]:
 
     yield other("database/locked_2s", "another program holds the database for 2 s", "lock", seconds=2.0)
     yield other("database/locked_40s", "another program holds the database for 40 s", "lock", seconds=40.0)
+    words, value = "another program holds the database for 340 s", {"seconds": 340.0}
+    yield Case("store/database/locked_340s", "store", words, after=1, act="lock", value=value, longer_s=400.0)
     yield other("database/gone", "the data folder is gone until a person brings it back", "data_away", "data_back")
     yield other("clock/ahead", "the clock is put forward by an hour", "clock", seconds=3600.0)
     yield other("clock/back", "the clock is put back by an hour", "clock", seconds=-3600.0)

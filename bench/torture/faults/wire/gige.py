@@ -9,8 +9,8 @@ from typing import Any, Protocol
 
 from bench.torture.faults.wire.streams import Datagrams, Link, Peer
 
-_DISCOVERED, _WRITE_REGISTERS, _WRITE_MEMORY = 0x03, 0x82, 0x86
-_ANSWERS = {_DISCOVERED: "discovery", 0x81: "register", 0x83: "written", 0x85: "description", 0x87: "set"}
+_WRITE_REGISTERS, _WRITE_MEMORY = 0x82, 0x86
+_ANSWERS = {0x81: "register", 0x83: "written", 0x85: "description", 0x87: "set"}
 _PARTS = {1: "leader", 2: "trailer", 3: "payload"}
 _STREAM_PORT, _STREAM_ADDRESS = 0xD00, 0xD18  # registers that say where images go
 _KEY = 0x42  # the first byte of a request
