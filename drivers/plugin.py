@@ -10,6 +10,8 @@ from pydantic import BaseModel, ConfigDict
 
 from drivers.interfaces import Device
 
+READING_TIMEOUT_S = 45.0
+
 
 class DriverConfig(BaseModel):
     """Base class of a driver's section in rig.yaml."""
@@ -44,6 +46,7 @@ class DriverSpec:
         build: creates the driver object from a validated config, without connecting.
         hosted: whether the driver must run in a supervised child process (for native libraries).
         call_timeout_s: longest time that one call may take before the child is killed; a config may ask for more.
+        reading_timeout_s: the same for calls that only read what the device knows (`report`, `settings`), if shorter.
     """
 
     kind: str
@@ -51,3 +54,4 @@ class DriverSpec:
     build: Callable[[Any], Device]
     hosted: bool = False
     call_timeout_s: float = 60.0
+    reading_timeout_s: float = READING_TIMEOUT_S

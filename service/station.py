@@ -260,8 +260,11 @@ class Station:
         config = self._config(name, spec)
         if spec.hosted:
             interface = INTERFACES[spec.kind]
-            call_timeout_s = max(spec.call_timeout_s, config.longest_call_s)
-            return cast(Device, hosted(interface, spec_path, config, call_timeout_s=call_timeout_s, name=name))
+            times = {
+                "call_timeout_s": max(spec.call_timeout_s, config.longest_call_s),
+                "reading_timeout_s": spec.reading_timeout_s,
+            }
+            return cast(Device, hosted(interface, spec_path, config, name=name, **times))
         return spec.build(config)
 
     def _config(self, name: str, spec: DriverSpec) -> DriverConfig:

@@ -1,9 +1,10 @@
 """`captures`: the real programs capture on a simulated rig for an hour; their memory and files must not creep up.
 
 The programs are `simulate rig` (with a sped-up arm), `run` with its driver processes and its worker, and `serve`,
-whose pages are read all the time. Every few seconds memory (USS and RSS), descriptors and threads of every process
-are sampled, and the sizes of the database, write-ahead log and logs. After a warm-up a line is fitted over the number
-of captures, which bench/soak/creep.py judges.
+whose pages are read all the time. A simulated person types the answers to the run's questions (bench/soak/person.py).
+Every few seconds memory (USS and RSS), descriptors and threads of every process are sampled, and the sizes of the
+database, write-ahead log and logs. After a warm-up a line is fitted over the number of captures, which
+bench/soak/creep.py judges.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import psutil
 import yaml
 
 from bench.soak.creep import CHILD, Sample, judge
+from bench.soak.person import Typist
 from service.core.records.events import Payload, ViewpointCaptured
 from service.core.run.state import RunState
 from service.run_record import RunFollower
@@ -67,6 +69,7 @@ def captures(folder: Path, minutes: float, every_s: float, planned: int, *, cali
         "pages": soak.pages,
         "events": report.events,
         "jobs": report.jobs,
+        "stops": soak.stops,
         "samples": len(soak.samples),
         **found,
         "faults": faults + found["faults"],
@@ -117,14 +120,15 @@ class _Soak:
     samples: list[Sample] = field(default_factory=list[Sample])
     faults: list[str] = field(default_factory=list[str])
     pages: int = 0
+    stops: int = 0  # of the arm by its watchdog, after each of which the person let it go on
 
     def go(self, seconds: float, every_s: float) -> None:
         """Run, read pages and sample until the time is up; then end the run and its processes."""
         words = ("run", str(self.protocol), "--rig", str(self.rig), "--data", str(self.data))
         with self.log.open("wb") as log:
             runner = subprocess.Popen(
-                command(*words, "--operator", "soak", "--auto-confirm", "--json"),
-                cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                command(*words, "--operator", "soak", "--json"),
+                cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=log, stderr=log,
             )  # fmt: skip
         try:
             headers = self.server.signed_in()
@@ -143,6 +147,8 @@ class _Soak:
         gives_up_s = time.monotonic() + _LONGEST_S
         ends_s = next_s = 0.0
         told_s = time.monotonic()
+        assert runner.stdin is not None
+        person = Typist(runner.stdin)
         with Store.open(self.data) as store:
             run: RunFollower | None = None
             count = seen = 0
@@ -158,6 +164,11 @@ class _Soak:
                     count += sum(_is_of_the_capture(event.payload) for event in log.events[seen:])
                     seen = len(log.events)
                     self._look(client, log.run_id, log.state)
+                    person.answer(log)
+                    self.stops = person.stops
+                    if person.puzzled:
+                        self.faults.append(f"the run stopped: {person.puzzled}")
+                        return
                 if count and not ends_s:
                     ends_s = time.monotonic() + seconds
                 if not ends_s and time.monotonic() > gives_up_s:
@@ -168,7 +179,7 @@ class _Soak:
                     self.samples.append(self._sample(runner.pid, count))
                 if time.monotonic() - told_s > 60:
                     told_s = time.monotonic()
-                    print(f"captures: {count} so far", flush=True)
+                    print(f"captures: {count} so far, {person.stops} stops", flush=True)
                 time.sleep(_LOOK_S)
 
     def _look(self, client: httpx.Client, run: str, state: RunState) -> None:

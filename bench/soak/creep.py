@@ -108,8 +108,9 @@ def table(found: Mapping[str, Any]) -> list[str]:
     lines = [
         f"{found['minutes']:g} minutes of captures with the arm at 20 times its speed: {found['captured']:,} "
         f"viewpoints, {found['events']:,} events, {found['jobs']:,} jobs, {found['pages']:,} rounds of pages, "
-        f"{found['samples']:,} samples; the first quarter is warm-up. Growth per 1000 captures with its 95 % "
-        "interval; a fault is what exceeds its bound for certain."
+        f"{found['samples']:,} samples; the first quarter is warm-up. The arm's watchdog stopped it "
+        f"{found['stops']} times because the machine was busy, and a simulated person let it go on. Growth per 1000 "
+        "captures with its 95 % interval; a fault is what exceeds its bound for certain."
         + ("" if found["judged"] else " **This was too short to judge**, and nothing below is a fault yet."),
         "",
         "| what | first | last | most | growth in 1000 captures | may grow by | why it may | |",

@@ -50,6 +50,7 @@ _SYNTAXES = (
 )
 # Status of a C-STORE (DICOM PS3.4, B.2.3).
 _SUCCESS, _OUT_OF_RESOURCES, _MISMATCH, _NOT_UNDERSTOOD = 0x0000, 0xA700, 0xA900, 0xC000
+_INVALID_PDU = "Evt19"  # an event of the state machine of DICOM PS3.8, 9.2
 _WAIT_S = 30.0  # for the other side; a connection that says nothing for so long is closed
 _MOST_ASSOCIATIONS = 32
 _COMMENT = 64  # characters of an error comment
@@ -136,6 +137,7 @@ class Receiver:
         for kind in _CLASSES:
             ae.add_supported_context(kind, list(_SYNTAXES))
         handlers: list[Any] = [
+            (evt.EVT_CONN_OPEN, self._opened),
             (evt.EVT_ACCEPTED, self._accepted),
             (evt.EVT_REJECTED, self._rejected),
             (evt.EVT_C_ECHO, self._echo),
@@ -160,6 +162,21 @@ class Receiver:
             self._server.ae.shutdown()
             self._server = None
 
+    def _opened(self, event: Any) -> None:
+        """End the association at a message that is none, which would end pynetdicom's thread without a word."""
+        messages = event.assoc.dimse
+        receive: Callable[[object], None] = messages.receive_primitive
+
+        def receive_or_end(part: object) -> None:
+            try:
+                receive(part)
+            except PARSE_ERRORS as error:
+                name = self._names.get(id(event.assoc), "a sender")
+                self._tell(f"{name}: the connection is ended, because a message cannot be read ({error})")
+                event.assoc.dul.event_queue.put(_INVALID_PDU)
+
+        messages.receive_primitive = receive_or_end
+
     def _accepted(self, event: Any) -> None:
         requestor = event.assoc.requestor
         with self._lock:
@@ -183,6 +200,10 @@ class Receiver:
             data: bytes = event.encoded_dataset()
             series, instance = _uids(data)
             if instance != str(event.request.AffectedSOPInstanceUID):
+                self._staging.refuse(name)
+                self._tell(
+                    f"{name}: a file was refused: it says that it is {instance}, and its sender says otherwise"
+                )
                 return _answer(_MISMATCH, "the data set has another SOP instance UID")
             self._staging.store(name, series, instance, data)
         except DeviceStorageFullError as error:
@@ -192,6 +213,7 @@ class Receiver:
             self._tell(f"{name}: a file was refused: {error}")
             return _answer(_NOT_UNDERSTOOD, error.what)
         except PARSE_ERRORS as error:
+            self._staging.refuse(name)
             self._tell(f"{name}: a file was refused: it cannot be read as DICOM ({error})")
             return _answer(_NOT_UNDERSTOOD, "the data set cannot be read")
         return _answer(_SUCCESS)

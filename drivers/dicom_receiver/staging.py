@@ -46,6 +46,8 @@ class Staging:
         self._carried: dict[str, set[str]] = {}  # by association: the series of which it brought files
         self._open: dict[str, set[str]] = {}  # by series: the associations that carry it and have not ended
         self._broken: set[str] = set()
+        self._refused: set[str] = set()  # associations with files that cannot be read; of which series is not known
+        self._incomplete: set[str] = set()  # series that such an association brought
         self._missed: dict[str, set[str]] = {}  # by series: files that could not be stored, where no mark could be
         try:
             self._root.mkdir(parents=True, exist_ok=True)
@@ -75,6 +77,7 @@ class Staging:
         """
         for uid in (series, instance):
             if not _UID.fullmatch(uid):
+                self.refuse(association)
                 raise DeviceRefusedError(f"{uid[:80]!r} is no UID", where=association, remedy="Send a valid file")
         with self._lock:
             self._carried.setdefault(association, set()).add(series)
@@ -105,6 +108,11 @@ class Staging:
         with self._lock:
             self._missed.get(series, set()).discard(instance)
 
+    def refuse(self, association: str) -> None:
+        """Note that a file cannot be read. It may be of any series that its association brings."""
+        with self._lock:
+            self._refused.add(association)
+
     def ended(self, association: str, *, released: bool) -> tuple[Outcome, ...]:
         """Deliver or hold the series of an association that ended, if no other one carries them.
 
@@ -117,7 +125,11 @@ class Staging:
         """
         with self._lock:
             found: list[Outcome] = []
-            for series in sorted(self._carried.pop(association, set())):
+            carried = self._carried.pop(association, set())
+            if association in self._refused:
+                self._refused.discard(association)
+                self._incomplete |= carried
+            for series in sorted(carried):
                 others = self._open[series] - {association}
                 if not released:
                     self._broken.add(series)
@@ -129,13 +141,16 @@ class Staging:
             return tuple(found)
 
     def _finish(self, series: str) -> Outcome:
-        broken = series in self._broken
+        broken, incomplete = series in self._broken, series in self._incomplete
         self._broken.discard(series)
+        self._incomplete.discard(series)
         missing = len(self._missed_of(series))
         if broken:
             return self._hold(series, "the connection ended before the sender had finished")
         if missing:
             return self._hold(series, f"{missing} more could not be stored")
+        if incomplete:
+            return self._hold(series, "a file that came with them was refused")
         return self._deliver(series)
 
     def _hold(self, series: str, why: str) -> Outcome:

@@ -23,13 +23,13 @@ from drivers.gphoto.dials import Dials
 from drivers.gphoto.link import AddedFile, Link, gp, library_version
 from drivers.gphoto.profile import Profile, battery_fraction
 from drivers.gphoto.profiles import profile_for
+from drivers.gphoto.shutter import release_shutter
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
 from drivers.photos.photo_file import check_jpeg_complete, read_exif, sha256_of
 from drivers.plugin import DriverConfig
 from service.core.units import megabytes, ms
 
 _LOG = logging.getLogger(__name__)
-BUSY_ATTEMPTS = 5
 PREVIEW_PATIENCE_S = 15.0
 LEAST_FREE_BYTES = 200_000_000  # room for one RAW+JPEG exposure of 61 megapixels
 MEDIA_TYPES = {
@@ -197,8 +197,8 @@ class GphotoCamera:
         dials.announced.clear()
         quality, focus = dials.quality(), dials.focus()
         self._check_space()
-        trigger_s = self._trigger()
-        added = self._collect(2 if quality == "RAW+JPEG" else 1, trigger_s)
+        trigger_s, *first = release_shutter(self._link, dials, self._check_space)
+        added = self._collect(2 if quality == "RAW+JPEG" else 1, trigger_s, *first)
         return self._image(added, folder, trigger_s, quality, focus)
 
     def released_images(self, folder: Path, timeout_s: float, since_utc_s: float = 0.0) -> tuple[CapturedImage, ...]:
@@ -275,27 +275,6 @@ class GphotoCamera:
                 where=self._link.where,
                 remedy="Empty or change the card",
             )
-
-    def _trigger(self) -> float:
-        for attempt in range(1, BUSY_ATTEMPTS + 1):
-            trigger_s = time.monotonic()
-            try:
-                self._link.call("Releasing the shutter", lambda camera: camera.trigger_capture())
-            except DeviceBusyError:
-                if attempt == BUSY_ATTEMPTS:
-                    raise
-                time.sleep(0.2 * attempt)
-            except DeviceUnavailableError as error:
-                # A full store, a wrong mode and a lost link all give -1: ask the camera which it is.
-                self._check_space()
-                raise DeviceRefusedError(
-                    f"The camera answers but did not release the shutter: {error.what}",
-                    where=self._link.where,
-                    remedy="Check the camera's display; turn the dial to M, and do not save to the camera only",
-                ) from error
-            else:
-                return trigger_s
-        raise AssertionError
 
     def _collect(self, expected: int, trigger_s: float, *first: AddedFile) -> list[AddedFile]:
         added = list(first)

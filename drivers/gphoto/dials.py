@@ -78,11 +78,15 @@ class Dials:
         self.refresh()
         return CameraSettings(
             aperture_f=self._number(profile.f_number),
-            exposure_s=self._number(profile.shutter),
+            exposure_s=self.exposure_s(),
             iso=round(self._number(profile.iso)),
             focus_mode=self.focus(),
             image_quality=self.quality(),
         )
+
+    def exposure_s(self) -> float:
+        """The exposure time, as last read."""
+        return self._number(self._profile.shutter)
 
     def focus(self) -> str:
         """The focus mode in a protocol's words, as last read."""

@@ -23,17 +23,27 @@ from pydantic import BaseModel
 from drivers.errors import DeviceError, DeviceTimeoutError, DeviceUnavailableError
 from drivers.host.heartbeat import CLOSE_TIMEOUT_S, START_TIMEOUT_S, Line
 from drivers.interfaces import DeviceIdentity
+from drivers.plugin import READING_TIMEOUT_S
 from service.core.errors import OrthocaptureError
 
 T = TypeVar("T")
 
 PING_TIMEOUT_S = 15.0
+_READING = frozenset({"report", "settings"})  # calls that only read what the device knows
 
 _LOG = logging.getLogger("drivers.host")
 _LEVELS = logging.getLevelNamesMapping()
 
 
-def hosted(interface: type[T], spec_path: str, config: BaseModel, *, call_timeout_s: float, name: str) -> T:
+def hosted(
+    interface: type[T],
+    spec_path: str,
+    config: BaseModel,
+    *,
+    call_timeout_s: float,
+    name: str,
+    reading_timeout_s: float = READING_TIMEOUT_S,
+) -> T:
     """Return a proxy with exactly the public methods of `interface`; each call runs in the driver's own process.
 
     Args:
@@ -42,10 +52,13 @@ def hosted(interface: type[T], spec_path: str, config: BaseModel, *, call_timeou
         config: the validated configuration; the child validates its JSON again.
         call_timeout_s: longest time that one call may take before the child is killed.
         name: the device's name in rig.yaml, for messages and logs.
+        reading_timeout_s: the same for `report` and `settings`, if shorter.
 
     `open()` starts the child, and restarts it after it died. Methods raise only OrthocaptureError.
     """
-    device = HostedDevice(spec_path, config, call_timeout_s=call_timeout_s, name=name)
+    device = HostedDevice(
+        spec_path, config, call_timeout_s=call_timeout_s, name=name, reading_timeout_s=reading_timeout_s
+    )
     methods: dict[str, Any] = {"__init__": _keep_device, "__doc__": f"{interface.__name__} in a process of its own."}
     for base in reversed(interface.__mro__):
         for method, function in vars(base).items():
@@ -92,10 +105,12 @@ class HostedDevice:
         call_timeout_s: float,
         name: str,
         heartbeat_s: float = 5.0,
+        reading_timeout_s: float = READING_TIMEOUT_S,
     ) -> None:
         self._spec_path = spec_path
         self._config_json = config.model_dump_json()
         self._call_timeout_s = call_timeout_s
+        self._reading_timeout_s = min(call_timeout_s, reading_timeout_s)
         self._name = name
         self._heartbeat_s = heartbeat_s
         self._lock = threading.RLock()
@@ -156,7 +171,8 @@ class HostedDevice:
             DeviceUnavailableError: the child is not running.
         """
         with self._lock:
-            return self._exchange(method, args, kwargs, self._call_timeout_s)
+            longest_s = self._reading_timeout_s if method in _READING else self._call_timeout_s
+            return self._exchange(method, args, kwargs, longest_s)
 
     # --- conversation --------------------------------------------------------------------------------
 

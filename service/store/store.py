@@ -14,7 +14,7 @@ from sqlalchemy import Connection, select
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.jobs.priorities import Lane
 from service.core.records.events import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
-from service.store.database.engine import LOOK, RESTORE, Database, database_path, open_database
+from service.store.database.engine import LOOK, PATIENCE_S, RESTORE, Database, database_path, open_database
 from service.store.database.tables import artefacts, events, heads, runs
 from service.store.durable_effects import Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock
 from service.store.errors import UnknownRunError
@@ -56,9 +56,11 @@ class Store:
         files: Files | None = None,
         *,
         create: bool = True,
+        patience_s: float = PATIENCE_S,
     ) -> Store:
         """Open a data folder; with `create`, make it if it does not exist.
 
+        A write waits up to about `patience_s` for other processes that write.
         Raises StoreVersionError for a database of a newer version, StoreError if the folder cannot be used.
         """
         files = files or DurableFiles()
@@ -70,7 +72,7 @@ class Store:
                 remedy="Name the data folder with --data DIR, or with the environment variable ORTHOCAPTURE_DATA",
             )
         folder = open_folder(data_dir, files, ids)
-        database = open_database(data_dir, files)
+        database = open_database(data_dir, files, patience_s)
         return cls(database, folder, files, clock or SystemClock(), ids, database_path(data_dir))
 
     @property

@@ -56,7 +56,8 @@ class Operations:
     def handle(self, request: codec.Request, data: bytes) -> Reply:
         """Carry out one operation.
 
-        Planned faults of the kinds busy, disk_full, reject, error and ignore take effect here.
+        Planned faults of the kinds busy, disk_full, reject, error, ignore and unconfirmed take effect here. With
+        `unconfirmed` the operation is carried out, and an error answered.
         """
         known = self.operations.get(request.operation)
         if known is None:
@@ -71,6 +72,8 @@ class Operations:
             reply = operation(request, data)
         except tuple(_CODES) as error:
             return Reply(_CODES[type(error)])
+        if fault is not None and fault.kind == "unconfirmed":
+            return Reply(GENERAL_ERROR)
         return Reply(reply.code, reply.parameters, reply.data, fault)
 
 

@@ -101,9 +101,22 @@ def test_stale_image_then_a_new_one(tmp_path: Path) -> None:
 
 def test_shutter_refused_by_a_camera_that_answers(tmp_path: Path) -> None:
     with rig([{"on": "shutter", "kind": "reject"}]) as (camera, _):
-        with pytest.raises(DeviceRefusedError, match="did not release"):
+        with pytest.raises(
+            DeviceRefusedError,
+            match=r"did not confirm .* no photograph came within 5 s.* if the shutter was released",
+        ):
             camera.capture(tmp_path)
         assert camera.capture(tmp_path).counter == 1
+
+
+def test_a_release_that_is_not_confirmed_is_known_by_its_photograph(tmp_path: Path) -> None:
+    """Before, the exposure was called not taken, and the next one was given its photograph."""
+    log = tmp_path / "truth.jsonl"
+    with rig([{"on": "shutter", "kind": "unconfirmed"}], "--exposures-log", str(log)) as (camera, _):
+        images = [camera.capture(tmp_path), camera.capture(tmp_path)]
+    truth = [json.loads(line)["sha256"] for line in log.read_text().splitlines()]
+    assert [image.counter for image in images] == [1, 2]
+    assert [image.jpeg.sha256 for image in images] == truth
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -25,6 +26,7 @@ from drivers.dicom_folder.folder import DicomFolder
 from drivers.dicom_receiver import Receiver, ReceiverConfig
 from drivers.errors import DeviceRefusedError, DeviceUnavailableError
 from tests.support.ct.ct_series import SHAPE, hospital, pixels, write_series
+from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY
 
 LISTEN = [sys.executable, "-m", "service.cli.main", "dicom-listen", "--port", "0", "--json"]
@@ -194,6 +196,40 @@ def test_a_full_disk_is_told_to_both_sides_and_the_series_is_held_back(tmp_path:
         assert listener.series() == [(5, ())]
 
 
+def test_a_series_is_held_back_if_a_file_that_came_with_it_cannot_be_read(tmp_path: Path) -> None:
+    """The file is of any series; without it the series was shown as whole."""
+    write_series(tmp_path / "suite", uid=UID)
+    every = slices(tmp_path / "suite")
+    whole = every[2].SeriesInstanceUID
+    del every[2].SeriesInstanceUID
+    with receiving(tmp_path / "ct") as listener:
+        first = calling(listener.receiver.port)
+        assert [first.send_c_store(ds).Status for ds in every] == [0, 0, 0xC000, 0, 0]
+        first.release()
+        assert "4 files are held back, because a file that came with them was refused" in listener.wait_for("held")
+        assert listener.series() == []
+        every[2].SeriesInstanceUID = whole
+        second = calling(listener.receiver.port)
+        assert [second.send_c_store(ds).Status for ds in every] == [0] * 5
+        second.release()
+        listener.wait_for("5 files are in")
+        assert listener.series() == [(5, ())]
+
+
+def test_a_message_that_is_none_ends_its_connection_at_once(tmp_path: Path) -> None:
+    write_series(tmp_path / "suite", uid=UID)
+    with receiving(tmp_path / "ct") as listener:
+        sender = calling(listener.receiver.port)
+        assert sender.send_c_store(slices(tmp_path / "suite")[0]).Status == 0
+        command = bytes.fromhex("0000000004000000 00000000")  # a command's length, and no command
+        value = struct.pack(">IBB", 2 + len(command), 1, 3) + command
+        assert sender.dul.socket is not None
+        sender.dul.socket.send(struct.pack(">BBI", 4, 0, len(value)) + value)
+        listener.wait_for("the connection is ended, because a message cannot be read")
+        listener.wait_for("1 files are held back, because the connection ended")
+        until(lambda: sender.is_aborted, "the sender is not told")
+
+
 # --- who may send, and what -------------------------------------------------------------------------------------
 
 
@@ -231,9 +267,11 @@ def test_a_file_with_a_path_for_a_uid_or_other_content_under_a_known_uid_is_refu
         assert (answer.Status, "another file with this UID" in answer.ErrorComment) == (0xC000, True)
         evil = every[1]
         evil["SeriesInstanceUID"] = pydicom.DataElement("SeriesInstanceUID", "LO", "../../evil")
-        assert sender.send_c_store(evil).Status == 0xC000
         sender.release()
         listener.wait_for("1 files are in")
+        sender = calling(listener.receiver.port)
+        assert sender.send_c_store(evil).Status == 0xC000
+        sender.release()
     assert not list(tmp_path.rglob("*evil*"))
     assert {path.name for path in tmp_path.iterdir()} == {"suite", "ct"}
 

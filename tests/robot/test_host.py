@@ -89,6 +89,18 @@ def test_call_timeout_kills_the_child(tmp_path: Path) -> None:
     device.close()
 
 
+def test_a_device_that_does_not_tell_what_it_knows_is_given_less_time_than_a_long_call() -> None:
+    """libgphoto2 hangs in `report` if a Canon's answers are noise; an exposure may take two minutes, a report not."""
+    config = FakeConfig(report_s=600)
+    device = hosted(Fake, SPEC, config, call_timeout_s=60, name="mute", reading_timeout_s=0.5)
+    device.open()
+    with pytest.raises(DeviceTimeoutError, match=r"report did not return within 0\.5 s"):
+        device.report()
+    device.open()
+    device.hang(0.6)
+    device.close()
+
+
 def test_heartbeat_finds_a_child_that_died_between_calls(caplog: pytest.LogCaptureFixture) -> None:
     device = HostedDevice(SPEC, FakeConfig(), call_timeout_s=30, name="mortal", heartbeat_s=0.1)
     device.open()

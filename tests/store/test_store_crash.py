@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from service.core.errors import StoreError
 from service.core.records.events import Event
+from service.store.database import engine
 from service.store.durable_effects import DurableFiles
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
 from service.store.verification.verify import AuditReport, verify
+from tests.support.processes.waiting import until
 from tests.support.record.store import (
     CountedIds,
     Crash,
@@ -185,3 +189,27 @@ def test_killed_writer_loses_nothing_that_it_reported(tmp_path: Path, delay_s: f
     with Store.open(tmp_path) as store:
         capture(store, run, "after")
     assert verify(tmp_path).events == report.events + 1
+
+
+def test_a_process_that_holds_the_database_for_long_is_waited_for(
+    before: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A runner stopped because another process was starved while it wrote."""
+    monkeypatch.setattr(engine, "BUSY_TIMEOUT_S", 0.1)
+    data = tmp_path / "data"
+    shutil.copytree(before, data)
+    other = sqlite3.connect(data / engine.DATABASE_NAME, isolation_level=None, check_same_thread=False)
+    with Store.open(data) as store, Store.open(data, patience_s=0.1) as hasty:
+        run = store.find_run("latest")
+        other.execute("BEGIN IMMEDIATE")
+        with pytest.raises(StoreError, match=r"database is locked.*look for one that hangs"):
+            record_one(hasty, run)
+        count = len(caplog.records)
+        with ThreadPoolExecutor() as pool:
+            recorded = pool.submit(record_one, store, run)
+            until(lambda: len(caplog.records) >= count + 3, "it does not say that it waits")
+            other.execute("ROLLBACK")
+            assert recorded.result(20)[0].payload.kind == "viewpoint_captured"
+    assert "another process has held" in caplog.records[-1].message
+    other.close()
+    assert verify(data).faults == ()

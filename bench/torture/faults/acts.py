@@ -20,7 +20,7 @@ import trimesh
 from bench.torture.faults.place.ct_suite import Suite
 from bench.torture.faults.place.disk import FaultyDisk, JumpingClock
 from bench.torture.faults.place.material import SCAN, ct_folder, mirrored_ct, other_ct, scan_folder, spoilt_ct
-from bench.torture.faults.place.newer_rigs import Film, pendant
+from bench.torture.faults.place.newer_rigs import Film, OtherClient, pendant
 from service.store.database.engine import database_path
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
@@ -262,6 +262,17 @@ def _pulled(trial: Trial, seconds: float | None) -> None:
         _background(trial, back)
 
 
+def _taken(trial: Trial) -> None:
+    """Control the camera from another program, which takes it before this one can."""
+    trial.other = OtherClient(trial.arm_host)
+    trial.ends.append(trial.other.let_go)
+
+
+def _let_go(trial: Trial) -> None:
+    assert trial.other is not None
+    trial.other.let_go()
+
+
 def _kuka_stop(trial: Trial) -> None:
     pendant(trial, "stop external_stop")
     trial.stopped()
@@ -319,6 +330,8 @@ ACTS: Mapping[str, Callable[[Trial], None]] = {
     "film": lambda trial: _film(trial).run(str(trial.case.value["how"])),
     "film_pauses": lambda trial: _film(trial).pause(),
     "film_ends": lambda trial: _pulled(trial, trial.case.value.get("seconds")),
+    "taken": _taken,
+    "gige_off": lambda trial: trial.simulators.stop(("gige",)),
     "table_off": lambda trial: trial.simulators.stop(("grbl",)),
     "kuka_off": lambda trial: trial.simulators.stop(("kuka",)),
     "kuka_stop": _kuka_stop,
@@ -329,6 +342,7 @@ MENDS: Mapping[str, Callable[[Trial], None]] = {
     "power_up": _power_up,
     "slider_up": lambda trial: _slider(trial, 1.0),
     "film": lambda trial: _film(trial).run(),
+    "let_go": _let_go,
     "kuka_release": lambda trial: pendant(trial, "release"),
     "scan": _whole_scan,
     "ct": _whole_ct,

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from bench.torture.faults.wire.proxy import AWAY_S, Spoil
 
 Scene = Literal[
-    "arm", "camera", "lightbox", "scan", "ct", "store", "table", "kuka", "video", "canon", "fri", "listen"
+    "arm", "camera", "lightbox", "scan", "ct", "store", "table", "kuka", "video", "canon", "fri", "listen", "gige"
 ]
 BOUND_S = 240.0  # limit for a case, in addition to the time that its device is away
 

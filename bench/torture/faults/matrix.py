@@ -83,6 +83,17 @@ _FRI: dict[str, tuple[str, int, int, int]] = {
     "fri/message": ("each of 40 messages of FRI", 1, 20, 40),
     "fri/reply": ("each of 40 replies to FRI", 1, 20, 40),
 }
+# A camera that rig.yaml names by its address is not searched for.
+_GIGE: dict[str, tuple[str, int, int, int]] = {
+    "gvcp/description": ("a piece of the camera's description", -1, 5, 1),
+    "gvcp/register": ("the value of a register", 1, 3, 1),
+    "gvcp/written": ("the answer to the taking of control", -1, 1, 1),
+    "gvcp/set": ("the answer to a setting", -1, 1, 1),
+    "gvcp/request": ("a request to the camera", 1, 5, 1),
+    "gvsp/leader": ("the beginning of an image", 1, 1, 1),
+    "gvsp/payload": ("a packet of an image", 1, 2, 1),
+    "gvsp/trailer": ("the end of an image", 1, 1, 1),
+}
 _LISTEN: dict[str, tuple[str, int, int, int]] = {
     "dicom/associate": ("the request of an association", -1, 1, 1),
     "dicom/accept": ("the answer to it", -1, 1, 1),
@@ -104,14 +115,19 @@ _NO_REFUSAL = {"rtde/controller", "rtde/stream", "rtde/command", "dashboard/welc
     "ptpip/event", "ptpip/request", "serial/request", "grbl/welcome", "grbl/status", "grbl/query", "grbl/jog",
     "lines/state", "lines/done", "lines/request", "lines/beat", "grbl/home", "fri/message", "fri/reply",
     "dicom/associate", "dicom/command", "dicom/slice", "dicom/release", "dicom/released",
+    "gvcp/request", "gvsp/leader", "gvsp/payload", "gvsp/trailer",
 }  # fmt: skip
+
+
+# Pixels have no checksum of their own: UDP's drops a packet that arrives changed, and so is it lost.
+_CHECKED_BY_UDP = {("gvsp/payload", "corrupt"), ("gvsp/payload", "mutated")}
 
 
 def _wires(device: str, scene: Scene, kinds: dict[str, tuple[str, int, int, int]], act: str = "") -> Iterator[Case]:
     for place, (what, after, nth, times) in kinds.items():
         kind = place.split("/")[1]
         for column, happens in COLUMNS.items():
-            if column == "reject" and place in _NO_REFUSAL:
+            if (column == "reject" and place in _NO_REFUSAL) or (place, column) in _CHECKED_BY_UDP:
                 continue
             spoil = Spoil(kind, column, nth, 1 if column.startswith("away_") else times)
             # With noise libgphoto2 hangs at an EOS until its process is killed, a minute for each attempt.
@@ -236,6 +252,21 @@ def _video_itself() -> Iterator[Case]:
     yield case("away_never", "it is gone for good", "film_ends", mend="")
 
 
+def _gige_itself() -> Iterator[Case]:
+    own = "gige/itself"
+    for name, what, kind in (
+        ("lost_packets", "packets of an image are lost, and sent again", "lost_packets"),
+        ("incomplete", "packets of an image are lost for good", "truncate"),
+        ("no_image", "no image comes", "no_image"),
+        ("stale", "the image before comes again", "stale"),
+    ):
+        plan = ({"device": "camera", "on": "image", "kind": kind, "nth": 2},)
+        yield Case(f"{own}/{name}", "gige", what, faults=plan)
+    yield Case(f"{own}/taken", "gige", "another program controls the camera", act="taken", mend="let_go")
+    yield Case(f"{own}/taken_on", "gige", "another program controls the camera, and keeps it", act="taken")
+    yield Case(f"{own}/switched_off", "gige", "the camera loses its power", after=1, act="gige_off")
+
+
 def _files() -> Iterator[Case]:
     def scan(name: str, what: str, act: str, mend: str = "scan", **value: object) -> Case:
         return Case(f"scanner/export/{name}", "scan", what, act=act, mend=mend, value=value)
@@ -318,6 +349,8 @@ def _store() -> Iterator[Case]:
 
     yield other("database/locked_2s", "another program holds the database for 2 s", "lock", seconds=2.0)
     yield other("database/locked_40s", "another program holds the database for 40 s", "lock", seconds=40.0)
+    words, value = "another program holds the database for 340 s", {"seconds": 340.0}
+    yield Case("store/database/locked_340s", "store", words, after=1, act="lock", value=value, longer_s=400.0)
     yield other("database/gone", "the data folder is gone until a person brings it back", "data_away", "data_back")
     yield other("clock/ahead", "the clock is put forward by an hour", "clock", seconds=3600.0)
     yield other("clock/back", "the clock is put back by an hour", "clock", seconds=-3600.0)
@@ -340,6 +373,8 @@ def cases() -> dict[str, Case]:
         *_wires("kuka", "fri", _FRI),
         *_kuka_itself(),
         *_video_itself(),
+        *_wires("gige", "gige", _GIGE),
+        *_gige_itself(),
         *_files(),
         *_wires("listen", "listen", _LISTEN, act="send"),
         *_listen_itself(),

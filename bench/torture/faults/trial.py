@@ -31,8 +31,18 @@ from bench.torture.faults.place.laboratory import (
     exposed,
     write_rig,
 )
-from bench.torture.faults.place.material import FIVE, ct_folder, make_material, scan_folder
-from bench.torture.faults.place.newer_rigs import KUKA_STATION, TABLE_STATION, Film, kuka_rig, table_rig, video_rig
+from bench.torture.faults.place.material import FIVE, make_material, scan_folder
+from bench.torture.faults.place.newer_rigs import (
+    KUKA_STATION,
+    TABLE_STATION,
+    Film,
+    OtherClient,
+    gige_rig,
+    kuka_rig,
+    table_rig,
+    video_rig,
+)
+from bench.torture.faults.place.older_rigs import arm_rig, camera_rig, ct_rig, lightbox_rig, listen_rig, scan_rig
 from bench.torture.faults.place.person import ArmEye, LeftError, Motions, Person, PlaceEye
 from bench.torture.faults.wire.proxy import RunningProxy, Wire, start_proxy
 from service.core.errors import OrthocaptureError
@@ -54,6 +64,7 @@ STATIONS: dict[str, dict[str, Any]] = {
 }
 _UNSIGNED = "the record could not be signed"
 _IMPORTS = ("scan", "ct", "listen")  # scenes without views, whose jobs are worked on here
+_CAMERAS = ("camera", "canon", "video", "gige")  # scenes with a real camera
 _SESSIONS = 3  # programs that drive the run in turn, if an error ends them
 
 
@@ -89,6 +100,7 @@ class Trial:
         self.words: list[str] = []
         self.verdict = Verdict(case.name)
         self.film: Film | None = None
+        self.other: OtherClient | None = None
         self.suite: Suite | None = None
         self._eye: Motions = Motions()
 
@@ -109,27 +121,29 @@ class Trial:
         """Note that a person stopped the arm now."""
         self._eye.stopped_s.append(time.monotonic())
 
-    def _plan(self) -> list[str]:
+    def plan(self) -> list[str]:
+        """Words that give the simulator the case's faults."""
         return ["--faults", json.dumps(list(self.case.faults))] if self.case.faults else []
 
     def _laboratory(self) -> Laboratory:
         devices = {
-            "arm": self._arm_devices,
-            "camera": lambda: self._camera_devices("camera"),
-            "canon": lambda: self._camera_devices("canon"),
-            "lightbox": self._lightbox_devices,
-            "scan": self._scan_devices,
-            "ct": self._ct_devices,
-            "listen": self._listen_devices,
-            "table": lambda: {"robot": table_rig(self, self._plan())},
-            "kuka": lambda: {"robot": kuka_rig(self, self._plan())},
-            "fri": lambda: {"robot": kuka_rig(self, self._plan(), fri=True)},
+            "arm": lambda: arm_rig(self),
+            "camera": lambda: camera_rig(self, "camera"),
+            "canon": lambda: camera_rig(self, "canon"),
+            "lightbox": lambda: lightbox_rig(self),
+            "scan": lambda: scan_rig(self),
+            "ct": lambda: ct_rig(self),
+            "listen": lambda: listen_rig(self),
+            "table": lambda: {"robot": table_rig(self, self.plan())},
+            "kuka": lambda: {"robot": kuka_rig(self, self.plan())},
+            "fri": lambda: {"robot": kuka_rig(self, self.plan(), fri=True)},
             "video": lambda: {"camera": video_rig(self)},
+            "gige": lambda: {"camera": gige_rig(self, self.plan())},
         }
         scene = self.case.scene
         rig = write_rig(self.folder, devices[scene]() if scene in devices else {}, **STATIONS.get(scene, {}))
         self.arm = arm = None if scene in ("arm", "table", "kuka", "fri") else BenchArm()
-        self.shutter = shutter = None if scene in ("camera", "canon", "video") else BenchCamera(picture=exposed)
+        self.shutter = shutter = None if scene in _CAMERAS else BenchCamera(picture=exposed)
         if arm is not None:
             arm.on_move = self._eye.began
         elif scene == "arm":
@@ -139,52 +153,9 @@ class Trial:
         return Laboratory(rig, arm, shutter)
 
     @property
-    def _near_host(self) -> str:
+    def near_host(self) -> str:
         """Address of the driver's end of a wire."""
         return self.arm_host[:-1] + "2"
-
-    def _arm_devices(self) -> dict[str, Any]:
-        near = self._near_host
-        self.simulators.start("ur", "--host", self.arm_host, "--speed-up", "3", *self._plan(), *self.case.options)
-        self.wired(
-            Wire("robot", "rtde", (near, 30004), (self.arm_host, 30004)),
-            Wire("robot", "dashboard", (near, 29999), (self.arm_host, 29999)),
-            Wire("robot", "script", (near, 30003), (self.arm_host, 30003)),
-        )
-        host = near if self.proxy else self.arm_host
-        limits = {"connect_timeout_s": 2.0, "watchdog_s": 1.0, "stale_after_s": 2.0}
-        return {"robot": {"driver": "ur", "host": host, **limits}}
-
-    def _camera_devices(self, body: str) -> dict[str, Any]:
-        words = (body, "--port", "0", "--fast", "--image-width", "96", *self._plan(), *self.case.options)
-        ready = self.simulators.start(*words)
-        port, near_port = int(ready["port"]), 15740
-        self.wired(Wire("camera", "ptpip", (self._near_host, near_port), ("127.0.0.1", port)))
-        address = f"ptpip:{self._near_host}:{near_port}" if self.proxy else str(ready["gphoto_port"])
-        return {"camera": {"driver": "gphoto", "port": address, "capture_timeout_s": 5.0}}
-
-    def _lightbox_devices(self) -> dict[str, Any]:
-        far, line = self.folder / "far", self.folder / "line"
-        self.simulators.start("lightbox", "--link", str(far), *self._plan(), *self.case.options)
-        self.wired(Wire("lightbox", "serial", str(line), str(far)))
-        return {"lightbox": {"driver": "lightbox", "port": str(line if self.proxy else far), "timeout_s": 0.3}}
-
-    def _scan_devices(self) -> dict[str, Any]:
-        scan_folder(self.scene_folder, self.material)
-        return {"scanner": {"driver": "scan_folder", "folder": str(self.scene_folder), "stable_s": 0.5}}
-
-    def _ct_devices(self) -> dict[str, Any]:
-        ct_folder(self.scene_folder, self.material)
-        scans = self.folder / "scans"
-        scans.mkdir()
-        return {
-            "scanner": {"driver": "scan_folder", "folder": str(scans), "stable_s": 0.5},
-            "ct": {"driver": "dicom_folder", "folder": str(self.scene_folder), "stable_s": 0.5},
-        }
-
-    def _listen_devices(self) -> dict[str, Any]:
-        self.suite = Suite(self)
-        return self.suite.rig(full=bool(self.case.value.get("full")))
 
     # --- the run ------------------------------------------------------------------------------------------
 

@@ -28,6 +28,7 @@ from service.people.sessions import People
 from service.rig import Rig, load_rig
 from service.run_start import signature_copy
 from service.steps import params_models
+from service.store.database.engine import BUSY_TIMEOUT_S
 from service.store.records import SITE
 from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.signing import checkpoint
@@ -100,7 +101,7 @@ def serve_command(
         limits = ConnectionLimits(affordable_connections(connections), address_connections, client_wait_s)
         with (
             listening(host, port, limits, proxies) as listener,
-            Store.open(data) as store,
+            Store.open(data, patience_s=BUSY_TIMEOUT_S) as store,  # a page does not wait for minutes
             sparing_log() as log,
             file_log(data, "web", admits=told),
         ):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import sqlite3
+import time
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -10,7 +12,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from sqlalchemy import Connection, Engine, create_engine, event, inspect, text
+from sqlalchemy import Connection, Engine, RootTransaction, create_engine, event, inspect, text
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.pool import ConnectionPoolEntry
 
@@ -19,7 +21,9 @@ from service.store.durable_effects import Files
 from service.store.errors import StoreVersionError
 
 DATABASE_NAME = "orthocapture.sqlite"
-BUSY_TIMEOUT_S = 30.0
+BUSY_TIMEOUT_S = 30.0  # SQLite waits so long for another process that writes; then a warning is logged
+PATIENCE_S = 300.0  # for all such waits of one write: a process that is starved may hold the database for minutes
+_LOG = logging.getLogger(__name__)
 REVISIONS = ("0001", "0002", "0003", "0004", "0005")  # of migrations/versions, in order
 RESTORE = "Restore the data folder from a copy; run `orthocapture audit verify` on the copy"
 LOOK = "Look at the disk of the data folder: room, cable, permissions; then resume the run. What was recorded is safe"
@@ -52,8 +56,9 @@ def fresh_schema() -> Mapping[tuple[str, str], tuple[str, str | None]]:
 class Database:
     """Connections to one database. Writers use BEGIN IMMEDIATE, so no transaction must be upgraded and retried."""
 
-    def __init__(self, engine: Engine, path: Path, files: Files) -> None:
+    def __init__(self, engine: Engine, path: Path, files: Files, patience_s: float = PATIENCE_S) -> None:
         self._engine = engine
+        self._patience_s = patience_s
         self._path = path
         self._files = files
         self._opened: dict[Path, tuple[int, int]] = {}  # device and inode of the files written to
@@ -69,10 +74,22 @@ class Database:
         """A write transaction: commits through `Files` at the end, rolls back on any exception. Raises StoreError."""
         with _store_errors(self._path), self._engine.connect() as plain:
             connection = plain.execution_options(writes=True)
-            with connection.begin() as transaction:
+            with self._begun(connection) as transaction:
                 yield connection
                 self.require_in_place()
                 self._files.commit(transaction.commit)
+
+    def _begun(self, connection: Connection) -> RootTransaction:
+        """Begin to write as soon as the other processes let it."""
+        began_s = time.monotonic()
+        while True:
+            try:
+                return connection.begin()
+            except DBAPIError as error:
+                waited_s = time.monotonic() - began_s
+                if not _is_busy(error) or waited_s >= self._patience_s:
+                    raise
+                _LOG.warning("another process has held %s for %.0f s; waiting for it", self._path, waited_s)
 
     def require_in_place(self) -> None:
         """Raise StoreError unless the database and its write-ahead log are still the files that were opened.
@@ -101,11 +118,14 @@ class Database:
         self._engine.dispose()
 
 
-def open_database(data_dir: Path, files: Files) -> Database:
-    """Open for writing, creating or upgrading the database. Raises StoreVersionError if a newer version wrote it."""
+def open_database(data_dir: Path, files: Files, patience_s: float = PATIENCE_S) -> Database:
+    """Open for writing, creating or upgrading the database. Raises StoreVersionError if a newer version wrote it.
+
+    A write waits up to about `patience_s` for other processes that write.
+    """
     path = database_path(data_dir)
     engine = _engine(f"file:{quote(str(path.absolute()))}?uri=true", writable=True)
-    database = Database(engine, path, files)
+    database = Database(engine, path, files, patience_s)
     try:
         with database.reading() as connection:
             is_current = _revision(connection) == REVISIONS[-1]
@@ -247,6 +267,10 @@ def _store_errors(path: Path) -> Generator[None]:
 
 def _explain(error: DBAPIError) -> str:
     return f"the database refused: {error.orig}"
+
+
+def _is_busy(error: DBAPIError) -> bool:
+    return str(getattr(error.orig, "sqlite_errorname", "")).startswith("SQLITE_BUSY")
 
 
 def _advise(error: DBAPIError) -> str:

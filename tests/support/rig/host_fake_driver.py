@@ -24,6 +24,7 @@ class FakeConfig(DriverConfig):
     word: str = "hello"
     trace: Path | None = None
     die_on_open: bool = False
+    report_s: float = 0.0  # how long `report` takes
 
 
 class Fake(Device, Protocol):
@@ -68,6 +69,7 @@ class FakeDriver:
             self._config.trace.write_text("closed")
 
     def report(self) -> DeviceReport:
+        time.sleep(self._config.report_s)
         return DeviceReport(self.open())
 
     def double(self, values: Array, *, offset: float = 0.0) -> Array:

@@ -124,11 +124,17 @@ class Suite:
         self.send(self._trial.folder / "other")
 
     def look(self) -> None:
-        """Note a series that can be seen and is not whole."""
+        """Note a series that can be seen and is not whole.
+
+        If the wire spoils content, a file may have come under the number of another series.
+        """
         whole = len(list((self._trial.material / CT).iterdir()))
+        spoil = self._trial.case.spoil
+        renumbered = spoil is not None and spoil.column in ("corrupt", "mutated")
         for series in self._visible():
             count = len(list(series.glob("*.dcm")))
-            if count and count != whole:
+            everywhere = len(list(self._folder.rglob("*.dcm")))
+            if count and count != whole and not (renumbered and everywhere >= whole):
                 self.faults.append(f"{count} of {whole} files of a series can be seen")
 
     def check(self, *, content: bool) -> None:

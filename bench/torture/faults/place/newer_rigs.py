@@ -1,4 +1,4 @@
-"""The rigs of a case with a turntable under GRBL, a KUKA arm, or a video camera."""
+"""The rigs of a case with a turntable under GRBL, a KUKA arm, a GigE Vision camera, or a video camera."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import multiprocessing
 import os
 import signal
 import socket
+import struct
+import threading
 import time
 from contextlib import closing, suppress
 from multiprocessing.process import BaseProcess
@@ -29,6 +31,7 @@ KUKA_STATION: dict[str, Any] = {
     "robot": "robot", "scene_centre_m": [0.55, 0.0, 0.0], "approach_azimuth_deg": 180,
 }  # fmt: skip
 _FRAME_S = 0.04
+_GVCP = 3956
 _FRI, _FRI_SPOILT = 30200, 30201  # where the driver listens, and where the controller sends
 
 
@@ -76,6 +79,43 @@ def pendant(trial: Trial, order: str) -> None:
         lines.write(order + "\n")
         lines.flush()
         lines.readline()
+
+
+def gige_rig(trial: Trial, plan: list[str]) -> dict[str, Any]:
+    """An industrial camera; returns its section of the rig file."""
+    near = trial.arm_host[:-1] + "2"
+    trial.simulators.start("gige", "--host", trial.arm_host, "--image-width", "96", *plan)
+    trial.wired(Wire("gige", "gige", (near, _GVCP), (trial.arm_host, _GVCP)))
+    host = near if trial.proxy else trial.arm_host
+    return {"driver": "genicam", "camera": host, "aperture_f": 22.0, "frame_timeout_s": 2.0}
+
+
+class OtherClient:
+    """Another program that controls a GigE Vision camera."""
+
+    def __init__(self, host: str) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect((host, _GVCP))
+        self._number = 0
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._hold, daemon=True)
+        self._thread.start()
+
+    def _hold(self) -> None:
+        while not self._end.wait(0.2):
+            self._control(2)
+        self._control(0)
+        self._socket.close()
+
+    def _control(self, value: int) -> None:
+        self._number = self._number % 0xFFFF + 1
+        with suppress(OSError):
+            self._socket.send(struct.pack(">BBHHHII", 0x42, 1, 0x82, 8, self._number, 0xA00, value))
+
+    def let_go(self) -> None:
+        """Give the camera back."""
+        self._end.set()
+        self._thread.join(5.0)
 
 
 # --- video --------------------------------------------------------------------------------------------------------

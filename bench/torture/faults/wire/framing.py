@@ -271,6 +271,8 @@ def refused(device: str, kind: str, message: bytes) -> bytes:  # noqa: PLR0911 -
         status = bytes.fromhex("0000000902000000")  # (0000,0900), two bytes
         at = message.index(status) + len(status)
         return message[:at] + b"\x00\xa7" + message[at + 2 :]
+    if device == "gige":
+        return b"\x80\x06" + message[2:4] + b"\0\0" + message[6:8]  # access denied
     if device == "lightbox":
         return b"ERR 2 refused\r\n"
     if device == "table":

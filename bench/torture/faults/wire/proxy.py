@@ -12,7 +12,8 @@ import struct
 import time
 import tty
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any, Literal
@@ -28,11 +29,11 @@ from bench.torture.faults.wire.framing import (
     PtpIp,
     Rtde,
     Script,
-    Talk,
     denied,
     refused,
 )
-from bench.torture.faults.wire.streams import Datagrams, Pipe, Stream
+from bench.torture.faults.wire.gige import GigeVision
+from bench.torture.faults.wire.streams import Datagrams, Link, Pipe, Stream
 
 Column = Literal[
     "drop", "stall", "truncate", "corrupt", "duplicate", "reorder", "reject",
@@ -62,22 +63,11 @@ class Wire:
     `rewrite` is replaced in requests, as by a router that translates addresses.
     """
 
-    device: Literal["robot", "camera", "lightbox", "table", "kuka", "ct"]
-    protocol: Literal["rtde", "dashboard", "script", "ptpip", "serial", "grbl", "kuka", "fri", "dicom"]
+    device: Literal["robot", "camera", "lightbox", "table", "kuka", "ct", "gige"]
+    protocol: Literal["rtde", "dashboard", "script", "ptpip", "serial", "grbl", "kuka", "fri", "dicom", "gige"]
     listen: tuple[str, int] | str
     upstream: tuple[str, int] | str
     rewrite: tuple[bytes, bytes] = (b"", b"")
-
-
-@dataclass(eq=False)
-class _Link:
-    """One connection through the proxy."""
-
-    close: Callable[[], object]
-    talk: Talk = field(default_factory=Talk)
-    stalled: set[bool] = field(default_factory=set[bool])  # directions in which nothing passes any more
-    held: dict[bool, bytes] = field(default_factory=dict[bool, bytes])  # until the next message has passed
-    refusing: bool = False
 
 
 class Proxy:
@@ -89,7 +79,7 @@ class Proxy:
         self._armed = False
         self._count = 0
         self._slow = False
-        self._links: set[_Link] = set()
+        self._links: set[Link] = set()
         self._servers: list[asyncio.Server] = []
         self._terminals: list[tuple[int, int, str]] = []
         self._tasks: set[asyncio.Task[None]] = set()
@@ -114,6 +104,8 @@ class Proxy:
                 self._plug_in_terminal(wire)
             elif wire.protocol == "fri":
                 await self._plug_in_datagrams(wire)
+            elif wire.protocol == "gige":
+                await self._plug_in_gige(wire)
             else:
                 handler = self._handler(wire)
                 server = await asyncio.start_server(handler, *wire.listen, reuse_address=True)
@@ -140,7 +132,7 @@ class Proxy:
                 with contextlib.suppress(OSError):
                     os.close(descriptor)
 
-        link = _Link(close)
+        link = Link(close)
         self._links.add(link)
         pumps = [
             self._begin(self._pump(wire, link, near_pipe, far_pipe, answers=False)),
@@ -152,7 +144,7 @@ class Proxy:
         assert not isinstance(wire.upstream, str)
         controller, driver = Datagrams(), Datagrams()
         driver.peer = wire.upstream
-        link = _Link(lambda: (controller.close(), driver.close()))
+        link = Link(lambda: (controller.close(), driver.close()))
 
         async def from_controller(data: bytes) -> None:
             await self._pass(wire, link, "message", data, driver, answers=True)
@@ -163,6 +155,13 @@ class Proxy:
         await controller.open(wire.listen, lambda data: self._begin(from_controller(data)))
         await driver.open((wire.listen[0], 0), lambda data: self._begin(from_driver(data)))
         self._links.add(link)
+
+    async def _plug_in_gige(self, wire: Wire) -> None:
+        assert not isinstance(wire.listen, str)
+        assert not isinstance(wire.upstream, str)
+        camera = GigeVision(wire.listen, wire.upstream, self._begin, partial(self._pass, wire))
+        await camera.open()
+        self._links.add(Link(camera.close))
 
     def _unplug_terminals(self) -> None:
         for _, _, path in self._terminals:
@@ -185,7 +184,7 @@ class Proxy:
                 near.cut()
                 far.cut()
 
-            link = _Link(close)
+            link = Link(close)
             self._links.add(link)
             pumps = [
                 asyncio.create_task(self._pump(wire, link, near, far, answers=False)),
@@ -207,7 +206,7 @@ class Proxy:
         return task
 
     async def _pump(
-        self, wire: Wire, link: _Link, source: Stream | Pipe, target: Stream | Pipe, *, answers: bool
+        self, wire: Wire, link: Link, source: Stream | Pipe, target: Stream | Pipe, *, answers: bool
     ) -> None:
         framer = _framer(wire, link, answers=answers)
         reading: asyncio.Task[bytes] | None = None
@@ -236,7 +235,7 @@ class Proxy:
     async def _pass(
         self,
         wire: Wire,
-        link: _Link,
+        link: Link,
         kind: str,
         message: bytes,
         target: Stream | Pipe | Datagrams,
@@ -255,7 +254,7 @@ class Proxy:
             if held := link.held.pop(answers, b""):
                 await target.write(held)
 
-    def _spoilt(self, wire: Wire, link: _Link, kind: str, message: bytes, *, answers: bool) -> bytes:  # noqa: PLR0911, PLR0912 - one line a column
+    def _spoilt(self, wire: Wire, link: Link, kind: str, message: bytes, *, answers: bool) -> bytes:  # noqa: PLR0911, PLR0912 - one line a column
         """Return what is passed on instead of a message."""
         if link.refusing:
             link.refusing = struct.unpack_from("<I", message, 4)[0] != RESPONSE
@@ -281,7 +280,7 @@ class Proxy:
                 return self._corrupted(message)
             case "noise":
                 return self._rng.randbytes(len(message))
-            case "duplicate" if wire.protocol == "fri":  # in a datagram of its own
+            case "duplicate" if wire.protocol in ("fri", "gige"):  # in a datagram of its own
                 link.held[answers] = message
                 return message
             case "duplicate":
@@ -306,7 +305,7 @@ class Proxy:
             damaged[at] ^= self._rng.randrange(1, 256)
         return bytes(damaged)
 
-    def _refusal(self, wire: Wire, link: _Link, kind: str, message: bytes) -> bytes:
+    def _refusal(self, wire: Wire, link: Link, kind: str, message: bytes) -> bytes:
         if wire.protocol == "ptpip" and struct.unpack_from("<I", message, 4)[0] == START_DATA:
             link.refusing = True
             return denied(message[8:12])
@@ -336,7 +335,7 @@ class Proxy:
             journal.write(json.dumps({"at_s": time.monotonic(), "what": what, **more}) + "\n")
 
 
-def _framer(wire: Wire, link: _Link, *, answers: bool) -> Framer:  # noqa: PLR0911 - one for each wire
+def _framer(wire: Wire, link: Link, *, answers: bool) -> Framer:  # noqa: PLR0911 - one for each wire
     match wire.protocol:
         case "rtde":
             return Rtde(answers=answers)

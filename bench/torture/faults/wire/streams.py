@@ -1,4 +1,4 @@
-"""Terminals and TCP connections as byte streams, and UDP ports, for the proxy."""
+"""Terminals and TCP connections as byte streams, UDP ports, and what the proxy knows of each of its links."""
 
 from __future__ import annotations
 
@@ -8,6 +8,22 @@ import os
 import socket
 import struct
 from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from bench.torture.faults.wire.framing import Talk
+
+Peer = tuple[str, int]
+
+
+@dataclass(eq=False)
+class Link:
+    """One connection through the proxy."""
+
+    close: Callable[[], object]
+    talk: Talk = field(default_factory=Talk)
+    stalled: set[bool] = field(default_factory=set[bool])  # directions in which nothing passes any more
+    held: dict[bool, bytes] = field(default_factory=dict[bool, bytes])  # until the next message has passed
+    refusing: bool = False
 
 
 class Pipe:
@@ -67,18 +83,30 @@ class Datagrams(asyncio.DatagramProtocol):
     """A UDP port that sends to `peer`: set, or else whoever sent last."""
 
     def __init__(self) -> None:
-        self.peer: tuple[str, int] | None = None
+        self.peer: Peer | None = None
         self._follows = True
         self._take: Callable[[bytes], object] = lambda _data: None
         self._transport: asyncio.DatagramTransport | None = None
 
-    async def open(self, address: tuple[str, int], take: Callable[[bytes], object]) -> None:
+    def towards(self, peer: Peer) -> Datagrams:
+        """This port as one that sends to `peer`."""
+        same = Datagrams()
+        same.peer, same._transport = peer, self._transport
+        return same
+
+    @property
+    def port(self) -> int:
+        """The number of the open port."""
+        assert self._transport is not None
+        return int(self._transport.get_extra_info("sockname")[1])
+
+    async def open(self, address: Peer, take: Callable[[bytes], object]) -> None:
         """Listen at an address, and hand each datagram to `take`. Raises OSError."""
         self._take, self._follows = take, self.peer is None
         loop = asyncio.get_running_loop()
         self._transport, _ = await loop.create_datagram_endpoint(lambda: self, local_addr=address)
 
-    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+    def datagram_received(self, data: bytes, addr: Peer) -> None:
         """Take a datagram."""
         if self._follows:
             self.peer = addr
