@@ -20,6 +20,14 @@ from simulators.faults import FaultPlan
 from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand.technician import MISHAP_EVERY, Hand
 from simulators.rig.cameras import CAMERAS, STILL, again, place, section
+from simulators.rig.deliveries import (
+    add_delivery_arguments,
+    check_delivery_arguments,
+    ct_words,
+    scanner_section,
+    scanner_words,
+)
+from simulators.rig.truth import truth_of
 from simulators.rig.world_server import World, WorldServer
 from simulators.scene.further_cameras import PLACES, FurtherCamera, further_cameras
 from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
@@ -35,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dir", type=Path, required=True, help="folder for rig.yaml, CT, scans, truth and logs")
     parser.add_argument("--image-width", type=int, default=1536, metavar="W", help="image width of the photographs")
     parser.add_argument("--speed-up", type=float, default=1.0, metavar="N", help="the arm takes 1/N of its time")
-    parser.add_argument("--ct-voxel-mm", type=float, default=0.4, help="edge of the CT's voxels")
+    add_delivery_arguments(parser)
     parser.add_argument("--arm", choices=ARMS, default=ARMS[0], help="model of the arm; each has its own stations")
     parser.add_argument("--camera", choices=tuple(CAMERAS), default="Sony ILCE-7RM5", help="model of the camera")
     parser.add_argument("--version", default="5.12", help="of Polyscope")
@@ -85,6 +93,7 @@ def serve(args: argparse.Namespace) -> None:
         raise SimulatorError("--second-camera-model names more cameras than --second-camera places")
     if args.camera not in STILL and (args.hand or len(args.second_camera_model) < len(args.second_camera)):
         raise SimulatorError(f"--camera {args.camera} can neither be held nor be a second camera: choose a still one")
+    check_delivery_arguments(args)
     termination = Termination()
     rig = _Rig(args, termination)
     try:
@@ -100,7 +109,7 @@ class _Rig:
         self.termination = termination
         self.folder: Path = args.dir.resolve()
         self.faults: FaultPlan = args.faults
-        scene = Scene.generate(args.scene, arm=args.arm)
+        scene = Scene.generate(args.scene, arm=args.arm, arms=args.arms)
         self.arms = () if args.hand else ("robot",) if args.arms == 1 else ("robot_1", "robot_2")
         self.children: dict[str, subprocess.Popen[str]] = {}
         self._words: dict[str, tuple[str, ...]] = {}  # command line with which each was started
@@ -260,7 +269,7 @@ class _Rig:
                 **robots,
                 "camera": self._camera(camera),
                 **{name: self._camera(self._ready[name]) for name in self.further},
-                "scanner": {"driver": "scan_folder", "folder": "scans", "unit": "mm", "stable_s": 1.0},
+                "scanner": scanner_section(self.args),
                 "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
                 "lightbox": {"driver": "lightbox", "port": "lightbox"},
             },
@@ -310,21 +319,7 @@ class _Rig:
 
     def _write_truth(self) -> None:
         if not self._truth:
-            self._truth = {
-                "scene": self.scene.seed,
-                "T_flange_camera": self.scene.T_flange_camera.tolist(),
-                "T_world_base": {name: T.tolist() for name, T in self.scene.T_world_base.items()},
-                "arm": {"model": self.scene.arm.name, **self.scene.arm.truth()},
-                "control_m": self.scene.control_m.tolist(),
-                "radius_m": self.scene.radius_m,
-                "intrinsics": self.scene.camera_intrinsics(self.args.image_width).to_json(),
-                "scans": [],
-                "ct": [],
-                "further_cameras": {
-                    name: {"T_outer_camera": one.T_outer_camera.tolist(), "clock_ahead_s": one.clock_ahead_s}
-                    for name, one in self.further.items()
-                },
-            }
+            self._truth = truth_of(self.scene, self.further, self.args.image_width)
         self._truth |= {"registration_m": self.scene.registration_m.tolist(), "moved": self.scene.moved}
         (self.folder / "truth.json").write_text(json.dumps(self._truth, indent=1))
 
@@ -333,13 +328,13 @@ class _Rig:
     def _act(self, request: Mapping[str, Any]) -> dict[str, Any]:
         match request.get("action"):
             case "hand_scan":
-                return self._deliver("scanner", "scans", ["--spray"] if self.world.spray else [])
+                return self._deliver("scans", scanner_words(self.args, self.folder, spray=self.world.spray))
             case "read":
                 if self.hand:
                     self.hand.read(str(request.get("words", "")))
                 return {"ok": True}
             case "ct_scan":
-                return self._deliver("ct", "ct", ["--voxel-mm", str(self.args.ct_voxel_mm)])
+                return self._deliver("ct", ct_words(self.args, self.folder))
             case "move_sphere":
                 answer = self.world.act(request)
                 with self._deliveries:
@@ -348,13 +343,12 @@ class _Rig:
             case _:
                 return self.world.act(request)
 
-    def _deliver(self, simulator: str, folder: str, options: list[str]) -> dict[str, Any]:
-        """Let the scanner or the CT deliver one export of the scene in its current state."""
+    def _deliver(self, truth: str, words: list[str]) -> dict[str, Any]:
+        """Let scanner or CT deliver one export of the scene in its current state; `truth`: where it is kept."""
         spheres = "--control-spheres" if self.world.control_spheres else "--no-control-spheres"
         command = [
-            sys.executable, "-m", "simulators", simulator, "--scene", str(self.scene.seed), "--once",
-            "--parent", str(os.getpid()), "--folder", str(self.folder / folder), spheres,
-            "--moved", json.dumps(self.scene.moved), *options,
+            sys.executable, "-m", "simulators", *words, "--scene", str(self.scene.seed), "--once",
+            "--parent", str(os.getpid()), spheres, "--moved", json.dumps(self.scene.moved),
             "--faults", self.faults.to_json(),
         ]  # fmt: skip
         with self._deliveries:
@@ -362,11 +356,11 @@ class _Rig:
                 command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
             )
             printed, errors = process.communicate()
-            (self.folder / "logs" / f"{simulator}.log").write_text(errors)
+            (self.folder / "logs" / f"{words[0]}.log").write_text(errors)
             if process.returncode != 0:
                 return {"ok": False, "error": errors.strip().splitlines()[-1] if errors else "it failed"}
             report = json.loads(printed.splitlines()[0])
-            self._truth["scans" if simulator == "scanner" else "ct"].append(report.pop("truth"))
+            self._truth[truth].append(report.pop("truth"))
             self._write_truth()
         return {"ok": True, **report}
 
