@@ -1,4 +1,4 @@
-"""What scanner and CT suite of a simulated rig deliver: the rig's options, section of rig.yaml, commands."""
+"""What the scanners and the CT suite of a simulated rig deliver: options, sections of rig.yaml, commands."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from simulators.scan_station.scanners import add_scanner_arguments, chosen_format
+from simulators.scan_station.scanners import SCANNERS, chosen_format
+from simulators.serve import SimulatorError
+
+_HAND = "hand"
+_MAIN = "scanner"  # the device that every rig has
 
 
 def add_delivery_arguments(parser: argparse.ArgumentParser) -> None:
@@ -15,27 +19,65 @@ def add_delivery_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ct-sends-to", metavar="HOST:PORT", help="the CT suite sends its series there instead of writing files"
     )
-    add_scanner_arguments(parser)
+    kinds = ", ".join(SCANNERS)
+    parser.add_argument("--scanner", default=_HAND, metavar="NAME[/FORMAT]", help=f"of the device scanner: {kinds}")
+    parser.add_argument(
+        "--further-scanner",
+        nargs="+",
+        default=(),
+        metavar="NAME[/FORMAT]",
+        help="further scanners; the devices have their names, such as artec_leo or structured_light_obj",
+    )
 
 
 def check_delivery_arguments(args: argparse.Namespace) -> None:
-    """Raise SimulatorError if the scanner does not export as the options say."""
-    chosen_format(args)
+    """Raise SimulatorError if there is no such scanner, or if its program does not export that format."""
+    for text in _scanners(args).values():
+        _kind(text)
 
 
-def scanner_section(args: argparse.Namespace) -> dict[str, Any]:
-    """The scanner's section in rig.yaml: of a known scanner, the profile of its name."""
-    expected = {"unit": "mm"} if args.scanner == "hand" else {"profile": args.scanner}
-    return {"driver": "scan_folder", "folder": "scans", **expected, "stable_s": 1.0}
+def scanner_sections(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """The scanners' sections in rig.yaml: of a known scanner, the profile of its name."""
+    return {device: _section(device, text) for device, text in _scanners(args).items()}
 
 
-def scanner_words(args: argparse.Namespace, folder: Path, *, spray: bool) -> list[str]:
-    """The command that exports a scan."""
-    words = ["scanner", "--folder", str(folder / "scans"), "--scanner", args.scanner, "--views", str(args.views)]
-    return [*words, *(["--format", args.format] if args.format else []), *(["--spray"] if spray else [])]
+def scanner_words(args: argparse.Namespace, device: str, folder: Path, *, spray: bool) -> list[str]:
+    """The command that exports a scan. Raises LookupError if there is no such device."""
+    scanners = _scanners(args)
+    if device not in scanners:
+        raise LookupError(f"there is no scanner {device!r}; {', '.join(scanners)}")
+    scanner, kind = _kind(scanners[device])
+    words = ["scanner", "--folder", str(folder / _folder(device)), "--scanner", scanner, "--format", kind]
+    return [*words, *(["--spray"] if spray else [])]
 
 
 def ct_words(args: argparse.Namespace, folder: Path) -> list[str]:
     """The command that delivers a series."""
     words = ["ct", "--folder", str(folder / "ct"), "--voxel-mm", str(args.ct_voxel_mm)]
     return [*words, *(["--send-to", args.ct_sends_to] if args.ct_sends_to else [])]
+
+
+def scan_folders(args: argparse.Namespace) -> list[str]:
+    """The folders to which the scanners export."""
+    return [_folder(device) for device in _scanners(args)]
+
+
+def _scanners(args: argparse.Namespace) -> dict[str, str]:
+    return {_MAIN: args.scanner, **{text.replace("/", "_"): text for text in args.further_scanner}}
+
+
+def _kind(text: str) -> tuple[str, str]:
+    name, _, wanted = text.partition("/")
+    if name not in SCANNERS:
+        raise SimulatorError(f"there is no scanner {name!r}; {', '.join(SCANNERS)}")
+    return name, chosen_format(name, wanted or None)
+
+
+def _section(device: str, text: str) -> dict[str, Any]:
+    scanner, _ = _kind(text)
+    expected = {"unit": "mm"} if scanner == _HAND else {"profile": scanner}
+    return {"driver": "scan_folder", "folder": _folder(device), **expected, "stable_s": 1.0}
+
+
+def _folder(device: str) -> str:
+    return "scans" if device == _MAIN else f"scans_{device}"

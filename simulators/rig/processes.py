@@ -24,7 +24,8 @@ from simulators.rig.deliveries import (
     add_delivery_arguments,
     check_delivery_arguments,
     ct_words,
-    scanner_section,
+    scan_folders,
+    scanner_sections,
     scanner_words,
 )
 from simulators.rig.truth import truth_of
@@ -34,6 +35,7 @@ from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nomina
 from simulators.serve import SimulatorError, Termination, announce
 
 _LOAD_KG = 1.6  # camera, lens and mount
+_NOTHING: Mapping[str, str] = {}
 _TAPE_SIGMA_M = 0.003  # accuracy with which a technician measures the scene's centre with a tape
 
 
@@ -142,7 +144,7 @@ class _Rig:
         # Start this first: stop() waits for the server's loop, and would wait for ever if the loop had never begun.
         threading.Thread(target=self.server.serve_forever, daemon=True).start()
         try:
-            for name in ("ct", "scans", "photographs", "logs"):
+            for name in ("ct", *scan_folders(self.args), "photographs", "logs"):
                 (self.folder / name).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise SimulatorError(f"the folder {self.folder} cannot be used: {error.strerror}") from error
@@ -269,7 +271,7 @@ class _Rig:
                 **robots,
                 "camera": self._camera(camera),
                 **{name: self._camera(self._ready[name]) for name in self.further},
-                "scanner": scanner_section(self.args),
+                **scanner_sections(self.args),
                 "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
                 "lightbox": {"driver": "lightbox", "port": "lightbox"},
             },
@@ -328,7 +330,9 @@ class _Rig:
     def _act(self, request: Mapping[str, Any]) -> dict[str, Any]:
         match request.get("action"):
             case "hand_scan":
-                return self._deliver("scans", scanner_words(self.args, self.folder, spray=self.world.spray))
+                device = str(request.get("device") or "scanner")
+                words = scanner_words(self.args, device, self.folder, spray=self.world.spray)
+                return self._deliver("scans", words, {"device": device})
             case "read":
                 if self.hand:
                     self.hand.read(str(request.get("words", "")))
@@ -343,8 +347,11 @@ class _Rig:
             case _:
                 return self.world.act(request)
 
-    def _deliver(self, truth: str, words: list[str]) -> dict[str, Any]:
-        """Let scanner or CT deliver one export of the scene in its current state; `truth`: where it is kept."""
+    def _deliver(self, kept: str, words: list[str], about: Mapping[str, str] = _NOTHING) -> dict[str, Any]:
+        """Let a scanner or the CT deliver one export of the scene in its current state.
+
+        `kept` is where its truth is, with `about`.
+        """
         spheres = "--control-spheres" if self.world.control_spheres else "--no-control-spheres"
         command = [
             sys.executable, "-m", "simulators", *words, "--scene", str(self.scene.seed), "--once",
@@ -360,7 +367,7 @@ class _Rig:
             if process.returncode != 0:
                 return {"ok": False, "error": errors.strip().splitlines()[-1] if errors else "it failed"}
             report = json.loads(printed.splitlines()[0])
-            self._truth[truth].append(report.pop("truth"))
+            self._truth[kept].append({**report.pop("truth"), **about})
             self._write_truth()
         return {"ok": True, **report}
 

@@ -75,7 +75,7 @@ def serve(args: argparse.Namespace) -> None:
     Without --once serve until SIGTERM, with another export at each SIGUSR1. With --once SIGTERM ends it at once.
     """
     folder: Path = args.folder
-    chosen_format(args)
+    chosen_format(args.scanner, args.format)
     folder.mkdir(parents=True, exist_ok=True)
     scene = Scene.generate(args.scene, args.moved)
     if args.once:
@@ -240,7 +240,7 @@ def _export(scene: Scene, args: argparse.Namespace, *, announce_it: bool) -> Non
     faults: FaultPlan = args.faults
     folder: Path = args.folder
     nth = args.nth or 1 + len(list(folder.glob("scan_*.*")))
-    kind = chosen_format(args)
+    kind = chosen_format(args.scanner, args.format)
     exports = _views(scene, args, kind, nth) if kind in VIEWS else [_mesh(scene, args, kind, nth)]
     for export in exports:
         fault = faults.check("scanner", "export")
@@ -278,7 +278,7 @@ def _views(scene: Scene, args: argparse.Namespace, kind: str, nth: int) -> list[
             scene, sensor_pose(index), *scanner.pixels,
             spray=args.spray, control_spheres=args.control_spheres, nth=nth + index,
         )
-        for index in range(args.views)
+        for index in range(args.views or scanner.views)
     ]  # fmt: skip
     if kind == "e57":
         rng = np.random.default_rng([scene.seed, 0xE57, nth])
