@@ -6,6 +6,8 @@ from typing import overload
 
 from simulators.geometry import Array
 
+UNITS = ("mm", "m", "inch")  # of lengths in files
+
 
 @overload
 def mm(length_m: float) -> float: ...
@@ -23,6 +25,13 @@ def metres(length_mm: Array) -> Array: ...
 def metres(length_mm: float | Array) -> float | Array:
     """Metres of a length or of lengths in millimetres."""
     return length_mm / 1000.0
+
+
+def in_unit(lengths_m: Array, unit: str) -> Array:
+    """Lengths in metres, in one of UNITS."""
+    if unit == "m":
+        return lengths_m
+    return mm(lengths_m) if unit == "mm" else mm(lengths_m) / 25.4
 
 
 def ms(duration_s: float) -> float:

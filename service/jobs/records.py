@@ -115,6 +115,20 @@ class ArmCorrection(JobRecord):
     stations: tuple[str, ...] | None = None  # stations of that arm, in arguments of version 1
 
 
+class FurtherArm(JobRecord):
+    """How the camera was mounted on another arm of the rig, calibrated on its own.
+
+    Attributes:
+        T_flange_camera: for uncorrected poses of this arm.
+        arm_correction: of its reported poses; None if they are used uncorrected.
+        stations: at which this arm stood.
+    """
+
+    T_flange_camera: Matrix
+    arm_correction: ArmCorrection | None = None
+    stations: tuple[str, ...]
+
+
 class Mounting(JobRecord):
     """How the camera was mounted on the arm.
 
@@ -122,11 +136,13 @@ class Mounting(JobRecord):
         T_flange_camera: for uncorrected poses of the arm; None if a person held the camera.
         arm_correction: of the reported poses; None if they are used uncorrected.
         arm_stations: stations of the corrected arm.
+        further_arms: that carried the camera at other stations.
     """
 
     T_flange_camera: Matrix | None = None
     arm_correction: ArmCorrection | None = None
     arm_stations: tuple[str, ...] | None = None
+    further_arms: tuple[FurtherArm, ...] = ()
 
 
 class BoardSize(JobRecord):

@@ -150,17 +150,18 @@ class JobRequest:
         Args:
             kind: of the job.
             arguments: with values, also where they come from earlier jobs.
-            references: field of the arguments (`camera`, `registrations/colmap`) → the reference that is recorded
-                instead of its value; None where no job computed the value, which is then recorded itself.
+            references: field of the arguments (`camera`, `registrations/colmap`, `further_arms/0/arm_correction`) →
+                the reference that is recorded instead of its value; None where no job computed the value, which is
+                then recorded itself.
             priority: see service.core.jobs.priorities.
         """
         recorded = arguments.plain()
         for path, reference in references.items():
             if reference is not None:
                 *parents, field = path.split("/")
-                place = recorded
+                place: Any = recorded
                 for name in parents:
-                    place = place[name]
+                    place = place[int(name)] if isinstance(place, list) else place[name]
                 place[field] = reference.record()
         return cls(kind.name, recorded, priority, kind.version)
 

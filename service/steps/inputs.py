@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -18,7 +18,7 @@ from service.jobs.calibration import calibrate
 from service.jobs.capture import hand_board, hand_view
 from service.jobs.kind import JobKind, JobRecord
 from service.jobs.looks import image_of
-from service.jobs.records import ArmCorrection, Mounting, ParameterCovariance, PosedPhotograph
+from service.jobs.records import ArmCorrection, FurtherArm, Matrix, Mounting, ParameterCovariance, PosedPhotograph
 from service.steps.context import StepContext
 
 R = TypeVar("R", bound=JobRecord)
@@ -195,25 +195,70 @@ class CameraMounting:
     references: Mapping[str, Reference | Each | None]
 
 
-def mounting_of(context: StepContext, step_id: str, stations: Iterable[str]) -> CameraMounting:
+def mounting_of(context: StepContext, step_ids: Sequence[str], stations: Iterable[str]) -> CameraMounting:
     """What turns robot poses into camera poses (service/worker/poses/robot_poses.py).
 
     A correction belongs to one arm: it is given with the stations at which that arm stood.
+
+    Args:
+        context: of the step.
+        step_ids: the hand-eye calibrations; those after the first are of further arms.
+        stations: of the images.
     """
+    first, *further = step_ids
+    at = sorted(set(stations))
+    arm = _arm_of(context, first, at)
+    mounting, references = Mounting(T_flange_camera=arm.T_flange_camera, arm_correction=None), arm.references()
+    if arm.correction is not None:
+        mounting = mounting.model_copy(update={"arm_correction": arm.correction, "arm_stations": arm.stations})
+    others = [_arm_of(context, step_id, at) for step_id in further]
+    if others:
+        mounting = mounting.model_copy(update={"further_arms": tuple(other.further() for other in others)})
+        for index, other in enumerate(others):
+            references |= other.references(f"further_arms/{index}/")
+    return CameraMounting(mounting, references)
+
+
+def arms_without_hand_eye(context: StepContext, step_ids: Sequence[str], stations: Iterable[str]) -> list[str]:
+    """Names of the robots that carried the camera at these stations, and in none of these calibrations."""
+    known = {robot for step_id in step_ids for robot in earlier_result(context, step_id, _CarriedBy).robots}
+    return sorted({context.devices.layout(station).robot for station in stations if station} - known)
+
+
+@dataclass(frozen=True, slots=True)
+class _CalibratedArm:
+    """One arm's hand-eye calibration, and the stations at which this arm stood."""
+
+    found: EarlierAnswer[calibrate.Answer]
+    T_flange_camera: Matrix
+    correction: ArmCorrection | None
+    stations: tuple[str, ...]
+
+    def further(self) -> FurtherArm:
+        return FurtherArm(
+            T_flange_camera=self.T_flange_camera, arm_correction=self.correction, stations=self.stations
+        )
+
+    def references(self, at: str = "") -> dict[str, Reference | None]:
+        named = {"T_flange_camera": "T_flange_camera"}
+        if self.correction is not None:
+            named |= {"arm_correction": "hand_eye/arm_correction"}
+        return {f"{at}{field}": self.found.reference(part) for field, part in named.items()}
+
+
+def _arm_of(context: StepContext, step_id: str, stations: Sequence[str]) -> _CalibratedArm:
     found = earlier_answer(context, step_id, calibrate.KIND)
-    hand_eye = found.answer.hand_eye
-    correction = None if hand_eye is None else hand_eye.arm_correction
-    references = {"T_flange_camera": found.reference("T_flange_camera")}
-    if correction is None:
-        return CameraMounting(Mounting(T_flange_camera=found.answer.T_flange_camera, arm_correction=None), references)
+    if found.answer.T_flange_camera is None:
+        raise ConfigurationError(
+            f"step {step_id!r} has no hand-eye calibration",
+            where=f"step {context.step.id}, hand_eye",
+            remedy="Name the step that solves hand_eye",
+        )
+    answer = None if found.answer.hand_eye is None else found.answer.hand_eye.arm_correction
+    correction = None if answer is None else ArmCorrection.model_validate(answer.plain())
     robots = set(earlier_result(context, step_id, _CarriedBy).robots)
-    mine = tuple(sorted({station for station in stations if context.devices.layout(station).robot in robots}))
-    mounting = Mounting(
-        T_flange_camera=found.answer.T_flange_camera,
-        arm_correction=ArmCorrection.model_validate(correction.plain()),
-        arm_stations=mine,
-    )
-    return CameraMounting(mounting, {**references, "arm_correction": found.reference("hand_eye/arm_correction")})
+    mine = tuple(station for station in stations if context.devices.layout(station).robot in robots)
+    return _CalibratedArm(found, found.answer.T_flange_camera, correction, mine)
 
 
 def intrinsics_covariance_of(found: EarlierAnswer[calibrate.Answer]) -> ParameterCovariance | None:

@@ -1,9 +1,10 @@
-"""A simulated CT suite: scans the scene and writes a DICOM series, in a patient frame of its own."""
+"""A simulated CT suite: scans the scene and writes or sends a DICOM series, in a patient frame of its own."""
 
 from __future__ import annotations
 
 import argparse
 import logging
+import tempfile
 import time
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.uid import UID, CTImageStorage, ExplicitVRLittleEndian, ImplicitVRLittleEndian, generate_uid
 
+from simulators.ct_suite.sending import network_address, send_series
 from simulators.ct_suite.volume import Grid, grid_around, voxelise
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, from_euler, inverse
@@ -41,6 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action=argparse.BooleanOptionalAction,
         default=True,
         help="the control spheres are in place",
+    )
+    parser.add_argument(
+        "--send-to",
+        type=network_address,
+        metavar="HOST:PORT",
+        help="send the series there (C-STORE, by dcmtk) instead",
     )
     parser.add_argument("--implicit-vr", action="store_true", help="write implicit VR little endian")
 
@@ -80,10 +88,15 @@ def _scan(scene: Scene, args: argparse.Namespace, *, announce_it: bool) -> None:
     folder: Path = args.folder
     series = generate_uid(entropy_srcs=[str(scene.seed), str(args.voxel_mm), str(time.time_ns())])
     T_ct_grid = inverse(T_world_ct) @ grid.T_world_grid
-    number = 1 + len([entry for entry in folder.glob("series_*") if entry.is_dir()])
-    target = folder / f"series_{number:02d}"
-    target.mkdir()
-    write_series(target, volume, grid, T_ct_grid, series, implicit=args.implicit_vr, faults=args.faults)
+    with tempfile.TemporaryDirectory(prefix="orthocapture-ct-") as own:
+        target = Path(own)
+        if args.send_to is None:
+            number = 1 + len([entry for entry in folder.glob("series_*") if entry.is_dir()])
+            target = folder / f"series_{number:02d}"
+            target.mkdir()
+        write_series(target, volume, grid, T_ct_grid, series, implicit=args.implicit_vr, faults=args.faults)
+        if args.send_to is not None:
+            send_series(target, *args.send_to)
     if announce_it:
         announce(
             folder=str(folder),

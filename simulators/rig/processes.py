@@ -20,7 +20,15 @@ from simulators.faults import FaultPlan
 from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand.technician import MISHAP_EVERY, Hand
 from simulators.rig.cameras import CAMERAS, STILL, again, place, section
+from simulators.rig.deliveries import (
+    add_delivery_arguments,
+    check_delivery_arguments,
+    delivery_words,
+    scan_folders,
+    scanner_sections,
+)
 from simulators.rig.export_processes import ExportProcesses
+from simulators.rig.truth import truth_of
 from simulators.rig.world_server import World, WorldServer
 from simulators.scene.further_cameras import PLACES, FurtherCamera, further_cameras
 from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
@@ -36,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dir", type=Path, required=True, help="folder for rig.yaml, CT, scans, truth and logs")
     parser.add_argument("--image-width", type=int, default=1536, metavar="W", help="image width of the photographs")
     parser.add_argument("--speed-up", type=float, default=1.0, metavar="N", help="the arm takes 1/N of its time")
-    parser.add_argument("--ct-voxel-mm", type=float, default=0.4, help="edge of the CT's voxels")
+    add_delivery_arguments(parser)
     parser.add_argument("--arm", choices=ARMS, default=ARMS[0], help="model of the arm; each has its own stations")
     parser.add_argument("--camera", choices=tuple(CAMERAS), default="Sony ILCE-7RM5", help="model of the camera")
     parser.add_argument("--version", default="5.12", help="of Polyscope")
@@ -89,6 +97,7 @@ def serve(args: argparse.Namespace) -> None:
         raise SimulatorError("--second-camera-model names more cameras than --second-camera places")
     if args.camera not in STILL and (args.hand or len(args.second_camera_model) < len(args.second_camera)):
         raise SimulatorError(f"--camera {args.camera} can neither be held nor be a second camera: choose a still one")
+    check_delivery_arguments(args)
     termination = Termination()
     rig = _Rig(args, termination)
     try:
@@ -104,7 +113,7 @@ class _Rig:
         self.termination = termination
         self.folder: Path = args.dir.resolve()
         self.faults: FaultPlan = args.faults
-        scene = Scene.generate(args.scene, arm=args.arm)
+        scene = Scene.generate(args.scene, arm=args.arm, arms=args.arms)
         self.arms = () if args.hand else ("robot",) if args.arms == 1 else ("robot_1", "robot_2")
         self.children: dict[str, subprocess.Popen[str]] = {}
         self._words: dict[str, tuple[str, ...]] = {}  # command line with which each was started
@@ -123,7 +132,7 @@ class _Rig:
         )
         self.server = WorldServer(self.world, self._act)
         self._exports = ExportProcesses(
-            self.folder / "logs", self._delivery_options, ahead=args.ahead, running=lambda: not termination.is_set()
+            self.folder / "logs", self._export_command, ahead=args.ahead, running=lambda: not termination.is_set()
         )
         self._writing = threading.Lock()
         self._truth: dict[str, Any] = {}
@@ -139,7 +148,7 @@ class _Rig:
         # Start this first: stop() waits for the server's loop, and would wait for ever if the loop had never begun.
         threading.Thread(target=self.server.serve_forever, daemon=True).start()
         try:
-            for name in ("ct", "scans", "photographs", "logs"):
+            for name in ("ct", *scan_folders(self.args), "photographs", "logs"):
                 (self.folder / name).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise SimulatorError(f"the folder {self.folder} cannot be used: {error.strerror}") from error
@@ -267,7 +276,7 @@ class _Rig:
                 **robots,
                 "camera": self._camera(camera),
                 **{name: self._camera(self._ready[name]) for name in self.further},
-                "scanner": {"driver": "scan_folder", "folder": "scans", "unit": "mm", "stable_s": 1.0},
+                **scanner_sections(self.args),
                 "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
                 "lightbox": {"driver": "lightbox", "port": "lightbox"},
             },
@@ -317,21 +326,7 @@ class _Rig:
 
     def _write_truth(self) -> None:
         if not self._truth:
-            self._truth = {
-                "scene": self.scene.seed,
-                "T_flange_camera": self.scene.T_flange_camera.tolist(),
-                "T_world_base": {name: T.tolist() for name, T in self.scene.T_world_base.items()},
-                "arm": {"model": self.scene.arm.name, **self.scene.arm.truth()},
-                "control_m": self.scene.control_m.tolist(),
-                "radius_m": self.scene.radius_m,
-                "intrinsics": self.scene.camera_intrinsics(self.args.image_width).to_json(),
-                "scans": [],
-                "ct": [],
-                "further_cameras": {
-                    name: {"T_outer_camera": one.T_outer_camera.tolist(), "clock_ahead_s": one.clock_ahead_s}
-                    for name, one in self.further.items()
-                },
-            }
+            self._truth = truth_of(self.scene, self.further, self.args.image_width)
         self._truth |= {"registration_m": self.scene.registration_m.tolist(), "moved": self.scene.moved}
         (self.folder / "truth.json").write_text(json.dumps(self._truth, indent=1))
 
@@ -340,13 +335,13 @@ class _Rig:
     def _act(self, request: Mapping[str, Any]) -> dict[str, Any]:
         match request.get("action"):
             case "hand_scan":
-                return self._deliver("scanner", "scans")
+                return self._deliver(str(request.get("device") or "scanner"))
             case "read":
                 if self.hand:
                     self.hand.read(str(request.get("words", "")))
                 return {"ok": True}
             case "ct_scan":
-                answer = self._deliver("ct", "ct")
+                answer = self._deliver("ct")
             case "move_sphere":
                 answer = self.world.act(request)
                 with self._writing:
@@ -356,25 +351,29 @@ class _Rig:
         self._exports.prepare_after(str(request.get("action")))
         return answer
 
-    def _deliver(self, simulator: str, told_as: str) -> dict[str, Any]:
-        """Let the scanner or the CT deliver one export of the scene in its current state."""
-        report = self._exports.deliver(simulator)
+    def _deliver(self, device: str) -> dict[str, Any]:
+        """Let a scanner or the CT deliver one export of the scene in its current state."""
+        report = self._exports.deliver(device)
         if report["ok"]:
             with self._writing:
-                self._truth[told_as].append(report.pop("truth"))
+                truth = report.pop("truth")
+                if device == "ct":
+                    self._truth["ct"].append(truth)
+                else:
+                    self._truth["scans"].append({**truth, "device": device})
                 self._write_truth()
         return report
 
-    def _delivery_options(self, simulator: str) -> tuple[str, ...]:
-        """The command line with which a simulator exports the scene in its current state."""
-        folder, only = {
-            "scanner": ("scans", ("--spray",) if self.world.spray else ()),
-            "ct": ("ct", ("--voxel-mm", str(self.args.ct_voxel_mm))),
-        }[simulator]
+    def _export_command(self, device: str) -> tuple[str, ...]:
+        """The command line of the simulator that exports the scene in its current state.
+
+        Raises LookupError if there is no such device.
+        """
+        words = delivery_words(self.args, device, self.folder, spray=self.world.spray)
         spheres = "--control-spheres" if self.world.control_spheres else "--no-control-spheres"
         return (
-            "--scene", str(self.scene.seed), "--folder", str(self.folder / folder), spheres,
-            "--moved", json.dumps(self.scene.moved), *only, "--faults", self.faults.to_json(),
+            *words, "--scene", str(self.scene.seed), spheres,
+            "--moved", json.dumps(self.scene.moved), "--faults", self.faults.to_json(),
         )  # fmt: skip
 
 

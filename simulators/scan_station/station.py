@@ -1,4 +1,4 @@
-"""A simulated hand scanner: exports the scene as seen by a scanner sweeping above it, in a frame of its own."""
+"""A simulated scanner: exports the scene as a hand scanner swept above it sees it, or as views of a sensor."""
 
 from __future__ import annotations
 
@@ -18,10 +18,13 @@ from scipy.spatial.transform import Rotation
 from simulators.faults import Fault, FaultPlan
 from simulators.geometry import Array, Ints, apply, inverse, transform
 from simulators.scan_station.formats import encode
+from simulators.scan_station.scanners import SCANNERS, VIEWS, add_scanner_arguments, chosen_format
+from simulators.scan_station.view_formats import e57, view_ply
+from simulators.scan_station.views import sensor_pose, sensor_view
 from simulators.scene.parts import Part, sphere_mesh, vertex_normals
 from simulators.scene.world import RADIUS_M, Scene, parse_moved
 from simulators.serve import Request, SimulatorError, Termination, announce, told
-from simulators.units import metres, mm
+from simulators.units import UNITS, in_unit, metres
 
 log = logging.getLogger(__name__)
 
@@ -60,8 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=False,
         help="the control spheres are in place",
     )
-    parser.add_argument("--format", choices=("ply", "obj", "stl"), default="ply")
-    parser.add_argument("--unit", choices=("mm", "m"), default="mm")
+    add_scanner_arguments(parser)
+    parser.add_argument("--unit", choices=UNITS, default="mm", help="of the file; E57 is in metres")
     parser.add_argument("--normals", action=argparse.BooleanOptionalAction, default=True, help="write vertex normals")
     parser.add_argument("--spacing-mm", type=float, default=0.5, help="vertex spacing of the mesh on spheres")
     parser.add_argument("--nth", type=int, help="number of the scan (default: exports in the folder, plus one)")
@@ -73,6 +76,7 @@ def serve(args: argparse.Namespace) -> None:
     Without --once serve until SIGTERM, with another export at each SIGUSR1. With --once SIGTERM ends it at once.
     """
     folder: Path = args.folder
+    chosen_format(args.scanner, args.format)
     folder.mkdir(parents=True, exist_ok=True)
     scene = Scene.generate(args.scene, args.moved)
     if args.once:
@@ -213,10 +217,39 @@ def _correlated(rng: np.random.Generator, faces: Ints, n: int, rounds: int) -> A
     return values
 
 
+@dataclass(frozen=True, slots=True)
+class _Export:
+    """The files of one export, the one with the surface first, and the frame in which they are."""
+
+    files: list[tuple[str, bytes]]
+    T_world_scan: Array
+    faces: int = 0
+
+
 def _export(scene: Scene, args: argparse.Namespace, *, announce_it: bool) -> None:
     faults: FaultPlan = args.faults
     folder: Path = args.folder
     nth = args.nth or 1 + len(list(folder.glob("scan_*.*")))
+    kind = chosen_format(args.scanner, args.format)
+    exports = _views(scene, args, kind, nth) if kind in VIEWS else [_mesh(scene, args, kind, nth)]
+    if announce_it and args.when_told and not told():
+        return
+    for export in exports:
+        fault = faults.check("scanner", "export")
+        for number, (name, data) in enumerate(export.files):
+            _write_progressively(folder / name, data, None if number else fault)
+        log.info("exported %s: %d faces", export.files[0][0], export.faces)
+    if announce_it:
+        first = exports[0]
+        announce(
+            folder=str(folder),
+            export=first.files[0][0],
+            faces=first.faces,
+            truth={"T_world_scan": first.T_world_scan.tolist()},
+        )
+
+
+def _mesh(scene: Scene, args: argparse.Namespace, kind: str, nth: int) -> _Export:
     scan = scan_scene(
         scene,
         spray=args.spray,
@@ -224,22 +257,33 @@ def _export(scene: Scene, args: argparse.Namespace, *, announce_it: bool) -> Non
         spacing_m=metres(args.spacing_mm),
         nth=nth,
     )
-    if announce_it and args.when_told and not told():
-        return
-    vertices = mm(scan.vertices_m) if args.unit == "mm" else scan.vertices_m
-    name = f"scan_{nth:02d}.{args.format}"
-    files = encode(args.format, name, vertices, scan.faces, scan.normals if args.normals else None)
-    fault = faults.check("scanner", "export")
-    for file_name, data in files:
-        _write_progressively(folder / file_name, data, fault if file_name == name else None)
-    log.info("exported %s: %d faces", name, len(scan.faces))
-    if announce_it:
-        announce(
-            folder=str(folder),
-            export=name,
-            faces=len(scan.faces),
-            truth={"T_world_scan": scan.T_world_scan.tolist()},
+    vertices = in_unit(scan.vertices_m, args.unit)
+    files = encode(kind, f"scan_{nth:02d}.{kind}", vertices, scan.faces, scan.normals if args.normals else None)
+    return _Export(files, scan.T_world_scan, len(scan.faces))
+
+
+def _views(scene: Scene, args: argparse.Namespace, kind: str, nth: int) -> list[_Export]:
+    """One E57 file with every view, or a PLY file for each view in the sensor's frame."""
+    scanner = SCANNERS[args.scanner]
+    views = [
+        sensor_view(
+            scene, sensor_pose(index), *scanner.pixels,
+            spray=args.spray, control_spheres=args.control_spheres, nth=nth + index,
         )
+        for index in range(args.views or scanner.views)
+    ]  # fmt: skip
+    if kind == "e57":
+        rng = np.random.default_rng([scene.seed, 0xE57, nth])
+        T_world_file = transform(Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.3, 0.3, 3))
+        placed = [(view.points_m, inverse(T_world_file) @ view.T_world_sensor) for view in views]
+        return [_Export([(f"scan_{nth:02d}.e57", e57(placed))], T_world_file)]
+    return [
+        _Export(
+            [(f"scan_{nth + index:02d}.ply", view_ply(scanner, in_unit(view.points_m, args.unit), view.normals))],
+            view.T_world_sensor,
+        )
+        for index, view in enumerate(views)
+    ]
 
 
 def _write_progressively(path: Path, data: bytes, fault: Fault | None) -> None:

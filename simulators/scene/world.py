@@ -41,6 +41,14 @@ def nominal_hand_eye() -> Array:
 
 
 @dataclass(frozen=True)
+class SecondArm:
+    """An arm of the same model at station 2, with errors of its own, and the camera as it is mounted there."""
+
+    arm: SimulatedArm
+    T_flange_camera: Array
+
+
+@dataclass(frozen=True)
 class Scene:
     """The ground truth of the simulated laboratory. World: z up, origin at the centre of the wooden board's top."""
 
@@ -57,6 +65,7 @@ class Scene:
     light_lux: float
     temperature_c: float
     moved: Moved = ()
+    second: SecondArm | None = None  # None: the one arm is moved to station 2
 
     @property
     def radius_m(self) -> float:
@@ -64,16 +73,19 @@ class Scene:
         return RADIUS_M
 
     @classmethod
-    def generate(cls, seed: int, moved: Moved = (), arm: str = ARM_MODEL.name) -> Scene:
+    def generate(cls, seed: int, moved: Moved = (), arm: str = ARM_MODEL.name, arms: int = 1) -> Scene:
         """Generate this seed's scene, identical on every machine and in every process, with some spheres moved.
 
-        Another arm stands at other stations; everything else of the scene is the same.
+        Another model of arm stands at other stations; everything else of the scene is the same. Of two arms, the
+        second one stands at station 2.
         """
         scene = cls._as_set_up(seed)
         if arm != ARM_MODEL.name:
             rng = np.random.default_rng([seed, 0x1B2])
             errors = LbrErrors.draw(rng)
             scene = replace(scene, arm=Lbr(errors, LBR_MODELS[arm]), T_world_base=_lbr_bases(rng))
+        if arms == 2:
+            scene = replace(scene, second=_second_arm(seed, arm, scene.T_flange_camera))
         for index, *centre in moved:
             scene = scene.with_sphere_at(int(index), np.array(centre))
         return scene
@@ -147,6 +159,11 @@ class Scene:
         """The true intrinsics at this image width."""
         return self.lens.scaled(width)
 
+    def arm_at(self, station: str) -> SimulatedArm:
+        """The arm that stands at a station."""
+        second = None if station == STATIONS[0] else self.second
+        return self.arm if second is None else second.arm
+
     def nominal_flange(self, q: Array) -> Array:
         """T_base_flange as the controller computes it from its encoders (N,), in radians."""
         return self.arm.reported(q)
@@ -155,13 +172,16 @@ class Scene:
         """The true T_world_flange: kinematics as built, and where the arm came to rest this time."""
         digest = hashlib.sha256(np.round(q, 5).tobytes() + str(self.seed).encode()).digest()
         noise = np.random.default_rng(int.from_bytes(digest[:8], "big")).standard_normal(3)
-        T_base_flange = self.arm.true(q)
-        T_base_flange[:3, 3] += self.arm.repeatability_m / np.sqrt(3.0) * noise
+        arm = self.arm_at(station)
+        T_base_flange = arm.true(q)
+        T_base_flange[:3, 3] += arm.repeatability_m / np.sqrt(3.0) * noise
         return self.T_world_base[station] @ T_base_flange
 
     def true_camera(self, q: Array, station: str) -> Array:
         """The true T_world_camera at joints q (N,)."""
-        return self.true_flange(q, station) @ self.T_flange_camera
+        second = None if station == STATIONS[0] else self.second
+        mount = self.T_flange_camera if second is None else second.T_flange_camera
+        return self.true_flange(q, station) @ mount
 
     def board_placement(self, nth: int) -> Array:
         """T_world_board of the calibration board's n-th placement: above the scene, slightly tilted.
@@ -201,6 +221,15 @@ class Scene:
                 out /= np.linalg.norm(out)
                 wires.append((lip - 0.012 * out, lip + rng.uniform(0.030, 0.045) * out))
         return wires
+
+
+def _second_arm(seed: int, model: str, T_flange_camera: Array) -> SecondArm:
+    """Another arm of a model; its mount holds the camera up to 0.3 mm and 0.1° elsewhere."""
+    rng = np.random.default_rng([seed, 0x2A12])
+    is_lbr = model in LBR_MODELS
+    arm = Lbr(LbrErrors.draw(rng), LBR_MODELS[model]) if is_lbr else UniversalRobot(ArmErrors.draw(rng))
+    offset = rng.uniform(-1.0, 1.0, 6)
+    return SecondArm(arm, T_flange_camera @ from_euler(np.radians(0.1) * offset[:3], 0.3e-3 * offset[3:]))
 
 
 def _registration_spheres(rng: np.random.Generator) -> tuple[Array, Array]:

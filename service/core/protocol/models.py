@@ -144,6 +144,7 @@ class HandAction(Record):
 
     action: Text  # what the simulator is asked to do
     station: str | None = None  # where
+    device: str | None = None  # with which device of the rig
 
 
 class StepFields(Record):

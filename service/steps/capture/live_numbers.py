@@ -98,7 +98,7 @@ class LiveAnalysis:
             if sha256 in begun or not all(capture.verdicts.values()):
                 continue
             image = PosedPhotograph(viewpoint=capture.viewpoint, station=capture.station, sha256=sha256)
-            mounted = mounting_of(self.context, self.params.hand_eye, [capture.station])
+            mounted = mounting_of(self.context, [self.params.hand_eye], [capture.station])
             earlier, looks = self._earlier()
             arguments = live_view.Arguments(
                 **self.shared.arguments(mounted.mounting).set_fields(),

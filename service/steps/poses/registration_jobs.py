@@ -149,7 +149,7 @@ class _Plan:
             return None
         markers = {**shared, "outlines": detected.artefacts[0].sha256, "poses": source}
         if source in QUICK:
-            reported: dict[str, Any] = {"arm_correction": None} if source == "robot" else {}
+            reported = _uncorrected(markers) if source == "robot" else {}
             return self._need("register", source, size, {**markers, **reported})
         model = self._model(self._mapper(source), size, shared)
         if model is not None and source == "hybrid":
@@ -253,6 +253,14 @@ class _Plan:
         request = JobRequest(kind, arguments, self._priority, job_kinds()[kind].version)
         self.tasks.setdefault((kind, name), Task(name, request, job))
         return job if job is not None and job.status == "finished" else None
+
+
+def _uncorrected(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments that take the arms' poses as they are reported."""
+    without: dict[str, Any] = {"arm_correction": None}
+    if arguments.get("further_arms"):
+        without["further_arms"] = [{**arm, **without} for arm in arguments["further_arms"]]
+    return without
 
 
 def _copied(arguments: Mapping[str, Any], *names: str) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from service.jobs.words import term
 from service.steps.context import JobRequest, JobResult, StepContext, StepKind, StepOutcome
 from service.steps.inputs import (
     CameraMounting,
+    arms_without_hand_eye,
     captured_images,
     earlier_answer,
     intrinsics_covariance_of,
@@ -59,7 +60,8 @@ class Params(StepParams):
     images_of: tuple[str, ...]  # capture steps with the images
     control_images_of: tuple[str, ...] = ()  # capture steps that see the control spheres, for the evaluation too
     calibration: str  # step with the intrinsics
-    hand_eye: str | None = None  # step with T_flange_camera; None: no robot carried the camera
+    # Step with T_flange_camera, or a list of steps with one for each arm; None: no robot carried the camera.
+    hand_eye: str | tuple[str, ...] | None = None
     scan: str  # step that imported the scan
     poses: tuple[Source, ...] = DEFAULT_SOURCES  # where the camera poses come from; each gives a registration
     structure_from_motion: StructureFromMotion = StructureFromMotion()  # sizes and numbers of features
@@ -205,9 +207,19 @@ def _search(context: StepContext, params: Params) -> JobRequest:
 
 def _mounting(context: StepContext, params: Params, images: list[PosedPhotograph]) -> CameraMounting:
     """How the camera was mounted on the arm; empty where a person held it."""
-    if params.hand_eye is None:
+    steps = (params.hand_eye,) if isinstance(params.hand_eye, str) else params.hand_eye or ()
+    if not steps:
         return CameraMounting(Mounting(), {})
-    return mounting_of(context, params.hand_eye, (image.station for image in images))
+    stations = [image.station for image in images]
+    strange = arms_without_hand_eye(context, steps, stations)
+    if strange:
+        names = " and ".join(strange)
+        context.tell(
+            f"No hand-eye calibration was taken with {names}: its camera poses are computed with the mount of "
+            "another arm, without its correction. Add a calibration at its station, and name both steps in hand_eye"
+        )
+        context.note("hand_eye_of_another_arm", robots=strange)
+    return mounting_of(context, steps, stations)
 
 
 def _words(found: RegistrationJobs) -> str:
