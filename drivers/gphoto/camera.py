@@ -84,7 +84,7 @@ class GphotoCamera:
 
     def _need(self) -> tuple[Profile, Dials]:
         if self._opened is None:
-            raise DeviceUnavailableError("The camera is not open", where=self._link.where, remedy="Open it first")
+            raise DeviceUnavailableError("the camera is not open", where=self._link.where, remedy="Open it first")
         return self._opened
 
     # --- every device -----------------------------------------------------------------------------------
@@ -129,7 +129,7 @@ class GphotoCamera:
     def report(self) -> DeviceReport:
         """Return battery, free space and settings; the clock offset comes from the EXIF time of the last exposure."""
         if self._identity is None:
-            raise DeviceUnavailableError("The camera is not open", where=self._link.where, remedy="Open it first")
+            raise DeviceUnavailableError("the camera is not open", where=self._link.where, remedy="Open it first")
         profile = self._profile
         self._dials.refresh()
         free = self._link.free_bytes()
@@ -289,7 +289,7 @@ class GphotoCamera:
                 # A full store, a wrong mode and a lost link all give -1: ask the camera which it is.
                 self._check_space()
                 raise DeviceRefusedError(
-                    f"The camera answers but did not release the shutter: {error.what}",
+                    f"the camera answers but did not release the shutter: {error.what}",
                     where=self._link.where,
                     remedy="Check the camera's display; turn the dial to M, and do not save to the camera only",
                 ) from error
@@ -375,7 +375,7 @@ def _parse(name: str) -> tuple[str, int, str]:
     """Stem, counter and suffix of a camera's file name; libgphoto2 prefixes files from its memory with capt_."""
     match = _NAME.match(name)
     if match is None:
-        raise StaleImageError(f"The file name {name} has no counter", where="camera", remedy="Repeat the exposure")
+        raise StaleImageError(f"the file name {name} has no counter", where="camera", remedy="Repeat the exposure")
     return match["stem"], int(match["counter"]), match["suffix"]
 
 

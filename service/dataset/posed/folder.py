@@ -191,7 +191,7 @@ def export_folder(
         )
     root, about = _beside(target)
     if root.exists() and not about.is_file():
-        raise DataError("a folder that is no export has this name", where=str(root), remedy="Move it away")
+        raise DataError("a folder that is not an export has this name", where=str(root), remedy="Move it away")
     try:
         lock = about.open("a+b")
     except OSError as error:

@@ -82,7 +82,7 @@ def draw_region(
 
 
 def read_region(step: str, source: Literal["ct", "scan"], corners: str, along: str) -> RegionDrawn:
-    """The region of the form's fields. Raises ConfigurationError if they are no polygon on the scene."""
+    """The region of the form's fields. Raises ConfigurationError if they are not a polygon on the scene."""
     return RegionDrawn(step=step, source=source, corners_m=_read_corners(corners), seen_along=_read_direction(along))
 
 
@@ -90,7 +90,7 @@ def _read_corners(text: str) -> tuple[_Point, ...]:
     corners = _read(_CORNERS, text)
     near = all(abs(value) <= _FARTHEST_M for corner in corners for value in corner)
     if not 3 <= len(corners) <= _MOST_CORNERS or not near:
-        raise _unusable(f"{len(corners)} corners are no polygon on this scene")
+        raise _unusable(f"{len(corners)} corners are not a polygon on this scene")
     return corners
 
 
