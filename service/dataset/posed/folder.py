@@ -98,7 +98,7 @@ class ExportFolder:
         """
         path = self._root / name
         if name in self._written or not path.resolve().is_relative_to(self._root.resolve()):
-            raise ConfigurationError("an exporter writes this file twice or elsewhere", where=name)
+            raise ConfigurationError("an exporter writes this file twice, or outside its folder", where=name)
         self._named(name, part)
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)

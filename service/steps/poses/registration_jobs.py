@@ -239,7 +239,7 @@ class _Plan:
         return arguments | {"reduced_to": [width, height]}
 
     def _need(self, kind: str, what: str, size: str, arguments: Mapping[str, Any]) -> JobState | None:
-        """The finished job for this work; None until it has finished, and where it has failed."""
+        """The finished job for this work; None until it has finished, or if it has failed."""
         name = "-".join(part for part in (what, size, self.root) if part)
         job = newest_job(self.state, self.step, kind, name)
         if job is not None and job.status == "failed":

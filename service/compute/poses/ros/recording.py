@@ -104,10 +104,12 @@ def read_recording(
                 raise DataError(what, where=f"{path}: {last}", remedy=_REMEDY) from error
     except _DAMAGES as error:
         raise DataError(
-            f"the file cannot be read behind {last} ({_plain(error)})", where=str(path), remedy=_REMEDY
+            f"the file cannot be read after {last} ({_plain(error)})", where=str(path), remedy=_REMEDY
         ) from error
     except OSError as error:
-        raise DataError(f"the file cannot be read ({error.strerror})", where=str(path), remedy="Check it") from error
+        raise DataError(
+            f"the file cannot be read ({error.strerror})", where=str(path), remedy="Check its permissions"
+        ) from error
     return found
 
 
