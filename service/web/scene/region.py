@@ -13,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.records.events import RegionDrawn
 from service.dataset.registrations import best_registration
+from service.jobs.surfaces import fuse
 from service.people.control import Control
 from service.run_record import RunRecord
 from service.web.run.forms import RunId
@@ -53,7 +54,9 @@ def drawn_rows(log: RunRecord) -> tuple[DrawnRow, ...]:
     rows: list[DrawnRow] = []
     for found in log.state.drawn:
         jobs = log.state.steps[found.region.step].jobs.values()
-        used = any(job.kind == "fuse" and job.status == "finished" and job.enqueued_seq > found.seq for job in jobs)
+        used = any(
+            job.kind == fuse.KIND.name and job.status == "finished" and job.enqueued_seq > found.seq for job in jobs
+        )
         rows.append(DrawnRow(found.by, found.region.source, len(found.region.corners_m), used))
     return tuple(rows)
 
