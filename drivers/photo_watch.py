@@ -196,7 +196,7 @@ class PhotoWatch:
             seen.exif.settings(focus_mode="", image_quality="")
             if taken_s is None:
                 seen.trouble = UnreadableFileError(
-                    "The photograph does not state when it was taken",
+                    "the photograph does not state when it was taken",
                     where=str(path),
                     remedy="Use files as they left the camera; editing programs often remove EXIF",
                 )
@@ -204,7 +204,7 @@ class PhotoWatch:
             seen.trouble = error
         except OSError as error:
             seen.trouble = UnreadableFileError(
-                f"The photograph cannot be read ({error.strerror})", where=str(path), remedy="Put the card in again"
+                f"the photograph cannot be read ({error.strerror})", where=str(path), remedy="Put the card in again"
             )
 
     @staticmethod

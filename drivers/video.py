@@ -161,7 +161,7 @@ class VideoCamera:
         differing = differences(settings, stated)
         if differing:
             raise DeviceRefusedError(
-                f"The protocol wants {'; '.join(differing)}, and software cannot set this source",
+                f"the protocol wants {'; '.join(differing)}, and software cannot set this source",
                 where=self._where,
                 remedy="Set the device with its own program, then state it in rig.yaml; or change the protocol",
             )
@@ -260,7 +260,7 @@ class VideoCamera:
         if all(wanted) and wanted != offered:
             source.release()
             raise DeviceFaultError(
-                f"It delivers {offered[0]} × {offered[1]} px instead of {wanted[0]} × {wanted[1]}",
+                f"it delivers {offered[0]} × {offered[1]} px instead of {wanted[0]} × {wanted[1]}",
                 where=self._where,
                 remedy="Choose a size that the device has, or leave width and height out of rig.yaml",
             )
@@ -293,7 +293,7 @@ class VideoCamera:
                 left_s = deadline_s - time.monotonic()
                 if left_s <= 0:
                     raise DeviceTimeoutError(
-                        f"No image for {self._config.frame_timeout_s:g} s",
+                        f"no image for {self._config.frame_timeout_s:g} s",
                         where=self._where,
                         remedy="Look at cable and program of the source, then repeat the exposure",
                     )
@@ -305,7 +305,7 @@ class VideoCamera:
         frame, self._unused = self._unused or self._read(source), None
         if frame is None:
             raise DeviceRefusedError(
-                f"The recording has no more images after {self._received}",
+                f"the recording has no more images after {self._received}",
                 where=self._where,
                 remedy="Use a longer recording: each exposure takes one image",
             )
@@ -321,7 +321,7 @@ class VideoCamera:
         if picture is None:  # pyright: ignore[reportUnnecessaryComparison] - wrong in OpenCV's types
             file.path.unlink()
             raise UnreadableFileError(
-                "The image cannot be decoded", where=str(file.path), remedy="Repeat the exposure"
+                "the image cannot be decoded", where=str(file.path), remedy="Repeat the exposure"
             )
         return file, (int(picture.shape[1]), int(picture.shape[0]))
 

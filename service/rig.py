@@ -146,7 +146,7 @@ class EmailSection(Record):
 class AlertsSection(Record):
     """Alerts to people away from the screen when a run has stopped, waits for a person, or has ended."""
 
-    webhook: WebhookSection | None = None  # a web address to tell
+    webhook: WebhookSection | None = None  # a web address to notify
     email: EmailSection | None = None  # people to write to
     on: tuple[Literal["stopped", "waits", "ended"], ...] = ("stopped", "waits", "ended")  # what is told
     waits_after_s: Annotated[float, Field(ge=0, le=86400)] = 30.0  # how long a run waits for a person before an alert
@@ -170,7 +170,7 @@ class RigSection(Record):
     stations: dict[str, StationSection] = Field(default_factory=dict)  # by the name that protocols use
     # The camera mount's drawing: a rigid 4×4 matrix, metres; the calibration replaces it.
     T_flange_camera_nominal: tuple[tuple[float, float, float, float], ...] | None = None
-    payload: PayloadSection | None = None  # what the arm is told that it carries
+    payload: PayloadSection | None = None  # what the arm is told it carries
     collision: CollisionSection = CollisionSection()  # what the plan of motions keeps clear of
     optics: OpticsSection | None = None  # None: depth of field is not judged
     lens: LensSection | None = None  # required if the software plans the board poses

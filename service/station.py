@@ -148,7 +148,7 @@ class Station:
         return self._further(name, self.rig.section.cameras[name]).camera
 
     def further_cameras(self) -> tuple[FurtherCamera, ...]:
-        """The rig's further cameras. Raises ConfigurationError if one is no camera, uncalibrated; DeviceError."""
+        """The rig's further cameras. Raises ConfigurationError if one is not a calibrated camera; DeviceError."""
         return tuple(self._further(name, section) for name, section in self.rig.section.cameras.items())
 
     def _further(self, name: str, section: FurtherCameraSection) -> FurtherCamera:

@@ -1,4 +1,4 @@
-"""Time and memory of the nearest neighbours of a Chamfer distance beside those of k-d tree libraries as they come.
+"""Time and memory of the nearest neighbours of a Chamfer distance, compared with k-d tree libraries.
 
 Run: python -m bench.ground_truth.chamfer [--millions 2] [--times 2] [--out NAME]
 """

@@ -61,7 +61,7 @@ class Child:
         self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
 
     def ask(self, interface: str, method: str) -> dict[str, Any]:
-        """Make one call; the answer says so if none came or the process died."""
+        """Make one call; the result says so if no answer came or the process died."""
         process = self._process
         if process is None or process.poll() is not None:
             process = self._process = self._start()

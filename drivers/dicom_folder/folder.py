@@ -78,7 +78,7 @@ class DicomFolder:
         """Return the number of series, their problems, and the files that are not DICOM."""
         series = self.series()
         arriving = [one for one in series if any(text.startswith(_ARRIVING) for text in one.problems)]
-        # A series in transfer is no fault, and its other problems may only be due to missing files.
+        # A series in transfer is not a fault, and its other problems may only be due to missing files.
         problems = [
             f"series {one.uid} ({one.description}): {text}"
             for one in series

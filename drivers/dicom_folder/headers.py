@@ -121,7 +121,7 @@ def _image_type(dataset: Dataset, groups: Sequence[Dataset]) -> tuple[str, ...]:
 
 
 def items(dataset: Dataset, sequence: str) -> list[Dataset]:
-    """The items of a sequence; none if it is missing, or is no sequence."""
+    """The items of a sequence; none if it is missing, or is not a sequence."""
     value = dataset.get(sequence)
     return [item for item in cast("list[object]", value or ()) if isinstance(item, Dataset)]
 

@@ -156,7 +156,7 @@ def _read_header(path: Path) -> _Header:
         raise _refused(path, f"it claims {shape[0]} × {shape[1]} × {shape[2]} voxels")
     datatype = struct.unpack(f"{order}h", head[70:72])[0]
     if datatype not in _TYPES:
-        raise _refused(path, f"its voxels are no whole numbers (data type {datatype})")
+        raise _refused(path, f"its voxels are not whole numbers (data type {datatype})")
     slope, intercept = struct.unpack(f"{order}2f", head[112:120])
     if slope not in (0.0, 1.0) or (slope == 1.0 and intercept != 0.0):
         raise _refused(path, "its labels are scaled")
@@ -178,7 +178,7 @@ def _place(path: Path, head: bytes, order: str) -> Transform:
         raise _refused(path, "it states no place in space (neither sform nor qform)")
     T[:3] *= _UNITS_M.get(head[123] & 7, 1e-3)  # programs that state no unit write millimetres
     if not np.isfinite(T).all() or abs(np.linalg.det(T[:3, :3])) < 1e-18:
-        raise _refused(path, "its place in space is no affine map")
+        raise _refused(path, "its place in space is not an affine map")
     return LPS_FROM_RAS @ T
 
 

@@ -91,7 +91,7 @@ def _marked(dataset: FileDataset, pixels: NDArray[np.generic], numbers: frozense
         case "LABELMAP":
             return np.isin(pixels, list(numbers))
         case other:
-            raise ValueError(f"segmentations of type {other} are not known")
+            raise ValueError(f"segmentations of type {other} are not supported")
 
 
 def _frame(dataset: FileDataset, index: int) -> NDArray[np.generic]:

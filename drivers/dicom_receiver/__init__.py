@@ -90,7 +90,7 @@ class Receiver:
         self._lock = threading.Lock()
 
     def __enter__(self) -> Self:
-        """Start; as `start`."""
+        """Start receiving; raises what `start` raises."""
         self.start()
         return self
 

@@ -78,7 +78,7 @@ class Staging:
         for uid in (series, instance):
             if not _UID.fullmatch(uid):
                 self.refuse(association)
-                raise DeviceRefusedError(f"{uid[:80]!r} is no UID", where=association, remedy="Send a valid file")
+                raise DeviceRefusedError(f"{uid[:80]!r} is not a UID", where=association, remedy="Send a valid file")
         with self._lock:
             self._carried.setdefault(association, set()).add(series)
             self._open.setdefault(series, set()).add(association)

@@ -95,7 +95,7 @@ class GenicamCamera:
         except LinkError as error:
             self.close()
             raise DeviceFaultError(
-                f"It does not take a setting: {error}",
+                f"it does not take a setting: {error}",
                 where=self._where,
                 remedy="Choose a pixel format and a gain that the camera has",
             ) from error
@@ -136,7 +136,7 @@ class GenicamCamera:
         differing = differences(settings, stated)
         if differing:
             raise DeviceRefusedError(
-                f"The protocol wants {'; '.join(differing)}",
+                f"the protocol wants {'; '.join(differing)}",
                 where=self._where,
                 remedy="Set the lens by hand and state it in rig.yaml, or change the protocol",
             )
@@ -148,7 +148,7 @@ class GenicamCamera:
         now = self.settings()
         if abs(now.exposure_s - settings.exposure_s) > TOLERANCE * settings.exposure_s:
             raise DeviceRefusedError(
-                f"The camera exposes for {now.exposure_s:g} s instead of {settings.exposure_s:g} s",
+                f"the camera exposes for {now.exposure_s:g} s instead of {settings.exposure_s:g} s",
                 where=self._where,
                 remedy="Choose an exposure time that the camera has",
             )
@@ -211,7 +211,7 @@ class GenicamCamera:
             frame = self._connected().acquire(exposure_s + self._config.frame_timeout_s)
         except NoImageError as error:
             raise DeviceTimeoutError(
-                f"No whole image: {error}",
+                f"no whole image: {error}",
                 where=self._where,
                 remedy="Look at cable and network (packet size, no other traffic), then repeat the exposure",
             ) from error
@@ -220,7 +220,7 @@ class GenicamCamera:
         pixels = picture(frame, self._config.pixel_format)
         if pixels is None:
             raise UnreadableFileError(
-                f"An image with pixel format {frame.code:#010x} came, not {self._config.pixel_format}",
+                f"an image with pixel format {frame.code:#010x} came, not {self._config.pixel_format}",
                 where=self._where,
                 remedy="Close other programs that use the camera, and open it again",
             )
@@ -249,7 +249,7 @@ class GenicamCamera:
         serial = link.serial
         if self._config.serial not in ("", serial):
             raise DeviceFaultError(
-                f"It has the serial number {serial}, not {self._config.serial}",
+                f"it has the serial number {serial}, not {self._config.serial}",
                 where=self._where,
                 remedy="State the camera's own serial number in rig.yaml, or connect the other camera",
             )
@@ -266,7 +266,7 @@ class GenicamCamera:
     def _check_gain(self, gain: float) -> None:
         if abs(gain - self._config.gain) > TOLERANCE * max(1.0, abs(self._config.gain)):
             raise DeviceFaultError(
-                f"It has the gain {gain:g} instead of {self._config.gain:g}",
+                f"it has the gain {gain:g} instead of {self._config.gain:g}",
                 where=self._where,
                 remedy="Choose a gain that the camera has",
             )

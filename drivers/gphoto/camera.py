@@ -84,7 +84,7 @@ class GphotoCamera:
 
     def _need(self) -> tuple[Profile, Dials]:
         if self._opened is None:
-            raise DeviceUnavailableError("The camera is not open", where=self._link.where, remedy="Open it first")
+            raise DeviceUnavailableError("the camera is not open", where=self._link.where, remedy="Open it first")
         return self._opened
 
     # --- every device -----------------------------------------------------------------------------------
@@ -129,7 +129,7 @@ class GphotoCamera:
     def report(self) -> DeviceReport:
         """Return battery, free space and settings; the clock offset comes from the EXIF time of the last exposure."""
         if self._identity is None:
-            raise DeviceUnavailableError("The camera is not open", where=self._link.where, remedy="Open it first")
+            raise DeviceUnavailableError("the camera is not open", where=self._link.where, remedy="Open it first")
         profile = self._profile
         self._dials.refresh()
         free = self._link.free_bytes()
@@ -354,7 +354,7 @@ def _parse(name: str) -> tuple[str, int, str]:
     """Stem, counter and suffix of a camera's file name; libgphoto2 prefixes files from its memory with capt_."""
     match = _NAME.match(name)
     if match is None:
-        raise StaleImageError(f"The file name {name} has no counter", where="camera", remedy="Repeat the exposure")
+        raise StaleImageError(f"the file name {name} has no counter", where="camera", remedy="Repeat the exposure")
     return match["stem"], int(match["counter"]), match["suffix"]
 
 

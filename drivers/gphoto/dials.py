@@ -32,7 +32,7 @@ class Dials:
             return self._link.value(self._profile.serial).lstrip("0")
         except DeviceRefusedError as error:
             raise DeviceUnavailableError(
-                f"The camera connects and then does not tell its settings: {error.what}",
+                f"the camera connects and then does not tell its settings: {error.what}",
                 where=self._link.where,
                 remedy="Check cable and power, then open the camera again; switch it off and on if need be",
             ) from error
@@ -101,7 +101,7 @@ class Dials:
         number = number_of(word)
         if number is None:
             raise DeviceRefusedError(
-                f"The camera reports {widget.name} {word!r}, which is not a number",
+                f"the camera reports {widget.name} {word!r}, which is not a number",
                 where=self._link.where,
                 remedy="Turn the mode dial to M; check that the lens is locked in place",
             )
@@ -115,7 +115,7 @@ class Dials:
         now = self._link.value(widget.name)
         if widget.by_hand and now not in widget.candidates(wanted):
             raise DeviceRefusedError(
-                f"The camera has {widget.name} {now} where {wanted} is needed",
+                f"the camera has {widget.name} {now} where {wanted} is needed",
                 where=self._link.where,
                 remedy=widget.by_hand,
             )
@@ -139,7 +139,7 @@ class Dials:
                 return
         now = self._link.value(name)
         raise DeviceRefusedError(
-            f"The camera keeps {name} at {now} instead of {word}",
+            f"the camera keeps {name} at {now} instead of {word}",
             where=self._link.where,
             remedy="Turn the mode dial to M and check what the camera's menu allows in this mode",
         ) from refusal

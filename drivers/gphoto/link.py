@@ -194,7 +194,7 @@ class Link:
     def call(self, doing: str, function: Callable[[Gphoto], T]) -> T:
         """Run a function on the camera and translate its errors; `doing` says what it does, for messages."""
         if self._camera is None:
-            raise DeviceUnavailableError("The camera is not open", where=self.where, remedy="Open it first")
+            raise DeviceUnavailableError("the camera is not open", where=self.where, remedy="Open it first")
         try:
             return function(self._camera)
         except gp.GPhoto2Error as error:

@@ -92,7 +92,7 @@ def choose_number(widget: Widget, wanted: float, offered: Sequence[str], where: 
     numbers = [(word, number) for word in offered if (number := number_of(word)) is not None]
     if not numbers:
         raise DeviceRefusedError(
-            f"The camera offers no values for {name}",
+            f"the camera offers no values for {name}",
             where=where,
             remedy="Turn the mode dial to M and check the lens",
         )
@@ -101,7 +101,7 @@ def choose_number(widget: Widget, wanted: float, offered: Sequence[str], where: 
     if abs(number - wanted) > RELATIVE_TOLERANCE * wanted:
         near = ", ".join(neighbour for neighbour, _ in numbers[:4])
         raise DeviceRefusedError(
-            f"The camera does not offer {name} {wanted:g}", where=where, remedy=f"Nearest that it offers: {near}"
+            f"the camera does not offer {name} {wanted:g}", where=where, remedy=f"Nearest that it offers: {near}"
         )
     return word
 
@@ -112,7 +112,7 @@ def choose_word(widget: Widget, wanted: str, offered: Sequence[str], where: str)
         if word in offered:
             return word
     raise DeviceRefusedError(
-        f"The camera does not offer {widget.name} {wanted}",
+        f"the camera does not offer {widget.name} {wanted}",
         where=where,
         remedy=f"It offers: {', '.join(offered) or 'nothing'}",
     )

@@ -48,7 +48,7 @@ def _photograph(link: Link, longest_s: float, unconfirmed: DeviceError) -> Added
             _LOG.warning("the camera did not confirm the release, and took a photograph: %s", unconfirmed.what)
             return AddedFile(str(data.folder), str(data.name))
     raise DeviceRefusedError(
-        f"The camera did not confirm that it released the shutter, and no photograph came within {longest_s:.0f} s: "
+        f"the camera did not confirm that it released the shutter, and no photograph came within {longest_s:.0f} s: "
         f"{unconfirmed.what}",
         where=link.where,
         remedy="Check the camera's display; turn the dial to M, and do not save to the camera only. Then take the "

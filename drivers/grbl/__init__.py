@@ -43,7 +43,7 @@ class GrblAxis(BaseModel):
 
     @property
     def turns(self) -> bool:
-        """Whether it turns; otherwise it slides."""
+        """Whether the axis turns; otherwise it slides."""
         return self.from_deg is not None
 
     @property

@@ -206,7 +206,7 @@ class GrblTable:
         """Start a motion to the axes' values (N,), radians or metres, and return at once.
 
         Raises SafetyStopError, LeaveNeededError; DeviceRefusedError for a target out of range, or if the controller
-        accelerates more than wanted: each change of its setting would wear its memory.
+        accelerates more than wanted. Its setting is not changed, because each change wears its memory.
         """
         setup = self._setup or self._not_open()
         target = self._axes.to_machine(self._values(target_rad))

@@ -22,7 +22,7 @@ def frame_jpeg(pixels: NDArray[np.uint8], where: str) -> bytes:
     """
     done, encoded = cv2.imencode(".jpg", pixels, _JPEG)
     if not done:
-        raise UnreadableFileError("An image cannot be encoded", where=where, remedy="Repeat the exposure")
+        raise UnreadableFileError("an image cannot be encoded", where=where, remedy="Repeat the exposure")
     return encoded.tobytes()
 
 

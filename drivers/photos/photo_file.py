@@ -48,7 +48,7 @@ class ExifRecord:
         """
         if self.aperture_f is None or self.exposure_s is None or self.iso is None:
             raise UnreadableFileError(
-                "The photograph does not state aperture, exposure time and ISO",
+                "the photograph does not state aperture, exposure time and ISO",
                 where=str(self.path),
                 remedy="Use files as they left the camera; editing programs often remove EXIF",
             )
@@ -141,7 +141,7 @@ def read_exif(path: Path) -> ExifRecord:
         )
     except exiv2.Exiv2Error as error:
         raise UnreadableFileError(
-            f"The photograph cannot be read: {error}", where=str(path), remedy="Copy it again from the camera"
+            f"the photograph cannot be read: {error}", where=str(path), remedy="Copy it again from the camera"
         ) from error
 
 

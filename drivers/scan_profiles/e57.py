@@ -21,7 +21,7 @@ _AXES = ("cartesianX", "cartesianY", "cartesianZ")
 def check_e57(path: Path) -> None:
     """Check that an E57 file is complete, from the length that its header states.
 
-    Raises IncompleteExportError, UnreadableFileError if it is no E57 file, and OSError.
+    Raises IncompleteExportError, UnreadableFileError if it is not an E57 file, and OSError.
     """
     with path.open("rb") as file:
         head = file.read(48)

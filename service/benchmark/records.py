@@ -109,12 +109,12 @@ def read_results(out: Path) -> tuple[BenchmarkResult, ...]:
     """All results in a folder, by name of their folders.
 
     Raises:
-        DataError: a file is no result.
+        DataError: a file is not a result.
     """
     results: list[BenchmarkResult] = []
     for path in sorted(out.glob(f"*/{RESULT}")):
         try:
             results.append(BenchmarkResult.model_validate_json(path.read_bytes()))
         except ValidationError as error:
-            raise DataError("this is no result of the benchmark", where=str(path), remedy="Remove it") from error
+            raise DataError("this is not a result of the benchmark", where=str(path), remedy="Remove it") from error
     return tuple(results)

@@ -42,7 +42,7 @@ def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
     kinds: dict[str, K] = {}
     for one in declared:
         if not isinstance(one, kind):
-            raise ConfigurationError(f"{one!r} is no {kind.__name__}", where=f"entry points {group}")
+            raise ConfigurationError(f"{one!r} is not a {kind.__name__}", where=f"entry points {group}")
         if one.name in kinds:
             raise ConfigurationError(f"two kinds are called {one.name!r}", where=f"entry points {group}")
         kinds[one.name] = one

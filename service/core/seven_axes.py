@@ -110,7 +110,7 @@ def elbow_angle_rad(arm: ArmModel, joints_rad: Array) -> float:
 
 
 def _reference(arm: ArmModel, wrist: Array, q4: float) -> Array:
-    """(3, 3) turn of the upper arm with joint 3 at 0 that brings the wrist there, from the shoulder."""
+    """Rotation (3, 3) of the upper arm that brings the wrist to this place (from the shoulder) with joint 3 at 0."""
     _, upper, fore, _ = arm.d_m[::2]
     leaning = np.arctan2(np.hypot(wrist[0], wrist[1]), wrist[2])
     q2 = leaning + np.arctan2(fore * np.sin(q4), upper + fore * np.cos(q4))

@@ -20,6 +20,7 @@ from service.core.protocol.step_params import Gives
 from service.core.results.arrival import late_words
 from service.core.run.state import JobState, RunState
 from service.jobs.kind import JobRecord
+from service.jobs.poses import structure_from_motion
 from service.jobs.registration import evaluate, further_camera, register
 from service.jobs.registration.evaluate import ErrorBudget, Row
 from service.jobs.registration.register import Registration, Registrations
@@ -93,7 +94,7 @@ def shared_adjustment_note(protocol: Protocol, state: RunState) -> str:
     model is one bundle adjustment of all tracks from there (service/compute/poses/sfm/model/mapping.py).
     """
     if not any(
-        job.kind == "structure_from_motion"
+        job.kind == structure_from_motion.KIND.name
         and "features" in job.arguments  # absent in older runs, which shared nothing
         for step in state.steps.values()
         for job in step.jobs.values()

@@ -18,7 +18,7 @@ _LOOK_EVERY_S = 2.0  # in this time a camera cannot fill the space that is kept 
 
 @dataclass
 class DiskWatch:
-    """Forecasts whether the disk has room for the rest of the run; records and tells when the forecast gets worse."""
+    """Forecasts whether the disk has room for the rest of the run; records and tells a forecast that is worse."""
 
     run: HeldRun
     protocol: Protocol
@@ -43,7 +43,7 @@ class DiskWatch:
         self._due_s = now_s + _LOOK_EVERY_S
 
     def forecast(self) -> Forecast:
-        """Make a forecast; record and tell it if it is worse than the one before."""
+        """Make a forecast; record it and tell the operator if it is worse than the one before."""
         state = self.run.refresh()
         found = forecast_of(self.run.store, self.protocol, state)
         worse = found.verdict not in ("enough", self._told)

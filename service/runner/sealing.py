@@ -30,7 +30,7 @@ class Seal:
     def sign(self, *, ended: bool) -> None:
         """Sign the chain's end and, if the run has `ended`, have the signature stamped.
 
-        A failure is told to the operator and raises nothing: the next signature covers the same events.
+        The operator is told of a failure; nothing is raised: the next signature covers the same events.
         """
         self.busy("signing the record")
         try:

@@ -65,5 +65,5 @@ class Launcher:
             self._children[run_id] = child
         now_s = time.time()
         first = Snapshot(at_utc_s=now_s, pid=child.pid, doing="starting", activity="starting", activity_utc_s=now_s)
-        with contextlib.suppress(OSError):  # the runner tells of itself soon
+        with contextlib.suppress(OSError):  # the runner will report by itself soon
             write_snapshot(self.data, run_id, first)

@@ -165,7 +165,7 @@ class Properties:
     def set_from_client(self, data: bytes) -> None:
         """Set a value: size, code, value. Raises NotWritableError or RefusedValueError."""
         if len(data) < 12 or struct.unpack_from("<I", data)[0] != len(data):
-            raise RefusedValueError(f"{len(data)} bytes are no value")
+            raise RefusedValueError(f"{len(data)} bytes are not a value")
         code = self._known(struct.unpack_from("<I", data, 4)[0])
         if code is Code.IMAGE_FORMAT:
             chosen = next((one for one in FORMATS if one.encode() == data[8:]), None)

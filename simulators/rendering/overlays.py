@@ -129,7 +129,7 @@ def draw_calibration_board(frame: Frame, T_world_board: Array, lamp_m: Array) ->
 
 
 def _sampled(x: Array, y: Array, outer: Array, margin: float, ahead: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Share (H, W) of each pixel that shows the board, and of that the share which is white.
+    """Fraction (H, W) of each pixel that the board covers, and the fraction of that which is white.
 
     Args:
         x: (H, W) of the pixels' centres, in squares.

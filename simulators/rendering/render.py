@@ -177,7 +177,7 @@ def _electrons(view: View, settings: Mapping[str, float]) -> float:
 
 
 def _amplification(settings: Mapping[str, float]) -> float:
-    """The share of saturation of one electron."""
+    """The signal of one electron as a fraction of saturation."""
     return settings["iso"] / REFERENCE["iso"] / FULL_WELL_E
 
 

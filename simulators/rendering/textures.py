@@ -118,7 +118,7 @@ def _fat(grain: _Grain) -> Array32:
 
 
 def _muscle(grain: _Grain, fibres: Array32) -> Array32:
-    """Red muscle along its fibres (H, W), with tendons and fat (H, W, 3)."""
+    """Colours (H, W, 3) of red muscle with tendons and fat; `fibres` (H, W) is its texture."""
     noise = grain.noise
     muscle = grain.coloured((0.34, 0.065, 0.05))
     muscle *= (1.0 + 0.34 * fibres + 0.18 * grain.fine + 0.08 * grain.speckle)[..., None]
@@ -127,7 +127,7 @@ def _muscle(grain: _Grain, fibres: Array32) -> Array32:
 
 
 def _bone(grain: _Grain) -> Array32:
-    """Bone with blood on it and pores (H, W, 3)."""
+    """Colours (H, W, 3) of bone with blood on it and pores."""
     bone = grain.coloured((0.66, 0.50, 0.36))
     bone *= (1.0 + 0.10 * grain.fine + 0.07 * grain.speckle + 0.08 * grain.wobble)[..., None]
     bone = mixed(bone, (0.45, 0.10, 0.08), 0.75 * ramp(0.3, 1.3, grain.noise.octaves(15, 0.007, 5)))

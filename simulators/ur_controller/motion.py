@@ -71,7 +71,7 @@ class MoveJ:
         self._t = 0.0
 
     def advance(self, dt_s: float) -> None:
-        """Advance by dt_s."""
+        """Advance the motion by dt_s."""
         self._t += dt_s
         s, v, a = self._profile.at(self._t)
         self.done = self._t >= self._profile.duration
@@ -133,7 +133,7 @@ class Stop:
         self.qdd = -qd / self._left if self._left > 0 else np.zeros(6)
 
     def advance(self, dt_s: float) -> None:
-        """Advance by dt_s."""
+        """Advance the motion by dt_s."""
         dt = min(dt_s, self._left)
         self.q = self.q + self.qd * dt + 0.5 * self.qdd * dt * dt
         self.qd = self.qd + self.qdd * dt
@@ -194,7 +194,7 @@ class Servo:
         self.target, self._lag_s = target, min(max(lookahead_s, 0.03), 0.2)
 
     def advance(self, dt_s: float) -> None:
-        """Advance by dt_s."""
+        """Advance the motion by dt_s."""
         qd = np.clip((self.target - self.q) / self._lag_s, -3.14, 3.14)
         self.qdd = (qd - self.qd) / dt_s
         self.q, self.qd = self.q + qd * dt_s, qd

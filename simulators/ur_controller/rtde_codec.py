@@ -48,7 +48,7 @@ class FrameReader:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[tuple[int, bytes]]:
-        """Add bytes; yields (type, payload) of each complete frame. Raises FrameError."""
+        """Add bytes; yield (type, payload) of each complete frame. Raises FrameError."""
         self._buffer += data
         while len(self._buffer) >= HEADER.size:
             size, kind = HEADER.unpack_from(self._buffer)

@@ -62,5 +62,5 @@ def test_an_unknown_method_and_another_folder_are_refused(folder: Path) -> None:
     unknown = answer("run", folder / "dataset", "--method", "magic", *common)
     assert "Choose one of colmap, gsplat, instant-ngp" in unknown["error"]["remedy"]
     other = answer("run", folder / "photographs", "--method", "stereo", *common)
-    assert other["error"]["what"] == "this is no data set in the format hdf5"
+    assert other["error"]["what"] == "this is not a data set in the format hdf5"
     assert answer("table", "--out", folder / "out")["results"] == []

@@ -144,7 +144,7 @@ def test_a_file_that_is_cut_short_waits_and_an_image_is_no_segmentation(tmp_path
     assert "3 bytes are missing" in " ".join(ct(tmp_path).report().problems)
     path.unlink()
     write_nifti(tmp_path / "image.nii", T, LABELS.transpose(2, 1, 0).astype(np.float32))
-    assert "its voxels are no whole numbers" in " ".join(ct(tmp_path).report().problems)
+    assert "its voxels are not whole numbers" in " ".join(ct(tmp_path).report().problems)
 
 
 def test_an_empty_segment_is_refused(tmp_path: Path) -> None:

@@ -131,7 +131,7 @@ def test_pairs_are_chosen_evenly_and_alike(folder: Path, scored: tuple[Path, Any
 def test_what_is_no_data_set_is_refused(tmp_path: Path) -> None:
     status, printed = run(tmp_path, tmp_path / "out")
     assert status == 1
-    assert "this is no data set for feature matching" in printed
+    assert "this is not a data set for feature matching" in printed
     assert "export RUN --format matching" in printed.replace("\n", " ")
 
 

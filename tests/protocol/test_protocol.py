@@ -82,7 +82,7 @@ FAULTS: list[tuple[str, str, str, str, str]] = [
         "unless_skipped: scan, min: 0.2,",
         "measure: sharp",
         "steps[1].gates[1].unless_skipped",
-        "'scan' is no earlier step that may be skipped",
+        "'scan' is not an earlier step that may be skipped",
     ),
     ("min: 0.2,", "min: .nan,", ".nan", "steps[1].gates[1].min", "valid number"),
     ("views: 3}", "views: 0}", "views: 0", "steps[1].params.views", "greater than or equal to 1"),

@@ -256,7 +256,7 @@ def test_of_a_trusted_proxys_words_the_last_stranger_counts(rig: Path) -> None:
 def test_a_proxy_is_an_address(rig: Path) -> None:
     refused = orthocapture("serve", "--rig", str(rig), "--data", str(rig.parent / "data"), "--trusted-proxy", "proxy")
     assert refused.returncode == 1
-    assert "'proxy' is no address" in refused.stderr
+    assert "'proxy' is not an address" in refused.stderr
 
 
 def test_the_list_of_addresses_is_not_public(rig: Path) -> None:

@@ -119,11 +119,11 @@ ALTERED = {
         "INSERT INTO sessions SELECT 'x', 'emmy', 'EVE234', csrf, created_utc_s, seen_utc_s, 0, 0 FROM sessions",
         "the sign-in of emmy on screen EVE234 is not told by any event",
     ),
-    "somebody else's sign-in": ("UPDATE sessions SET token_sha256 = 'x'", "is not the one that its event tells of"),
+    "somebody else's sign-in": ("UPDATE sessions SET token_sha256 = 'x'", "is not the one that its event records"),
     "the lock of a screen": ("UPDATE sessions SET locked = 0", "is not locked; the events say otherwise"),
     "a link": (
         f"INSERT INTO invitations VALUES ('{token_sha256('eve')}', 'emmy', 9e9, 0)",
-        "a link for the account emmy is not one that the events tell of",
+        "a link for the account emmy is not one that the events record",
     ),
     "a link that was used": (
         "UPDATE invitations SET used = 0 WHERE account = 'grace'",
@@ -133,7 +133,7 @@ ALTERED = {
     "when a time stamp was asked for": ("UPDATE timestamps SET at_utc = 'x'", "it is not the one that was given"),
     "a time stamp that nobody gave": (
         "INSERT INTO timestamps SELECT run_id, seq, 'http://eve', at_utc, token FROM timestamps",
-        "time stamp of http://eve: no event tells that it was given",
+        "time stamp of http://eve: no event records that it was given",
     ),
     "who did a job": ("UPDATE jobs SET worker = 'x' WHERE state = 'finished'", "differs from its event job_finished"),
     "the order of jobs": ("UPDATE jobs SET position = 9 WHERE state = 'finished'", "another place in the queue"),

@@ -13,7 +13,7 @@ _LONGEST_VARINT = 10
 
 
 class ProtobufError(ValueError):
-    """Bytes that are no protobuf message; the text says why."""
+    """Bytes that are not a protobuf message; the text says why."""
 
 
 def fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
@@ -48,7 +48,7 @@ def doubles(message: bytes, number: int) -> tuple[float, ...]:
         if field != number:
             continue
         if not isinstance(value, bytes) or len(value) % 8:
-            raise ProtobufError(f"field {number} is no list of doubles")
+            raise ProtobufError(f"field {number} is not a list of doubles")
         found.extend(struct.unpack(f"<{len(value) // 8}d", value))
     return tuple(found)
 

@@ -26,7 +26,7 @@ class FriSample:
         period_ms: between two messages, as the controller has it.
         received: messages so far.
         lost: messages so far that never came.
-        refused: datagrams so far that were no messages of this controller.
+        refused: datagrams so far that were not messages of this controller.
     """
 
     monotonic_s: float

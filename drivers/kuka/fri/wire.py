@@ -22,7 +22,7 @@ _FULL_TURN = 2 * math.pi  # more than any joint of an LBR turns
 
 
 class FriError(ValueError):
-    """A datagram that is no monitor message of FRI; the text says why."""
+    """A datagram that is not a monitor message of FRI; the text says why."""
 
 
 class Session(IntEnum):

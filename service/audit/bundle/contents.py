@@ -75,7 +75,7 @@ class BundledRun:
 def read_bundled_run(
     connection: Connection, run_id: str, protocol: Protocol, root: RunStarted, keys: Sequence[PublicKey]
 ) -> BundledRun:
-    """Read what a bundle tells of a run."""
+    """Read what a bundle says about a run."""
     events = read_events(connection, run_id, 0)
     state = fold(protocol, events)
     return BundledRun(

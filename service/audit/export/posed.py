@@ -74,7 +74,7 @@ def crop_size(text: str) -> tuple[int, int] | None:
     """Width and height of `WIDTHxHEIGHT`; None for "", which is whole images.
 
     Raises:
-        ConfigurationError: it is no size.
+        ConfigurationError: it is not a size.
     """
     if not text:
         return None

@@ -8,7 +8,7 @@ Exit status: 0 whole and unaltered; 1 something differs, and every difference is
 this is not a bundle or `cryptography` is missing.
 
 Every signature here is checked against keys that the bundle itself brings. That the bundle comes from whom it says
-it comes from, only a key's fingerprint tells that was obtained in another way: give it with --key.
+it comes from, only a key's fingerprint tells, if you obtained it in another way: give it with --key.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def _integer(digits: str) -> Any:
 
 
 def _constant(name: str) -> Any:
-    raise ValueError(f"{name} is no JSON")
+    raise ValueError(f"{name} is not JSON")
 
 
 # --- the container ----------------------------------------------------------------------------------------------
@@ -358,7 +358,7 @@ class Check:
                 manifest[name]
             for name in ("head", "site_head"):
                 if not isinstance(manifest[name], dict):
-                    raise TypeError(f"{name} is no object")  # noqa: TRY301
+                    raise TypeError(f"{name} is not an object")  # noqa: TRY301
         except (*UNREADABLE, KeyError, TypeError, OverflowError, AttributeError) as error:
             raise NotABundleError(f"manifest.json cannot be read: {short_words(error)}") from error
         if len(files) != len(manifest["files"]):
@@ -698,7 +698,7 @@ class Chain:
         if found != sha256:
             check.fault(shown, f"its content was altered: its SHA-256 is {found}, recorded is {sha256}")
         if not isinstance(seq, int) or not isinstance(payload, dict):
-            check.fault(shown, "it is no event")
+            check.fault(shown, "it is not an event")
             return
         self.end = (seq, sha256)
         self.hashes[seq] = sha256
@@ -720,7 +720,7 @@ class Chain:
 
 
 def _heads(value: Any) -> dict[str, tuple[int, str]]:
-    """Ends of chains as a start of the service wrote them down; what is none is left out: the hash tells it."""
+    """Ends of chains as recorded when the service started; what is not one is left out, and the hash reveals it."""
     found = value.items() if isinstance(value, dict) else ()
     pairs = {run: end for run, end in found if isinstance(end, list) and len(end) == 2}
     return {run: (end[0], end[1]) for run, end in pairs.items() if isinstance(end[0], int)}
@@ -850,7 +850,7 @@ class Token:
         """Raises ValueError when it was given for something else."""
         algorithm, imprint = self._imprint
         if algorithm not in _DIGESTS or _digest(algorithm, message) != imprint:
-            raise ValueError("it was given for something else than this checkpoint")
+            raise ValueError("it was given for something other than this checkpoint")
 
     def check_signature(self, trusted: Sequence[x509.Certificate]) -> None:
         """Raises ValueError, InvalidSignature when no line of certificates leads to one of the trusted."""

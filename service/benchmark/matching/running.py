@@ -95,7 +95,7 @@ def open_matching_data(folder: Path) -> MatchingData:
             raise ValueError(f"{min(unknown)} is not among the views")
     except DAMAGED as error:
         raise DataError(
-            "this is no data set for feature matching",
+            "this is not a data set for feature matching",
             where=str(folder),
             remedy="Export one: orthocapture export RUN --format matching --out DIR",
         ) from error

@@ -18,7 +18,7 @@ def views_of(data: Path) -> tuple[StereoView, ...]:
     """The images of an export in the format `colmap-pinhole`.
 
     Raises:
-        DataError: a camera is no pinhole, or an image cannot be read.
+        DataError: a camera is not a pinhole, or an image cannot be read.
     """
     model = pycolmap.Reconstruction(str(data / "sparse" / "0"))
     views: list[StereoView] = []

@@ -54,7 +54,7 @@ def run_command(
 
     The method gets images, poses and the extent of the scene in the format that it reads. Its mesh is brought back
     into the frame of the data set, cut to the box of the ground truth, and scored as `evaluate chamfer` does. If the
-    method is not installed, the command tells what is expected; run it elsewhere and give its mesh with --mesh.
+    method is not installed, the command says what is expected; run it elsewhere and give its mesh with --mesh.
     """
     with reporting_errors(json), progress_bar(quiet=json) as progress:
         # These load the numerics, which take seconds.

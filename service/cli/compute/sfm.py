@@ -139,7 +139,7 @@ def _robot_poses(path: Path | None, hand_eye: Path | None, files: Mapping[str, P
     T_flange_camera = np.eye(4) if hand_eye is None else read_hand_eye(hand_eye)
     found = {name: T @ T_flange_camera for name, T in given.items() if name in files}
     if not found:
-        raise DataError("no image of the folder has a robot pose", where=str(path), remedy="check the names")
+        raise DataError("no image of the folder has a robot pose", where=str(path), remedy="Check the names")
     return found
 
 

@@ -145,7 +145,7 @@ def spheres_of(
     if expected is not None and seeds_m is not None and len(seeds_m) != expected:
         raise DataError(
             f"{counted(len(seeds_m), 'seed')} given for {counted(expected, 'expected sphere')}",
-            remedy="give one for each",
+            remedy="Give one for each",
         )
     normals: Array | None = None
     faces: NDArray[np.integer] = np.empty((0, 3), dtype=np.int64)
@@ -202,7 +202,7 @@ def read_seeds(text: str | None) -> Array | None:
             rows = [row.split(",") for row in text.split(";") if row.strip()]
             seeds = np.array([[float(word) for word in row] for row in rows])
     except (ValueError, KeyError, TypeError, OSError) as error:
-        raise DataError(f"the seeds cannot be read ({error})", where=text, remedy="give x,y,z;x,y,z in mm") from error
+        raise DataError(f"the seeds cannot be read ({error})", where=text, remedy="Give x,y,z;x,y,z in mm") from error
     if seeds.ndim != 2 or seeds.shape[1] != 3 or len(seeds) == 0:
-        raise DataError("the seeds are not points x,y,z", where=text, remedy="give x,y,z;x,y,z in mm, or a JSON file")
+        raise DataError("the seeds are not points x,y,z", where=text, remedy="Give x,y,z;x,y,z in mm, or a JSON file")
     return metres(seeds)

@@ -45,11 +45,11 @@ def dicom_listen_command(
             raise ConfigurationError(
                 f"{host} is reachable from other machines, and any caller may send",
                 where="--host",
-                remedy="Name the AE titles that may send with --from. A title is no password: also restrict the "
+                remedy="Name the AE titles that may send with --from. A title is not a password: also restrict the "
                 "port to the CT suite in the firewall",
             )
         require_writable_folder(folder)
-        logging.getLogger("pynetdicom").setLevel(logging.CRITICAL)  # what people should know is told in words
+        logging.getLogger("pynetdicom").setLevel(logging.CRITICAL)  # what people should know is printed in words
         stopped = threading.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: stopped.set())

@@ -116,7 +116,7 @@ def check_arm(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
         raise DataError(
             f"the poses are {mm(distance_m):.0f} mm and {np.degrees(angle_rad):.1f}° off the forward kinematics "
             f"of a {arm.name}",
-            remedy="check the arm's model, that the poses are the flange's (tool centre point zero), and radians",
+            remedy="Check the arm's model, that the poses are the flange's (tool centre point zero), and radians",
         )
 
 

@@ -28,7 +28,7 @@ def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
         raise DataError(
             f"the first line is {','.join(header)!r}",
             where=f"{path}:1",
-            remedy="it must be image,q1,q2,… with a column for each of the arm's axes",
+            remedy="It must be image,q1,q2,… with a column for each of the arm's axes",
         )
     joints: dict[str, Array] = {}
     for line, row in rows:
@@ -38,21 +38,21 @@ def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
         try:
             values = np.array([float(cell) for cell in row[1:]])
         except ValueError:
-            raise DataError("a field is not a number", where=where, remedy="correct the line") from None
+            raise DataError("a field is not a number", where=where, remedy="Correct the line") from None
         if values.shape != (axes,) or not np.isfinite(values).all():
-            raise DataError(f"not {axes} finite numbers after the name", where=where, remedy="correct the line")
+            raise DataError(f"not {axes} finite numbers after the name", where=where, remedy="Correct the line")
         if np.abs(values).max() > _LARGEST_RAD:
             raise DataError(
-                f"{np.abs(values).max():.0f} rad is not a joint angle", where=where, remedy="write radians"
+                f"{np.abs(values).max():.0f} rad is not a joint angle", where=where, remedy="Write radians"
             )
         if row[0].strip() in joints:
-            raise DataError(f"image {row[0].strip()} has two rows", where=where, remedy="remove one of them")
+            raise DataError(f"image {row[0].strip()} has two rows", where=where, remedy="Remove one of them")
         joints[row[0].strip()] = values
     missing = [image for image in images if image not in joints]
     if missing:
         raise DataError(
             f"{len(missing)} images have no joints: {', '.join(missing[:5])}",
             where=str(path),
-            remedy="add their rows, or leave the images out",
+            remedy="Add their rows, or leave the images out",
         )
     return {image: joints[image] for image in images}

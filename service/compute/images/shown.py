@@ -28,7 +28,7 @@ def decode_reduced(
         upright: rotate by the orientation tag; otherwise the pixels are as stored, like those that are measured.
 
     Raises:
-        DataError: it is no picture that can be decoded, or has too many pixels to show.
+        DataError: it is not a picture that can be decoded, or has too many pixels to show.
     """
     stored_px, rows = picture_size(content, name)
     if stored_px * rows > _MOST_PIXELS:

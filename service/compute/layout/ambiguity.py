@@ -159,15 +159,15 @@ def _checked(centres_m: Array, radius_m: float) -> Array:
         raise DataError(f"sphere centres of shape {centres.shape} are not points (N, 3)")
     if len(centres) < SUBSET:
         raise ComputeError(
-            f"{len(centres)} spheres have no layout to judge, {SUBSET} are needed", remedy="place more spheres"
+            f"{len(centres)} spheres have no layout to judge, {SUBSET} are needed", remedy="Place more spheres"
         )
     if distances(centres)[~np.eye(len(centres), dtype=bool)].min() < radius_m:
-        raise ComputeError("two spheres are at the same place", remedy="check the list of centres for repeats")
+        raise ComputeError("two spheres are at the same place", remedy="Check the list of centres for repeats")
     return centres
 
 
 def _sphere_margins(count: int, matches: Confusions) -> Array:
-    """(N,) smallest misfit of an assignment that takes each sphere for another one; infinite if there is none."""
+    """For each sphere, (N,), the smallest misfit of an assignment that confuses it; infinite if there is none."""
     margins = np.full(count, np.inf)
     moved = matches.seen != matches.taken
     for column in range(SUBSET):

@@ -74,7 +74,7 @@ def layout_from_photographs(
         most = max((len(p.cones) for p in photographs), default=0)
         raise ComputeError(
             f"no photograph shows more than {most} spheres, {LEAST_SPHERES} are needed",
-            remedy="photograph all spheres from above, sharp and from less than a metre",
+            remedy="Photograph all spheres from above, sharp and from less than a metre",
         )
     first = photographs[order[0]]
     group = _Group([order[0]], [np.arange(len(first.cones))], [np.eye(4)])

@@ -1,4 +1,4 @@
-"""EXIF of exported photographs: kept, carried over to resampled ones, on demand without what names a person or place.
+"""EXIF of exported photographs: kept, copied to resampled ones; on request without what names a person or place.
 
 The camera's serial numbers are personal data where one person owns the camera.
 """

@@ -55,12 +55,12 @@ def match_constellations(a: Array, b: Array, tolerance_m: float = 2e-3) -> Const
     if count_mirrored >= 4 and count_mirrored > count:
         raise ComputeError(
             f"the two sphere constellations are mirror images ({count_mirrored} spheres agree only when mirrored)",
-            remedy="one mesh has an axis negated: export it again, or correct the orientation of the CT series",
+            remedy="One mesh has an axis negated: export it again, or correct the orientation of the CT series",
         )
     if count < 4:
         raise ComputeError(
             f"only {count} of {len(a)} and {len(b)} spheres agree within {mm(tolerance_m):.1f} mm, 4 are needed",
-            remedy="check the units of both meshes, and that the spheres did not move between the scans",
+            remedy="Check the units of both meshes, and that the spheres did not move between the scans",
         )
     best, rival = proper[0], proper[1:]
     rows = np.array([i for i, _ in best])
@@ -68,12 +68,12 @@ def match_constellations(a: Array, b: Array, tolerance_m: float = 2e-3) -> Const
     if spread[2] < 2 * tolerance_m:
         raise ComputeError(
             "the matched spheres lie in a plane, so that a mirrored mesh could not be distinguished from a true one",
-            remedy="mount at least one sphere at another height",
+            remedy="Mount at least one sphere at another height",
         )
     if any(len(other) == len(best) for other in rival):
         raise ComputeError(
             f"the sphere constellation is symmetric: {len(best)} spheres agree in more than one way",
-            remedy="move one sphere so that no rotation maps the arrangement onto itself",
+            remedy="Move one sphere so that no rotation maps the arrangement onto itself",
         )
     columns = np.array([j for _, j in best])
     T_a_b, _ = align_points(a[rows], b[columns])

@@ -87,7 +87,7 @@ def close_loop(
         ComputeError: fewer than four common spheres.
     """
     if len(match.pairs) < _LEAST:
-        raise ComputeError(f"{len(match.pairs)} spheres in common do not close a loop", remedy="scan all spheres")
+        raise ComputeError(f"{len(match.pairs)} spheres in common do not close a loop", remedy="Scan all spheres")
     rows, columns = (np.array(side) for side in zip(*match.pairs, strict=True))
     pa, pb = a[rows], b[columns]
     R = match.T_a_b[:3, :3]

@@ -20,7 +20,7 @@ def known_arms() -> tuple[ArmModel, ...]:
         arm: object = point.load()
         if not isinstance(arm, ArmModel):
             raise ConfigurationError(
-                f"the entry point {point.name} of {GROUP} is no ArmModel",
+                f"the entry point {point.name} of {GROUP} is not an ArmModel",
                 where=point.value,
                 remedy="Let it name an ArmModel, or remove the package that has it",
             )

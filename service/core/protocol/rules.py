@@ -90,7 +90,7 @@ def _gates(
         if isinstance(unless, str):
             named = steps[seen[unless]] if unless in seen else None
             if not isinstance(named, dict) or named.get("skippable") is not True:
-                yield (*where, "unless_skipped"), f"{unless!r} is no earlier step that may be skipped"
+                yield (*where, "unless_skipped"), f"{unless!r} is not an earlier step that may be skipped"
         measure = gate.get("measure")
         if isinstance(measure, str):
             if gate.get("accept_by") is not None and measure in NEVER_ACCEPTED:

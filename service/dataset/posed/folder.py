@@ -98,7 +98,7 @@ class ExportFolder:
         """
         path = self._root / name
         if name in self._written or not path.resolve().is_relative_to(self._root.resolve()):
-            raise ConfigurationError("an exporter writes this file twice or elsewhere", where=name)
+            raise ConfigurationError("an exporter writes this file twice, or outside its folder", where=name)
         self._named(name, part)
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -191,7 +191,7 @@ def export_folder(
         )
     root, about = _beside(target)
     if root.exists() and not about.is_file():
-        raise DataError("a folder that is no export has this name", where=str(root), remedy="Move it away")
+        raise DataError("a folder that is not an export has this name", where=str(root), remedy="Move it away")
     try:
         lock = about.open("a+b")
     except OSError as error:

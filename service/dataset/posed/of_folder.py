@@ -33,7 +33,7 @@ def data_set_of_folder(folder: Path) -> DataSet:
         DataError: the folder is in another format, a file of it was changed or is missing, or it cannot be read.
     """
     if not (folder / INDEX).is_file() or not (folder / SUMS).is_file():
-        raise DataError("this is no data set in the format hdf5", where=str(folder), remedy=_REMEDY)
+        raise DataError("this is not a data set in the format hdf5", where=str(folder), remedy=_REMEDY)
     check_folder(folder)
     try:
         return _read(folder)

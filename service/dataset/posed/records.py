@@ -131,7 +131,7 @@ class DataSet:
 
     @property
     def mark(self) -> str:
-        """A sentence for every file that can say it; "" for a real capture."""
+        """The sentence that marks simulated data in every file with room for it; "" for a real capture."""
         return "SIMULATED: made by a simulated rig, not by a camera in front of a specimen" if self.simulated else ""
 
     def errors_of(self, views: Sequence[int]) -> Array | None:

@@ -67,7 +67,7 @@ class Answer(JobRecord):
         calibration: file with them.
         outlines: file with the outlines of its images, by viewpoint.
         measured_on: whether these were measured in its JPEGs or in its developed raw files.
-        T_outer_camera: None if its images do not tell; `why` says the reason.
+        T_outer_camera: None if its images do not determine it; `why` gives the reason.
         covariance: (6, 6) of it, m and rad.
         views: on which it rests.
         excluded: images left out, with the reason.

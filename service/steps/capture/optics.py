@@ -33,7 +33,7 @@ def optics_departures(
     Args:
         context: of the step.
         captures: images of this step to compare; None: all.
-        quiet: do not note and tell departures.
+        quiet: neither note departures nor tell the operator.
         against_itself: compare the images with one another, because a later step calibrates from them.
     """
     mine = context.evidence.captures(context.step.id) if captures is None else captures

@@ -8,6 +8,7 @@ from service.core.jobs.references import Reference
 from service.core.protocol.models import Protocol, Step
 from service.core.run.state import RunState
 from service.jobs.kind import JobRecord
+from service.jobs.registration import evaluate
 from service.steps.context import JobRequest
 from service.steps.poses.front_end import early_matches
 from service.steps.poses.registration_jobs import Task, name_of, recorded_registration_jobs
@@ -25,7 +26,7 @@ def evaluation_tasks(protocol: Protocol, state: RunState, step: Step) -> dict[st
     """The evaluation jobs of registrations that arrived after the step's own evaluation, by registration."""
     if step.gives != "accuracy" or state.steps[step.id].skipped:
         return {}
-    own = [j for j in state.steps[step.id].jobs.values() if j.kind == "evaluate" and j.priority == WAITED]
+    own = [j for j in state.steps[step.id].jobs.values() if j.kind == evaluate.KIND.name and j.priority == WAITED]
     newest = max(own, key=lambda job: job.enqueued_seq, default=None)
     found = recorded_registration_jobs(protocol, state, protocol.step(evaluated_step(step)))
     if newest is None or newest.status != "finished" or found is None:
@@ -36,8 +37,8 @@ def evaluation_tasks(protocol: Protocol, state: RunState, step: Step) -> dict[st
         if name not in evaluated:
             arguments = {**newest.arguments, "registrations": {name: Reference(job.job, "result").record()}}
             key = f"{name}-{name_of(newest)}"
-            request = JobRequest("evaluate", arguments, LATER, 2)
-            tasks[name] = Task(key, request, newest_job(state, step.id, "evaluate", key))
+            request = JobRequest(evaluate.KIND.name, arguments, LATER, 2)
+            tasks[name] = Task(key, request, newest_job(state, step.id, request.kind, key))
     return tasks
 
 

@@ -137,7 +137,9 @@ def early_matches(protocol: Protocol, state: RunState) -> list[NewJob]:
         arguments = {**shared, "features": named, "pairs": [list(pair) for pair in pairs]}
         key = job_key(state, step_id, "match", sha256)
         attempt = state.steps[step_id].attempt
-        jobs.append(NewJob("match", step_id, attempt, key, arguments, priority=EARLY, version=match.KIND.version))
+        jobs.append(
+            NewJob(match.KIND.name, step_id, attempt, key, arguments, priority=EARLY, version=match.KIND.version)
+        )
     return jobs
 
 

@@ -24,6 +24,7 @@ from service.jobs.kind import JobRecord, read_part
 from service.jobs.poses.features import ImagesToMatch
 from service.jobs.poses.match import PairsToMatch
 from service.jobs.records import ImageFile, ImagesCamera, PosedPhotograph
+from service.jobs.registration import detect_spheres
 from service.steps.context import JobRequest
 from service.steps.poses.front_end import IMAGES_A_JOB, PAIRS_A_JOB, EarlyJobs, chunks, found_early
 from service.steps.poses.sources import PLANNED, QUICK, WantedRegistrations, decisive, posed
@@ -239,7 +240,7 @@ class _Plan:
         return arguments | {"reduced_to": [width, height]}
 
     def _need(self, kind: str, what: str, size: str, arguments: Mapping[str, Any]) -> JobState | None:
-        """The finished job for this work; None until it has finished, and where it has failed."""
+        """The finished job for this work; None until it has finished, or if it has failed."""
         name = "-".join(part for part in (what, size, self.root) if part)
         job = newest_job(self.state, self.step, kind, name)
         if job is not None and job.status == "failed":
@@ -282,7 +283,9 @@ def recorded_registration_jobs(protocol: Protocol, state: RunState, step: Step) 
     now = state.steps[step.id]
     if step.gives != "registrations" or now.skipped or all(note.note != PLANNED for note in now.notes):
         return None
-    begun = [j for j in now.jobs.values() if j.kind == "detect_spheres" and not set(_REDUCED) & set(j.arguments)]
+    begun = [
+        j for j in now.jobs.values() if j.kind == detect_spheres.KIND.name and not set(_REDUCED) & set(j.arguments)
+    ]
     if not begun:
         return None
     newest = max(begun, key=lambda job: job.enqueued_seq)

@@ -71,7 +71,7 @@ class KeyFolder:
                     raise SigningKeyError(
                         "the signing key can be read by other users of this machine",
                         where=str(checked),
-                        remedy=f"chmod go-rwx {checked}; if somebody may have read it: orthocapture audit rotate-key",
+                        remedy=f"Chmod go-rwx {checked}; if somebody may have read it: orthocapture audit rotate-key",
                     )
             key = load_pem_private_key(path.read_bytes(), password=None)
         except FileNotFoundError as error:

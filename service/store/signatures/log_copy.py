@@ -71,7 +71,7 @@ def copy_faults(data_dir: Path, copy: Path) -> tuple[list[Fault], list[str]]:
         if log[number - 1] != line:
             return [Fault(None, None, f"{NAME}, line {number}", f"it is not the line that {copy} holds")], []
     missing = len(log) - len(held)
-    return [], [f"{copy} has not the last {missing} lines of {NAME} yet"] if missing else []
+    return [], [f"{copy} does not have the last {missing} lines of {NAME} yet"] if missing else []
 
 
 def _whole_lines(content: bytes) -> bytes:

@@ -166,7 +166,7 @@ def _check(checkpoint: Checkpoint | None, stamp: Timestamp, certificates: Path |
     at = f"existed at {utc_text(response.tst_info.gen_time)}"
     if certificates is None:
         if response.tst_info.message_imprint.message != hashlib.sha256(message).digest():
-            raise ValueError("it was given for something else than this checkpoint")
+            raise ValueError("it was given for something other than this checkpoint")
         return f"{at} (its signature was not checked: no certificates were given)"
     roots, others = _certificates(certificates)
     _verify(VerifierBuilder(), roots, others, response, message)

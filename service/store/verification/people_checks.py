@@ -114,7 +114,7 @@ def people_faults(
         if sha256 is None:
             yield _fault(f"{where} is not told by any event, or has ended")
         elif sha256 not in ("", session_sha256(row)):
-            yield _fault(f"{where} is not the one that its event tells of")
+            yield _fault(f"{where} is not the one that its event records")
         elif row["locked"] != locked:
             yield _fault(f"{where} is {'' if row['locked'] else 'not '}locked; the events say otherwise")
 
@@ -126,7 +126,7 @@ def _link_faults(told: _RecordedAccounts, rows: Rows) -> Iterator[Fault]:
         if known is None and account in told.unhashed_links:
             continue
         if known != _Link(account, row["expires_utc_s"]):
-            yield _fault(f"table invitations: a link {of} is not one that the events tell of")
+            yield _fault(f"table invitations: a link {of} is not one that the events record")
         elif row["used"] != int(told.open_links.get(account) != sha256):
             state = "used up" if row["used"] else "valid"
             yield _fault(f"table invitations: a link {of} is {state}; the events say otherwise")
@@ -139,7 +139,7 @@ def _account_faults(told: _RecordedAccounts, rows: Rows) -> Iterator[Fault]:
         seen.add(name)
         known = told.accounts.get(name)
         if known is None:
-            yield _fault(f"the account {name} ({row['role']}) was made by nobody: no event tells of it")
+            yield _fault(f"the account {name} ({row['role']}) was made by nobody: no event records it")
             continue
         if (known.role, known.state) != (row["role"], row["state"]):
             recorded = f"{known.role}, {known.state}"
@@ -151,7 +151,7 @@ def _account_faults(told: _RecordedAccounts, rows: Rows) -> Iterator[Fault]:
         if row["badge_hash"] and "badge_hash" not in known.stored:
             yield _fault(f"the badge of the account {name} was set past the software")
         if known.created_utc and (known.created_utc, known.full_name) != (row["created_utc"], row["full_name"]):
-            yield _fault(f"the account {name} has another name or beginning than its event tells of")
+            yield _fault(f"the account {name} has another name or beginning than its event records")
     for name in told.accounts.keys() - seen:
         yield _fault(f"the account {name} was made, and its row is gone")
 

@@ -141,7 +141,7 @@ def stamp_faults(
             if told[place] != (stamp.at_utc, sha256_text(stamp.token)):
                 yield Fault(*place[:2], "", f"time stamp of {place[2]}: it is not the one that was given")
         elif first is not None and site_seq.get(place[:2], first) >= first:
-            yield Fault(*place[:2], "", f"time stamp of {place[2]}: no event tells that it was given")
+            yield Fault(*place[:2], "", f"time stamp of {place[2]}: no event records that it was given")
     for place in told:
         if place[0] in stamps and place not in present:
             yield Fault(*place[:2], "", f"the time stamp of {place[2]} was taken away")

@@ -222,7 +222,7 @@ def exported_file(
 ) -> Response:
     """Download one of the recorded exports; a folder as a zip file."""
     path, record = exports.path(site.run(run_id).events, file_name)
-    # Never shown within this origin: a report is a page of its own, and pages from here may act.
+    # A download, never shown here: a report may hold scripts, and pages of this origin may act on runs.
     headers = {"X-SHA256": record.sha256, "Cache-Control": "private, no-store"}
     if path.is_dir():
         headers["Content-Disposition"] = f'attachment; filename="{path.name}.zip"'

@@ -12,7 +12,7 @@ from service.web.record.planned_poses import StationPlan, Vector
 
 WIDTH = 640.0  # of the drawing; its height follows from what is on it
 _MARGIN = 62.0
-_TICK = 30.0  # length of the line that tells where a camera looks
+_TICK = 30.0  # length of the line that shows where a camera looks
 _MOST_LABELS = 40
 _MOST_SYMBOLS = 400  # beyond this, viewpoints that would overlap are drawn as one
 _CELL = 6.0  # edge of the square within which viewpoints overlap

@@ -37,7 +37,7 @@ _FOLDERS = (
     "scene",
 )
 
-# Templates lie beside their pages: "run/step.html.j2" is service/web/run/templates/step.html.j2.
+# Templates lie beside their pages: "run/run.html.j2" is service/web/run/templates/run.html.j2.
 TEMPLATES = Environment(
     loader=PrefixLoader({folder: PackageLoader(f"service.web.{folder}") for folder in _FOLDERS}),
     autoescape=select_autoescape(["html", "j2"]),
@@ -91,7 +91,7 @@ def render(
 
     Args:
         request: whose `person` is who is signed in, or None on the few public pages.
-        template: `run/step.html.j2` is service/web/run/templates/step.html.j2.
+        template: `run/run.html.j2` is service/web/run/templates/run.html.j2.
         shown: record of what the page shows; the template has its fields as variables.
         status: of the response.
         more: further variables of the template.

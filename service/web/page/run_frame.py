@@ -162,7 +162,7 @@ LOST = Banner(
 
 
 def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner:  # noqa: PLR0911 - one return a case
-    """What to say of the robot. What is not known for certain is said to be unknown."""
+    """What to say of the robot; what is not known for certain is shown as unknown."""
     if state.terminal:
         return Banner("ended", "standing", "end", "The run has ended.", "It drives no robot any more.")
     if snapshot.doing in ("unknown", "ended"):

@@ -65,7 +65,7 @@ def scan_spheres(log: RunRecord) -> tuple[Sphere, ...]:
 
 
 def ct_spheres(log: RunRecord) -> tuple[Sphere, ...]:
-    """All spheres of the CT, in its frame; the CT does not tell which of them are removed later."""
+    """All spheres of the CT, in its frame; the CT does not show which of them are removed later."""
     return _numbered(_found_in(log, last_step(log, "ct_surface")), "sphere")
 
 

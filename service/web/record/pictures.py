@@ -85,7 +85,7 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[DrawnOutline] = (), *, 
     A photograph is decoded at an eighth, a quarter or half of its size if that is wide enough.
 
     Raises:
-        DataError: it is no picture that can be decoded.
+        DataError: it is not a picture that can be decoded.
     """
     import cv2  # noqa: PLC0415 - a web process starts without it
 

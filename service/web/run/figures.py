@@ -138,7 +138,7 @@ def duration(seconds: float) -> str:
 def readings(
     snapshot: Snapshot, space: Forecast | None = None, clocks: Sequence[ClockReading] = ()
 ) -> tuple[Reading, ...]:
-    """What the runner last told of the machine and the devices; what it did not tell is said to be unknown.
+    """What the runner last reported of the machine and the devices; what it did not report is shown as unknown.
 
     Args:
         snapshot: of the runner.

@@ -73,7 +73,7 @@ def _signed_in(site: Site, token: str) -> Person | None:
 
 
 def _newest(site: Site, run_id: str) -> tuple[int, int]:
-    """The last event, and a number that changes with what the runner tells; its falling silent is news as well."""
+    """The last event, and a number that changes with what the runner reports, or when it falls silent."""
     snapshot = read_snapshot(site.data, run_id)
     silent = snapshot.age_s() // STALE_S if snapshot.stale else 0
     return site.store.head(run_id), hash((silent, *snapshot.shown()))

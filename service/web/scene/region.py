@@ -13,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.records.events import RegionDrawn
 from service.dataset.registrations import best_registration
+from service.jobs.surfaces import fuse
 from service.people.control import Control
 from service.run_record import RunRecord
 from service.web.run.forms import RunId
@@ -53,7 +54,9 @@ def drawn_rows(log: RunRecord) -> tuple[DrawnRow, ...]:
     rows: list[DrawnRow] = []
     for found in log.state.drawn:
         jobs = log.state.steps[found.region.step].jobs.values()
-        used = any(job.kind == "fuse" and job.status == "finished" and job.enqueued_seq > found.seq for job in jobs)
+        used = any(
+            job.kind == fuse.KIND.name and job.status == "finished" and job.enqueued_seq > found.seq for job in jobs
+        )
         rows.append(DrawnRow(found.by, found.region.source, len(found.region.corners_m), used))
     return tuple(rows)
 
@@ -82,7 +85,7 @@ def draw_region(
 
 
 def read_region(step: str, source: Literal["ct", "scan"], corners: str, along: str) -> RegionDrawn:
-    """The region of the form's fields. Raises ConfigurationError if they are no polygon on the scene."""
+    """The region of the form's fields. Raises ConfigurationError if they are not a polygon on the scene."""
     return RegionDrawn(step=step, source=source, corners_m=_read_corners(corners), seen_along=_read_direction(along))
 
 
@@ -90,7 +93,7 @@ def _read_corners(text: str) -> tuple[_Point, ...]:
     corners = _read(_CORNERS, text)
     near = all(abs(value) <= _FARTHEST_M for corner in corners for value in corner)
     if not 3 <= len(corners) <= _MOST_CORNERS or not near:
-        raise _unusable(f"{len(corners)} corners are no polygon on this scene")
+        raise _unusable(f"{len(corners)} corners are not a polygon on this scene")
     return corners
 
 

@@ -20,13 +20,13 @@ from service.web.server.sparing_log import EVERY_S, SparingHandler
 
 
 def known_proxies(addresses: Sequence[str]) -> frozenset[str]:
-    """The addresses of trusted proxies in their usual form. Raises ConfigurationError for what is no address."""
+    """The addresses of trusted proxies in their usual form. Raises ConfigurationError for what is not an address."""
     for address in addresses:
         try:
             ip_address(address)
         except ValueError:
             raise ConfigurationError(
-                f"{address!r} is no address",
+                f"{address!r} is not an address",
                 where="--trusted-proxy",
                 remedy="Give the IP address from which the proxy connects, such as 10.0.0.5",
             ) from None

@@ -75,7 +75,7 @@ class _AcceptedSocket(socket.socket):
 
 
 def _nothing() -> None:
-    """Before there is something to tell."""
+    """Do nothing, while nobody has asked to be told."""
 
 
 def affordable_connections(wanted: int) -> int:

@@ -84,7 +84,7 @@ class ForwardedClient:
         await self._app(scope, receive, send)
 
     def _last_stranger(self, proxy: str, forwarded: list[str]) -> str:
-        """Right to left, each entry is the word of the one after it: the first that is no proxy of ours counts."""
+        """Read from the right, each entry was written by the one after it: the first that is not our proxy counts."""
         believed = proxy
         for entry in reversed(",".join(forwarded).split(",")):
             address = _address(entry.strip())

@@ -13,7 +13,7 @@ from typing import TextIO
 EVERY_S = 60.0
 _KINDS = 200  # all further ones count as one
 _LEFT_OUT = "left_out"  # in a record, for handlers that come after
-_FAULTS = 10  # of the software in a time: people are told a reference that is to be found
+_FAULTS = 10  # of the software per period: people are given a reference, which must be found
 
 Kind = tuple[str | int, ...]
 

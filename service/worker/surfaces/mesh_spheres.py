@@ -130,7 +130,7 @@ def _found(vertices_m: Array, faces: Any, radius_m: float, expected: int) -> tup
         raise ComputeError(
             f"the mesh was read in the wrong unit: with its coordinates multiplied by {mistake.factor:g} it has "
             f"{mistake.spheres} spheres of {mm(radius_m):g} mm radius, as it is it lacks some ({mistake.words})",
-            remedy="set the unit in the program that exported it, or in rig.yaml, and import it again; "
+            remedy="Set the unit in the program that exported it, or in rig.yaml, and import it again; "
             "nothing is scaled silently",
         ) from error
 

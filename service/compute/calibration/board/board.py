@@ -55,10 +55,10 @@ class Board:
         if min(self.columns, self.rows) < 3 or not 0 < self.square_m < 10:
             raise DataError(
                 f"a board of {self.columns} × {self.rows} points {mm(self.square_m):g} mm apart cannot be used",
-                remedy="give its inner corners (3 × 3 at least) and the side of a square",
+                remedy="Give its inner corners (3 × 3 at least) and the side of a square",
             )
         if self.pattern == "charuco" and not 0 < self._marker_m() < self.square_m:
-            raise DataError("a ChArUco marker is smaller than its square", remedy="give the marker's side")
+            raise DataError("a ChArUco marker is smaller than its square", remedy="Give the marker's side")
 
     def points(self) -> Array:
         """(columns · rows, 3) in the board frame, metres, row by row: x along the columns, y along the rows."""
@@ -87,12 +87,14 @@ class Board:
         """
         identifier = getattr(cv2.aruco, self.dictionary, None)
         if not self.dictionary.startswith("DICT_") or not isinstance(identifier, int):
-            raise DataError(f"{self.dictionary} is not a marker dictionary of OpenCV", remedy="such as DICT_5X5_1000")
+            raise DataError(
+                f"{self.dictionary} is not a marker dictionary of OpenCV", remedy="Name one, such as DICT_5X5_1000"
+            )
         dictionary = cv2.aruco.getPredefinedDictionary(identifier)
         if len(dictionary.bytesList) < (self.columns + 1) * (self.rows + 1) // 2:
             raise DataError(
                 f"{self.dictionary} has {len(dictionary.bytesList)} markers, fewer than this board",
-                remedy="name the dictionary that the board was printed with",
+                remedy="Name the dictionary that the board was printed with",
             )
         size = (self.columns + 1, self.rows + 1)
         board = cv2.aruco.CharucoBoard(size, self.square_m, self._marker_m(), dictionary)
@@ -161,7 +163,7 @@ def _find_checkerboard(image: Grey, columns: int, rows: int) -> tuple[Array, NDA
     found = _search_checkerboard(image, columns, rows)
     corners, good = refine_corners(image, found, half_window(_grid_spacing(found.reshape(rows, columns, 2)), _REACH))
     if np.count_nonzero(good) < 0.8 * len(good):
-        raise ComputeError("corners of the board drifted while they were refined", remedy="take a sharper image")
+        raise ComputeError("corners of the board drifted while they were refined", remedy="Take a sharper image")
     if (columns + rows) % 2 and not _first_square_is_dark(image, corners.reshape(rows, columns, 2)):
         return corners[::-1].copy(), good[::-1].copy()
     return corners, good
@@ -202,7 +204,7 @@ def _search_checkerboard(image: Grey, columns: int, rows: int) -> Array:
             return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
     raise ComputeError(
         f"no board of {columns} × {rows} inner corners in the image",
-        remedy="the whole board must be visible, sharp and evenly lit; check columns and rows (inner corners)",
+        remedy="The whole board must be visible, sharp and evenly lit; check columns and rows (inner corners)",
     )
 
 
@@ -245,7 +247,7 @@ def half_window(spacing_px: float, reach: float) -> int:
 
 
 def _first_square_is_dark(image: Grey, grid: Array) -> bool:
-    """Compare the mean brightness at the centres of the two colours' squares."""
+    """Whether the first square is dark, by the mean brightness at the centres of the squares of each colour."""
     centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     x = np.clip(centres[..., 0].round().astype(int), 0, image.shape[1] - 1)
     y = np.clip(centres[..., 1].round().astype(int), 0, image.shape[0] - 1)
@@ -269,19 +271,19 @@ def _find_charuco(image: Grey, board: Board) -> BoardView:
             break
     raise ComputeError(
         f"fewer than {_MIN_CHARUCO_CORNERS} corners of the ChArUco board in the image",
-        remedy="check columns and rows (inner corners), dictionary, sharpness; a board older than OpenCV 4.6: legacy",
+        remedy="Check columns and rows (inner corners), dictionary, sharpness; a board older than OpenCV 4.6: legacy",
     )
 
 
 def _charuco_view(image: Grey, board: Board, indices: NDArray[np.int64], corners: Array) -> BoardView:
     H, _ = cv2.findHomography(board.points()[indices, :2], corners, cv2.RANSAC, 0.3 * _scatter(corners))
     if H is None:  # pyright: ignore[reportUnnecessaryComparison]
-        raise ComputeError("the ChArUco corners do not lie on a plane", remedy="more of the board must be visible")
+        raise ComputeError("the ChArUco corners do not lie on a plane", remedy="More of the board must be visible")
     grid = cv2.perspectiveTransform(board.points()[None, :, :2], H)[0].reshape(board.rows, board.columns, 2)
     row, column = np.divmod(indices, board.columns)
     part = np.asarray(grid, dtype=np.float64)[row.min() : row.max() + 1, column.min() : column.max() + 1]
     if min(part.shape[:2]) < 2:
-        raise ComputeError("only one row of the ChArUco board is seen", remedy="more of the board must be visible")
+        raise ComputeError("only one row of the ChArUco board is seen", remedy="More of the board must be visible")
     refined, good = refine_corners(image, corners, half_window(_grid_spacing(part), board.reach()))
     return BoardView(indices[good], refined[good])
 
@@ -315,7 +317,7 @@ def _find_circles(image: Grey, board: Board) -> BoardView:
             break
     raise ComputeError(
         f"no asymmetric grid of {board.columns} × {board.rows} circles in the image",
-        remedy="the whole grid must be visible; OpenCV counts the circles of one row and then the rows",
+        remedy="The whole grid must be visible; OpenCV counts the circles of one row and then the rows",
     )
 
 

@@ -108,7 +108,7 @@ def usable_views(found: Sequence[BoardImage]) -> UsableViews:
         raise ComputeError(
             f"the board was found in none of {len(found)} images: "
             + "; ".join(f"{reason} ({count})" for reason, count in reasons.most_common(3)),
-            remedy="check the board's pattern, its inner corners, light and focus",
+            remedy="Check the board's pattern, its inner corners, light and focus",
         )
     size = sizes.most_common(1)[0][0]
     indices: list[int] = []

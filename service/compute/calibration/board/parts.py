@@ -105,7 +105,7 @@ def with_parts(
 
 
 def _too_little(count: int) -> ComputeError:
-    return ComputeError(f"only {count} corners of the board can be seen", remedy="more of the board must be visible")
+    return ComputeError(f"only {count} corners of the board can be seen", remedy="More of the board must be visible")
 
 
 def _doubt_px(board: Board, known: BoardKnowledge, T_base_camera: Transform) -> float:

@@ -49,7 +49,7 @@ def solve_closed_form(hands: Array, boards: Array, method: ClosedForm) -> Transf
     # Andreff's answer is a rotation only for exact data.
     U, scale, Vt = np.linalg.svd(np.nan_to_num(rotation))
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()) or scale[2] < 0.1:
-        raise ComputeError(f"hand-eye calibration by {method} has no answer", remedy="take views with more rotation")
+        raise ComputeError(f"hand-eye calibration by {method} has no answer", remedy="Take views with more rotation")
     return transform(U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt, translation)
 
 
@@ -74,7 +74,7 @@ def observability(hands: Array) -> tuple[float, float, float]:
     if n < MIN_VIEWS:
         raise ComputeError(
             f"{n} views for the hand-eye calibration, at least {MIN_VIEWS} are needed",
-            remedy="take more board images",
+            remedy="Take more board images",
         )
     i, j = np.triu_indices(n, 1)
     relative = np.swapaxes(hands[i, :3, :3], 1, 2) @ hands[j, :3, :3]
@@ -85,13 +85,13 @@ def observability(hands: Array) -> tuple[float, float, float]:
     if spread < _MIN_ROTATION_DEG:
         raise ComputeError(
             f"the flange turned by {spread:.1f}° at most, {_MIN_ROTATION_DEG:.0f}° are needed",
-            remedy="tilt the camera to several sides of the board, 40° or more in all",
+            remedy="Tilt the camera to several sides of the board, 40° or more in all",
         )
     if second < _MIN_SECOND_AXIS_DEG:
         raise ComputeError(
             f"the flange turned about one axis only ({axes[2]:.1f}° about it, {second:.1f}° about any other): "
             "the camera's position along this axis is undetermined",
-            remedy="tilt the camera about a second axis too",
+            remedy="Tilt the camera about a second axis too",
         )
     system = (np.eye(3) - relative).reshape(-1, 3)
     return spread, second, float(np.linalg.cond(system))
@@ -138,7 +138,7 @@ def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> tuple
         if best is None or median < best[0]:
             best = (median, X, mm)
     if best is None:
-        raise ComputeError("hand-eye calibration has no answer", remedy="take views with more rotation")
+        raise ComputeError("hand-eye calibration has no answer", remedy="Take views with more rotation")
     keep = np.argsort(best[2], kind="stable")[: max(MIN_VIEWS, (3 * n) // 4)]
     answer = solve_closed_form(hands[keep], boards[keep], "park")
     return answer, mean_pose((hands @ answer @ boards)[keep])

@@ -151,7 +151,7 @@ class _Agreed:
 
     @property
     def keep(self) -> NDArray[np.bool_]:
-        """(N,) whether a view is no outlier."""
+        """(N,) whether a view is an inlier."""
         return ~np.isin(np.arange(len(self.turned)), list(self.excluded))
 
 

@@ -141,7 +141,7 @@ def find_outliers(data: HandEyeMeasurements, rng: np.random.Generator) -> dict[i
         if now.sum() < max(MIN_VIEWS, (1 - _MAX_EXCLUDED) * len(e)):
             raise ComputeError(
                 f"{np.count_nonzero(~now)} of {len(e)} board images disagree with the robot's poses",
-                remedy="check that images and poses belong together, the board's size, and that the board lay still",
+                remedy="Check that images and poses belong together, the board's size, and that the board lay still",
             )
         if np.array_equal(now, keep):
             break

@@ -105,7 +105,7 @@ def _step(gram: Array) -> Array:
         scaled = H * scale[:, None] * scale
     if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > 1e12:
         raise ComputeError(
-            "the views do not determine the hand-eye transform", remedy="take views with more rotation"
+            "the views do not determine the hand-eye transform", remedy="Take views with more rotation"
         )
     return -scale * np.linalg.solve(scaled, scale * gram[:12, 12])
 
@@ -137,7 +137,7 @@ def solve_reprojection(
 
     found = halved_gauss_newton(at(X, B), candidate, _gain, _settles, most=_ITERATIONS)
     if not found.settled:
-        raise ComputeError("the reprojection error did not converge", remedy="check robot poses and board size")
+        raise ComputeError("the reprojection error did not converge", remedy="Check robot poses and board size")
     return found.state.hand_eye, found.state.board
 
 

@@ -75,7 +75,7 @@ def check_setup(hands: Array, boards: Array, point_m: Array, setup: Setup) -> No
     )
     for poses, words, remedy in readings:
         found = _fit(poses, boards, point_m)
-        # Poses in millimetres fit in rotation as they are: only their positions tell.
+        # Poses in millimetres fit in rotation as they are: only their positions give it away.
         better = found.fits and not as_read.fits if poses is in_metres else found.beats(as_read)
         if better:
             raise ComputeError(
@@ -87,7 +87,7 @@ def check_setup(hands: Array, boards: Array, point_m: Array, setup: Setup) -> No
         raise ComputeError(
             f"the robot's poses do not fit the images: half of them place the board more than {as_read} from "
             "its place, even with the poses inverted or in millimetres",
-            remedy="check that each image has its own pose (order, names), that the pose is the flange's, the "
+            remedy="Check that each image has its own pose (order, names), that the pose is the flange's, the "
             "order qx,qy,qz,qw, the board's square, camera.json, and that the board lay still",
         )
 

@@ -153,9 +153,9 @@ def _factor(scaled: Array) -> Array:
     try:
         L = np.asarray(np.linalg.cholesky(scaled), dtype=np.float64)
     except np.linalg.LinAlgError as error:
-        raise ComputeError(_UNDETERMINED, remedy="take views with more rotation") from error
+        raise ComputeError(_UNDETERMINED, remedy="Take views with more rotation") from error
     if not np.diag(L).min() > _SINGULAR:
-        raise ComputeError(_UNDETERMINED, remedy="take views with more rotation")
+        raise ComputeError(_UNDETERMINED, remedy="Take views with more rotation")
     return L
 
 

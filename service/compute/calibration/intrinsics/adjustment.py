@@ -144,7 +144,7 @@ def start(
             criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-6),
         )
     except cv2.error as error:
-        raise ComputeError(f"no camera explains the views ({error.err})", remedy="check the board's size") from error
+        raise ComputeError(f"no camera explains the views ({error.err})", remedy="Check the board's size") from error
     terms = (float(v) for v in np.asarray(distortion).ravel()[:4])
     camera = CameraModel(*size, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *terms)
     return camera, np.stack([start_pose(view, points, camera) for view in views])
@@ -160,7 +160,7 @@ def start_pose(view: BoardView, points: Array, camera: CameraModel) -> Array:
         points[view.indices], view.corners, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_IPPE
     )
     if not done:
-        raise ComputeError("the board's pose could not be computed", remedy="check the corner counts")
+        raise ComputeError("the board's pose could not be computed", remedy="Check the corner counts")
     return np.concatenate([np.asarray(rvec, np.float64).ravel(), np.asarray(tvec, np.float64).ravel()])
 
 
@@ -231,7 +231,7 @@ def adjust(
         gradient = np.sum([view.gradient for view in here.equations], axis=0) + prior * here.theta
         shape = np.sqrt(np.diag(normal))
         if not np.isfinite(shape).all() or shape.min() <= 0:
-            raise ComputeError("the views do not determine the camera", remedy="take views with more tilt")
+            raise ComputeError("the views do not determine the camera", remedy="Take views with more tilt")
         scaled = normal / np.outer(shape, shape) + damping * np.eye(parameters)
         step = -np.linalg.solve(scaled, gradient / shape) / shape
         moved = np.stack([p + _pose_step(view, step) for p, view in zip(here.poses, here.equations, strict=True)])
@@ -250,7 +250,7 @@ def adjust(
     theta, poses = end.theta, end.poses
     state, _, scale = _linearise(views, points, theta, poses, size)
     if not np.isfinite(theta).all() or theta[:2].min() <= 0:
-        raise ComputeError("the calibration did not converge", remedy="check the board's size and the views")
+        raise ComputeError("the calibration did not converge", remedy="Check the board's size and the views")
     return Adjustment(camera_of(theta, size), theta, poses, state, scale)
 
 

@@ -221,7 +221,7 @@ def _solve_without_outliers(
             raise ComputeError(
                 f"{len(used)} usable board views, at least {_MIN_VIEWS} are needed"
                 + "".join(f"; view {index}: {reasons[index]}" for index in sorted(reasons)),
-                remedy="take more board images with different tilts",
+                remedy="Take more board images with different tilts",
             )
         chosen = [views[k] for k in used]
         if begin is None:
@@ -317,7 +317,7 @@ def _check_tilt(views: Sequence[BoardView], points: Array, size: tuple[int, int]
     if spread < _MIN_TILT_SPREAD_DEG:
         raise ComputeError(
             f"all board views have nearly the same tilt (normals within {spread:.1f}°): focal length undetermined",
-            remedy=f"tilt the board or the camera by {_MIN_TILT_SPREAD_DEG:.0f}° or more (30°), to several sides",
+            remedy=f"Tilt the board or the camera by {_MIN_TILT_SPREAD_DEG:.0f}° or more (30°), to several sides",
         )
 
 

@@ -91,7 +91,7 @@ def compare_optics(calibration: Sequence[Optics], capture: Sequence[Optics]) -> 
     """
     if not calibration or not capture:
         raise DataError(
-            "no images to compare the optics of", remedy="give the calibration's and the capture's images"
+            "no images to compare the optics of", remedy="Give the calibration's and the capture's images"
         )
     departures: list[OpticsDeparture] = []
     compared: list[str] = []

@@ -52,7 +52,7 @@ def cross_validate(result: IntrinsicsResult, *, seed: int = 0) -> CrossValidatio
     """
     n = len(result.corners)
     if n < MIN_VIEWS_TO_VALIDATE:
-        raise ComputeError(f"{n} views cannot be cross-validated", remedy="take more board images")
+        raise ComputeError(f"{n} views cannot be cross-validated", remedy="Take more board images")
     points = result.board.points()
     size = (result.camera.width, result.camera.height)
     folds = min(_FOLDS, n)

@@ -92,7 +92,7 @@ def _widened(box: Box) -> Box:
 
 
 def _rough(image_bgr: NDArray[np.uint8], camera: CameraModel, ellipse: EllipseEstimate) -> RoughSphere | None:
-    """The cone through an ellipse in pixels; None if the ellipse does not fit its mask or is no outline."""
+    """The cone through an ellipse in pixels; None if the ellipse does not fit its mask or is not an outline."""
     if ellipse.loss > MOST_LOSS:
         return None
     t = np.linspace(0.0, 2 * np.pi, _POINTS, endpoint=False)

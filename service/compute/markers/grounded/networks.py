@@ -87,7 +87,7 @@ def _read(folder: Path, kind: Any, **options: bool) -> Any:
     # Damaged weights and configurations raise whatever the parsers of these libraries do.
     except Exception as error:
         raise DataError(
-            f"this is no {kind.__name__}: {str(error).splitlines()[0] if str(error) else type(error).__name__}",
+            f"this is not a {kind.__name__}: {str(error).splitlines()[0] if str(error) else type(error).__name__}",
             where=str(folder),
             remedy="Download the files again, and compare their SHA-256",
         ) from error

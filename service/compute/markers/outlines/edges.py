@@ -39,7 +39,7 @@ def profiles(cone: Cone, camera: CameraModel, n_azimuths: int, offsets_px: Array
 
 
 def profiles_of(cones: Sequence[Cone], camera: CameraModel, n_azimuths: int, offsets_px: Array) -> Profiles:
-    """`profiles` for G cones at once."""
+    """Sample positions across the outlines of G cones, as `profiles` does for one."""
     azimuth = np.linspace(0.0, 2 * np.pi, n_azimuths, endpoint=False).astype(np.float64)
     half = np.array([c.half_angle_rad for c in cones])[:, None]
     frames = np.array([c.frame() for c in cones])

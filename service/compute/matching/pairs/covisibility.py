@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from service.compute.matching.pairs.loader import VISIBLE, View, look_up
 from service.core.geometry import Array
 
-LEAST_OVERLAP = 0.1  # of the points of either view: less is no pair
+LEAST_OVERLAP = 0.1  # of the points of either view: less does not make a pair
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,7 +56,7 @@ def from_colmap_camera(camera: pycolmap.Camera) -> CameraModel:
         raise DataError(
             f"camera model {name} is not supported",
             where=f"camera {camera.camera_id}",
-            remedy="export the model with an OPENCV, FULL_OPENCV, RADIAL, SIMPLE_RADIAL or PINHOLE camera",
+            remedy="Export the model with an OPENCV, FULL_OPENCV, RADIAL, SIMPLE_RADIAL or PINHOLE camera",
         )
     return CameraModel(*size, fx, fy, cx - HALF_PIXEL, cy - HALF_PIXEL, k1, k2, p1, p2, *more)
 

@@ -45,7 +45,7 @@ def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> obj
         raise DataError(
             f"the COLMAP model cannot be read: {outcome}",
             where=str(folder),
-            remedy="check that cameras, images and points3D belong together and are complete",
+            remedy="Check that cameras, images and points3D belong together and are complete",
         )
     return outcome
 

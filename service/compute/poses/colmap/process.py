@@ -58,7 +58,7 @@ class ColmapProcess:
             tail = self._tail()
             self.close()
             raise ComputeError(
-                f"COLMAP crashed during {task}: {tail}", where=str(self._log), remedy="see its log"
+                f"COLMAP crashed during {task}: {tail}", where=str(self._log), remedy="See its log"
             ) from None
         except BaseException:
             self.close()  # otherwise a late answer could be taken for the next task's
@@ -71,7 +71,7 @@ class ColmapProcess:
             return value
         if isinstance(value, OrthocaptureError):
             raise value
-        raise ComputeError(f"COLMAP failed during {task}: {value}", where=str(self._log), remedy="see its log")
+        raise ComputeError(f"COLMAP failed during {task}: {value}", where=str(self._log), remedy="See its log")
 
     def _answer(
         self, task: str, job: dict[str, Any], deadline: float, progress: Progress | None

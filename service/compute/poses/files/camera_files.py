@@ -52,13 +52,13 @@ def read_camera_json(path: Path) -> CameraModel:
     for key in (*_CAMERA_KEYS, *_DISTORTION):
         value = document.get(key, 0.0)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise DataError(f"{key} is {value!r}, not a number", where=str(path), remedy=f"correct {key}")
+            raise DataError(f"{key} is {value!r}, not a number", where=str(path), remedy=f"Correct {key}")
         values[key] = value
     if min(values["fx"], values["fy"]) <= 0 or any(values[k] < 1 or values[k] % 1 for k in ("width", "height")):
         raise DataError(
             "width, height, fx and fy must be positive, width and height whole numbers",
             where=str(path),
-            remedy="correct them",
+            remedy="Correct them",
         )
     size = (int(values["width"]), int(values["height"]))
     return CameraModel(*size, *(float(values[k]) for k in (*_CAMERA_KEYS, *_DISTORTION)[2:]))
@@ -82,7 +82,7 @@ def read_spheres_json(path: Path) -> ScanSpheres:
     radius = document["radius_mm"]
     if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0 < radius < math.inf:
         raise DataError(
-            f"radius_mm is {radius!r}, not a positive number", where=str(path), remedy="correct radius_mm"
+            f"radius_mm is {radius!r}, not a positive number", where=str(path), remedy="Correct radius_mm"
         )
     centres: list[Array] = []
     for key in ("registration_mm", "control_mm"):
@@ -90,10 +90,10 @@ def read_spheres_json(path: Path) -> ScanSpheres:
         if rows.size == 0:
             rows = np.empty((0, 3))
         if rows.ndim != 2 or rows.shape[1] != 3:
-            raise DataError(f"{key} is not a list of [x, y, z]", where=str(path), remedy=f"correct {key}")
+            raise DataError(f"{key} is not a list of [x, y, z]", where=str(path), remedy=f"Correct {key}")
         centres.append(metres(rows))
     if len(centres[0]) == 0:
-        raise DataError("registration_mm is empty", where=str(path), remedy="give at least three spheres")
+        raise DataError("registration_mm is empty", where=str(path), remedy="Give at least three spheres")
     return ScanSpheres(centres[0], metres(float(radius)), control_m=centres[1])
 
 
@@ -103,14 +103,14 @@ def _check_keys(document: Mapping[str, Any], needed: set[str], optional: set[str
     if missing or unknown:
         parts = [f"missing {', '.join(missing)}"] * bool(missing) + [f"unknown {', '.join(unknown)}"] * bool(unknown)
         allowed = ", ".join(sorted(needed | optional))
-        raise DataError(f"wrong keys: {'; '.join(parts)}", where=str(path), remedy=f"the keys are {allowed}")
+        raise DataError(f"wrong keys: {'; '.join(parts)}", where=str(path), remedy=f"The keys are {allowed}")
 
 
 def json_object(path: Path) -> dict[str, Any]:
     """The object in a JSON file.
 
     Raises:
-        DataError: the file is no JSON, or holds no object.
+        DataError: the file is not JSON, or holds no object.
     """
     document = parse_json(file_text(path), name=str(path))
     if not isinstance(document, dict):
@@ -127,7 +127,7 @@ def finite_numbers(value: object, where: str) -> Array:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise DataError("not an array of numbers", where=where, remedy="correct the numbers") from None
+        raise DataError("not an array of numbers", where=where, remedy="Correct the numbers") from None
     if not np.isfinite(array).all():
-        raise DataError("a number is not finite", where=where, remedy="correct the numbers")
+        raise DataError("a number is not finite", where=where, remedy="Correct the numbers")
     return array

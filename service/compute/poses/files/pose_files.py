@@ -40,7 +40,7 @@ def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Tra
         transforms = path / "transforms.json"
         poses = read_transforms_json(transforms) if transforms.is_file() else read_colmap_model(path)
     elif not path.is_file():
-        raise DataError("the pose file does not exist", where=str(path), remedy="check the path")
+        raise DataError("the pose file does not exist", where=str(path), remedy="Check the path")
     elif path.suffix.lower() == ".json":
         poses = read_transforms_json(path)
     elif path.suffix.lower() in {".csv", ".txt"}:
@@ -49,7 +49,7 @@ def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Tra
         raise DataError(
             "unknown kind of pose file",
             where=str(path),
-            remedy="give a .csv, a transforms.json or a COLMAP model folder",
+            remedy="Give a .csv, a transforms.json or a COLMAP model folder",
         )
     return poses if images is None else _select(poses, images, path)
 
@@ -101,7 +101,7 @@ def _without_pose(missing: Sequence[str], images: Sequence[str], path: Path) -> 
     return DataError(
         f"{len(missing)} of {len(images)} images have no pose: {', '.join(missing[:5])}",
         where=str(path),
-        remedy="add their poses, or leave the images out",
+        remedy="Add their poses, or leave the images out",
     )
 
 
@@ -119,31 +119,31 @@ def read_poses_csv(path: Path) -> dict[str, Transform]:
     header = tuple(cell.strip() for cell in next(rows, (1, []))[1])
     if header != _HEADER:
         raise DataError(
-            f"the first line is {','.join(header)!r}", where=f"{path}:1", remedy=f"it must be {','.join(_HEADER)}"
+            f"the first line is {','.join(header)!r}", where=f"{path}:1", remedy=f"It must be {','.join(_HEADER)}"
         )
     for line, row in rows:
         where = f"{path}:{line}"
         if not any(cell.strip() for cell in row):
             continue
         if len(row) != len(_HEADER):
-            raise DataError(f"{len(row)} fields instead of {len(_HEADER)}", where=where, remedy="correct the line")
+            raise DataError(f"{len(row)} fields instead of {len(_HEADER)}", where=where, remedy="Correct the line")
         name = row[0].strip()
         try:
             values = np.array([float(cell) for cell in row[1:]])
         except ValueError:
-            raise DataError("a field is not a number", where=where, remedy="correct the line") from None
+            raise DataError("a field is not a number", where=where, remedy="Correct the line") from None
         if not name or not np.isfinite(values).all():
-            raise DataError("the name is empty or a number is not finite", where=where, remedy="correct the line")
+            raise DataError("the name is empty or a number is not finite", where=where, remedy="Correct the line")
         length = float(np.linalg.norm(values[3:]))
         if abs(length - 1) > _UNIT:
             raise DataError(
-                f"the quaternion's length is {length:.4f}, not 1", where=where, remedy="check the order qx,qy,qz,qw"
+                f"the quaternion's length is {length:.4f}, not 1", where=where, remedy="Check the order qx,qy,qz,qw"
             )
         if name in poses:
-            raise DataError(f"image {name} has two poses", where=where, remedy="remove one of them")
+            raise DataError(f"image {name} has two poses", where=where, remedy="Remove one of them")
         poses[name] = from_quaternion(values[:3], values[3:])
     if not poses:
-        raise DataError("the file holds no pose", where=str(path), remedy="write one line per image")
+        raise DataError("the file holds no pose", where=str(path), remedy="Write one line per image")
     return poses
 
 
@@ -170,20 +170,20 @@ def read_transforms_json(path: Path) -> dict[str, Transform]:
     """
     frames = json_object(path).get("frames")
     if not isinstance(frames, list) or not frames:
-        raise DataError("no list of frames in the file", where=str(path), remedy="give a nerfstudio transforms.json")
+        raise DataError("no list of frames in the file", where=str(path), remedy="Give a nerfstudio transforms.json")
     poses: dict[str, Transform] = {}
     for index, frame in enumerate(cast("list[Any]", frames)):
         where = f"{path}: frames[{index}]"
         entry = cast("dict[str, Any]", frame) if isinstance(frame, dict) else {}
         name = entry.get("file_path")
         if not isinstance(name, str) or "transform_matrix" not in entry:
-            raise DataError("a frame needs file_path and transform_matrix", where=where, remedy="correct the frame")
+            raise DataError("a frame needs file_path and transform_matrix", where=where, remedy="Correct the frame")
         name = name.removeprefix("./")
         matrix = finite_numbers(entry["transform_matrix"], where)
         if matrix.shape not in {(4, 4), (3, 4)}:
-            raise DataError(f"transform_matrix is {matrix.shape}, not 4 × 4", where=where, remedy="correct the frame")
+            raise DataError(f"transform_matrix is {matrix.shape}, not 4 × 4", where=where, remedy="Correct the frame")
         if name in poses:
-            raise DataError(f"image {name} has two poses", where=where, remedy="remove one of them")
+            raise DataError(f"image {name} has two poses", where=where, remedy="Remove one of them")
         poses[name] = transform(_rotation(matrix[:3, :3], where), matrix[:3, 3]) @ OPENGL
     return poses
 
@@ -194,7 +194,7 @@ def _rotation(matrix: Array, where: str) -> Array:
         raise DataError(
             "the matrix is not a rotation (scaled, sheared or mirrored)",
             where=where,
-            remedy="export rigid poses, without a scale",
+            remedy="Export rigid poses, without a scale",
         )
     U, _, Vt = np.linalg.svd(matrix)
     return U @ Vt
@@ -213,7 +213,7 @@ def write_transforms_json(
     document = {
         **({"simulated": True} if simulated else {}),
         "camera_model": "OPENCV",
-        **transforms_intrinsics(camera, where=str(path), remedy="calibrate with the model opencv4 or opencv5"),
+        **transforms_intrinsics(camera, where=str(path), remedy="Calibrate with the model opencv4 or opencv5"),
         "frames": [
             {"file_path": name, "transform_matrix": (T @ OPENGL).tolist()} for name, T in T_world_camera.items()
         ],
@@ -259,5 +259,5 @@ def read_colmap_model(folder: Path) -> dict[str, Transform]:
     raise DataError(
         "no COLMAP model in the folder",
         where=str(folder),
-        remedy="it must hold cameras, images and points3D (.bin or .txt)",
+        remedy="It must hold cameras, images and points3D (.bin or .txt)",
     )

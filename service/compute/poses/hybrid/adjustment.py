@@ -129,7 +129,7 @@ def _descend(
     )
     if found.stuck:
         raise ComputeError(
-            "the bundle adjustment does not converge", remedy="check the camera, the poses and the spheres"
+            "the bundle adjustment does not converge", remedy="Check the camera, the poses and the spheres"
         )
     return found.state.state, found.state.rows, found.steps
 

@@ -16,7 +16,7 @@ _HEAD = 4  # bytes of the encapsulation, from whose end everything is aligned
 
 
 class CdrError(ValueError):
-    """The bytes are no message of the expected type."""
+    """The bytes are not a message of the expected type."""
 
 
 class CdrWriter:

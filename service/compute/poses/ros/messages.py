@@ -245,5 +245,5 @@ def _write_transform(out: CdrWriter, T: Transform) -> None:
 def _read_transform(read: CdrReader) -> Transform:
     values = read.doubles(7)
     if not np.isfinite(values).all() or abs(float(np.linalg.norm(values[3:])) - 1) > _UNIT:
-        raise CdrError("a pose is not finite, or its quaternion has not the length 1")
+        raise CdrError("a pose is not finite, or its quaternion does not have length 1")
     return from_quaternion(values[:3], values[3:])

@@ -90,7 +90,7 @@ def read_recording(
 
     Raises:
         ConfigurationError: the package mcap is not installed.
-        DataError: the file is no MCAP file, is damaged, or a message is not what its type says; names the message.
+        DataError: the file is not MCAP, is damaged, or a message is not what its type says; names the message.
     """
     found = Recording(FrameTree(str(path)))
     last = "its beginning"
@@ -100,13 +100,16 @@ def read_recording(
             try:
                 _take(found, topic, kind, data, on_image)
             except CdrError as error:
-                raise DataError(f"{last} is no {kind}: {error}", where=f"{path}: {last}", remedy=_REMEDY) from error
+                what = f"{last} is not a {kind}: {error}"
+                raise DataError(what, where=f"{path}: {last}", remedy=_REMEDY) from error
     except _DAMAGES as error:
         raise DataError(
-            f"the file cannot be read behind {last} ({_plain(error)})", where=str(path), remedy=_REMEDY
+            f"the file cannot be read after {last} ({_plain(error)})", where=str(path), remedy=_REMEDY
         ) from error
     except OSError as error:
-        raise DataError(f"the file cannot be read ({error.strerror})", where=str(path), remedy="Check it") from error
+        raise DataError(
+            f"the file cannot be read ({error.strerror})", where=str(path), remedy="Check its permissions"
+        ) from error
     return found
 
 

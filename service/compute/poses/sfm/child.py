@@ -66,7 +66,7 @@ def _extract(job: dict[str, Any], _progress: Progress) -> dict[str, Any]:
         raise DataError(
             f"the image is {size[0]}×{size[1]}, the camera {camera['width']}×{camera['height']}",
             where=job["file"],
-            remedy="check the file, and that the calibration was made at the images' size",
+            remedy="Check the file, and that the calibration was made at the images' size",
         )
     scale = np.ones(2)
     factor = reduction(options["max_image_size"], *size)

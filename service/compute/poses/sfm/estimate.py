@@ -172,7 +172,7 @@ def reconstruct_from(
     names = sorted(features)
     _check_count(len(names))
     if mapper == "triangulated" and not T_world_camera_start:
-        raise ComputeError("triangulation needs initial poses", remedy="give T_world_camera_start")
+        raise ComputeError("triangulation needs initial poses", remedy="Give T_world_camera_start")
     _check_features({name: features[name] for name in names}, camera)
     folder.mkdir(parents=True, exist_ok=True)
     index = {name: k for k, name in enumerate(names)}
@@ -199,7 +199,7 @@ def _check_features(features: Mapping[str, ImageFeatures], camera: CameraModel) 
         if (found.width, found.height) != (camera.width, camera.height):
             raise DataError(
                 f"image {name} is {found.width}×{found.height}, the camera {camera.width}×{camera.height}",
-                remedy="check that the calibration was made at the images' size",
+                remedy="Check that the calibration was made at the images' size",
             )
     poor = [name for name, found in features.items() if len(found.pixels) < _FEW]
     if poor:
@@ -217,7 +217,7 @@ def _by_name(images: Mapping[str, Path] | Sequence[Path]) -> dict[str, Path]:
     else:
         files = {path.name: Path(path) for path in images}
         if len(files) != len(images):
-            raise DataError("two images have the same file name", remedy="rename one of them")
+            raise DataError("two images have the same file name", remedy="Rename one of them")
     for name, path in files.items():
         if not path.is_file():
             raise DataError(f"image {name} does not exist", where=str(path))
@@ -242,7 +242,7 @@ def _model(
         raise ComputeError(
             f"{mapper} mapping registered {len(poses)} of {len(names)} images",
             where=os.fspath(folder),
-            remedy="check the images' overlap, sharpness and texture",
+            remedy="Check the images' overlap, sharpness and texture",
         )
     position = {names.index(name): k for k, name in enumerate(poses)}
     image = np.array([position[int(i)] for i in outcome["track_image"]], dtype=np.int64)

@@ -71,7 +71,7 @@ class ImageFeatures:
                 width, height = (int(v) for v in archive["size"])
                 return cls(width, height, archive["pixels"], archive["scales_px"], archive["descriptors"])
         except _DAMAGED as error:
-            raise DataError("these bytes are not features of an image", remedy="extract them again") from error
+            raise DataError("these bytes are not features of an image", remedy="Extract them again") from error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,7 +130,7 @@ def unpack_matches(data: bytes) -> list[PairMatches]:
                 for k, (first, second) in enumerate(pairs)
             ]
     except _DAMAGED as error:
-        raise DataError("these bytes are not matches of images", remedy="match the images again") from error
+        raise DataError("these bytes are not matches of images", remedy="Match the images again") from error
 
 
 def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.uint32]:

@@ -23,7 +23,7 @@ _HOOD = 1.3  # radius around a centre that contains its sphere's surface, in rad
 _MOST_SAMPLES = 5000  # per sphere; further neighbours share their noise
 _NEAR_MISSES = 6
 _MIXED = 0.2  # |orientation| below which the normals are inconclusive
-_MAX_RADIUS_SIGMA = 0.15  # in radii; a less certain radius is no evidence of a sphere
+_MAX_RADIUS_SIGMA = 0.15  # in radii; a less certain radius does not prove a sphere
 _FEWEST_PATCHES = 5  # cells of surface: enough for centre and radius, plus one for redundancy
 _ROUGHER = 2.0  # times the rms of the best covered spheres; noise within one mesh varies less
 _SEED_REACH = 1.6  # radii between a seed (a rough centre or a point on the surface) and the centre
@@ -116,7 +116,7 @@ def locate_spheres(
     vertices, triangles = _checked(vertices_m, faces, normals)
     patches = surfels(vertices, triangles, normals, _SURFEL * radius_m)
     if len(patches.area) == 0:
-        raise ComputeError("found 0 spheres: the mesh has no surface", remedy="check the mesh's unit")
+        raise ComputeError("found 0 spheres: the mesh has no surface", remedy="Check the mesh's unit")
     tree = cKDTree(patches.position)
     if seeds_m is not None:
         return _at_seeds(np.atleast_2d(seeds_m), vertices, triangles, patches, tree, radius_m, bounds)
@@ -139,16 +139,16 @@ def _checked(vertices_m: Array, faces: NDArray[np.integer], normals: Array | Non
     if vertices.ndim != 2 or vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
         raise DataError(
             f"vertices {vertices.shape} and faces {triangles.shape} are not a triangle mesh",
-            remedy="export triangles, with vertices (V, 3) and faces (F, 3)",
+            remedy="Export triangles, with vertices (V, 3) and faces (F, 3)",
         )
     if len(vertices) < 3:
-        raise DataError("the mesh has no surface", remedy="export it again")
+        raise DataError("the mesh has no surface", remedy="Export it again")
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(vertices)):
-        raise DataError("the mesh's faces refer to vertices that it does not have", remedy="export it again")
+        raise DataError("the mesh's faces refer to vertices that it does not have", remedy="Export it again")
     if not np.isfinite(vertices).all():
-        raise DataError("the mesh has vertices that are not finite", remedy="export it again")
+        raise DataError("the mesh has vertices that are not finite", remedy="Export it again")
     if normals is not None and np.shape(normals) != vertices.shape:
-        raise DataError(f"normals {np.shape(normals)} for vertices {vertices.shape}", remedy="export it again")
+        raise DataError(f"normals {np.shape(normals)} for vertices {vertices.shape}", remedy="Export it again")
     return vertices, triangles
 
 
@@ -340,7 +340,7 @@ def _wrong_count(
     return ComputeError(
         f"found {len(found)} spheres of radius {mm(radius):.2f} mm in the mesh, expected {wanted}: {listing}"
         + (f". Refused candidates: {almost}" if almost else ""),
-        remedy="check the mesh's unit and the radius, and that every sphere was scanned over a cap of 60° at least; "
+        remedy="Check the mesh's unit and the radius, and that every sphere was scanned over a cap of 60° at least; "
         "scan again what was refused, or give seeds",
     )
 
@@ -359,7 +359,7 @@ def _at_seeds(
 ) -> tuple[MeshSphere, ...]:
     """The sphere at each seed, in the seeds' order."""
     if seeds.ndim != 2 or seeds.shape[1] != 3 or not np.isfinite(seeds).all():
-        raise DataError(f"seeds {seeds.shape} are not points (K, 3)", remedy="give x, y, z of a point at each sphere")
+        raise DataError(f"seeds {seeds.shape} are not points (K, 3)", remedy="Give x, y, z of a point at each sphere")
     peaks = vote_peaks(patches, radius)
     chosen: list[SphereFit] = []
     for number, seed in enumerate(seeds):
@@ -380,12 +380,12 @@ def _at_seeds(
             x, y, z = mm(seed)
             raise ComputeError(
                 f"no sphere of radius {mm(radius):.2f} mm at seed {number} ({x:.1f}, {y:.1f}, {z:.1f}) mm{why}",
-                remedy="give a point on the sphere or near its centre, in the mesh's frame",
+                remedy="Give a point on the sphere or near its centre, in the mesh's frame",
             )
         best = min(accepted, key=lambda f: abs(float(np.linalg.norm(f.centre - seed)) - 0.5 * radius))
         for other, fit in enumerate(chosen):
             if not _apart(best, fit, radius):
-                raise ComputeError(f"seeds {other} and {number} are at the same sphere", remedy="give one for each")
+                raise ComputeError(f"seeds {other} and {number} are at the same sphere", remedy="Give one for each")
         chosen.append(best)
     worth = _uncertainties(chosen, radius)
     return tuple(_sphere(fit, w) for fit, w in zip(chosen, worth, strict=True))

@@ -123,7 +123,7 @@ def _fusion(summary: RunSummary, *, personal: bool) -> tuple[tuple[str, str], ..
 
 
 def _devices(summary: RunSummary, *, personal: bool) -> tuple[UsedDevice, ...]:
-    """Every device as it first answered."""
+    """Every device as it first identified itself in the run."""
     known = bodies(summary.events)
     found: dict[str, UsedDevice] = {}
     for event in summary.events:
