@@ -33,6 +33,7 @@ CHOSEN = (
     "table/itself/door_tapped",
     "kuka/itself/protective_stop",
     "video/itself/frozen",
+    "gige/gvsp/payload/drop",
     "scanner/export/half_written",
     "store/disk_full/commit_02",
 )
