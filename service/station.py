@@ -43,7 +43,8 @@ INTERFACES: Mapping[str, type[Any]] = {
     "lightbox": Lightbox,
 }
 _PATH_FIELDS = ("folder", "port", "path")
-_ADDRESS_FIELDS = ("host", "port")
+_ADDRESS_FIELDS = ("host", "port", "camera", "model")  # the first that a device has says which one it is
+_ANY_PORT = ("usb", "usb:")
 _ACTING = ("robot", "camera", "lightbox")
 
 D = TypeVar("D", bound=Device)
@@ -212,7 +213,10 @@ class Station:
         """Lock a device that acts for this process; folders may be read by several processes."""
         spec, _ = self._spec(name)
         settings = self._config(name, spec).model_dump()
-        where = next((_one_name(field, str(settings[field])) for field in _ADDRESS_FIELDS if settings.get(field)), "")
+        named = {field: str(settings.get(field) or "") for field in _ADDRESS_FIELDS}
+        where = next(
+            (_one_name(field, value) for field, value in named.items() if value and value not in _ANY_PORT), ""
+        )
         if spec.kind in _ACTING:
             self._locks[name] = DeviceLock.take(f"{self.rig.section.devices[name]['driver']} {where}".strip(), name)
 
@@ -284,8 +288,10 @@ class Station:
 
 def _one_name(field: str, address: str) -> str:
     """The same text for a device whatever name it is given: a link to its port, the name of its host."""
-    if field != "host":
+    if field == "port":
         return address if ":" in address else os.path.realpath(address)
+    if field != "host":
+        return address
     try:
         return socket.gethostbyname(address)
     except OSError:  # to open it will fail, with an error that says so

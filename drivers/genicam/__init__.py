@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.errors import (
+    DeviceError,
     DeviceFaultError,
     DeviceRefusedError,
     DeviceTimeoutError,
@@ -89,20 +90,25 @@ class GenicamCamera:
         self._files.reopened()
         try:
             self._identified = self._checked_identity(link)
+            self._set_up(link)
+        except DeviceError:
+            self.close()
+            raise
+        return self._identified
+
+    def _set_up(self, link: CameraLink) -> None:
+        """Set pixel format and gain. Raises DeviceFaultError, or DeviceUnavailableError if the connection is lost."""
+        try:
             link.set_pixel_format(self._config.pixel_format)
             link.set_gain(self._config.gain)
             self._check_gain(link.gain)
         except LinkError as error:
-            self.close()
+            self.settings()  # the connection may be lost
             raise DeviceFaultError(
                 f"it does not take a setting: {error}",
                 where=self._where,
                 remedy="Choose a pixel format and a gain that the camera has",
             ) from error
-        except DeviceFaultError:
-            self.close()
-            raise
-        return self._identified
 
     def close(self) -> None:
         """Disconnect."""
@@ -242,11 +248,15 @@ class GenicamCamera:
         return DeviceUnavailableError(
             what,
             where=self._where,
-            remedy="Check power, cable and name (arv-tool-0.8 or the maker's program lists cameras), then open it",
+            remedy="Close other programs that use it; check power, cable and name (arv-tool-0.8 or the maker's "
+            "program lists cameras), then open it",
         )
 
     def _checked_identity(self, link: CameraLink) -> DeviceIdentity:
-        serial = link.serial
+        try:
+            serial, model = link.serial, f"{link.vendor} {link.model}"
+        except LinkError as error:
+            raise self._unavailable(f"It connects and then does not tell what it is: {error}") from error
         if self._config.serial not in ("", serial):
             raise DeviceFaultError(
                 f"it has the serial number {serial}, not {self._config.serial}",
@@ -255,7 +265,7 @@ class GenicamCamera:
             )
         return DeviceIdentity(
             kind="camera",
-            model=f"{link.vendor} {link.model}",
+            model=model,
             serial=serial,
             firmware="",
             driver="genicam",

@@ -38,12 +38,25 @@ class AravisCamera:
         """
         self._aravis, self._gobject, self._glib = (_library(name) for name in LIBRARIES)
         self._camera: int | None = self._call("arv_camera_new", _POINTER, name.encode(), of=(_TEXT,))
+        if not self._controls():
+            self.close()
+            raise LinkError("another program controls the camera")
 
     def close(self) -> None:
         """Disconnect."""
         camera, self._camera = self._camera, None
         if camera is not None:
             self._unref(camera)
+
+    def _controls(self) -> bool:
+        """Whether the camera takes settings from here. By GigE Vision one program controls, and others may read."""
+        is_network, device, is_controller = (
+            getattr(self._aravis, f"arv_{name}")
+            for name in ("camera_is_gv_device", "camera_get_device", "gv_device_is_controller")
+        )
+        for function, gives in ((is_network, ctypes.c_int), (device, _POINTER), (is_controller, ctypes.c_int)):
+            function.restype, function.argtypes = gives, (_POINTER,)
+        return not is_network(self._camera) or bool(is_controller(device(self._camera)))
 
     @property
     def software(self) -> str:

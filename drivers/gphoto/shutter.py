@@ -30,8 +30,8 @@ def release_shutter(
             if attempt == BUSY_ATTEMPTS:
                 raise
             time.sleep(0.2 * attempt)
-        except DeviceUnavailableError as error:
-            # A full store, a wrong mode, a lost answer and a lost link all give -1: ask the camera which it is.
+        except (DeviceUnavailableError, DeviceRefusedError) as error:
+            # A full store, a wrong mode, a lost or spoilt answer and a lost link: ask the camera which it is.
             check_space()
             return trigger_s, _photograph(link, dials.exposure_s() + UNCONFIRMED_S, error)
         else:

@@ -57,7 +57,7 @@ class Operations:
         """Carry out one operation.
 
         Planned faults of the kinds busy, disk_full, reject, error, ignore and unconfirmed take effect here. With
-        `unconfirmed` the operation is carried out, and an error answered.
+        `unconfirmed` the operation is carried out, and an error answered (`value`, or a general one).
         """
         known = self.operations.get(request.operation)
         if known is None:
@@ -73,7 +73,7 @@ class Operations:
         except tuple(_CODES) as error:
             return Reply(_CODES[type(error)])
         if fault is not None and fault.kind == "unconfirmed":
-            return Reply(GENERAL_ERROR)
+            return Reply(int(fault.value or GENERAL_ERROR))
         return Reply(reply.code, reply.parameters, reply.data, fault)
 
 

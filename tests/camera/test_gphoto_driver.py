@@ -99,6 +99,7 @@ def test_stale_image_then_a_new_one(tmp_path: Path) -> None:
     assert hashlib.sha256(first.jpeg.path.read_bytes()).hexdigest() == first.jpeg.sha256
 
 
+@pytest.mark.slow
 def test_shutter_refused_by_a_camera_that_answers(tmp_path: Path) -> None:
     with rig([{"on": "shutter", "kind": "reject"}]) as (camera, _):
         with pytest.raises(
@@ -109,10 +110,12 @@ def test_shutter_refused_by_a_camera_that_answers(tmp_path: Path) -> None:
         assert camera.capture(tmp_path).counter == 1
 
 
-def test_a_release_that_is_not_confirmed_is_known_by_its_photograph(tmp_path: Path) -> None:
+@pytest.mark.parametrize("answer", [0x2002, 0x201D])  # a general error, and an invalid parameter
+def test_a_release_that_is_not_confirmed_is_known_by_its_photograph(answer: int, tmp_path: Path) -> None:
     """Before, the exposure was called not taken, and the next one was given its photograph."""
     log = tmp_path / "truth.jsonl"
-    with rig([{"on": "shutter", "kind": "unconfirmed"}], "--exposures-log", str(log)) as (camera, _):
+    fault = {"on": "shutter", "kind": "unconfirmed", "value": answer}
+    with rig([fault], "--exposures-log", str(log)) as (camera, _):
         images = [camera.capture(tmp_path), camera.capture(tmp_path)]
     truth = [json.loads(line)["sha256"] for line in log.read_text().splitlines()]
     assert [image.counter for image in images] == [1, 2]

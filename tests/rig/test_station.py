@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import yaml
 
 from drivers.errors import DeviceError, DeviceUnavailableError
 from drivers.host.device_lock import DeviceLock
@@ -129,6 +130,27 @@ def test_a_user_of_the_machine_is_told_that_another_user_drives_the_arm() -> Non
         told = subprocess.run(other, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True).stdout
         assert f"another process drives this device (ur 127.0.0.9): process {holder.pid}" in told
         holder.kill()
+
+
+@pytest.mark.parametrize(
+    ("device", "other"),
+    [
+        ("{driver: genicam, camera: 127.0.0.91, aperture_f: 8}", "genicam 127.0.0.92"),
+        ("{driver: gphoto, port: 'usb:', model: ILCE-1}", "gphoto ILCE-7RM5"),
+    ],
+)
+def test_two_cameras_of_one_driver_are_two_devices(tmp_path: Path, device: str, other: str) -> None:
+    """A rig with two industrial cameras could not open the second."""
+    rig = RIG.replace("devices:", f"devices:\n  eye: {device}")
+    own = yaml.safe_load(device)
+    for address, words in ((f"{own['driver']} {own.get('camera') or own['model']}", True), (other, False)):
+        lock = DeviceLock.take(address, "elsewhere")
+        folder = tmp_path / str(words)
+        folder.mkdir()
+        with station_of(folder, rig) as (station, _), pytest.raises(DeviceError) as refused:
+            station.device("eye")
+        assert ("another process" in str(refused.value)) == words
+        lock.release()
 
 
 def test_an_arm_is_driven_by_one_process_whatever_rig_file_names_it(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from bench.torture.faults.judgement import rules
-from bench.torture.faults.judgement.table import Row, differences, read_table, table
+from bench.torture.faults.judgement.table import Row, differences, read_table, report, table
 from bench.torture.faults.judgement.verdict import Verdict, masked
 from bench.torture.faults.matrix import COLUMNS, cases
 from bench.torture.faults.place.person import Motions
@@ -33,6 +33,7 @@ CHOSEN = (
     "table/itself/door_tapped",
     "kuka/itself/protective_stop",
     "video/itself/frozen",
+    "gige/gvsp/payload/drop",
     "scanner/export/half_written",
     "store/disk_full/commit_02",
 )
@@ -127,3 +128,15 @@ def test_the_table_is_read_as_it_is_written_and_differences_are_told(tmp_path: P
         f"{second.name}: ask / completed / ; the table says nothing / completed / "
     ]
     assert table(some, [], rows) == path.read_text(), "rows that were not tried stay"
+
+
+def test_results_say_on_which_revision_each_case_was_tried_last(tmp_path: Path) -> None:
+    names = list(cases())[:3]
+    about = {"machine": {"processor": "P", "cores": 2}, "cases": 3, "options": [], "seconds": 1}
+    for date, commit, tried in (("2026-11-01", "aaa", names[:2]), ("2026-11-02", "bbb", names[1:])):
+        new = [{**Verdict(name, True, end="completed").told(), "commit": commit} for name in tried]
+        day = about | {"date": date, "commit": commit}
+        report(day, names, new, tmp_path / f"torture_faults-{date}")
+    page = (tmp_path / "torture_faults-2026-11-02.md").read_text()
+    assert "3 of 3 cases were tried" in page
+    assert "| 2026-11-01 | aaa | 1 |\n| 2026-11-02 | bbb | 2 |" in page

@@ -121,6 +121,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--record", action="store_true", help="write docs/reference/faults.md and bench/results")
     parser.add_argument("--list", action="store_true", help="list the cases and exit")
     parser.add_argument("--out", type=Path, help="write the verdicts to this file (JSON)")
+    parser.add_argument(
+        "--read", nargs="+", type=Path, default=[], metavar="FILE", help="try nothing; take verdicts written by --out"
+    )
     options = parser.parse_args(arguments)
     some = chosen(options)
     if options.list:
@@ -130,7 +133,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     revision = commit()  # before the results change the working tree
     folder = Path(tempfile.mkdtemp(prefix="orthocapture-faults-"))
     began_s = time.monotonic()
-    verdicts = sweep(some, folder, options)
+    if options.read:
+        rows = [row for path in options.read for row in json.loads(path.read_text())]
+        verdicts = [Verdict(**{key: row[key] for key in row if key != "commit"}) for row in rows]
+    else:
+        verdicts = sweep(some, folder, options)
+        rows = [{**verdict.told(), "commit": revision} for verdict in verdicts]
     broken = [verdict for verdict in verdicts if verdict.broken]
     differing = differences(verdicts, read_table(DOCUMENT))
     for line in differing:
@@ -139,7 +147,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"{len(verdicts)} of {len(cases())} cases, {len(broken)} with a fault, {len(differing)} not as in the table"
     )
     if options.out:
-        options.out.write_text(json.dumps([verdict.told() for verdict in verdicts], indent=1) + "\n")
+        options.out.write_text(json.dumps(rows, indent=1) + "\n")
     if options.record:
         about = {
             "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
@@ -151,7 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         }
         DOCUMENT.write_text(table(list(cases().values()), verdicts, read_table(DOCUMENT)), encoding="utf-8")
         stem = RESULTS / f"torture_faults-{about['date']}"
-        report(about, cases(), verdicts, stem)
+        report(about, cases(), rows, stem)
     if not broken:
         shutil.rmtree(folder, ignore_errors=True)
     return 1 if broken or (differing and not options.record) else 0

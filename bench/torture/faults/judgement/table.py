@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -97,24 +97,51 @@ def table(cases: Sequence[Case], verdicts: Sequence[Verdict], before: Mapping[st
     return _HEAD + "\n".join(sections)
 
 
-def report(about: Mapping[str, Any], known: Container[str], new: Sequence[Verdict], stem: Path) -> None:
-    """Write the results as JSON and Markdown; results of the same day that were not tried again stay."""
+def report(about: Mapping[str, Any], known: Container[str], new: Sequence[Mapping[str, Any]], stem: Path) -> None:
+    """Write the results as JSON and Markdown; cases that were not tried again keep their last results.
+
+    Args:
+        about: date, commit, machine, options, number of cases and duration of this sweep.
+        known: names of the cases that there are.
+        new: the verdicts of this sweep as plain data, each with its commit.
+        stem: path of the results without suffix; earlier results are beside it.
+    """
     path = stem.with_suffix(".json")
-    before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"sweeps": [], "verdicts": []}
-    rows = {row["name"]: row for row in before["verdicts"] if row["name"] in known}
-    rows |= {verdict.name: {**verdict.told(), "commit": about["commit"]} for verdict in new}
+    today: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    rows = {row["name"]: row for row in today.get("verdicts") or _earlier(path) if row["name"] in known}
+    rows |= {row["name"]: {**row, "date": about["date"]} for row in new}
     now: dict[str, Any] = {key: about[key] for key in ("options", "commit", "seconds")}
-    sweeps: list[dict[str, Any]] = [*before["sweeps"], now | {"tried": len(new)}]
+    sweeps: list[dict[str, Any]] = [*today.get("sweeps", []), now | {"tried": len(new)}]
     whole = {key: about[key] for key in ("date", "machine", "cases")}
     whole |= {"sweeps": sweeps, "verdicts": list(rows.values())}
     path.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
-    told = {field.name for field in fields(Verdict)}
-    verdicts = [Verdict(**{key: row[key] for key in row if key in told}) for row in rows.values()]
-    stem.with_suffix(".md").write_text(_page(about, sweeps, verdicts), encoding="utf-8")
+    stem.with_suffix(".md").write_text(_page(about, sweeps, list(rows.values())), encoding="utf-8")
 
 
-def _page(about: Mapping[str, Any], sweeps: Sequence[Mapping[str, Any]], verdicts: Sequence[Verdict]) -> str:
+def _earlier(path: Path) -> list[dict[str, Any]]:
+    """The last verdict of each case in the results of earlier days."""
+    rows: dict[str, dict[str, Any]] = {}
+    for one in sorted(path.parent.glob("torture_faults-*.json")):
+        if one.name < path.name:
+            day = json.loads(one.read_text(encoding="utf-8"))
+            rows |= {row["name"]: {"date": day["date"], **row} for row in day["verdicts"]}
+    return list(rows.values())
+
+
+def _revisions(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A table of the revisions on which the cases were tried last."""
+    counts = Counter((row["date"], row["commit"]) for row in rows)
+    return [
+        "| last tried on | revision | cases |",
+        "|---|---|---:|",
+        *(f"| {date} | {commit} | {counts[date, commit]} |" for date, commit in sorted(counts)),
+    ]
+
+
+def _page(about: Mapping[str, Any], sweeps: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]]) -> str:
     """The results for people: the sweeps, a table of the wires and states, and the faults."""
+    told = {field.name for field in fields(Verdict)}
+    verdicts = [Verdict(**{key: row[key] for key in row if key in told}) for row in rows]
     broken = [verdict for verdict in verdicts if verdict.broken]
     commands = [" ".join(["python -m bench.torture.faults", *sweep["options"]]) for sweep in sweeps]
     commands = [words if len(words) < _LONGEST else f"{words[:_LONGEST]} …" for words in commands]
@@ -130,6 +157,8 @@ def _page(about: Mapping[str, Any], sweeps: Sequence[Mapping[str, Any]], verdict
         "",
         f"{len(verdicts)} of {about['cases']} cases were tried, "
         f"{sum(v.reached for v in verdicts)} in which the planned fault occurred, **{len(broken)} with a fault**.",
+        "",
+        *_revisions(rows),
         "",
         "| wire or state | cases | nothing | again, reopen or retry | asked | stopped | completed "
         "| left open | longest s |",
