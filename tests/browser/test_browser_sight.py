@@ -218,10 +218,12 @@ SLOW_FIRST_CAMERA = """() => {
     const real = window.fetch, view = document.querySelector("[data-live-view]");
     window.held = [];
     window.shown = [];
+    let tell;
+    window.asked = new Promise((go) => { tell = go; });
     window.fetch = async (address, options) => {
         const answer = await real(address, options);
         if (address.endsWith("camera=")) {
-            await new Promise((go) => window.held.push(go));
+            await new Promise((go) => { window.held.push(go); tell(); });
             const look = () => { if (!view.classList.contains("without-frame")) window.shown.push("frame"); };
             new MutationObserver(look).observe(view, { attributes: true });
         }
@@ -275,7 +277,7 @@ def test_a_frame_of_the_camera_that_was_left_is_not_shown_as_the_other_ones(serv
         panel.get_by_role("button", name="Start live view").click()
         expect(panel.get_by_role("status")).to_have_text("Live", timeout=20_000)
         page.evaluate(SLOW_FIRST_CAMERA)
-        page.wait_for_function("held.length > 0")
+        page.evaluate("asked")
         panel.get_by_role("button", name="top", exact=True).click()  # it sends no frames
         expect(panel.locator("[data-live-light]")).to_have_text("")
         page.evaluate("held.forEach((go) => go())")
