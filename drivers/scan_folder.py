@@ -13,12 +13,15 @@ from pydantic import Field, field_validator
 
 from drivers.errors import DeviceUnavailableError, IncompleteExportError
 from drivers.interfaces import DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
-from drivers.meshes.export_watch import ExportWatch
-from drivers.meshes.mesh_file import MeshUnit, read_mesh_file
+from drivers.meshes.export_watch import ExportWatch, mesh_files
+from drivers.meshes.mesh_file import MESH_SUFFIXES, MeshUnit, read_mesh_file
 from drivers.plugin import DriverConfig, DriverSpec
 from drivers.scan_profiles import profile_named
 from drivers.scan_profiles.profile import ScanProfile
 from drivers.scan_profiles.reading import check_export, read_export
+
+# What scanners' programs write, their own projects among it.
+_SURFACES = (*MESH_SUFFIXES, ".e57", ".asc", ".xyz", ".pcd", ".ptx", ".wrl", ".3mf", ".zdf", ".praw")
 
 
 class ScanFolderConfig(DriverConfig):
@@ -71,6 +74,7 @@ class ScanFolder:
         """Return the free space, the number of exports, and the incomplete ones as problems."""
         require_folder(self._config.folder)
         exports, pending = self._watch.poll()
+        pending += self._foreign()
         return DeviceReport(
             identity=self._identity(),
             free_bytes=free_bytes(self._config.folder),
@@ -106,6 +110,18 @@ class ScanFolder:
             return {"unit": self._config.unit}
         units = ", ".join(f"{suffix[1:]} in {unit}" for suffix, unit in self._profile.units.items())
         return {"unit": self._config.unit, "profile": f"{self._config.profile}: {units}. {self._profile.advice}"}
+
+    def _foreign(self) -> tuple[str, ...]:
+        """One sentence for each file that some scanner exports, but not the one of the profile."""
+        if self._profile is None:
+            return ()
+        others = tuple(suffix for suffix in _SURFACES if suffix not in self._profile.suffixes)
+        known = ", ".join(suffix[1:].upper() for suffix in self._profile.suffixes)
+        return tuple(
+            f"{path.name}: the profile {self._config.profile} does not read this kind of file, only {known}. "
+            f"{self._profile.advice}"
+            for path in mesh_files(self._config.folder, others)
+        )
 
     def _identity(self) -> DeviceIdentity:
         return DeviceIdentity(

@@ -9,18 +9,15 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
-import subprocess
-import sys
 import tempfile
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from bench.machine import REPOSITORY, RESULTS, commit, machine
+from bench.machine import RESULTS, commit, machine
 from bench.whole_runs.whole_run import orthocapture, simulated_rig
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.geometry import inverse
@@ -29,6 +26,7 @@ from service.core.units import mm
 from service.dataset.summary import RunSummary, summarise
 from service.run_start import recorded_run
 from service.store.store import Store
+from tests.support.ct.dicom_listener import dicom_listener
 from tests.support.protocols.small_demo import SLICE_MM, small_demo
 
 # Name of the device → the scanner of the rig, and the exports that together are one scan.
@@ -78,9 +76,9 @@ def scanned_by_all(folder: Path, host: str) -> dict[str, Any]:
     small_demo(protocol)
     record = with_scanners(yaml.safe_load(protocol.read_text(encoding="utf-8")))
     protocol.write_text(yaml.safe_dump(record, sort_keys=False, allow_unicode=True), encoding="utf-8")
-    with listening(rig / "ct") as port:
+    with dicom_listener(rig / "ct") as address:
         words = ["--image-width", str(WIDTH), "--ct-voxel-mm", str(SLICE_MM), "--speed-up", "10", "--host", host]
-        words += ["--ct-sends-to", f"127.0.0.1:{port}", "--further-scanner", *(name for name, _ in SCANNERS.values())]
+        words += ["--ct-sends-to", address, "--further-scanner", *(name for name, _ in SCANNERS.values())]
         with simulated_rig(rig, SCENE, words) as ready:
             doctor = orthocapture("doctor", "--rig", ready["rig"], "--json", timeout_s=300, log=folder / "doctor.log")
             run = orthocapture(
@@ -136,23 +134,6 @@ def _steps_of(by_id: Mapping[str, dict[str, Any]], name: str, parts: int) -> lis
         "params": {**evaluation["params"], "registration": registering["id"], "scan": scanning["id"]},
     }
     return [scanning, registering, judging]
-
-
-@contextmanager
-def listening(folder: Path) -> Generator[int]:
-    """`orthocapture dicom-listen` into a folder; yields its port."""
-    folder.mkdir(parents=True)
-    process = subprocess.Popen(
-        [sys.executable, "-m", "service.cli.main", "dicom-listen", "--port", "0", "--json", "--folder", str(folder),
-         "--from", "CTSUITE"],
-        cwd=REPOSITORY, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        assert process.stdout is not None
-        yield json.loads(process.stdout.readline())["port"]
-    finally:
-        process.terminate()
-        process.communicate(timeout=60)
 
 
 def _row(

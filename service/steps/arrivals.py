@@ -11,24 +11,55 @@ from typing import Any, TypeVar
 import numpy as np
 
 from drivers.errors import DeviceTimeoutError
-from drivers.interfaces import CtSource, ScannedMesh
+from drivers.interfaces import CtSource, DeviceReport, ScannedMesh
 from service.core.records.events import ArtefactRef, FilesKept
 from service.steps.context import StepContext
 from service.steps.notes import DEIDENTIFIED
 from service.store.records import NewArtefact
 
 T = TypeVar("T")
+_LASTING_S = 3.0  # for so long at least, the same words hold
 
 
-def wait_for(context: StepContext, find: Callable[[], Sequence[T]], wait_s: float, what: str) -> T:
-    """Wait until `find` returns something, and return the newest. Raises DeviceTimeoutError after `wait_s`."""
-    deadline_s = context.monotonic_s() + wait_s
+def wait_for(
+    context: StepContext,
+    find: Callable[[], Sequence[T]],
+    wait_s: float,
+    what: str,
+    report: Callable[[], DeviceReport],
+) -> T:
+    """Wait until `find` returns something, and return the newest.
+
+    Meanwhile people see what is wrong with the files that are there, once it has lasted for some seconds: a file that
+    is being written is no fault.
+
+    Args:
+        context: of the step.
+        find: looks for what is wanted, oldest first.
+        wait_s: longest wait.
+        what: it is, in words.
+        report: of the device, with its problems.
+
+    Raises:
+        DeviceTimeoutError: after `wait_s`.
+    """
+    look_s = context.monotonic_s()
+    deadline_s = look_s + wait_s
+    before: tuple[str, ...] = ()
+    wrong = ""
     while not (found := find()):
         context.checkpoint()
-        context.progress(f"waiting for {what}", 0, 1)
-        if context.monotonic_s() > deadline_s:
+        now_s = context.monotonic_s()
+        if now_s >= look_s:
+            problems = report().problems
+            lasting = [text for text in problems if text in before]
+            wrong = "".join(f"; {text}" for text in lasting[:1])
+            wrong += f" (and {len(lasting) - 1} more)" if len(lasting) > 1 else ""
+            before, look_s = problems, now_s + _LASTING_S
+        context.progress(f"waiting for {what}{wrong}", 0, 1)
+        if now_s > deadline_s:
             raise DeviceTimeoutError(
-                f"{what} did not arrive within {wait_s:.0f} s",
+                f"{what} did not arrive within {wait_s:.0f} s{wrong}",
                 where=f"step {context.step.id}",
                 remedy="Check the export folder with `orthocapture doctor`, then confirm to wait again",
             )

@@ -1,21 +1,18 @@
-"""Gloved hands and badge readers in a real browser: the plan, a badge, the live view, the keyboard."""
+"""Gloved hands and badge readers in a real browser: the plan, a badge, the keyboard."""
 
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, FloatRect, Locator, Page, expect
 
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import OperatorAction, StepNote
-from service.monitor.snapshot import write_frame
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
@@ -31,7 +28,6 @@ from tests.support.runs.bench_run import PROTOCOL
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 BADGE = "0004711815"
 DENSE = PROTOCOL.replace("count: 4", "count: 54")  # as many viewpoints as a station of the paper's protocol
-AT_THE_LENS = PROTOCOL.replace("id: fixation", "id: camera_set_up\n    drawing: camera")
 # A badge reader's keys: far faster than the test could press them; the letters end in the focused field.
 READ = """(badge) => {
     for (const key of badge) {
@@ -243,80 +239,6 @@ def test_a_reason_is_chosen_or_written(server: Served, browser: Browser) -> None
         with Store.open(server.data) as store:
             said = [e.payload.reason for e in store.events(run_id) if isinstance(e.payload, OperatorAction)]
         assert said == ["A device is out of order: the drill"]
-
-
-# --- the live view -----------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def camera(data: Path, run_id: str) -> Generator[list[cv2.typing.MatLike]]:
-    """A camera whose newest frame is the last one of the list."""
-    frames: list[cv2.typing.MatLike] = []
-    over = threading.Event()
-
-    def send() -> None:
-        while not over.wait(0.3):
-            if frames:
-                write_frame(data, run_id, cv2.imencode(".jpg", frames[-1])[1].tobytes())
-
-    sender = threading.Thread(target=send)
-    sender.start()
-    try:
-        yield frames
-    finally:
-        over.set()
-        sender.join()
-
-
-def test_the_lens_is_focused_by_the_live_view_of_its_step(server: Served, browser: Browser) -> None:
-    noise = np.random.default_rng(1).integers(40, 200, (85, 128), np.uint8)
-    sharp = cv2.resize(noise, (1024, 680), interpolation=cv2.INTER_NEAREST)
-    with (
-        at_the_table(server, browser, protocol=AT_THE_LENS) as (tablet, run_id),
-        camera(server.data, run_id) as frames,
-    ):
-        page = tablet.page
-        panel = page.get_by_role("region", name="Live view")
-        figure, marks = panel.locator("[data-live-figure]"), panel.locator("[data-live-marks]")
-        frames.append(sharp)
-        panel.get_by_role("button", name="Start live view").click()
-        expect(figure).to_have_text("100 %", timeout=20_000)
-        found = int(marks.get_attribute("data-found") or 0)
-        assert found > 10_000, "edges are marked"
-        red = page.evaluate(
-            """() => { const c = document.querySelector("[data-live-marks]");
-                const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
-                let n = 0;
-                for (let i = 0; i < d.length; i += 4) if (d[i] === 255 && d[i + 1] === 40 && d[i + 3] === 255) n += 1;
-                return n; }"""
-        )
-        assert red > 0.8 * found  # the magnifier's frame covers some
-        frames.append(cv2.GaussianBlur(sharp, (0, 0), 6))
-        expect(figure).to_have_text(re.compile(r"^[123]?\d %"), timeout=20_000)
-        assert int(marks.get_attribute("data-found") or 0) < 0.5 * found
-        frames.append(sharp)
-        expect(figure).to_have_text(re.compile(r"^(9[5-9]|100) %"), timeout=20_000)
-        panel.get_by_role("button", name="Mark sharp edges").click()
-        expect(marks).to_have_attribute("data-found", "0")
-        # The magnifier shows the touched area, in pixels of the frame.
-        frames.append(np.where(np.arange(1024) < 512, 30, 220).astype(np.uint8)[None].repeat(680, 0))
-        expect(panel.locator("[data-live-light]")).to_contain_text(
-            "Mean 125 of 255; 0.0 % at the white end", timeout=20_000
-        )
-        stage = box(panel.locator("[data-live-stage]"))
-        for share, light in ((0.2, 30), (0.8, 220)):
-            page.mouse.click(stage["x"] + share * stage["width"], stage["y"] + 0.5 * stage["height"])
-            middle = """() => {
-                const loupe = document.querySelector("[data-live-loupe]").getContext("2d");
-                return [...loupe.getImageData(160, 120, 1, 1).data];
-            }"""
-            assert page.evaluate(middle)[0] == pytest.approx(light, abs=3)
-        frames.append(np.full((680, 1024), 255, np.uint8))
-        expect(panel.locator("[data-live-light]")).to_contain_text("100.0 % at the white end", timeout=20_000)
-        # The event belongs to this step.
-        step = OperatorAction(action="skip", step="camera_set_up", reason="focused the day before")
-        record(server, run_id, step)
-        expect(panel).to_be_hidden(timeout=20_000)
 
 
 # --- the keyboard ------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """A whole small run with a Canon on the arm and two further cameras, from doctor to data set, pages and report.
 
-One run for all of it: cameras of two makers over two dialects of PTP, raw files, extrinsics against the truth.
+One run for all of it: cameras of two makers over two dialects of PTP, raw files, extrinsics against the truth; a CT
+suite that sends its series, and a structured-light scanner that exports E57.
 """
 
 from __future__ import annotations
@@ -25,12 +26,14 @@ from service.core.records.events import JobFinished, ViewpointCaptured
 from service.dataset.summary import summarise
 from service.run_start import recorded_run
 from service.store.store import Store
+from tests.support.ct.dicom_listener import dicom_listener
 from tests.support.pages.web import web_site
 from tests.support.protocols.small_demo import SLICE_MM, VIEWS, small_demo
 from tests.support.rig.rig import orthocapture, simulated_rig
 from tests.support.runs.ended_run import ended_run, patient
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
+SCANNER = "structured_light"
 FIXED, STEREO = "camera_2", "camera_3"  # a Sony on a stand; a Canon beside the first one
 PLACES = pytest.mark.parametrize("name", [FIXED, STEREO])
 
@@ -67,7 +70,12 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
     options = ("--scene", "7", "--image-width", "960", "--ct-voxel-mm", str(SLICE_MM), "--speed-up", "10")
     canon, sony = "Canon EOS R5", "Sony ILCE-7RM5"
     cameras = ("--camera", canon, "--second-camera", "fixed", "stereo", "--second-camera-model", sony, canon)
-    with simulated_rig(folder, *options, *cameras, host="127.0.0.49") as rig:
+    with (
+        dicom_listener(folder / "ct") as address,
+        simulated_rig(
+            folder, *options, *cameras, "--ct-sends-to", address, "--scanner", SCANNER, host="127.0.0.49"
+        ) as rig,
+    ):
         only_jpeg(Path(rig["rig"]), FIXED)
         patient(Path(rig["rig"]), watchdog_s=1.0)
         doctor = orthocapture("doctor", "--rig", rig["rig"], "--json")
@@ -106,6 +114,22 @@ def test_doctor_finds_the_cameras_ready(ended: Ended) -> None:
         "camera": "Canon EOS R5", FIXED: "ILCE-7RM5", STEREO: "Canon EOS R5",
     }  # fmt: skip
     assert all(one["ok"] for one in found.values())
+
+
+def test_the_series_was_sent_and_the_scan_is_of_its_profile(ended: Ended) -> None:
+    found = ended.doctor["devices"]
+    assert found["ct"]["ok"]
+    assert found["scanner"]["ok"]
+    assert "e57 in m" in found["scanner"]["details"]["profile"]
+    with Store.open(ended.data, create=False) as store:
+        run_id = store.find_run("latest")
+        steps = summarise(store, run_id, recorded_run(store, run_id)[0]).state.steps
+        scans = [row.ref for row in store.artefacts(run_id) if row.ref.original_name.endswith(".e57")]
+    (received,) = (path for path in (ended.data.parent / "ct").iterdir() if path.name[0] != ".")
+    assert steps["ct_import"].measures["slices"] == len(list(received.iterdir()))
+    assert steps["ct_import"].measures["spheres_found"] == 13
+    assert len(scans) == 2
+    assert steps["scanning"].measures["sphere_change_max_mm"] < 0.1
 
 
 def test_it_comes_to_its_end_with_every_view(ended: Ended) -> None:

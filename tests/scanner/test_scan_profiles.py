@@ -288,16 +288,29 @@ def test_the_report_says_what_the_profile_expects(tmp_path: Path) -> None:
     assert "ordered" in report.details["profile"]
 
 
-def test_the_search_for_spheres_says_that_the_unit_is_wrong(tmp_path: Path) -> None:
+def test_a_file_that_the_profile_does_not_read_is_told(tmp_path: Path) -> None:
+    bodies().export(tmp_path / "scan.stl")
+    (tmp_path / "notes.txt").write_text("no scan")
+    scanner = ScanFolder(ScanFolderConfig(folder=tmp_path, profile="zivid", stable_s=0))
+    assert scanner.exports() == ()
+    (problem,) = scanner.report().problems
+    assert problem.startswith(
+        "scan.stl: the profile zivid does not read this kind of file, only PLY. In Zivid Studio"
+    )
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+def test_the_search_for_spheres_says_that_the_unit_is_wrong(tmp_path: Path, parts: int) -> None:
     bodies(1 / 25.4).export(tmp_path / "scan.ply")
     mesh = scanned(tmp_path, "artec_leo", "mm").mesh
     buffer = io.BytesIO()
     np.savez(buffer, vertices_m=mesh.vertices_m, faces=mesh.faces)
     with Store.open(tmp_path / "data") as store:
         kept = store.put_bytes(buffer.getvalue(), kind="scan_mesh", media_type="application/x-npz", original_name="a")
-        arguments = {"mesh": kept.sha256, "radius_m": RADIUS_MM / 1000, "expected": len(CENTRES_MM)}
+        files: dict[str, Any] = {"mesh": kept.sha256} if parts == 1 else {"meshes": [kept.sha256] * parts}
+        arguments = {**files, "radius_m": RADIUS_MM / 1000, "expected": len(CENTRES_MM)}
         context: RecordedContext = JobContext(arguments, store, tmp_path, lambda *_: None)
         with pytest.raises(ComputeError, match=r"inches read as millimetres") as caught:
-            HANDLERS["locate_spheres"](context)
+            HANDLERS["locate_spheres" if parts == 1 else "merge_scans"](context)
     assert "multiplied by 25.4 it has 4 spheres of 15 mm radius" in caught.value.what
     assert "rig.yaml" in caught.value.remedy

@@ -7,7 +7,6 @@ import io
 import numpy as np
 
 from service.compute.surfaces.part_merging import merge_parts
-from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
 from service.core.errors import ComputeError
 from service.core.geometry import apply
 from service.core.units import mm
@@ -15,7 +14,7 @@ from service.jobs.records import matrix
 from service.jobs.surfaces import locate_spheres as locate_job
 from service.jobs.surfaces import merge_scans as merge_job
 from service.worker.job import JobAnswer, JobContext
-from service.worker.surfaces.mesh_spheres import search_spheres
+from service.worker.surfaces.mesh_spheres import found_spheres, search_spheres
 
 
 def merge_scans(context: JobContext[merge_job.Arguments]) -> JobAnswer:
@@ -28,7 +27,7 @@ def merge_scans(context: JobContext[merge_job.Arguments]) -> JobAnswer:
     centres = []
     for number, (vertices_m, faces) in enumerate(parts, start=1):
         try:
-            found = locate_spheres(vertices_m, faces, arguments.radius_m)
+            found = found_spheres(vertices_m, faces, arguments.radius_m)
         except ComputeError as error:
             raise ComputeError(f"part {number} of the scan: {error.what}", remedy=error.remedy) from error
         centres.append(np.array([sphere.centre_m for sphere in found]).reshape(-1, 3))

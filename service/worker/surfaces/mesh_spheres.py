@@ -90,7 +90,7 @@ def search_spheres(
 ) -> tuple[dict[str, float], SpheresFound]:
     """The measures and the spheres of a mesh."""
     radius_m = arguments.radius_m
-    spheres = _found(vertices_m, faces, radius_m, arguments.expected)
+    spheres = found_spheres(vertices_m, faces, radius_m, arguments.expected)
     centres = np.array([s.centre_m for s in spheres])
     covariances = np.array([s.covariance for s in spheres])
     layout = check_layout(centres, covariances, radius_m=radius_m) if len(spheres) >= LAYOUT_SUBSET else None
@@ -119,8 +119,10 @@ def search_spheres(
     return measures, SpheresFound(spheres_m=centres.tolist(), details=details)
 
 
-def _found(vertices_m: Array, faces: Any, radius_m: float, expected: int) -> tuple[MeshSphere, ...]:
-    """The spheres; if they are missing because of the mesh's unit, the error says so."""
+def found_spheres(
+    vertices_m: Array, faces: Any, radius_m: float, expected: int | None = None
+) -> tuple[MeshSphere, ...]:
+    """The spheres, of any number or `expected`; if they are missing because of the mesh's unit, the error says so."""
     try:
         return find_spheres(vertices_m, faces, radius_m, expected)
     except ComputeError as error:

@@ -7,13 +7,14 @@ from typing import Any
 SECOND = "hand_eye_2"
 
 
-def for_two_arms(record: dict[str, Any], calibration: str, removal: str) -> dict[str, Any]:
+def for_two_arms(record: dict[str, Any], calibration: str, removal: str, images: int) -> dict[str, Any]:
     """The protocol with a hand-eye calibration at station 2, after the camera went to the arm there.
 
     Args:
-        record: of a protocol for one arm that is moved.
+        record: of a protocol for one arm that is moved, whose board poses are planned.
         calibration: the step that solves hand_eye at station 1.
         removal: the step that takes the board away.
+        images: of the board with the second arm.
     """
     by_id = {step["id"]: step for step in record["steps"]}
     change = {
@@ -24,8 +25,8 @@ def for_two_arms(record: dict[str, Any], calibration: str, removal: str) -> dict
         "simulated_hands": [{"action": "move_robot", "station": "station_2"}, {"action": "place_board"}],
     }
     first = by_id[calibration]
-    params = {key: value for key, value in first["params"].items() if key in ("board_poses", "viewpoints")}
-    params = _at_station_2(params) | {"solve": ["hand_eye"], "intrinsics_of": calibration}
+    params = {key: value for key, value in first["params"].items() if key == "board_poses"}
+    params = _at_station_2(params, images) | {"solve": ["hand_eye"], "intrinsics_of": calibration}
     judged = ("views", "settings_departures", "optics_departures", "hand_eye_sigma_mm", "hand_eye_held_out_mm")
     gates = [gate for gate in first["gates"] if gate["measure"] in judged]
     second = {
@@ -53,9 +54,6 @@ def for_two_arms(record: dict[str, Any], calibration: str, removal: str) -> dict
     return {**record, "steps": steps}
 
 
-def _at_station_2(params: dict[str, Any]) -> dict[str, Any]:
-    """The same poses, at the other station, under other names."""
-    if "board_poses" in params:
-        return {"board_poses": {**params["board_poses"], "station": "station_2", "prefix": "h"}}
-    sets = [{**one, "station": "station_2", "prefix": "h"} for one in params["viewpoints"]]
-    return {"viewpoints": sets}
+def _at_station_2(params: dict[str, Any], images: int) -> dict[str, Any]:
+    """The same poses, but fewer, at the other station, under other names."""
+    return {"board_poses": {**params["board_poses"], "station": "station_2", "prefix": "h", "count": images}}

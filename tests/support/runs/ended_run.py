@@ -34,7 +34,9 @@ def ended_run(data: Path, truth: Path) -> Generator[EndedRun]:
 
 
 def patient(rig: Path, **robot: float) -> None:
-    """Let the rig wait longer for the arm than a real one does: a busy machine is no dead link."""
+    """Let the rig wait longer for its arms than a real one does: a busy machine is no dead link."""
     record = yaml.safe_load(rig.read_text(encoding="utf-8"))
-    record["devices"]["robot"] |= {"stale_after_s": 20.0, "unattended_s": 20.0, **robot}
+    for name in ("robot", "robot_1", "robot_2"):
+        if name in record["devices"]:
+            record["devices"][name] |= {"stale_after_s": 20.0, "unattended_s": 20.0, **robot}
     rig.write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")

@@ -68,7 +68,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 def _mesh(context: StepContext, params: Params) -> tuple[JobRequest, tuple[ArtefactRef, ...], Mapping[str, float]]:
     """Store a mesh that was segmented elsewhere: the job on it, the stored files, and its measures."""
     ct = context.devices.ct()
-    scan = ct.read_mesh(wait_for(context, ct.segmented_meshes, params.wait_s, "a segmented CT mesh"))
+    scan = ct.read_mesh(wait_for(context, ct.segmented_meshes, params.wait_s, "a segmented CT mesh", ct.report))
     mesh, kept = keep_mesh(context, scan, device="ct", kind="ct_mesh")
     radius_m = metres(context.protocol.spheres.radius_mm)
     arguments = locate_spheres.Arguments(mesh=mesh.sha256, radius_m=radius_m, expected=params.spheres)
@@ -78,7 +78,7 @@ def _mesh(context: StepContext, params: Params) -> tuple[JobRequest, tuple[Artef
 def _series(context: StepContext, params: Params) -> tuple[JobRequest, tuple[ArtefactRef, ...], Mapping[str, float]]:
     """Store a series: the job on it, the stored files, and its measures."""
     ct = context.devices.ct()
-    series = wait_for(context, lambda: _sound(ct), params.wait_s, "a CT series without faults")
+    series = wait_for(context, lambda: _sound(ct), params.wait_s, "a CT series without faults", ct.report)
     volume = ct.read(series)
     labels, found = _labels(context, params, volume)
     kept = keep_clean(context, ct, series.files, device="ct", kind="ct_slice")
@@ -109,7 +109,7 @@ def _labels(
     if params.source != "segmentation":
         return (), {}
     ct = context.devices.ct()
-    file = wait_for(context, ct.segmentations, params.wait_s, "a segmentation of the CT series")
+    file = wait_for(context, ct.segmentations, params.wait_s, "a segmentation of the CT series", ct.report)
     labels = ct.read_labels(file, volume, params.segments)
     kept = keep_clean(context, ct, file.files, device="ct", kind="ct_segmentation")
     array = keep_array(context, labels.inside, device="ct", kind="ct_labels", name="labels.npy")

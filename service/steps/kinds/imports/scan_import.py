@@ -82,7 +82,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         return [found[-params.parts :]] if len(found) >= params.parts else []
 
     wanted = "a complete scan export" if params.parts == 1 else f"{params.parts} complete scan exports"
-    scans = [scanner.read(export) for export in wait_for(context, fresh, params.wait_s, wanted)]
+    scans = [scanner.read(export) for export in wait_for(context, fresh, params.wait_s, wanted, scanner.report)]
     found = {f"scan_{name}": sum(float(scan.findings[name]) for scan in scans) for name in scans[0].findings}
     measures = {name: value for name, value in found.items() if name in Measures.declared()}  # a driver may find more
     measures["faces"] = float(sum(len(scan.mesh.faces) for scan in scans))

@@ -137,21 +137,36 @@
     tellSharpness();
   }
 
+  // What was computed of the camera that was left is not of the other one.
+  function forget() {
+    frame = null;
+    [marks, loupe, histogram].forEach((canvas) => canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height));
+    one("sharpness").value = 0;
+    one("figure").textContent = "–";
+    one("light").textContent = "";
+  }
+
   async function next() {
     if (!open) return;
     const began = performance.now();
+    const asked = camera;
     try {
-      const response = await fetch(`${panel.dataset.live}?camera=${encodeURIComponent(camera)}`, { cache: "no-store" });
-      if (response.status === 200) {
-        const address = URL.createObjectURL(await response.blob());
+      const response = await fetch(`${panel.dataset.live}?camera=${encodeURIComponent(asked)}`, { cache: "no-store" });
+      const content = response.status === 200 ? await response.blob() : null;
+      if (asked !== camera) {
+        // Another camera was chosen meanwhile: this frame is not of the one that is pressed.
+      } else if (content) {
+        const address = URL.createObjectURL(content);
         picture.src = address;
         await picture.decode();
         if (shown) URL.revokeObjectURL(shown);
         shown = address;
-        view.classList.remove("without-frame");
-        read();
-        draw();
-        say("Live");
+        if (asked === camera) {
+          view.classList.remove("without-frame");
+          read();
+          draw();
+          say("Live");
+        }
       } else {
         view.classList.add("without-frame");
         say(response.status === 204 ? "No frame yet: the camera is busy, or no capture runs." : "No frames: the run or the sign-in has ended.");
@@ -209,7 +224,7 @@
     camera = button.dataset.liveCamera;
     choices.forEach((other) => other.setAttribute("aria-pressed", String(other === button)));
     best = 0; // another lens
-    frame = null;
+    forget();
     view.classList.add("without-frame");
     say("Waiting for a frame…");
   }));
