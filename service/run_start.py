@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ipaddress import ip_address
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.protocol.models import LoadedProtocol, Protocol
@@ -15,8 +16,10 @@ from service.run_record import recorded_protocol, recorded_root
 from service.runner.software import software_versions
 from service.store.files.space_used import forecast_of, require_space
 from service.store.records import NewArtefact
-from service.store.signatures.timestamps import Authority
 from service.store.store import Store
+
+if TYPE_CHECKING:
+    from service.store.signatures.timestamps import Authority
 
 _SCHEMES = ("ptpip:", "socket://")
 
@@ -113,6 +116,8 @@ def recorded_rig(store: Store, root: RunStarted) -> Rig:
 
 def time_stamp_authority(rig: Rig) -> Authority | None:
     """The authority that stamps the end of runs of this rig, or None."""
+    from service.store.signatures.timestamps import Authority  # noqa: PLC0415 - certificates, which `status` can do without
+
     section = rig.section.timestamp
     return None if section is None else Authority(section.url, rig.folder / section.certificates, section.timeout_s)
 

@@ -125,7 +125,7 @@ def test_a_camera_that_hangs_and_goes_on(pipe: Path, tmp_path: Path) -> None:
         try:
             with pytest.raises(DeviceTimeoutError, match="no image"):
                 capture_until_refused(camera, tmp_path)
-            assert "no image for" in camera.report().problems[0]
+            assert "No image for" in camera.report().problems[0]
         finally:
             writer.send_signal(signal.SIGCONT)
         assert camera.capture(tmp_path).jpeg.size_bytes > 0
