@@ -228,7 +228,7 @@ class GenicamCamera:
         pixels = picture(frame, self._config.pixel_format)
         if pixels is None:
             raise UnreadableFileError(
-                f"An image came that is no whole one of {self._config.pixel_format}: {frame.width} × {frame.height} px, "
+                f"No whole image in {self._config.pixel_format} came: {frame.width} × {frame.height} px, "
                 f"pixel format {frame.code:#010x}, {len(frame.data)} bytes",
                 where=self._where,
                 remedy="Repeat the exposure; if it comes again, close other programs that use the camera",
