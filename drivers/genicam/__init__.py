@@ -25,7 +25,7 @@ from drivers.errors import (
     UnreadableFileError,
 )
 from drivers.genicam.aravis import AravisCamera
-from drivers.genicam.link import CameraLink, LibraryMissingError, LinkError, NoImageError
+from drivers.genicam.link import CameraLink, LibraryMissingError, LinkError, NoImageError, NotInControlError
 from drivers.genicam.pixels import picture
 from drivers.genicam.producer import ProducerCamera
 from drivers.interfaces import CameraSettings, CapturedImage, DeviceIdentity, DeviceReport
@@ -102,6 +102,8 @@ class GenicamCamera:
             link.set_pixel_format(self._config.pixel_format)
             link.set_gain(self._config.gain)
             self._check_gain(link.gain)
+        except NotInControlError as error:
+            raise self._unavailable(str(error)) from error
         except LinkError as error:
             self.settings()  # the connection may be lost
             raise DeviceFaultError(
@@ -226,9 +228,10 @@ class GenicamCamera:
         pixels = picture(frame, self._config.pixel_format)
         if pixels is None:
             raise UnreadableFileError(
-                f"an image with pixel format {frame.code:#010x} came, not {self._config.pixel_format}",
+                f"no whole image in {self._config.pixel_format} came: {frame.width} × {frame.height} px, "
+                f"pixel format {frame.code:#010x}, {len(frame.data)} bytes",
                 where=self._where,
-                remedy="Close other programs that use the camera, and open it again",
+                remedy="Repeat the exposure; if it comes again, close other programs that use the camera",
             )
         return pixels
 

@@ -10,7 +10,7 @@ import ctypes
 import ctypes.util
 from typing import Any
 
-from drivers.genicam.link import Frame, LibraryMissingError, LinkError, NoImageError
+from drivers.genicam.link import Frame, LibraryMissingError, LinkError, NoImageError, NotInControlError
 from service.core.units import seconds_of_us, us
 
 LIBRARIES = ("aravis-0.8", "gobject-2.0", "glib-2.0")
@@ -19,6 +19,8 @@ _SUCCESS = 0  # of ArvBufferStatus
 # one that sees all traffic of the machine until its filter is set; a foreign packet ends the wait for the image.
 _NOTHING_IN_IT = (1, 8)
 _TRIES = 5  # exposures
+_DENIED = "access-denied"  # GigE Vision's answer to who is not in control; what it lacks it calls otherwise
+_NO_CONTROL = "the camera takes no settings from here: another program controls it, or the connection was lost"
 _POINTER, _TEXT, _REAL = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_double
 
 
@@ -40,7 +42,7 @@ class AravisCamera:
         self._camera: int | None = self._call("arv_camera_new", _POINTER, name.encode(), of=(_TEXT,))
         if not self._controls():
             self.close()
-            raise LinkError("another program controls the camera")
+            raise NotInControlError(_NO_CONTROL)
 
     def close(self) -> None:
         """Disconnect."""
@@ -171,7 +173,7 @@ class AravisCamera:
             free = self._glib.g_error_free
             free.restype, free.argtypes = None, (ctypes.POINTER(_Error),)
             free(error)
-            raise LinkError(message)
+            raise NotInControlError(_NO_CONTROL) if _DENIED in message else LinkError(message)
         return value
 
     def _unref(self, thing: int) -> None:

@@ -10,6 +10,10 @@ class LinkError(Exception):
     """A call failed; the message is the library's."""
 
 
+class NotInControlError(LinkError):
+    """The camera takes no settings from here: another program controls it, or control was lost."""
+
+
 class LibraryMissingError(Exception):
     """A library is not installed; `remedy` says how to install it."""
 

@@ -90,7 +90,7 @@ def test_settings_and_exposures(way: dict[str, str], tmp_path: Path) -> None:
         with pytest.raises(DeviceRefusedError, match="instead of 3 s"):
             camera.apply(CameraSettings(22.0, 3.0, 100))
         # Another program does not get the camera, and does not disturb this one.
-        told = "not allowed" if way else "another program controls the camera"
+        told = "not allowed" if way else "another program controls it"
         with pytest.raises(DeviceUnavailableError, match=f"{told}.*Close other programs"), opened(way):
             pass
         assert camera.capture(tmp_path).jpeg.size_bytes > 0
