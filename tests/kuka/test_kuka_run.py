@@ -1,6 +1,7 @@
 """A whole small run with two simulated KUKAs, one at each station, from doctor to the evaluation.
 
-The camera is calibrated on both arms, because each has errors of its own. The scanner is one of single views.
+The camera is calibrated on both arms, because each has errors of its own. A hand scanner scans the control
+spheres, and one of single views the whole scene.
 """
 
 from __future__ import annotations
@@ -17,22 +18,13 @@ import yaml
 
 from service.core.records.events import JobEnqueued, ViewpointCaptured
 from service.jobs.calibration import calibrate
-from tests.support.protocols.small_demo import small_demo
-from tests.support.protocols.two_arms import SECOND, for_two_arms
+from tests.support.protocols.two_arms import FIRST, SECOND, for_two_arms, kuka_demo
 from tests.support.rig.rig import orthocapture, simulated_rig
 from tests.support.runs.ended_run import EndedRun, ended_run, patient
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 ARM = "LBR Med 14"
-FIRST = "camera_calibration"
-PARTS = 3  # views of a simulated Zivid that are one scan
-# Where its arm cannot take the poses that the demonstration lists for a larger one, the software plans them.
-BOARD_POSES = {
-    "station": "station_1", "prefix": "b", "count": 24, "tilts_deg": [8, 20, 32, 38],
-    "rolls_deg": [0, 12, -12, 180, 168], "distances_m": [0.62, 0.68, 0.74], "above_scene_m": 0.09, "coverage": 0.9,
-}  # fmt: skip
-# With three views a station, the poses of an arm that repeats to 0.15 mm are not what the demonstration asks for.
-WIDER = {"predicted_target_error_mm": 1.5, "robot_corrected_rms_px": 2.0}
+SCANNER, PARTS = "zivid", 3  # views of it that are one scan
 
 
 @dataclass(frozen=True)
@@ -47,24 +39,16 @@ class Run:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Generator[Run]:
     folder = tmp_path_factory.mktemp("kuka")
     protocol, data = folder / "demo.yaml", folder / "data"
-    record = yaml.safe_load(small_demo(protocol).read_text(encoding="utf-8"))
-    (calibration,) = (step for step in record["steps"] if step["kind"] == "calibration")
-    del calibration["params"]["viewpoints"]
-    calibration["params"]["board_poses"] = BOARD_POSES
-    for gate in (gate for step in record["steps"] for gate in step.get("gates", [])):
-        gate["max"] = WIDER.get(gate["measure"], gate.get("max"))
-        if gate["max"] is None:
-            del gate["max"]
-        if gate["measure"] == "sphere_change_max_mm":
-            gate["max"] = 0.5  # single views show a part of each sphere
-    for step in record["steps"]:
-        if step["kind"] == "scan_import":
-            step["params"]["parts"] = PARTS
-            step["gates"].append({"measure": "part_residual_max_mm", "max": 0.1, "unit": "mm"})
-    record = for_two_arms(record, FIRST, "board_removal", images=12)
+    record = kuka_demo(protocol)
+    by_id = {step["id"]: step for step in record["steps"]}
+    by_id["control_scan"]["params"]["device"] = "scanner"
+    by_id["scanning"]["params"] |= {"device": SCANNER, "parts": PARTS}
+    by_id["scanning"]["simulated_hands"] = [{"action": "hand_scan", "device": SCANNER}]
+    by_id["scanning"]["gates"].append({"measure": "part_residual_max_mm", "max": 0.1, "unit": "mm"})
+    record = for_two_arms(record, images=12)
     protocol.write_text(yaml.safe_dump(record, sort_keys=False, allow_unicode=True), encoding="utf-8")
     options = ("--scene", "7", "--image-width", "960", "--ct-voxel-mm", "1.0", "--speed-up", "10", "--arm", ARM)
-    two = ("--arms", "2", "--scanner", "zivid")
+    two = ("--arms", "2", "--further-scanner", SCANNER)
     with simulated_rig(folder, *options, *two, host="127.0.0.44") as rig:
         patient(Path(rig["rig"]), answer_timeout_s=20.0)
         doctor = orthocapture("doctor", "--rig", rig["rig"], "--json")
@@ -89,7 +73,7 @@ def test_it_comes_to_its_end_with_every_view(run: Run) -> None:
     for name in ("robot_1", "robot_2"):
         robot = run.doctor["devices"][name]
         assert (robot["ok"], robot["identity"]["model"], robot["identity"]["driver"]) == (True, ARM, "kuka_sunrise")
-    assert "Zivid" in run.doctor["devices"]["scanner"]["identity"]["model"]
+    assert "Zivid" in run.doctor["devices"][SCANNER]["identity"]["model"]
     assert state.steps["scanning"].measures["scan_parts"] == PARTS
 
 

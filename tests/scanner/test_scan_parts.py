@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,10 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from drivers.interfaces import Scanner
+from drivers.scan_folder import ScanFolder, ScanFolderConfig
 from service.compute.surfaces.part_merging import merge_parts
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
+from service.core.records.events import StepFailed
 from service.store.store import Store
+from tests.support.runs.bench_run import begin_run, say
 from tests.support.runs.computing_run import OneScanner, begin_computing_run
 
 RADIUS_M = 0.006
@@ -114,3 +119,32 @@ def test_a_run_waits_for_all_parts_and_makes_one_mesh(tmp_path: Path) -> None:
     away = np.linalg.norm(placed[:, None] - SPHERES_M[None], axis=2).min(axis=1)
     assert len(found) == len(SPHERES_M)
     assert away.max() < 0.05e-3
+
+
+class OneZivid(OneScanner):
+    """The bench with a scanner whose program exports views."""
+
+    def scanner(self, name: str | None = None) -> Scanner:
+        return cast(Scanner, ScanFolder(ScanFolderConfig(folder=self.folder, stable_s=0, profile="zivid")))
+
+
+def test_a_step_that_waits_in_vain_says_what_is_wrong_with_the_file_that_came(tmp_path: Path) -> None:
+    rig = OneZivid()
+    rig.folder = tmp_path / "scans"
+    rig.folder.mkdir()
+    trimesh.creation.icosphere(1, 1e3 * RADIUS_M).export(rig.folder / "part.stl")
+    with Store.open(tmp_path / "data") as store:
+        bench = begin_run(store, PROTOCOL, tmp_path)
+        bench.rig = rig
+
+        def pass_by(_seconds: float) -> None:
+            bench.ahead_s += 2.0
+
+        bench.on_wait = pass_by
+        bench.script("scan", "recovery", say("abort", reason="another program exported it"))
+        assert bench.run().status == "aborted"
+        *_, failed = bench.payloads(StepFailed)
+    assert (
+        "3 complete scan exports did not arrive within 20 s; part.stl: the profile zivid does not" in failed.message
+    )
+    assert "save as PLY, ordered" in failed.message

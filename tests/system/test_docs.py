@@ -262,6 +262,13 @@ RUN_ELSEWHERE = {
     'orthocapture simulate rig --scene 7 --dir rig --arm "LBR Med 14"': (
         "tests/kuka/test_kuka_run.py::test_it_comes_to_its_end_with_every_view"
     ),
+    **dict.fromkeys(
+        (
+            "orthocapture simulate rig --scene 7 --dir rig --scanner zivid",
+            "orthocapture simulate rig --ct-sends-to 127.0.0.1:11112 --scene 7 --dir rig",
+        ),
+        "tests/further/test_second_camera_whole_run.py::test_the_series_was_sent_and_the_scan_is_of_its_profile",
+    ),
     'orthocapture simulate rig --scene 7 --dir rig --camera "Canon EOS R5"': (
         "tests/further/test_second_camera_whole_run.py::test_it_comes_to_its_end_with_every_view"
     ),

@@ -60,7 +60,8 @@ def match_constellations(a: Array, b: Array, tolerance_m: float = 2e-3) -> Const
     if count < 4:
         raise ComputeError(
             f"only {count} of {len(a)} and {len(b)} spheres agree within {mm(tolerance_m):.1f} mm, 4 are needed",
-            remedy="Check the units of both meshes, and that the spheres did not move between the scans",
+            remedy="Check that both are of the same specimen, the units of both meshes, and that the spheres did not "
+            "move between the scans",
         )
     best, rival = proper[0], proper[1:]
     rows = np.array([i for i, _ in best])
