@@ -102,7 +102,7 @@ def on_the_ramp(count: int) -> Array:
     return np.stack([down * LOW_X, y, HIGH_Z * (1 - down)], axis=1)
 
 
-MOVES = np.arange(-8, 9) * FOOTPRINT_M
+MOVES: Array = np.arange(-8.0, 9.0) * FOOTPRINT_M
 
 
 def test_a_steep_place_is_most_alike_where_it_is(views: list[StereoView]) -> None:

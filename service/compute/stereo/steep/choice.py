@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 
+from service.core.geometry import Array
+
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float32]
 
@@ -23,14 +25,14 @@ def edges_of(faces: Ints) -> Ints:
     return ends[ends[:, 0] != ends[:, 1]]
 
 
-def averaged(values: NDArray[np.floating], edges: Ints, rounds: int) -> NDArray[np.floating]:
+def averaged(values: NDArray[np.floating], edges: Ints, rounds: int) -> Array:
     """Values (V, ...) after so many means of each vertex with its neighbours."""
-    count = len(values)
+    out, count = np.asarray(values, dtype=np.float64), len(values)
     mean = _incidence(np.concatenate([edges, edges[:, ::-1]]), (count, count)) + identity(count, format="csr")
     mean = diags(1 / np.asarray(mean.sum(axis=1)).ravel()) @ mean
     for _ in range(rounds):
-        values = mean @ values
-    return values
+        out = np.asarray(mean @ out, dtype=np.float64)
+    return out
 
 
 def beliefs(costs: Floats, edges: Ints, per_step: float, most: float) -> Floats:

@@ -152,7 +152,7 @@ def _axes(points_m: Array, normals: Array, eye_m: Array) -> tuple[Array, Array]:
     toward = eye_m - points_m + 1e-9  # never exactly along the normal
     steep = toward - np.einsum("ij,ij->i", toward, normals)[:, None] * normals
     steep /= np.maximum(np.linalg.norm(steep, axis=1, keepdims=True), 1e-12)
-    return steep, np.cross(normals, steep)
+    return steep, np.cross(normals, steep).astype(np.float64)
 
 
 def _likeness(patches: Floats, seen: NDArray[np.bool_]) -> Floats:
