@@ -50,6 +50,19 @@ class RayMesh:
         origin = (eye_m - self._centre_m).astype(np.float32)
         return np.asarray(self._scene.run(np.broadcast_to(origin, directions.shape), directions), dtype=np.int32)
 
+    def depths(self, T_world_camera: Transform, rays: Array) -> Array:
+        """Depth (N,) along z at which rays (N, 3) of a camera, with z = 1, meet the surface; NaN where they do not.
+
+        Raises:
+            ConfigurationError: embreex, which casts the rays, is not installed.
+        """
+        eye, directions = T_world_camera[:3, 3], rays @ T_world_camera[:3, :3].T
+        face = self.first_face(eye, np.ascontiguousarray(directions, dtype=np.float32))
+        normal = self._normal[face]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = (self._offset_m[face] - normal @ eye) / np.einsum("ij,ij->i", normal, directions)
+        return np.where((face >= 0) & np.isfinite(depth) & (depth > 0), depth, np.nan)
+
     def planes_seen(self, T_world_camera: Transform) -> Array:
         """(F + 1, 4) each face's unit normal towards the camera, in its frame, and n · p (≤ 0) for its points p.
 

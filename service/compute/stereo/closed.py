@@ -22,14 +22,14 @@ def closed(surface: Surface) -> Surface:
     """A surface without holes near the given one; what it adds is a guess and never a result."""
     with tempfile.TemporaryDirectory(prefix="orthocapture-") as name:
         points, mesh = Path(name) / "points.ply", Path(name) / "mesh.ply"
-        _write_points(points, surface.vertices_m, _vertex_normals(surface))
+        _write_points(points, surface.vertices_m, vertex_normals(surface))
         options = pycolmap.PoissonMeshingOptions(depth=_DEPTH, trim=0.0, num_threads=1)
         pycolmap.poisson_meshing(points, mesh, options)
         found = trimesh.load_mesh(mesh, process=False)
     return Surface(np.asarray(found.vertices, dtype=np.float64), np.asarray(found.faces, dtype=np.int64))
 
 
-def _vertex_normals(surface: Surface) -> Array:
+def vertex_normals(surface: Surface) -> Array:
     """(V, 3) unit normals, each the mean of its faces by their areas."""
     normals = np.zeros_like(surface.vertices_m)
     for corner in range(3):

@@ -61,12 +61,7 @@ def _depth_of(guess: RayMesh, camera: CameraModel, T_world_camera: Transform) ->
     """Depth along z of every _STEP-th pixel; NaN where no surface is met."""
     v, u = np.mgrid[: camera.height : _STEP, : camera.width : _STEP]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-    planes = guess.planes_seen(T_world_camera)
-    directions = (rays.reshape(-1, 3) @ T_world_camera[:3, :3].T).astype(np.float32)
-    met = planes[guess.first_face(T_world_camera[:3, 3], np.ascontiguousarray(directions))]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = met[:, 3] / np.einsum("ij,ij->i", met[:, :3], rays.reshape(-1, 3))
-    return np.where(depth > 0, depth, np.nan).reshape(u.shape)
+    return guess.depths(T_world_camera, rays.reshape(-1, 3)).reshape(u.shape)
 
 
 def _searched(one: NDArray[np.uint8], two: NDArray[np.uint8], guess: Disparity) -> Disparity:

@@ -1,4 +1,4 @@
-"""From posed images to a mesh: pairs, depth maps, fusion, surface; then once more, finely, near that surface."""
+"""From posed images to a mesh: pairs, depth maps, fusion, surface; once more, finely, near it; then what is steep."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from service.compute.stereo.guided import guided_depth
 from service.compute.stereo.matching import DepthMap, depth_of_pair
 from service.compute.stereo.pairs import StereoView, looked_at_m, stereo_pairs
 from service.compute.stereo.rectify import rectified
+from service.compute.stereo.steep.complete import completed
 from service.compute.stereo.surface import surface_of
 from service.core.errors import ComputeError
 from service.core.geometry import Array
@@ -32,7 +33,8 @@ def reconstruct(views: Sequence[StereoView], progress: Progress) -> Surface:
     """The surface that posed images of pinhole cameras show, in the frame and unit of the poses.
 
     A first surface from small images, closed where nothing was matched, is the guess around which larger images are
-    matched. The depth of both is fused: the first holds more of what is steep, the second is finer.
+    matched. The depth of both is fused: the first holds more of what is steep, the second is finer. If there are many
+    images, what the fused surface lacks where it is steep is searched for last.
 
     Raises:
         ComputeError: no two images can be matched, or no surface comes out.
@@ -58,7 +60,12 @@ def reconstruct(views: Sequence[StereoView], progress: Progress) -> Surface:
         found = guided_depth(rectified(large[one], large[two], centre), near, _distance_m(large, one, two, centre))
         fine += [] if found is None else [found]
     progress("fusing all depth maps", 0, 0)
-    return _surface([*coarse, *fine], VOXEL_PX * _footprint_m(large, centre), _FEWEST if many else 1)
+    fused_all = _surface([*coarse, *fine], VOXEL_PX * _footprint_m(large, centre), _FEWEST if many else 1)
+    if not many:
+        return fused_all
+    del coarse, fine
+    progress("searching what is steep", 0, 0)
+    return completed(fused_all, small, _footprint_m(small, centre))
 
 
 def _surface(maps: Sequence[DepthMap], voxel_m: float, least: int) -> Surface:

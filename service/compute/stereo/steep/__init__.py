@@ -1,0 +1,1 @@
+"""Places that a fused surface lacks because they are steep: searched for along the normals of a closed guess."""
