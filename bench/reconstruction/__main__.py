@@ -1,6 +1,7 @@
 """Reconstructs simulated views with a method of the benchmark, and writes its table and figure to bench/results.
 
-Run: python -m bench.reconstruction [--views 36] [--width 1920] [--scene 7] [--method stereo] [--out NAME]
+Run: python -m bench.reconstruction [--views 36] [--width 1920] [--scene 7] [--method stereo] [--scenario dense]
+    [--out NAME]
 
 The images are those of `bench.scenes`: without the whole protocol, with true poses, and with the simulated scan as
 the ground truth. The control spheres are in images and scan.
@@ -25,19 +26,20 @@ WORK = REPOSITORY / "build" / "bench" / "reconstruction"
 
 
 def main() -> None:
-    """Run both scenarios, and keep results, table and figure."""
+    """Run the scenarios, and keep results, table and figure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--views", type=int, default=36)
     parser.add_argument("--width", type=int, default=1920)
     parser.add_argument("--scene", type=int, default=7)
     parser.add_argument("--method", default="stereo")
+    parser.add_argument("--scenario", nargs="+", choices=SCENARIOS, default=SCENARIOS)
     parser.add_argument("--cache", type=Path, default=CACHE)
     parser.add_argument("--out", default="reconstruction")
     args = parser.parse_args()
     dataset = simulated_data_set(render_scene(args.scene, args.width, args.views, cache=args.cache))
     work = WORK / f"scene{args.scene:02d}_{args.width}_{args.views}"
     work.mkdir(parents=True, exist_ok=True)
-    for scenario in SCENARIOS:
+    for scenario in args.scenario:
         result = run_trial(Trial(method_named(args.method), scenario, work), dataset)
         print(scenario, result.score or result.failure, result.effort, flush=True)
     results = read_results(work)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivers.interfaces import CtSource, Mesh, ScanExport, ScannedMesh, Scanner
+from drivers.interfaces import CtSource, DeviceIdentity, DeviceReport, Mesh, ScanExport, ScannedMesh, Scanner
 from service.compute.ground_truth.ply import read_ply
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import ProtocolError
@@ -75,6 +75,9 @@ class Shelf:
     def __init__(self, file: Path, mesh: Surface) -> None:
         self.file, self.mesh = file, mesh
         file.write_bytes(b"as it was exported")
+
+    def report(self) -> DeviceReport:
+        return DeviceReport(DeviceIdentity("shelf", "Bench shelf", "S-1", "1.0", "bench", "1", "memory"))
 
     def exports(self) -> tuple[ScanExport, ...]:
         return (ScanExport("mesh", (self.file,), "2036-11-21T10:00:00Z"),)

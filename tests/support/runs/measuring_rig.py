@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from drivers.errors import DeviceFaultError
-from drivers.interfaces import CtSource, Mesh, ScanExport, ScannedMesh
+from drivers.interfaces import CtSource, DeviceIdentity, DeviceReport, Mesh, ScanExport, ScannedMesh
 from service.compute.planning.information import (
     ViewInformation,
     view_information,
@@ -97,6 +97,9 @@ class BenchCt:
         self.file = folder / "segmented.stl"
         self.file.write_bytes(b"as it was exported")
         self.works = True
+
+    def report(self) -> DeviceReport:
+        return DeviceReport(DeviceIdentity("ct", "Bench CT", "CT-1", "1.0", "bench", "1", "memory"))
 
     def segmented_meshes(self) -> tuple[ScanExport, ...]:
         if not self.works:
