@@ -129,7 +129,7 @@ def test_a_changed_file_and_another_format_are_refused(folder: Path, dataset: Da
     with pytest.raises(DataError, match=r"splits\.json was altered"):
         data_set_of_folder(copy)
     write_data_set(dataset, exporter("colmap"), tmp_path / "colmap")
-    with pytest.raises(DataError, match="no data set in the format hdf5"):
+    with pytest.raises(DataError, match="not a data set in the format hdf5"):
         data_set_of_folder(tmp_path / "colmap")
 
 
