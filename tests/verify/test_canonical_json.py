@@ -53,8 +53,8 @@ def test_numbers_are_written_as_ecmascript_does(value: float) -> None:
     ("text", "said"),
     [
         (b'{"a":1,"a":2}', "twice"),
-        (b"NaN", "no JSON"),
-        (b"-Infinity", "no JSON"),
+        (b"NaN", "not JSON"),
+        (b"-Infinity", "not JSON"),
         (b"\xff", "utf-8"),
         (b"[" * 100_000, "too deeply"),
         (b"1" * 5000, "too long"),
