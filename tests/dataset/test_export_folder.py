@@ -110,7 +110,7 @@ def test_nothing_is_overwritten(dataset: DataSet, tmp_path: Path) -> None:
         write_data_set(dataset, exporter("gltf"), tmp_path / "out")
     (tmp_path / ".other.part").mkdir()
     (tmp_path / ".other.part" / "precious").write_text("mine")
-    with pytest.raises(DataError, match="no export"):
+    with pytest.raises(DataError, match="not an export"):
         write_data_set(dataset, exporter("gltf"), tmp_path / "other")
     assert (tmp_path / ".other.part" / "precious").read_text() == "mine"
     with pytest.raises(DataError, match="cannot be made"):

@@ -200,7 +200,7 @@ def test_what_is_no_recording_is_told(tmp_path: Path) -> None:
     file.write_text("this is no recording")
     done = run(file, "--out", tmp_path / "b", *FRAMES)
     assert done.exit_code == 1
-    assert "cannot be read behind its beginning" in done.output
+    assert "cannot be read after its beginning" in done.output
 
 
 def test_a_recording_that_is_cut_short_names_the_last_message(photographs: BoardFolder, tmp_path: Path) -> None:
@@ -209,4 +209,4 @@ def test_a_recording_that_is_cut_short_names_the_last_message(photographs: Board
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     done = run(file, "--out", tmp_path / "out", *FRAMES)
     assert done.exit_code == 1
-    assert "cannot be read behind" in done.output
+    assert "cannot be read after" in done.output

@@ -176,7 +176,7 @@ def test_a_log_that_was_cut_or_changed_shows_against_its_copy(data: Path, tmp_pa
     sign_again(data)
     report = verify(data, signatures_copy=copy)
     assert report.faults == ()
-    assert f"{copy} has not the last 2 lines of {NAME} yet" in report.notes
+    assert f"{copy} does not have the last 2 lines of {NAME} yet" in report.notes
     bring_up_to_date(data, copy)
     # Everything is rolled back to the first run, log included: nothing within the folder shows it.
     lines = (data / NAME).read_bytes().splitlines(keepends=True)
