@@ -22,14 +22,6 @@ settings.register_profile("repeatable", derandomize=True, database=None)
 settings.load_profile("repeatable")
 
 
-_MOST_PROCESSES = 8  # each takes about 0.6 GB for the modules of all tests
-
-
-def pytest_xdist_auto_num_workers() -> int:
-    """Start one process more than there are cores: a fifth of the time, tests wait for devices, pages and clocks."""
-    return min((os.cpu_count() or 1) + 1, _MOST_PROCESSES)
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the files with slow tests first, so that none keeps one process busy while all others have ended."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}

@@ -142,6 +142,9 @@ class _Soak:
                 self.faults.append(f"the runner had not ended {_ENDS_S:.0f} s after SIGTERM")
                 runner.kill()
                 runner.wait()
+            if runner.stdin is not None:
+                with suppress(OSError):  # what the person typed last found nobody
+                    runner.stdin.close()
 
     def _follow(self, runner: subprocess.Popen[bytes], client: httpx.Client, seconds: float, every_s: float) -> None:
         gives_up_s = time.monotonic() + _LONGEST_S

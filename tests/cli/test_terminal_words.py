@@ -125,7 +125,7 @@ def test_simulators_explain_themselves_as_every_command_does() -> None:
     [
         (["rig", "--scene", "x", "--dir", "d"], "Invalid value for '--scene'"),
         (["rig", "--scene", "7"], "Missing option '--dir'"),
-        (["rig", "--scen", "7", "--dir", "d"], "No such option: --scen (Possible options: --scene)"),
+        (["rig", "--scen", "7", "--dir", "d"], "No such option: --scen (Possible options: --scanner, --scene)"),
         (["rig", "--scene", "7", "--dir", "d", "--arms", "3"], "'3' is not one of '1', '2'"),
         (["camera", "--image", "a.jpg", "b.jpg", "--bogus"], "No such option: --bogus"),
         (["lightbocks"], "No such simulator 'lightbocks'. Did you mean 'lightbox'?"),
