@@ -293,7 +293,7 @@ def test_a_terminal_that_waits_can_be_left_and_nothing_is_lost(tmp_path: Path) -
     data = tmp_path / "data"
     with Store.open(data) as store:
         run = record(tmp_path, store)
-        long_job(run, 240)
+        long_job(run, 80)
         run_id = run.run_id
     master, slave = pty.openpty()
     words = command("resume", run_id, "--data", str(data))
