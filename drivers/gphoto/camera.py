@@ -215,10 +215,9 @@ class GphotoCamera:
                 images.append(self._released(folder))
                 continue
             left_ms = max(1, round(ms(deadline_s - time.monotonic())))
-            event, data = self._link.next_event(1 if images else min(200, left_ms))
-            if event == gp.GP_EVENT_FILE_ADDED:
-                announced.append(AddedFile(str(data.folder), str(data.name)))
-            elif event == gp.GP_EVENT_TIMEOUT and (images or time.monotonic() >= deadline_s):
+            event, added = self._link.next_event(1 if images else min(200, left_ms))
+            announced += added
+            if event == gp.GP_EVENT_TIMEOUT and (images or time.monotonic() >= deadline_s):
                 return tuple(images)
 
     def _released(self, folder: Path) -> CapturedImage:
@@ -287,9 +286,7 @@ class GphotoCamera:
                     where=self._link.where,
                     remedy="Check the save destination and the display of the camera, then take the exposure again",
                 )
-            event, data = self._link.next_event(200)
-            if event == gp.GP_EVENT_FILE_ADDED:
-                added.append(AddedFile(str(data.folder), str(data.name)))
+            added += self._link.next_event(200)[1]
         return added
 
     def _save(self, added: AddedFile, folder: Path) -> CapturedFile:

@@ -204,18 +204,17 @@ class Link:
         """Drain pending events, which also makes libgphoto2 reread all properties; returns the announced files."""
         added: list[AddedFile] = []
         while True:
-            event, data = self.next_event(wait_ms)
+            event, announced = self.next_event(wait_ms)
             if event == gp.GP_EVENT_TIMEOUT:
                 return added
-            if event == gp.GP_EVENT_FILE_ADDED:
-                added.append(AddedFile(str(data.folder), str(data.name)))
+            added += announced
 
-    def next_event(self, wait_ms: int) -> tuple[int, Any]:
-        """Wait for the next event of the camera; returns its type, or GP_EVENT_TIMEOUT, and its data."""
+    def next_event(self, wait_ms: int) -> tuple[int, tuple[AddedFile, ...]]:
+        """Wait for the next event of the camera; returns its type, or GP_EVENT_TIMEOUT, and the file it announces."""
         event, data = self.call("Waiting for the camera", lambda camera: camera.wait_for_event(wait_ms))
         if event == gp.GP_EVENT_UNKNOWN and (found := _REPORTED.match(str(data))):
             self.reported.add(found["name"])
-        return event, data
+        return event, (AddedFile(str(data.folder), str(data.name)),) if event == gp.GP_EVENT_FILE_ADDED else ()
 
     def names(self) -> frozenset[str]:
         """The names of all widgets that the camera has."""

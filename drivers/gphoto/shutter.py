@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from drivers.errors import DeviceBusyError, DeviceError, DeviceRefusedError, DeviceUnavailableError
 from drivers.gphoto.dials import Dials
-from drivers.gphoto.link import AddedFile, Link, gp
+from drivers.gphoto.link import AddedFile, Link
 
 _LOG = logging.getLogger(__name__)
 BUSY_ATTEMPTS = 5
@@ -43,10 +43,9 @@ def _photograph(link: Link, longest_s: float, unconfirmed: DeviceError) -> Added
     """Wait for the file of an exposure that the camera did not confirm. Raises DeviceRefusedError if none comes."""
     deadline_s = time.monotonic() + longest_s
     while time.monotonic() < deadline_s:
-        event, data = link.next_event(200)
-        if event == gp.GP_EVENT_FILE_ADDED:
+        for added in link.next_event(200)[1]:
             _LOG.warning("the camera did not confirm the release, and took a photograph: %s", unconfirmed.what)
-            return AddedFile(str(data.folder), str(data.name))
+            return added
     raise DeviceRefusedError(
         f"the camera did not confirm that it released the shutter, and no photograph came within {longest_s:.0f} s: "
         f"{unconfirmed.what}",

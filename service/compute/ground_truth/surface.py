@@ -46,6 +46,14 @@ class Surface:
         return self.area_vectors_m2 / np.maximum(length, 1e-300)
 
     @cached_property
+    def vertex_normals(self) -> Array:
+        """(V, 3) area-weighted unit normals; zero for vertices without faces."""
+        corner = self.faces.ravel()
+        vectors = np.repeat(self.area_vectors_m2, 3, axis=0)
+        total = np.stack([np.bincount(corner, vectors[:, k], len(self.vertices_m)) for k in range(3)], axis=1)
+        return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+
+    @cached_property
     def area_m2(self) -> float:
         """Area of all faces."""
         return float(np.linalg.norm(self.area_vectors_m2, axis=1).sum())

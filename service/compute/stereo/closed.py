@@ -22,19 +22,11 @@ def closed(surface: Surface) -> Surface:
     """A surface without holes near the given one; what it adds is a guess and never a result."""
     with tempfile.TemporaryDirectory(prefix="orthocapture-") as name:
         points, mesh = Path(name) / "points.ply", Path(name) / "mesh.ply"
-        _write_points(points, surface.vertices_m, vertex_normals(surface))
+        _write_points(points, surface.vertices_m, surface.vertex_normals)
         options = pycolmap.PoissonMeshingOptions(depth=_DEPTH, trim=0.0, num_threads=1)
         pycolmap.poisson_meshing(points, mesh, options)
         found = trimesh.load_mesh(mesh, process=False)
     return Surface(np.asarray(found.vertices, dtype=np.float64), np.asarray(found.faces, dtype=np.int64))
-
-
-def vertex_normals(surface: Surface) -> Array:
-    """(V, 3) unit normals, each the mean of its faces by their areas."""
-    normals = np.zeros_like(surface.vertices_m)
-    for corner in range(3):
-        np.add.at(normals, surface.faces[:, corner], surface.area_vectors_m2)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
 
 def _write_points(path: Path, points_m: Array, normals: Array) -> None:

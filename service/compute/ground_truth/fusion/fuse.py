@@ -25,7 +25,6 @@ from service.compute.ground_truth.fusion.overlap import (
     distance_to,
     overlap,
     propose_wound,
-    vertex_normals,
 )
 from service.compute.ground_truth.fusion.regions import Region, RegionCorrection, corrected
 from service.compute.ground_truth.surface import IntArray, Surface
@@ -133,7 +132,7 @@ def fuse(
     within = distance_to(carrier.vertices_m, ~usable, chosen.blend_m) / chosen.blend_m
     weight, detail = _smooth_step(within), _smooth_step((within - _DETAIL_FROM) / (1 - _DETAIL_FROM))
     known_m = np.where(usable, -seen.offset_m, 0.0)
-    followed = deviation_field(carrier, known_m, usable, chosen.lengths)[:, None] * vertex_normals(carrier)
+    followed = deviation_field(carrier, known_m, usable, chosen.lengths)[:, None] * carrier.vertex_normals
     onto = seen.nearest_m - carrier.vertices_m
     moved, folded = moved_unfolded(carrier, followed + detail[:, None] * (onto - followed))
     sigma = _sigma(carrier, weight, np.linalg.norm(onto - followed, axis=1), max(chosen.sigma_ct_m, spread), chosen)
@@ -162,7 +161,7 @@ def _sigma(carrier: Surface, weight: Array, gap: Array, sigma_ct_m: float, setti
     """(V,) standard deviation along the normal; where both count, their disagreement does, too."""
     ct = np.full(len(weight), sigma_ct_m**2)
     if settings.alignment_covariance is not None:
-        normals = vertex_normals(carrier)
+        normals = carrier.vertex_normals
         J = np.einsum("ni,nik->nk", normals, place_jacobian(carrier.vertices_m))
         ct += np.einsum("nk,kl,nl->n", J, settings.alignment_covariance, J)
     between = (weight * (1 - weight) * gap) ** 2

@@ -57,7 +57,7 @@ def overlap(ct: Surface, scan: Surface, limits: OverlapLimits | None = None) -> 
     rough, vertex = PointIndex(scan.vertices_m[used]).nearest(ct.vertices_m, reach_m)
     near = np.flatnonzero(np.isfinite(rough))
     place, face = _on_faces_around(scan, used[vertex[near]], ct.vertices_m[near])
-    normals = vertex_normals(ct)
+    normals = ct.vertex_normals
     way = ct.vertices_m[near] - place
     nearest, covered = ct.vertices_m.copy(), np.zeros(len(rough), dtype=np.bool_)
     offset = np.full(len(rough), np.inf)
@@ -170,14 +170,6 @@ def rim_vertices(surface: Surface) -> IntArray:
     keys, counts = np.unique(ends[:, 0] * n + ends[:, 1], return_counts=True)
     alone = keys[counts == 1]
     return np.unique(np.concatenate([alone // n, alone % n]))
-
-
-def vertex_normals(surface: Surface) -> Array:
-    """(V, 3) area-weighted unit normals; zero for vertices without faces."""
-    corner = surface.faces.ravel()
-    vectors = np.repeat(surface.area_vectors_m2, 3, axis=0)
-    total = np.stack([np.bincount(corner, vectors[:, k], len(surface.vertices_m)) for k in range(3)], axis=1)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
 
 def distance_to(points: Array, chosen: Mask, within_m: float) -> Array:

@@ -8,7 +8,6 @@ import numpy as np
 from service.compute.ground_truth.distances.chamfer import ChamferScore
 from service.compute.ground_truth.distances.heat_map import HeatScale, Panel, heat_picture
 from service.compute.ground_truth.fusion.fuse import Fused, Source
-from service.compute.ground_truth.fusion.overlap import vertex_normals
 from service.compute.ground_truth.surface import Surface
 
 _COLOURS = {Source.CT: (214, 94, 0), Source.SCAN: (0, 114, 178), Source.BLEND: (240, 228, 66)}  # red, green, blue
@@ -26,6 +25,6 @@ def fusion_picture(ct: Surface, scan: Surface, score: ChamferScore, scale: HeatS
     """
     palette = np.array([_COLOURS[source] for source in Source], dtype=np.uint8)
     title = "source: " + ", ".join(f"{_WORDS[s]} {100 * fused.share(s):.0f} %" for s in Source)
-    sources = Panel(fused.surface.vertices_m, palette[fused.source], vertex_normals(fused.surface), title)
+    sources = Panel(fused.surface.vertices_m, palette[fused.source], fused.surface.vertex_normals, title)
     picture = heat_picture(ct, scan, score, scale, ("CT", "scan"), (sources,))
     return cv2.imencode(".png", picture)[1].tobytes()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.surface import Surface
 from service.compute.pixels.ray_mesh import RayMesh
-from service.compute.stereo.closed import closed, vertex_normals
+from service.compute.stereo.closed import closed
 from service.compute.stereo.pairs import StereoView
 from service.compute.stereo.steep.choice import averaged, beliefs, edges_of
 from service.compute.stereo.steep.evidence import Photograph, best_views, evidence, photograph, seen_through
@@ -64,7 +64,7 @@ def completed(known: Surface, views: Sequence[StereoView], footprint_m: float) -
         return known
     vertices, normals, found = guess.vertices_m.copy(), np.zeros((0, 3)), np.zeros(0)
     for reach, step, spacing in _SEARCHES:
-        even = averaged(vertex_normals(Surface(vertices, guess.faces)), edges, _EVEN)
+        even = averaged(Surface(vertices, guess.faces).vertex_normals, edges, _EVEN)
         normals = even[part.vertices] / np.maximum(np.linalg.norm(even[part.vertices], axis=1, keepdims=True), 1e-9)
         moves = np.arange(-reach, reach + step / 2, step) * footprint_m
         moved, found = _moved(photographs, vertices[part.vertices], normals, part, moves, spacing * footprint_m)
