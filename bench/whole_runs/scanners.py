@@ -14,15 +14,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from bench.machine import RESULTS, commit, machine
 from bench.whole_runs.whole_run import orthocapture, simulated_rig
-from service.compute.evaluation.accuracy import true_error_m
-from service.core.geometry import inverse
+from service.cli.run.demo import true_cameras, true_error_mm
 from service.core.run.state import StepState
-from service.core.units import mm
 from service.dataset.summary import RunSummary, summarise
 from service.run_start import recorded_run
 from service.store.store import Store
@@ -159,20 +156,13 @@ def _row(
 def _true_mm(
     summary: RunSummary, registered: StepState, name: str, truth: Mapping[str, Any], exposures: Path
 ) -> float | None:
-    """As service.cli.run.demo.true_errors_mm, for one of several registrations."""
     scans = [scan for scan in truth["scans"] if scan["device"] == name]
     found = (registered.result or {}).get("registrations", {}).get(_POSES)
     if not scans or found is None:
         return None
-    lines = [json.loads(line) for line in exposures.read_text(encoding="utf-8").splitlines() if line.strip()]
-    T_world_camera = {line["sha256"]: np.array(line["T_world_camera"]) for line in lines}
-    photographs = {capture.viewpoint: capture.artefacts[0].sha256 for capture in summary.captures()}
-    T_scan_world = inverse(np.array(scans[-1]["T_world_scan"]))
-    cameras = found["T_scan_camera"]
-    true = np.array([T_scan_world @ T_world_camera[photographs[name]] for name in cameras])
-    spheres = (summary.state.steps[f"scanning_{name}"].result or {})["spheres_m"]
-    centre = np.array(spheres).mean(axis=0)
-    return mm(true_error_m(np.array(list(cameras.values())), true, centre))
+    spheres_m = (summary.state.steps[f"scanning_{name}"].result or {})["spheres_m"]
+    T_world_camera = true_cameras(summary, exposures)
+    return true_error_mm(found["T_scan_camera"], T_world_camera, scans[-1]["T_world_scan"], spheres_m)
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:

@@ -11,15 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 import yaml
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.compute.evaluation.accuracy import true_error_m
+from service.cli.run.demo import true_error_mm
 from service.core.errors import DataError
-from service.core.geometry import inverse
 from service.core.protocol.models import load_protocol
 from service.core.records.events import OperatorAction, RunStarted, ViewImported, ViewpointCaptured
 from service.core.records.import_list import FileRole, PhotographRole
@@ -210,15 +208,13 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def true_error_mm(data: Path, run: str, photographer: Photographer) -> float:
+def error_mm(data: Path, run: str, photographer: Photographer) -> float:
     """Error of the registration at the centre of the spheres, against the true camera poses."""
     with Store.open(data) as store:
         summary = summarise(store, run, recorded_run(store, run)[0])
         cameras = summary.registrations()["colmap"].T_scan_camera
-        centre = np.array(summary.scan_spheres_m()).mean(axis=0)
-    T_scan_world = inverse(photographer.T_world_scan)
-    true = np.array([T_scan_world @ photographer.T_world_camera[name] for name in cameras])
-    return 1e3 * true_error_m(np.array(list(cameras.values())), true, centre)
+        spheres_m = summary.scan_spheres_m()
+    return true_error_mm(cameras, photographer.T_world_camera, photographer.T_world_scan, spheres_m)
 
 
 @pytest.mark.slow
@@ -259,7 +255,7 @@ def test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere(
         assert [(p.step, p.reason) for p in skipped] == [("ct", "no CT series among the files")]
         summary = summarise(store, result["run"], recorded_run(store, result["run"])[0])
         write_data_set(data_set_of(summary), exporter("plain"), tmp_path / "dataset")
-    assert true_error_mm(data, result["run"], photographer) < 0.3
+    assert error_mm(data, result["run"], photographer) < 0.3
     assert verify(data, result["run"]).ok
     says_so(data, result["run"], tmp_path)
     again = orthocapture(*words, "--json")

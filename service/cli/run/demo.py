@@ -17,6 +17,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from numpy.typing import ArrayLike
 from rich.markup import escape
 from rich.table import Table
 
@@ -39,7 +40,7 @@ from service.cli.run.ending import end_with_children, sigterm_like_ctrl_c
 from service.cli.shipped_protocols import shipped_protocols
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.errors import ConfigurationError, OrthocaptureError
-from service.core.geometry import inverse
+from service.core.geometry import Array, inverse
 from service.core.protocol.models import LoadedProtocol, load_protocol
 from service.core.units import mm
 from service.dataset.posed.folder import check_folder
@@ -144,23 +145,44 @@ def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
 
     Only the demo and tests use it, after the run.
     """
-    truth = json_module.loads(truth_file.read_text())
-    exposures = [
-        json_module.loads(line)
-        for line in (truth_file.parent / "truth_exposures.jsonl").read_text().splitlines()
-        if line.strip()
-    ]
-    T_world_camera = {exposure["sha256"]: np.array(exposure["T_world_camera"]) for exposure in exposures}
-    T_scan_world = inverse(np.array(truth["scans"][-1]["T_world_scan"]))
-    photographs = {capture.viewpoint: capture.artefacts[0].sha256 for capture in summary.captures()}
-    centre_scan_m = np.array(summary.scan_spheres_m()).mean(axis=0)
-    errors: dict[str, float] = {}
-    for source, registration in summary.registrations().items():
-        cameras = registration.T_scan_camera
-        estimated = np.array([cameras[name] for name in cameras])
-        true = np.array([T_scan_world @ T_world_camera[photographs[name]] for name in cameras])
-        errors[source] = mm(true_error_m(estimated, true, centre_scan_m))
-    return errors
+    T_world_scan = json_module.loads(truth_file.read_text())["scans"][-1]["T_world_scan"]
+    T_world_camera = true_cameras(summary, truth_file.parent / "truth_exposures.jsonl")
+    spheres_m = summary.scan_spheres_m()
+    return {
+        source: true_error_mm(registration.T_scan_camera, T_world_camera, T_world_scan, spheres_m)
+        for source, registration in summary.registrations().items()
+    }
+
+
+def true_cameras(summary: RunSummary, exposures_log: Path) -> dict[str, Array]:
+    """The true T_world_camera (4, 4) of each capture's first file, by viewpoint, from the simulated camera's log."""
+    exposures = [json_module.loads(line) for line in exposures_log.read_text().splitlines() if line.strip()]
+    by_sha256 = {exposure["sha256"]: np.array(exposure["T_world_camera"]) for exposure in exposures}
+    return {
+        capture.viewpoint: by_sha256[capture.artefacts[0].sha256]
+        for capture in summary.captures()
+        if capture.artefacts[0].sha256 in by_sha256
+    }
+
+
+def true_error_mm(
+    T_scan_camera: Mapping[str, ArrayLike],
+    T_world_camera: Mapping[str, ArrayLike],
+    T_world_scan: ArrayLike,
+    spheres_m: ArrayLike,
+) -> float:
+    """The true registration error in mm at the centre of the spheres.
+
+    Args:
+        T_scan_camera: the registration, by viewpoint.
+        T_world_camera: the truth, by viewpoint.
+        T_world_scan: the truth (4, 4).
+        spheres_m: (M, 3) in the scan.
+    """
+    T_scan_world = inverse(np.asarray(T_world_scan, dtype=np.float64))
+    true = np.array([T_scan_world @ np.asarray(T_world_camera[name]) for name in T_scan_camera])
+    centre_m = np.asarray(spheres_m, dtype=np.float64).mean(axis=0)
+    return mm(true_error_m(np.array(list(T_scan_camera.values())), true, centre_m))
 
 
 def free_address() -> str:
