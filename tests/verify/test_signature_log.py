@@ -169,6 +169,20 @@ def test_the_log_follows_the_key(data: Path) -> None:
     assert len({line.key_id for line in lines}) == 2
 
 
+def test_a_signature_made_while_the_evidence_is_verified_is_no_fault(data: Path) -> None:
+    signed: list[str] = []
+
+    def sign_meanwhile(*_: object) -> None:
+        if not signed:  # once, while the files are read
+            sign_again(data)
+            signed.append(run_of(data))
+
+    report = verify(data, progress=sign_meanwhile)
+    assert signed != []
+    assert report.faults == ()
+    assert verify(data).faults == ()
+
+
 def test_a_log_that_was_cut_or_changed_shows_against_its_copy(data: Path, tmp_path: Path) -> None:
     copy = tmp_path / "elsewhere.jsonl"
     bring_up_to_date(data, copy)

@@ -63,7 +63,8 @@ def copy_faults(data_dir: Path, copy: Path) -> tuple[list[Fault], list[str]]:
         raise StoreError(
             "there is no such copy of the log of signatures", where=str(copy), remedy="Name the copy of this folder"
         )
-    log, held = (_whole_lines(_bytes(path)).splitlines(keepends=True) for path in (data_dir / NAME, copy))
+    # The copy first: a signature made meanwhile is in the log before it is in the copy.
+    held, log = (_whole_lines(_bytes(path)).splitlines(keepends=True) for path in (copy, data_dir / NAME))
     for number, line in enumerate(held, start=1):
         if number > len(log):
             what = f"{NAME} ends before line {number} of its copy: it was cut, and the record perhaps with it"

@@ -18,7 +18,7 @@ from service.store.files.artefacts import read_artefacts
 from service.store.records import SITE, Artefact, RunRow
 from service.store.run_rows import read_runs
 from service.store.signatures.log import NAME as LOG_NAME
-from service.store.signatures.log import log_findings, read_log
+from service.store.signatures.log import LogLine, log_findings, read_log
 from service.store.signatures.log_copy import copy_faults
 from service.store.signatures.timestamps import timestamp_findings
 from service.store.verification import chain_checks as checks
@@ -107,8 +107,10 @@ def verify(
     of_wal, notes_of_wal = wal_findings(data_dir)
     database = open_read_only(data_dir, DurableFiles())
     try:
+        # Before the database's snapshot: a signature made meanwhile is in the database first, and then in the log.
+        lines = read_log(data_dir / LOG_NAME)
         with database.reading() as connection:
-            report = _verify_readable(data_dir, connection, run_id, progress, certificates, with_files=files)
+            report = _verify_readable(data_dir, connection, lines, run_id, progress, certificates, with_files=files)
     finally:
         database.close()
     report = replace(report, faults=(*report.faults, *of_wal), notes=(*report.notes, *notes_of_wal))
@@ -121,6 +123,7 @@ def verify(
 def _verify_readable(
     data_dir: Path,
     connection: Connection,
+    lines: Sequence[LogLine] | None,
     run_id: str | None,
     progress: Progress | None,
     certificates: Path | None,
@@ -129,7 +132,7 @@ def _verify_readable(
 ) -> AuditReport:
     """Verify; raises StoreError if the check fails on rows that only a damaged database can hold."""
     try:
-        return _verify(data_dir, connection, run_id, progress, certificates, with_files=with_files)
+        return _verify(data_dir, connection, lines, run_id, progress, certificates, with_files=with_files)
     except (TypeError, ValueError, LookupError, ArithmeticError) as error:
         damage = database_damage(connection)
         if not damage:
@@ -140,6 +143,7 @@ def _verify_readable(
 def _verify(
     data_dir: Path,
     connection: Connection,
+    lines: Sequence[LogLine] | None,
     run_id: str | None,
     progress: Progress | None,
     certificates: Path | None,
@@ -164,7 +168,7 @@ def _verify(
     orphans, foreign = unlisted_files(folder, evidence.every_sha256) if with_files else ([], [])
     if not with_files:
         notes.append("the files were not read again: only records and signatures were checked")
-    of_log, said_of_log = _log_findings(data_dir, evidence, site, keys)
+    of_log, said_of_log = _log_findings(lines, evidence, site, keys)
     every_run = run_id is None
     ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]
     faults = [
@@ -181,13 +185,11 @@ def _verify(
 
 
 def _log_findings(
-    data_dir: Path, evidence: EvidenceRows, site: ChainFacts, keys: signatures.Keys
+    lines: Sequence[LogLine] | None, evidence: EvidenceRows, site: ChainFacts, keys: signatures.Keys
 ) -> tuple[list[Fault], list[str]]:
     """Faults and notes of the log of signatures that is kept beside the database."""
     public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
-    return log_findings(
-        read_log(data_dir / LOG_NAME), evidence.checkpoints, public_keys, awaited=bool(site.key_changes)
-    )
+    return log_findings(lines, evidence.checkpoints, public_keys, awaited=bool(site.key_changes))
 
 
 def _check_chains(
