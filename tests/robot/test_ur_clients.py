@@ -240,6 +240,7 @@ def test_dashboard_lines(controller: tuple[str, str]) -> None:
 # --- ur_rtde ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_unmodified_ur_rtde(controller: tuple[str, str]) -> None:
     host, version = controller
     command = [sys.executable, "-m", "tests.support.vendor.ur_vendor_session", host, version]

@@ -26,6 +26,8 @@ from simulators.faults import FaultPlan
 from simulators.scene.world import Scene
 from tests.support.rig.simulator_process import simulator
 
+pytestmark = pytest.mark.slow
+
 SEED = 7
 SCENE = Scene.generate(SEED)
 RADIUS_M = 0.015
@@ -126,7 +128,6 @@ def test_normals_face_outwards(sprayed: Scanned) -> None:
     assert np.median(normals[board, 2]) > 0.99
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("form", ["obj", "stl"])
 def test_other_formats_hold_the_same_scan(tmp_path: Path, form: str) -> None:
     scan = scanned(tmp_path, "--format", form, "--spacing-mm", "1.2", "--spray")
@@ -191,7 +192,6 @@ def ct(tmp_path_factory: pytest.TempPathFactory) -> Ct:
     return Ct(source.read(series), truth, seconds)
 
 
-@pytest.mark.slow
 def test_ct_spheres_are_where_they_are_to_a_tenth_of_a_voxel(ct: Ct) -> None:
     vertices, _ = surface(ct.volume.hounsfield, ct.volume.T_ct_voxel, -425)
     world = apply(ct.T_world_ct, vertices)
@@ -201,7 +201,6 @@ def test_ct_spheres_are_where_they_are_to_a_tenth_of_a_voxel(ct: Ct) -> None:
         assert abs(fit.radius_m - RADIUS_M) < 0.1e-3
 
 
-@pytest.mark.slow
 def test_ct_surface_lies_on_the_specimen(ct: Ct) -> None:
     vertices, _ = surface(ct.volume.hounsfield, ct.volume.T_ct_voxel, -475)
     world = apply(ct.T_world_ct, vertices)

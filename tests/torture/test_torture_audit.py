@@ -25,6 +25,7 @@ def test_what_is_altered_is_told_with_its_place_or_documented(about: dict[str, o
     assert about["problems"] == []
 
 
+@pytest.mark.slow
 def test_every_sweep_was_done_and_none_told_nothing(about: dict[str, object]) -> None:
     sweeps = about["sweeps"]
     assert isinstance(sweeps, dict)
