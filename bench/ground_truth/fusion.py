@@ -23,7 +23,6 @@ from bench.machine import RESULTS, commit, machine
 from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.distances.triangle_tree import TriangleTree
 from service.compute.ground_truth.fusion.fuse import FusionSettings, Source, fuse
-from service.compute.ground_truth.fusion.overlap import vertex_normals
 from service.compute.ground_truth.surface import Surface
 from service.compute.surfaces.isosurface import surface
 from service.core.geometry import Array, apply
@@ -87,7 +86,7 @@ def measured(seed: int, voxel_m: float, spacing_m: float, high: Array) -> dict[s
     fused = fuse(ct, scan, np.array([0.0, 0.0, 1.0]), FusionSettings(keep_scan_only=False))
     cpu = time.process_time() - cpu
     vertices, faces = scene.solid_mesh(control_spheres=False)
-    points, normals = fused.surface.vertices_m, vertex_normals(fused.surface)
+    points, normals = fused.surface.vertices_m, fused.surface.vertex_normals
     inside = np.flatnonzero(np.all((points > LOW_M + _INSIDE_M) & (points < high - _INSIDE_M), axis=1))
     points, normals, weight = points[inside], normals[inside], fused.weight[inside]
     height = heights(Surface(vertices, faces.astype(np.int64)), points, normals)

@@ -20,7 +20,6 @@ from bench.machine import RESULTS, commit, machine
 from bench.reconstruction.simulated import simulated_data_set
 from bench.scenes import CACHE, render_scene
 from service.compute.ground_truth.distances.neighbours import PointIndex
-from service.compute.ground_truth.fusion.overlap import vertex_normals
 from service.compute.ground_truth.surface import IntArray, Surface
 from service.compute.pixels.ray_mesh import RayMesh
 from service.core.geometry import Array, apply, inverse
@@ -37,7 +36,7 @@ def incidence(dataset: DataSet, chosen: IntArray) -> Array:
     """(K, views) cosine between normal and ray at chosen vertices of the truth; -1 where a view sees none."""
     mesh = Surface(dataset.mesh.vertices_m, dataset.mesh.faces)
     rays = RayMesh(mesh.vertices_m, mesh.faces)
-    points, normals = mesh.vertices_m[chosen], vertex_normals(mesh)[chosen]
+    points, normals = mesh.vertices_m[chosen], mesh.vertex_normals[chosen]
     middles = mesh.vertices_m[mesh.faces].mean(axis=1)
     out = np.full((len(chosen), len(dataset.views)), -1.0)
     for k, view in enumerate(dataset.views):
