@@ -27,6 +27,7 @@ from service.compute.registration.solve import RegistrationResult, register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from simulators.scene.world import RADIUS_M, Scene
+from tests.support.stated_errors import normalised_rms, sigma_components_m
 
 SOURCES = ("true", "disturbed", "smooth", "robot")
 SFM_NOISE = (3e-5 / np.sqrt(3), np.radians(0.003) / np.sqrt(3))  # per coordinate: 0.03 mm and 0.003° in total
@@ -132,10 +133,10 @@ def _registered(
         "pose_sigma_deg": float(np.degrees(r.pose_sigma[1])),
         "control_radial_mm": control.mean_radial_error_mm,
         "control_px": control.mean_reprojection_error_px,
-        "control_normalised": control.normalised_rms or 0.0,
+        "control_normalised": normalised_rms(control) or 0.0,
         "left_out_radial_mm": spared.mean_radial_error_mm,
-        "left_out_normalised": spared.normalised_rms or 0.0,
-        **{f"sigma_{k}_mm": 1e3 * v for k, v in r.sigma_components_m(centre).items()},
+        "left_out_normalised": normalised_rms(spared) or 0.0,
+        **{f"sigma_{k}_mm": 1e3 * v for k, v in sigma_components_m(r, centre).items()},
     }
 
 

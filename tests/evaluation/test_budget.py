@@ -26,6 +26,7 @@ from service.core.errors import ComputeError
 from service.core.geometry import apply, inverse, transform
 from service.worker.registration.evaluate import budget_record
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, exact_outlines, scene
+from tests.support.stated_errors import sigma_components_m
 
 SIGMA_M = 0.02e-3
 
@@ -131,7 +132,7 @@ def budget_of(seed: int, stated_m: float = SIGMA_M) -> ErrorBudget:
     centre = REGISTRATION_M.mean(axis=0)
     placed = Alignment(registration.T_world_scan, registration.covariance)
     return ErrorBudget(
-        contributions(registration.sigma_components_m(centre), scanned, ct),
+        contributions(sigma_components_m(registration, centre), scanned, ct),
         (control_observation(placed, found, controls), *loop_observations(places, scanned, ct)),
     )
 

@@ -14,6 +14,7 @@ from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse, skew, transform
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, Scene, exact_outlines, scene
 from tests.support.scenes.tracked_scene import tracked_scene
+from tests.support.stated_errors import sigma_components_m
 
 NOTHING_COMMON = CommonErrors(shift_px=1e-5, growth_px=1e-5, light_px=1e-5)
 TARGET = np.array([0.02, -0.01, 0.05])
@@ -71,7 +72,7 @@ def test_errors_have_the_size_stated(pose_sigma: tuple[float, float], sphere_sig
         result = solved(made, seed, pose_sigma=pose_sigma, sphere_sigma_m=sphere_sigma_m)
         values.append(chi2(result, made))
         assert 0.4 < result.chi2_reduced < 2.0
-        parts = result.sigma_components_m(TARGET)
+        parts = sigma_components_m(result, TARGET)
         assert max(parts, key=lambda k: parts[k]) == main
         assert sum(v**2 for v in parts.values()) == pytest.approx(result.sigma_at_m(TARGET) ** 2, rel=1e-3)
     assert 0.6 < np.mean(values) < 1.6
@@ -134,7 +135,7 @@ def test_what_no_view_can_tell_remains() -> None:
     seen = np.concatenate([made.centres_camera(i, REGISTRATION_M) for i in range(n)])
     distance = float(np.mean(np.linalg.norm(seen, axis=1)))
     expected = np.sqrt(3) * 0.1 / made.camera.fx * distance
-    assert result.sigma_components_m(TARGET)["common"] == pytest.approx(expected, rel=0.1)
+    assert sigma_components_m(result, TARGET)["common"] == pytest.approx(expected, rel=0.1)
 
 
 def test_covariances_of_the_wrong_shape_are_refused() -> None:

@@ -47,12 +47,6 @@ class Evaluation:
     mean_reprojection_error_px: float
     errors: tuple[ControlSphereError, ...]
 
-    @property
-    def normalised_rms(self) -> float | None:
-        """Rms of the normalised errors: near 1 if the stated covariances are right; None if there are none."""
-        values = [e.normalised for e in self.errors if e.normalised is not None]
-        return float(np.sqrt(np.mean(np.square(values)))) if values else None
-
     def per_sphere(self) -> dict[int, tuple[float, float, int]]:
         """Sphere → mean radial error (mm), mean reprojection error (px), number of images."""
         out: dict[int, tuple[float, float, int]] = {}

@@ -120,11 +120,6 @@ class RegistrationResult:
         """Target registration error: predicted standard deviation (3D) in metres at a point (3,) of the scan."""
         return float(self.sigma_map_m(np.asarray(point_scan_m)[None])[0])
 
-    def sigma_components_m(self, point_scan_m: Array) -> dict[str, float]:
-        """Contribution of each source to `sigma_at_m`; the squares sum to its square."""
-        at = (self.T_world_scan[:3, :3] @ point_scan_m)[None]
-        return {name: float(np.sqrt(_variance_m2(at, c)[0])) for name, c in self.components.items()}
-
     def covariance_at_m2(self, point_scan_m: Array) -> Array:
         """(3, 3) covariance in m², world axes, of the position of a point (3,) of the scan."""
         J = np.hstack([np.eye(3), -skew(self.T_world_scan[:3, :3] @ point_scan_m)])
