@@ -17,7 +17,7 @@ from drivers.stillness import PoseSpread, pose_spread
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, Transform
 from service.core.records.events import ArtefactRef, FurtherExposure, Matrix4, ViewpointCaptured
-from service.steps.capture.further_cameras import FurtherImage, expose_further, files_of, keep_further
+from service.steps.capture.further_cameras.images import FurtherImage, expose_further, files_of, keep_further
 from service.steps.capture.image_files import put_image
 from service.steps.capture.motion import settle_criteria
 from service.steps.capture.plan.viewpoints import Viewpoint

@@ -23,7 +23,7 @@ from service.jobs.capture import further_view, live_summary, live_view
 from service.jobs.looks import image_of
 from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Point, PosedPhotograph
 from service.jobs.surfaces import coverage_points, locate_spheres
-from service.steps.capture.further_looks import describe_further, look_at_further
+from service.steps.capture.further_cameras.looks import describe_further, look_at_further
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.capture.spoilt import ImageSharpness, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.context import JobRequest, StepContext

@@ -30,7 +30,7 @@ from service.steps.capture.exposure import (
     record_shot,
     wanted_settings,
 )
-from service.steps.capture.further_cameras import exposing_at, settings_of
+from service.steps.capture.further_cameras.images import exposing_at, settings_of
 from service.steps.capture.motion import MotionLimits, move_and_settle, settle_criteria
 from service.steps.capture.plan.viewpoints import Viewpoint, flange_target
 from service.steps.context import FurtherCamera, StepContext
