@@ -29,6 +29,7 @@ class Pedal:
     _count: int | None = field(init=False, default=None)  # None until the first call for the open question
     _armed_s: float | None = field(init=False, default=None)  # time of the press that armed the pedal
     _silent_until_s: float = field(init=False, default=0.0)
+    _told: str = field(init=False, default="")  # why the box does not answer, told once until it answers again
 
     @property
     def armed(self) -> bool:
@@ -63,8 +64,11 @@ class Pedal:
             count = self.presses()
         except DeviceError as error:
             self._silent_until_s = self.monotonic_s() + _RETRY_S
-            self.tell(f"the foot pedal does not work: {error}")
+            if str(error) != self._told:
+                self._told = str(error)
+                self.tell(f"the foot pedal does not work: {error}")
             return False
+        self._told = ""
         if self._count is None or count < self._count:  # a light box that was switched off counts from zero
             self._count = count
         pressed, self._count = count != self._count, count

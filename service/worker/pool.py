@@ -22,6 +22,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 from service.compute.memory import keep_freed_memory
+from service.compute.priority import compute_in_background
 from service.core.jobs.priorities import Lane
 from service.logs.file_log import file_log
 from service.monitor.worker_sign import SignOfLife
@@ -32,7 +33,6 @@ _log = logging.getLogger(__name__)
 _POLL_S = 0.2
 _RESTART_S = 1.0  # delay before a dead child is replaced
 _MOST_WAITED = 4  # children for jobs that a step waits for; there are seldom more of them at a time
-_NICE = 10  # of background children, so that the others and the capture have priority
 
 Progress = Callable[[str, int, int], None]
 
@@ -170,8 +170,8 @@ def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     tempfile.tempdir = str(scratch)
     keep_freed_memory()
-    if lane == "background" and hasattr(os, "nice"):
-        os.nice(_NICE)
+    if lane == "background":
+        compute_in_background()
 
     def tell(what: str, done: int, total: int) -> None:
         with contextlib.suppress(OSError):  # the worker has ended, and this process will too

@@ -129,3 +129,16 @@ def test_a_broken_pedal_is_told_once_in_half_a_minute(box: Box, look: Callable[.
     box.now_s += 30.0
     box.count += 1
     assert look()
+
+
+def test_the_same_fault_is_told_once_until_the_box_answers_again(box: Box, look: Callable[..., bool]) -> None:
+    for _ in range(3):
+        box.fault = DeviceUnavailableError("unplugged", where="lightbox")
+        assert not look()
+        box.now_s += 31.0
+    assert len(box.told) == 1
+    box.fault = None
+    assert not look()
+    box.fault = DeviceUnavailableError("unplugged", where="lightbox")
+    assert not look()
+    assert len(box.told) == 2

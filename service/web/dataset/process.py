@@ -5,13 +5,11 @@ It ends when the process that started it ends.
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
 from service.audit.background.child_process import Progress, report
-
-_POLITE = 10  # a capture and its worker need the processor more
+from service.compute.priority import compute_in_background
 
 
 def preview(data: Path, run_id: str, folder: Path, progress: Progress) -> str:
@@ -25,7 +23,7 @@ def preview(data: Path, run_id: str, folder: Path, progress: Progress) -> str:
 
 
 if __name__ == "__main__":
-    os.nice(_POLITE)
+    compute_in_background()  # a capture and its worker need the processor more
     report(
         lambda progress: preview(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]), progress), outlives_parent=False
     )
