@@ -33,7 +33,7 @@ def export_command(
             "--format",
             metavar="NAME",
             help="colmap, colmap-binary, colmap-pinhole, sugar, eth3d, nerfstudio, instant-ngp, neus2, dtu, bop, "
-            "hdf5, gltf, plain, matching, or that of a plug-in.",
+            "hdf5, gltf, plain, matching, mcap, or that of a plug-in.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="A new folder; it appears when it is whole.")],

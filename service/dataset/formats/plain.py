@@ -38,9 +38,9 @@ def _write_camera(dataset: DataSet, folder: ExportFolder, place: str) -> None:
     camera = only_camera(dataset, "a plain data set")
     poses = {view.file: view.T_world_camera for view in dataset.views}
     in_images = {f"images/{name}": T for name, T in poses.items()}
-    folder.written_by(f"{place}camera.json", lambda path: write_camera_json(path, camera))
-    folder.written_by(f"{place}poses.csv", lambda path: write_poses_csv(path, poses))
     simulated = dataset.simulated
+    folder.written_by(f"{place}camera.json", lambda path: write_camera_json(path, camera, simulated=simulated))
+    folder.written_by(f"{place}poses.csv", lambda path: write_poses_csv(path, poses))
     folder.written_by(
         f"{place}transforms.json", lambda path: write_transforms_json(path, camera, in_images, simulated=simulated)
     )
