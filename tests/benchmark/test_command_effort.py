@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import platform
+import subprocess
 import sys
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from service.benchmark.commands import run_commands
 from service.core.errors import ComputeError, ConfigurationError
 
 HELD = 300 << 20
+ROOT = Path(__file__).parents[2]
 
 
 def program(lines: str) -> tuple[str, ...]:
@@ -48,3 +51,32 @@ def test_a_program_that_is_not_there_and_one_that_fails_are_told(tmp_path: Path)
         run_commands((program("import os; os.kill(os.getpid(), 9)"),), tmp_path, tmp_path / "log")
     with pytest.raises(ComputeError, match="was ended from outside"):
         run_commands((program("import os; os.kill(os.getppid(), 9)"),), tmp_path, tmp_path / "log")
+
+
+FREED = """
+from pathlib import Path
+import numpy as np
+from service.compute.memory import keep_freed_memory, return_freed_memory
+
+def resident_mb():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+
+keep_freed_memory()
+maps, between = [], []
+for _ in range(20):
+    maps.append(np.ones(2 << 20))
+    between.append(bytes(2000))
+held = resident_mb()
+maps.clear()
+kept = resident_mb()
+return_freed_memory()
+print(held - kept, kept - resident_mb())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries keep and return as they do")
+def test_freed_memory_is_kept_until_it_is_returned() -> None:
+    done = subprocess.run([sys.executable, "-c", FREED], cwd=ROOT, capture_output=True, text=True, check=True)
+    at_once, returned = map(float, done.stdout.split())
+    assert at_once < 100
+    assert returned > 200
