@@ -51,7 +51,8 @@ def export_command(
         bool,
         typer.Option(
             "--anonymous",
-            help="Leave GPS, owner and serial numbers out of the pictures, and people out of the metadata.",
+            help="Leave GPS, owner and serial numbers out of the pictures, people out of the metadata, and the "
+            "scanner's own files out of the folder.",
         ),
     ] = False,
     title: Annotated[

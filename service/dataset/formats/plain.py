@@ -14,6 +14,7 @@ from service.dataset.posed.records import DataSet, only_camera
 def write(dataset: DataSet, folder: ExportFolder) -> None:
     """`images/`, `camera.json`, `poses.csv`, `transforms.json`, `mesh.ply`, and the scanner's own export in `scan/`.
 
+    An anonymous export has no `scan/`.
     `poses.csv` is T_world_camera in metres, x right, y down, z forward, with the quaternion's scalar last.
     `transforms.json` has the same poses with OpenGL's axes. In `camera.json` the centre of the first pixel is (0, 0),
     in `transforms.json` it is (0.5, 0.5). `mesh.ply` is in metres; if CT and scan were fused, each vertex has its
