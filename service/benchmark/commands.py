@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import shlex
 import shutil
 import subprocess
-import time
+import sys
 from pathlib import Path
+from typing import Any
 
 import psutil
 
 from service.benchmark.method import Command
+from service.benchmark.programs import measured
 from service.benchmark.records import ComputingEffort, Machine
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.units import gigabytes, megabytes
@@ -31,33 +34,43 @@ def run_commands(commands: tuple[Command, ...], work: Path, log: Path) -> Comput
     wall_s = cpu_s = peak_bytes = 0.0
     log.write_bytes(b"")
     for command in commands:
-        with log.open("ab") as output:
-            output.write(f"$ {shlex.join(command)}\n".encode())
-            output.flush()
-            began = time.monotonic()
-            try:
-                process = subprocess.Popen(
-                    command, cwd=work, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
-                )
-            except OSError as error:
-                raise ConfigurationError(
-                    f"{command[0]} cannot be started: {error.strerror}", where=shlex.join(command)
-                ) from error
-            _, status, used = os.wait4(process.pid, 0)
-            process.returncode = os.waitstatus_to_exitcode(status)
-        wall_s += time.monotonic() - began
-        cpu_s += used.ru_utime + used.ru_stime
-        peak_bytes = max(peak_bytes, 1024.0 * used.ru_maxrss)
-        if process.returncode != 0:
+        took = _measured(command, work, log)
+        wall_s += took["wall_s"]
+        cpu_s += took["cpu_s"]
+        peak_bytes = max(peak_bytes, took["peak_bytes"])
+        if took["status"] != 0:
             last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-_LAST_LINES:]
             raise ComputeError(
-                f"{command[0]} ended with status {process.returncode}:\n" + "\n".join(last),
+                f"{command[0]} ended with status {took['status']}:\n" + "\n".join(last),
                 where=shlex.join(command),
                 remedy=f"Its whole output is in {log}",
             )
     return ComputingEffort(
         wall_s=round(wall_s, 2), cpu_s=round(cpu_s, 2), peak_memory_mb=round(megabytes(peak_bytes))
     )
+
+
+def _measured(command: Command, work: Path, log: Path) -> dict[str, Any]:
+    """Run a command, and return its status and what it took, as `programs/measured.py` says it."""
+    reading, writing = os.pipe()
+    with log.open("ab") as output, os.fdopen(reading, "rb") as said:
+        output.write(f"$ {shlex.join(command)}\n".encode())
+        output.flush()
+        try:
+            process = subprocess.Popen(
+                [sys.executable, "-I", "-S", measured.__file__, str(writing), *command],
+                cwd=work, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, pass_fds=(writing,),
+            )  # fmt: skip
+        finally:
+            os.close(writing)
+        answer = said.read()
+        process.wait()
+    if not answer:
+        raise ComputeError(f"{command[0]} was ended from outside", where=shlex.join(command))
+    took: dict[str, Any] = json.loads(answer)
+    if "refused" in took:
+        raise ConfigurationError(f"{command[0]} cannot be started: {took['refused']}", where=shlex.join(command))
+    return took
 
 
 def this_machine() -> Machine:

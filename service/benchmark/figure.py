@@ -19,6 +19,8 @@ from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.distances.sampling import sample
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import DataError
+from service.dataset.formats.meshes import png
+from service.dataset.posed.records import SIMULATED
 
 SPACING_M = 4e-4  # of the samples that are drawn
 FULL_M = 2e-3  # end of the colours: one scale for all figures
@@ -36,11 +38,9 @@ def figure(out: Path, results: Sequence[BenchmarkResult], known: Mapping[str, Me
     Raises:
         DataError: no method has a mesh, or a file is missing.
     """
-    scored = [result for result in results if result.score is not None]
-    if not scored:
-        raise DataError("no method has a mesh yet", where=str(out), remedy="Run a method with `benchmark run`")
-    dataset = max(scored, key=lambda result: result.finished_utc).dataset_sha256
-    by = {(r.method, r.scenario): r for r in scored if r.dataset_sha256 == dataset}
+    newest = _newest(out, results)
+    dataset = newest.dataset_sha256
+    by = {(r.method, r.scenario): r for r in results if r.score is not None and r.dataset_sha256 == dataset}
     names = sorted({method for method, _ in by})
     gt = _surface(truth_file(out, dataset))
     points = sample(gt, SPACING_M, np.random.default_rng(0)).points_m
@@ -52,12 +52,29 @@ def figure(out: Path, results: Sequence[BenchmarkResult], known: Mapping[str, Me
         ]
         rows.append(heat_row(panels, gt, points, _PANEL_PX))
     body = np.vstack(rows)
-    return np.vstack([body, heat_bar(body.shape[1], scale)])
+    parts = [body, heat_bar(body.shape[1], scale)]
+    if newest.simulated:
+        parts.append(_line("The data set is simulated.", body.shape[1]))
+    return np.vstack(parts)
 
 
 def figure_png(out: Path, results: Sequence[BenchmarkResult], known: Mapping[str, Method]) -> bytes:
     """The figure as PNG; raises as `figure`."""
-    return cv2.imencode(".png", figure(out, results, known))[1].tobytes()
+    return png(figure(out, results, known), SIMULATED if _newest(out, results).simulated else "")
+
+
+def _newest(out: Path, results: Sequence[BenchmarkResult]) -> BenchmarkResult:
+    """The newest result with a mesh."""
+    scored = [result for result in results if result.score is not None]
+    if not scored:
+        raise DataError("no method has a mesh yet", where=str(out), remedy="Run a method with `benchmark run`")
+    return max(scored, key=lambda result: result.finished_utc)
+
+
+def _line(words: str, width: int) -> NDArray[np.uint8]:
+    line = np.full((34, width, 3), 255, dtype=np.uint8)
+    cv2.putText(line, words, (20, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (40, 40, 40), 1, cv2.LINE_AA)
+    return line
 
 
 def _panel(out: Path, result: BenchmarkResult | None, title: str, index: PointIndex, scale: HeatScale) -> Panel:

@@ -83,7 +83,8 @@ def run_trial(
     mesh, effort, failure = _mesh(trial, place, commands, progress)
     truth = truth_file(trial.out, whole.identity)
     if not truth.is_file():
-        write_ply(truth, Surface(whole.mesh.vertices_m, whole.mesh.faces), 1.0, {}, ["world frame, metres"])
+        comments = list(filter(None, ("world frame, metres", whole.mark)))
+        write_ply(truth, Surface(whole.mesh.vertices_m, whole.mesh.faces), 1.0, {}, comments)
     score, sha256, faces = _scored(trial, mesh, dataset, progress) if mesh is not None else (None, "", 0)
     result = BenchmarkResult(
         method=trial.method.name,
@@ -169,7 +170,7 @@ def _scored(trial: Trial, mesh: Path, dataset: DataSet, progress: Progress) -> t
         )
     surface = Surface(trial.method.to_world(file.vertices_m, place_of(trial.method, trial.folder).data), file.faces)
     scored = score_mesh(surface, dataset.mesh, trial.settings)
-    write_scored(scored, dataset.mesh, trial.folder, trial.settings)
+    write_scored(scored, dataset, trial.folder, trial.settings)
     return scored.score, hash_file(mesh)[0], len(file.faces)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 import trimesh
 
@@ -18,7 +17,8 @@ from service.compute.ground_truth.surface import Surface
 from service.core.errors import DataError
 from service.core.geometry import inverse
 from service.core.units import mm
-from service.dataset.posed.records import Mesh
+from service.dataset.formats.meshes import png
+from service.dataset.posed.records import DataSet, Mesh
 
 MARGIN_M = 0.002
 _POINTS = 200_000  # of the truth, by which its box is found
@@ -103,9 +103,15 @@ def compare(
     )
 
 
-def write_scored(scored: Scored, truth: Mesh, folder: Path, settings: ChamferSettings | None = None) -> None:
-    """Write the mesh as it was scored (`mesh.ply`, metres, world frame) and its heat maps (`heat_map.png`)."""
-    write_ply(folder / "mesh.ply", scored.surface, 1.0, {}, ["world frame, metres; cut to the box of the truth"])
+def write_scored(scored: Scored, dataset: DataSet, folder: Path, settings: ChamferSettings | None = None) -> None:
+    """Write the mesh as it was scored (`mesh.ply`, metres, world frame) and its heat maps (`heat_map.png`).
+
+    Both say so if the data set is simulated.
+    """
+    comments = ["world frame, metres; cut to the box of the truth", dataset.mark]
+    write_ply(folder / "mesh.ply", scored.surface, 1.0, {}, list(filter(None, comments)))
     scale = HeatScale.of(scored.chamfer, (settings or ChamferSettings()).outlier_m)
-    picture = heat_picture(scored.surface, Surface(truth.vertices_m, truth.faces), scored.chamfer, scale)
-    (folder / "heat_map.png").write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+    truth = Surface(dataset.mesh.vertices_m, dataset.mesh.faces)
+    names = ("prediction", "simulated truth" if dataset.simulated else "truth")
+    picture = heat_picture(scored.surface, truth, scored.chamfer, scale, names)
+    (folder / "heat_map.png").write_bytes(png(picture, dataset.mark))

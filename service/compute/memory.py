@@ -1,4 +1,4 @@
-"""Makes this process keep freed memory for its next arrays."""
+"""Makes this process keep freed memory for its next arrays, or return it."""
 
 from __future__ import annotations
 
@@ -21,3 +21,9 @@ def keep_freed_memory() -> None:
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(_M_MMAP_THRESHOLD, _LARGEST_KEPT)
         libc.mallopt(_M_TRIM_THRESHOLD, _MOST_KEPT)
+
+
+def return_freed_memory() -> None:
+    """Return to the system what was freed and kept, before a step whose arrays have other sizes."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL("libc.so.6").malloc_trim(0)

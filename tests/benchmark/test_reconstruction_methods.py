@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import shlex
@@ -170,6 +171,20 @@ def test_a_method_is_run_and_its_mesh_comes_back_into_the_world(name: str, datas
     assert len(json.loads((tmp_path / "out" / f"{name}-sparse" / "data" / "splits.json").read_text())["dense"]) == 8
 
 
+@pytest.mark.parametrize("simulated", [True, False])
+@pytest.mark.usefixtures("stand_ins")
+def test_meshes_and_pictures_of_a_simulated_data_set_say_so(
+    dataset: DataSet, tmp_path: Path, simulated: bool
+) -> None:
+    known = dataclasses.replace(dataset, simulated=simulated)
+    run_trial(Trial(methods()["instant-ngp"], "sparse", tmp_path, settings=COARSE), known)
+    kept = [*tmp_path.glob("truth-*.ply"), *(tmp_path / "instant-ngp-sparse").glob("*.p[ln][yg]")]
+    assert {path.name for path in kept} >= {"mesh.ply", "heat_map.png"}
+    drawn = figure_png(tmp_path, read_results(tmp_path), methods())
+    for data in (*(path.read_bytes() for path in kept), drawn):
+        assert (b"SIMULATED: made by a simulated rig" in data) == simulated
+
+
 @pytest.mark.usefixtures("stand_ins")
 def test_a_mesh_made_elsewhere_is_scored_and_another_frame_is_noticed(dataset: DataSet, tmp_path: Path) -> None:
     ngp, neus2 = methods()["instant-ngp"], methods()["neus2"]
@@ -246,7 +261,8 @@ def test_the_table_has_dense_and_sparse_and_what_was_not_run(dataset: DataSet, t
     assert f"| NeuS2 | sparse | 8 | 160 × 120 | {sparse.chamfer_mm:.3f} |" in text
     assert "It was made by a simulated rig." in text
     assert "scripts/run.py --scene" in text
-    picture = cv2.imdecode(np.frombuffer(figure_png(tmp_path, read_results(tmp_path), methods()), np.uint8), 1)
+    drawn = figure_png(tmp_path, read_results(tmp_path), methods())
+    picture = cv2.imdecode(np.frombuffer(drawn, np.uint8), 1)
     assert picture is not None
     top, bottom = np.array_split(picture, 2)
     assert all(len(np.unique(half.reshape(-1, 3), axis=0)) > 100 for half in (top, bottom))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import cv2
 import numpy as np
 import pytest
@@ -137,6 +139,26 @@ def test_a_place_behind_the_known_surface_is_seen_by_no_view_and_one_before_it_i
     assert (best_views(photographs, on, up)[0] >= 0).all()
     assert (best_views(photographs, below, up)[0] == -1).all()
     assert seen_through(photographs, np.concatenate([on, below, above])).tolist() == [0, 0, len(views)]
+
+
+def test_the_views_of_many_places_take_no_more_memory_than_those_of_a_few(views: list[StereoView]) -> None:
+    known = RayMesh(together(*FLOORS).vertices_m, together(*FLOORS).faces)
+    photographs = [photograph(view, known) for view in views] * 3
+    places = on_the_ramp(40_000)
+    normals = np.broadcast_to(NORMAL, places.shape)
+    lifted = places[:, None] + np.linspace(-1e-3, 1e-3, 5)[:, None] * NORMAL
+    peaks: list[int] = []
+    chosen: list[NDArray[np.int64]] = []
+    through: list[NDArray[np.int64]] = []
+    for part in (slice(0, 10_000), slice(10_000, None), slice(None)):
+        tracemalloc.start()
+        chosen.append(best_views(photographs, places[part], normals[part])[0])
+        through.append(seen_through(photographs, lifted[part]))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert np.array_equal(np.concatenate(chosen[:2]), chosen[2])
+    assert np.array_equal(np.concatenate(through[:2]), through[2])
+    assert peaks[2] < 2 * peaks[0]
 
 
 def test_neighbours_decide_where_a_vertex_has_no_evidence_and_outvote_one_that_errs() -> None:

@@ -9,6 +9,7 @@ import re
 import socket
 import subprocess
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,13 +18,16 @@ from rich.console import Console
 from rich.table import Table
 from typer.testing import CliRunner
 
+from service.benchmark.method import methods
 from service.cli.common import print_table
 from service.cli.main import app
 from service.cli.run.demo import free_address
 from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.operators import Display, TerminalOperator
+from service.compute.matching.methods.method import matchers
 from service.core.protocol.models import load_protocol
 from service.core.run.decide import AskOperator
+from service.dataset.posed.exporter import exporters
 from service.jobs.words import term
 from service.steps import params_models
 from service.steps.capture.live_numbers import seen_words
@@ -166,3 +170,19 @@ def test_names_of_the_record_are_words() -> None:
     assert seen_words(9, 10) == "9/10 spheres"
     assert seen_words(13, 10) == "13 spheres (10 expected in this image)"
     assert json.dumps(seen_words(3, None)) == '"3 spheres"'
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "named"),
+    [
+        (("export",), "--format", exporters),
+        (("benchmark", "run"), "--method", methods),
+        (("benchmark", "matching"), "--method", matchers),
+    ],
+)
+def test_the_help_names_every_format_and_method(
+    command: tuple[str, ...], option: str, named: Callable[[], Mapping[str, object]]
+) -> None:
+    help_text = re.sub(r"[│\s]+", " ", _output(*command, "--help")[1])
+    listed = help_text.split(option, 1)[1].split("or that of a plug-in", 1)[0]
+    assert set(named()) <= set(re.findall(r"[a-z0-9-]+", listed))

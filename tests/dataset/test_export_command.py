@@ -69,6 +69,15 @@ def test_a_run_is_exported_recorded_and_still_verifies(recorded: Path, tmp_path:
             assert pixel is None or np.abs(pixel - 0.5 - ours).max() < 0.01
 
 
+def test_an_anonymous_export_has_none_of_the_scanners_own_files(recorded: Path, tmp_path: Path) -> None:
+    for options, held in (((), True), (("--anonymous",), False)):
+        out = tmp_path / f"plain{len(options)}"
+        status, printed = export(recorded, "--format", "plain", "--out", str(out), *options)
+        assert status == 0, printed
+        assert (out / "scan").exists() == held
+        assert (out / "mesh.ply").is_file()
+
+
 def test_the_masks_cover_the_spheres_that_the_photographs_show(recorded: Path) -> None:
     """Within the mask of a sphere the colour differs from that around it: mask, pose and pixels belong together."""
     run = read_run(recorded, "latest")

@@ -201,7 +201,7 @@ def says_simulated(path: Path) -> bool:
 #: Files that cannot say it: bare numbers, or a form of which every key is a number of an image.
 SILENT = (
     "*.bin", "scene_*.json", "models_info.json", "SHA256SUMS", "loader.py", "ground_truth_depth/*/*",
-    "camera.json", "poses.csv",
+    "poses.csv",
 )  # fmt: skip
 
 

@@ -241,6 +241,27 @@ def test_the_command_writes_heat_maps_in_the_unit_of_the_surface(tmp_path: Path)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
 
 
+@pytest.mark.parametrize("spacing_mm", [0.1, 0.4])
+def test_the_picture_of_a_small_surface_has_no_paper_between_its_samples(tmp_path: Path, spacing_mm: float) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=10.0)
+    ball.export(tmp_path / "gt.ply")
+    ball.apply_translation([0, 0, 0.3]).export(tmp_path / "pred.ply")
+    picture_file = tmp_path / "heat.png"
+    done = run(tmp_path / "pred.ply", tmp_path / "gt.ply", "--picture", picture_file, "--spacing-mm", spacing_mm)
+    assert done.exit_code == 0, done.output
+    picture = cv2.imread(str(picture_file))
+    assert picture is not None
+    shown = picture.min(axis=2) < 250
+    shown[:60] = shown[-100:] = False  # titles and scale
+    rows, columns = np.nonzero(shown[:, : shown.shape[1] // 2])
+    radius = 0.5 * np.ptp(rows)
+    v, u = np.mgrid[: shown.shape[0], : shown.shape[1] // 2]
+    disc = np.hypot(v - rows.min() - radius, u - columns.min() - 0.5 * np.ptp(columns)) < 0.97 * radius
+    disc[:60] = False
+    assert np.count_nonzero(disc) > 400_000
+    assert shown[:, : shown.shape[1] // 2][disc].mean() > 0.995
+
+
 def test_point_clouds_are_compared_with_meshes(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     points = rng.random((5000, 3)) * [12, 8, 0] + [0, 0, 0.4]

@@ -173,6 +173,9 @@ def test_camera_json(tmp_path: Path) -> None:
     path = tmp_path / "camera.json"
     write_camera_json(path, CAMERA)
     assert read_camera_json(path) == CAMERA
+    write_camera_json(path, CAMERA, simulated=True)
+    assert json.loads(path.read_text())["simulated"] is True
+    assert read_camera_json(path) == CAMERA
     good: dict[str, Any] = json.loads(path.read_text())
     for change, message in (
         ({"k7": 0.1}, "unknown k7"),

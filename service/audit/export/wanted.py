@@ -25,8 +25,8 @@ class WantedExport:
         form: name of the format.
         crop: `WIDTHxHEIGHT` in pixels; "" for whole images or, where several crops are wanted, for 1920x1080.
         crops: of each image, at most.
-        anonymous: GPS, owner and serial numbers are left out of the pictures, and people and serial numbers out of
-            the metadata.
+        anonymous: GPS, owner and serial numbers are left out of the pictures, people and serial numbers out of
+            the metadata, and the scanner's own files out of the folder.
         stated: title, licence, ethics, creators and citation; they replace those of the protocol.
         version: of the data set, MAJOR.MINOR.PATCH.
     """

@@ -33,7 +33,7 @@ def export_command(
             "--format",
             metavar="NAME",
             help="colmap, colmap-binary, colmap-pinhole, sugar, eth3d, nerfstudio, instant-ngp, neus2, dtu, bop, "
-            "hdf5, gltf, plain, matching, or that of a plug-in.",
+            "hdf5, gltf, plain, matching, mcap, or that of a plug-in.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="A new folder; it appears when it is whole.")],
@@ -51,7 +51,8 @@ def export_command(
         bool,
         typer.Option(
             "--anonymous",
-            help="Leave GPS, owner and serial numbers out of the pictures, and people out of the metadata.",
+            help="Leave GPS, owner and serial numbers out of the pictures, people out of the metadata, and the "
+            "scanner's own files out of the folder.",
         ),
     ] = False,
     title: Annotated[

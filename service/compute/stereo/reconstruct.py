@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from service.compute.ground_truth.surface import Surface
+from service.compute.memory import return_freed_memory
 from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.stereo.closed import closed
 from service.compute.stereo.fusion import fused
@@ -64,6 +65,7 @@ def reconstruct(views: Sequence[StereoView], progress: Progress) -> Surface:
     if not many:
         return fused_all
     del coarse, fine
+    return_freed_memory()
     progress("searching what is steep", 0, 0)
     return completed(fused_all, small, _footprint_m(small, centre))
 

@@ -14,6 +14,7 @@ from service.dataset.posed.records import DataSet, only_camera
 def write(dataset: DataSet, folder: ExportFolder) -> None:
     """`images/`, `camera.json`, `poses.csv`, `transforms.json`, `mesh.ply`, and the scanner's own export in `scan/`.
 
+    An anonymous export has no `scan/`.
     `poses.csv` is T_world_camera in metres, x right, y down, z forward, with the quaternion's scalar last.
     `transforms.json` has the same poses with OpenGL's axes. In `camera.json` the centre of the first pixel is (0, 0),
     in `transforms.json` it is (0.5, 0.5). `mesh.ply` is in metres; if CT and scan were fused, each vertex has its
@@ -38,9 +39,9 @@ def _write_camera(dataset: DataSet, folder: ExportFolder, place: str) -> None:
     camera = only_camera(dataset, "a plain data set")
     poses = {view.file: view.T_world_camera for view in dataset.views}
     in_images = {f"images/{name}": T for name, T in poses.items()}
-    folder.written_by(f"{place}camera.json", lambda path: write_camera_json(path, camera))
-    folder.written_by(f"{place}poses.csv", lambda path: write_poses_csv(path, poses))
     simulated = dataset.simulated
+    folder.written_by(f"{place}camera.json", lambda path: write_camera_json(path, camera, simulated=simulated))
+    folder.written_by(f"{place}poses.csv", lambda path: write_poses_csv(path, poses))
     folder.written_by(
         f"{place}transforms.json", lambda path: write_transforms_json(path, camera, in_images, simulated=simulated)
     )

@@ -18,6 +18,8 @@ from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 from service.dataset.posed.about import About
 
+SIMULATED = "SIMULATED: made by a simulated rig, not by a camera in front of a specimen"
+
 
 @dataclass(frozen=True, slots=True)
 class PosedView:
@@ -132,7 +134,7 @@ class DataSet:
     @property
     def mark(self) -> str:
         """The sentence that marks simulated data in every file with room for it; "" for a real capture."""
-        return "SIMULATED: made by a simulated rig, not by a camera in front of a specimen" if self.simulated else ""
+        return SIMULATED if self.simulated else ""
 
     def errors_of(self, views: Sequence[int]) -> Array | None:
         """(6 N, 6 N) `pose_errors` of the views with these numbers, which may repeat."""

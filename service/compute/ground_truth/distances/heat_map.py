@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.ground_truth.distances.chamfer import ChamferScore, DistanceSamples
+from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.distances.sampling import normals_of
 from service.compute.ground_truth.surface import Surface
 from service.core.geometry import Array
@@ -21,7 +22,10 @@ BEYOND = (128, 128, 128)  # grey: farther than the outlier limit
 _PANEL_PX = 900  # longer side of each surface in the picture
 _BAR_PX, _TEXT_PX = 24, 34
 _MARGIN_PX = 20
-_BEHIND_PX = 8  # depth over which a steep surface may fall between neighbouring pixels
+_BEHIND = 1.6  # of the width around a point: depth over which a steep surface may fall there
+_DENSE = 4  # points for a pixel: no gap is larger than a pixel
+_SOME = 2000  # points whose neighbours are asked for
+_WIDER, _LARGEST_GAP_PX = 2.5, 24  # than the distance of the nearest neighbours: points are not evenly spread
 _FONT = (cv2.FONT_HERSHEY_SIMPLEX, 0.6)
 _INK, _PAPER = (40, 40, 40), (255, 255, 255)
 
@@ -156,23 +160,41 @@ def _view(surface: Surface, points: Array) -> Array:
 
 
 def _splat(panel: Panel, seen: Array, pixel_m: float, shape: tuple[int, int], away: Array) -> Pixels:
-    """The points of one surface as pixels, the nearest to the viewer on top."""
+    """The points of one surface as pixels, the nearest to the viewer on top, without paper between neighbours."""
     at = (seen[:, :2] / pixel_m).astype(np.int64)
     order = np.argsort(-seen[:, 2])
     depth = np.full(shape, np.inf, dtype=np.float32)
     depth[at[order, 1], at[order, 0]] = seen[order, 2]
+    gap = _gap_px(seen, pixel_m, int(np.count_nonzero(np.isfinite(depth))))
     # What lies behind shows between the points; it is far behind the nearest point around it.
-    front = cv2.erode(depth, np.ones((5, 5), np.uint8))
-    order = order[seen[order, 2] <= front[at[order, 1], at[order, 0]] + _BEHIND_PX * pixel_m]
+    around = 2 * max(2, gap) + 1
+    front = cv2.erode(depth, np.ones((around, around), np.uint8))
+    behind_m = _BEHIND * around * pixel_m
+    order = order[seen[order, 2] <= front[at[order, 1], at[order, 0]] + behind_m]
     colours = panel.colours[order].astype(np.float64)
     if panel.normals is not None:
         colours *= (0.55 + 0.45 * np.abs(panel.normals[order] @ away))[:, None]
     image = np.full((*shape, 3), _PAPER, dtype=np.uint8)
     image[at[order, 1], at[order, 0]] = colours[:, ::-1].astype(np.uint8)
-    empty = np.all(image == _PAPER, axis=2)
-    filled = cv2.erode(image, np.ones((3, 3), np.uint8))  # paper is the brightest
-    image[empty] = filled[empty]
+    empty = np.ones(shape, dtype=np.uint8)
+    empty[at[order, 1], at[order, 0]] = 0
+    found = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    away_px, nearest = np.asarray(found[0], dtype=np.float32), np.asarray(found[1], dtype=np.int64)
+    of_label = np.zeros((int(nearest.max()) + 1, 3), dtype=np.uint8)
+    of_label[nearest[empty == 0]] = image[empty == 0]
+    filled = (empty == 1) & (away_px < gap + 0.5)
+    image[filled] = of_label[nearest[filled]]
     return image
+
+
+def _gap_px(seen: Array, pixel_m: float, occupied: int) -> int:
+    """How far from a point of a surface (N, 3) the middle of a gap between neighbours is, in pixels."""
+    if len(seen) < 2 or len(seen) > _DENSE * occupied:
+        return 1
+    some = np.arange(0, len(seen), max(1, len(seen) // _SOME))
+    nearest = PointIndex(seen).neighbours(seen[some], 2)[:, 1]
+    apart_m = float(np.median(np.linalg.norm(seen[some] - seen[nearest], axis=1)))
+    return int(np.clip(np.ceil(_WIDER * apart_m / pixel_m), 1, _LARGEST_GAP_PX))
 
 
 def _captioned(image: Pixels, title: str) -> Pixels:

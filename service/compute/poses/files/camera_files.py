@@ -35,19 +35,20 @@ _CALIBRATION_KEYS = (
     "sigma_by_image", "sigma_corner_px", "inflation", "covariance", "coverage", "tilt", "cross_validation",
     "residuals", "uncertainty", "warnings", "optics",
 )  # fmt: skip
+_SIMULATED = "simulated"  # of a camera that a simulated rig had
 
 
 def read_camera_json(path: Path) -> CameraModel:
     """Camera from {"width","height","fx","fy","cx","cy"} and, if not zero, "k1" … "k6", "p1", "p2" (as in OpenCV).
 
-    A file written by `calibrate intrinsics` also holds the calibration's results. Any other key is refused, since it
-    could change the meaning of the numbers.
+    A file written by `calibrate intrinsics` also holds the calibration's results, and one of a simulated data set
+    says so. Any other key is refused, since it could change the meaning of the numbers.
 
     Raises:
         DataError: a key is missing, unknown or not a number.
     """
     document = json_object(path)
-    _check_keys(document, set(_CAMERA_KEYS), {*_DISTORTION, *_CALIBRATION_KEYS}, path)
+    _check_keys(document, set(_CAMERA_KEYS), {*_DISTORTION, *_CALIBRATION_KEYS, _SIMULATED}, path)
     values: dict[str, float] = {}
     for key in (*_CAMERA_KEYS, *_DISTORTION):
         value = document.get(key, 0.0)
@@ -64,9 +65,10 @@ def read_camera_json(path: Path) -> CameraModel:
     return CameraModel(*size, *(float(values[k]) for k in (*_CAMERA_KEYS, *_DISTORTION)[2:]))
 
 
-def write_camera_json(path: Path, camera: CameraModel) -> None:
+def write_camera_json(path: Path, camera: CameraModel, *, simulated: bool = False) -> None:
     """Write a camera in the form that `read_camera_json` reads."""
-    path.write_text(json.dumps(camera.record(), indent=2) + "\n", encoding="utf-8")
+    mark = {_SIMULATED: True} if simulated else {}
+    path.write_text(json.dumps(mark | camera.record(), indent=2) + "\n", encoding="utf-8")
 
 
 def read_spheres_json(path: Path) -> ScanSpheres:

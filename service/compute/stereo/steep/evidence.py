@@ -29,7 +29,8 @@ _NOISE = 1.0  # grey values
 _FINE, _COARSE = 0.75, 4.5  # pixels: details between these sizes are compared, shading is not
 _STEP = 4  # pixels between the rays of the known surface
 _SLACK_M = 2e-3  # of the known surface
-_AT_ONCE = 1500  # places
+_AT_ONCE = 1500  # places whose patches are in memory
+_LISTED = 10_000  # places that are held against all views at a time
 _COLUMNS = 4096  # of the rectangle that lists are folded into for cv2.remap
 _ROWS = 30_000
 
@@ -80,20 +81,31 @@ def photograph(view: StereoView, known: RayMesh) -> Photograph:
 
 
 def seen_through(photographs: Sequence[Photograph], points_m: Array) -> Ints:
-    """(...) how many photographs show a known surface behind each point (..., 3)."""
+    """(N, ...) how many photographs show a known surface behind each point (N, ..., 3)."""
     out = np.zeros(points_m.shape[:-1], dtype=np.int64)
-    for one in photographs:
-        _, z, place, inside = one.seen(points_m)
-        nearest = one.nearest[place[..., 1], place[..., 0]]
-        out += inside & (nearest > 0) & (z < nearest - _SLACK_M)
+    for begin in range(0, len(points_m), _LISTED):
+        part = slice(begin, begin + _LISTED)
+        for one in photographs:
+            _, z, place, inside = one.seen(points_m[part])
+            nearest = one.nearest[place[..., 1], place[..., 0]]
+            out[part] += inside & (nearest > 0) & (z < nearest - _SLACK_M)
     return out
 
 
 def best_views(photographs: Sequence[Photograph], points_m: Array, normals: Array) -> tuple[Ints, Array]:
     """(N, VIEWS) the views that face each place most, with parallax between them, and their cosines.
 
-    -1 and 0 where there are no more. What lies behind the known surface is not seen.
+    -1 and 0 where there are no more. What lies behind the known surface is not seen. The memory that this takes does
+    not grow with the places times the views.
     """
+    chosen, found = np.full((len(points_m), VIEWS), -1, dtype=np.int64), np.zeros((len(points_m), VIEWS))
+    for begin in range(0, len(points_m), _LISTED):
+        part = slice(begin, begin + _LISTED)
+        chosen[part], found[part] = _best_views_at_once(photographs, points_m[part], normals[part])
+    return chosen, found
+
+
+def _best_views_at_once(photographs: Sequence[Photograph], points_m: Array, normals: Array) -> tuple[Ints, Array]:
     count = len(points_m)
     cosines = np.zeros((count, len(photographs)))
     slants = np.zeros((count, len(photographs), 3))

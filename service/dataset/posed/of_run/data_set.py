@@ -58,8 +58,8 @@ def data_set_of(
     Args:
         summary: the run.
         not_in_yet: results that have not arrived yet, in words.
-        personal: False leaves GPS, owner and serial numbers out of the pictures, and people and serial numbers out of
-            the metadata.
+        personal: False leaves GPS, owner and serial numbers out of the pictures, people and serial numbers out of
+            the metadata, and the scanner's own files, which may state anything, out altogether.
         stated: title, licence, ethics, creators and citation; they replace those of the protocol.
         version: of the data set.
 
@@ -104,7 +104,7 @@ def data_set_of(
             about, masks=masks, mesh=f"{truth.words}, in the frame of the scan", covariance=stated_errors.words
         ),
         pose_errors=joint,
-        scan_files=scan_files(summary),
+        scan_files=scan_files(summary) if personal else (),
     )
 
 
