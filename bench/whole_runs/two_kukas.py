@@ -39,10 +39,12 @@ def _rows(folder: Path, name: str, *, each: bool) -> list[str]:
     protocol.write_text(yaml.safe_dump(_protocol(protocol, each=each), sort_keys=False), encoding="utf-8")
     with simulated_rig(folder / "rig", SCENE, (*OPTIONS, "--host", "127.0.0.181")) as ready:
         patient(Path(ready["rig"]), answer_timeout_s=20.0)
-        orthocapture(
+        done = orthocapture(
             "run", str(protocol), "--rig", ready["rig"], "--data", str(data), "--operator", "bench", "--auto-confirm",
             "--json", timeout_s=3600, log=folder / "run.log",
         )  # fmt: skip
+    if done.status:
+        raise SystemExit(f"{name}: the run did not end (status {done.status}): {done.answer}\n{done.complaint}")
     with ended_run(data, Path(ready["truth"])) as ended:
         rows = [
             f"| {name} | {row.poses} | {row.mean_radial_error_mm:.3f} | {row.mean_reprojection_error_px:.3f} | "

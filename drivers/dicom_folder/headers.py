@@ -41,6 +41,7 @@ class SliceHeader:
     position_mm: tuple[float, ...] | None
     rescale: tuple[float, float] | None  # slope and intercept: stored values to Hounsfield units
     cut_short: bool
+    stated_instances: int | None  # NumberOfSeriesRelatedInstances: the files of the whole series, where it is stated
 
     @property
     def name(self) -> str:
@@ -111,7 +112,13 @@ def _header(path: Path, dataset: FileDataset, groups: Sequence[Dataset], frame: 
         position_mm=grouped(groups, "PlanePositionSequence", "ImagePositionPatient", 3),
         rescale=None if slope is None or intercept is None else (slope[0], intercept[0]),
         cut_short=syntax in _UNCOMPRESSED and path.stat().st_size < pixel_bytes,
+        stated_instances=_stated_instances(dataset),
     )
+
+
+def _stated_instances(dataset: Dataset) -> int | None:
+    number = _numbers(dataset, "NumberOfSeriesRelatedInstances", 1)
+    return None if number is None or number[0] < 1 else int(number[0])
 
 
 def _image_type(dataset: Dataset, groups: Sequence[Dataset]) -> tuple[str, ...]:

@@ -51,11 +51,22 @@ def problems_of(headers: Sequence[SliceHeader]) -> tuple[str, ...]:
         for syntax in sorted({h.transfer_syntax for h in headers})
         if (remedy := lacking_decoder(syntax)) is not None
     ]
+    problems += _count_problems(headers)
     images = [header for header in headers if header.rows * header.columns > 0]
     placed = [header for header in images if _placed(header) and "LOCALIZER" not in header.image_type]
     if placed:
         problems += _shape_problems(placed) or _position_problems(placed)
     return tuple(problems)
+
+
+def _count_problems(headers: Sequence[SliceHeader]) -> list[str]:
+    """Whether fewer files are here than the series states; most scanners state no number.
+
+    ImagesInAcquisition is not used: one acquisition may be reconstructed into several series.
+    """
+    stated = max((header.stated_instances or 0 for header in headers), default=0)
+    found = len({header.instance_uid for header in headers})
+    return [f"incomplete: {found} of the {stated} files that the series states"] if found < stated else []
 
 
 def _placed(header: SliceHeader) -> bool:

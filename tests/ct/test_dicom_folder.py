@@ -130,6 +130,22 @@ def test_a_gap_is_flagged_with_slices_and_positions(tmp_path: Path) -> None:
     assert "8.800 mm" in problem
 
 
+def test_half_a_series_without_a_gap_is_known_by_the_number_that_it_states(tmp_path: Path) -> None:
+    stated = set_tag("NumberOfSeriesRelatedInstances", SHAPE[0])
+    write_series(tmp_path / "whole", uid="1.2.3", change=stated)
+    write_series(tmp_path / "half", uid="1.2.4", change=stated, skip=(3, 4))
+    whole, half = source(tmp_path).series()
+    assert whole.problems == ()
+    assert half.problems == ("incomplete: 3 of the 5 files that the series states",)
+    with pytest.raises(UnreadableFileError, match="incomplete: 3 of the 5 files"):
+        source(tmp_path).read(half)
+
+
+def test_an_acquisition_that_was_reconstructed_into_two_series_is_no_half_series(tmp_path: Path) -> None:
+    write_series(tmp_path, change=set_tag("ImagesInAcquisition", 2 * SHAPE[0]))
+    assert only(tmp_path).problems == ()
+
+
 def test_a_truncated_slice_is_named(tmp_path: Path) -> None:
     write_series(tmp_path)
     victim = tmp_path / "I0003"

@@ -45,11 +45,34 @@ def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
     mesh = context.keep_bytes(
         buffer.getvalue(), kind="ct_mesh", media_type="application/x-npz", name="ct_surface.npz"
     )
-    measures, found = search_spheres(arguments, vertices_m, faces)
+    try:
+        measures, found = search_spheres(arguments, vertices_m, faces)
+    except ComputeError as error:
+        if arguments.labels is not None:
+            raise
+        raise ComputeError(
+            f"{error.what}. {_covered(T_ct_voxel, len(hounsfield))}",
+            where="CT series",
+            remedy="Compare the slices with the scanner's and send the whole series again if some are missing; "
+            "otherwise check the threshold, and the number and radius of the spheres in the protocol",
+        ) from error
     measures["surface_faces"] = float(len(faces))
     if arguments.labels is not None:
         measures["label_contrast_hu"] = _contrast(arguments, hounsfield, T_ct_voxel, np.array(found.spheres_m))
     return JobAnswer(measures, (mesh,), found)
+
+
+def _covered(T_ct_voxel: Array, slices: int) -> str:
+    """What slices cover along their normal, in words: half a series without a gap looks whole."""
+    normal = np.cross(T_ct_voxel[:3, 0], T_ct_voxel[:3, 1])
+    normal /= np.linalg.norm(normal)
+    first_m = float(normal @ T_ct_voxel[:3, 3])
+    last_m = first_m + float(normal @ T_ct_voxel[:3, 2]) * (slices - 1)
+    x, y, z = normal
+    return (
+        f"The {slices} slices cover {mm(first_m):.1f} to {mm(last_m):.1f} mm along their normal "
+        f"({x:.2f}, {y:.2f}, {z:.2f}); if the spheres reach beyond, the series is incomplete"
+    )
 
 
 def _contrast(arguments: ct_job.Arguments, hounsfield: Any, T_ct_voxel: Array, centres: Array) -> float:
