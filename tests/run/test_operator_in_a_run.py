@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 from drivers.interfaces import SafetyState
 from service.core.records.events import (
@@ -13,7 +14,9 @@ from service.core.records.events import (
 )
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
-from tests.support.rig.bench_rig import Answer
+from service.monitor.snapshot import Doing
+from service.rig import CollisionSection, OpticsSection
+from tests.support.rig.bench_rig import Answer, BenchRig, ScriptedOperator
 from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, say
 
 # --- pause, abort, redo, skip ----------------------------------------------------------------------------
@@ -38,6 +41,50 @@ def test_pause_in_mid_motion_stops_the_arm_and_resume_goes_on_with_the_next_view
     assert bench.rig.arm.stopped_short == 1
     assert seen == [(False, 3)] * 5
     assert bench.captured() == VIEWS
+
+
+@dataclass
+class Watching(ScriptedOperator):
+    """Notes the progress that it is shown."""
+
+    shown: list[tuple[str, int, int]] = field(default_factory=list[tuple[str, int, int]])
+
+    def show(self, what: str, done: int, total: int) -> None:
+        self.shown.append((what, done, total))
+        super().show(what, done, total)
+
+
+@dataclass
+class PlanningRig(BenchRig):
+    """A rig whose arm has kinematics that are known, so that its motion is planned."""
+
+    def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
+        return CollisionSection(arm="UR10e"), None
+
+
+def test_a_long_planning_shows_its_progress_and_heeds_pause(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL.replace("count: 4, distance_m: 0.6", "count: 400, distance_m: 0.6"))
+    bench.rig, operator = PlanningRig(), Watching()
+    bench.operator = operator
+
+    def planning() -> list[tuple[int, int]]:
+        words = "planning the motion: checking the viewpoints"
+        return [(done, total) for what, done, total in operator.shown if what == words]
+
+    def attended(_doing: Doing) -> None:
+        bench.ahead_s += 1.0  # the main loop attends to buttons and devices again once the clock has gone on
+        if len(planning()) == 3 and not bench.state().paused:
+            bench.act("pause")
+
+    def paused(what: str) -> None:
+        if what == "paused":
+            bench.act("abort", reason="seen enough")
+
+    operator.on_attend, operator.on_show = attended, paused
+    state = bench.run()
+    assert (state.status, state.stop_reason) == ("aborted", "seen enough")
+    assert planning() == [(0, 400), (16, 400), (32, 400), (48, 400)]
+    assert bench.rig.arm.moves == 0
 
 
 def test_abort_in_mid_motion_stops_the_arm_and_ends_the_run(bench: Bench) -> None:

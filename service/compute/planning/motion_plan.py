@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Literal
@@ -15,10 +15,13 @@ from service.compute.planning.optics import DepthOfField, depths_m
 from service.core.geometry import Array, Transform, inverse, transform
 
 Order = Literal["as_listed", "shortest"]
+#: Told how far the planning is: the work, done, of how many (0 if unknown). What it raises ends the planning.
+Told = Callable[[str, int, int], None]
 
 _NUDGES_DEG = tuple(sign * step for step in (2.5, 5.0, 7.5, 10.0, 12.5, 15.0) for sign in (1, -1))
 #: Spacing of the configurations that are checked on the way from one viewpoint to the next.
 PATH_STEP_RAD = np.radians(3.0)
+_VIEWS_AT_ONCE = 16  # viewpoints that are checked together: one by one, most of the time goes into calls
 _AT_ONCE = 24  # postures that are checked together: seven axes have hundreds for one pose
 _MOST_WAYS = 36  # postures to which a way is looked for if the straight one to the best posture is blocked
 _ROOM_M = 0.05  # clearance beyond which more is not better
@@ -74,24 +77,38 @@ class MotionPlan:
         return tuple(view for view in self.views if view.outcome == "refused")
 
 
-def plan_motion(views: Sequence[tuple[str, Transform]], situation: Situation, order: Order) -> MotionPlan:
+def plan_motion(
+    views: Sequence[tuple[str, Transform]],
+    situation: Situation,
+    order: Order,
+    told: Told = lambda _what, _done, _total: None,
+) -> MotionPlan:
     """Check, nudge and order camera poses (name, T_base_camera).
+
+    `told` is called before each few viewpoints.
 
     A pose that is out of reach, in collision or out of focus is turned about the vertical through the scene's centre,
     by up to 15°, until it is feasible; otherwise it is refused with the reason of the original pose. A viewpoint
     whose straight path in joint space is blocked is refused at its place in the order.
     """
-    placed = [_place(name, T, situation) for name, T in views]
+    placed: list[PlannedView] = []
+    for k in range(0, len(views), _VIEWS_AT_ONCE):
+        told("checking the viewpoints", k, len(views))
+        some = views[k : k + _VIEWS_AT_ONCE]
+        best = best_postures([T for _, T in some], situation)
+        placed += [_place(name, T, joints, situation) for (name, T), joints in zip(some, best, strict=True)]
     able = [view for view in placed if view.outcome != "refused"]
     refused = [view for view in placed if view.outcome == "refused"]
     way = np.vstack([situation.start_rad, *(view.joints_rad for view in able)])
     sequence: Sequence[int] = range(len(able))
     if order == "shortest" and len(able) > 2:
-        sequence = shortest_order(travel_times_s(way, situation))
+        told("finding a short way", 0, 0)
+        sequence = shortest_order(travel_times_s(way, situation), lambda: told("finding a short way", 0, 0))
     kept: list[PlannedView] = []
     here = situation.start_rad
     total = 0.0
-    for i in sequence:
+    for number, i in enumerate(sequence):
+        told("checking the way between the viewpoints", number, len(able))
         blocked = _blocked(here, able[i].joints_rad, situation)
         free = _other_way(here, able[i], situation) if blocked else None
         if free is not None:
@@ -146,52 +163,57 @@ def turn_times_s(turns_rad: Array, speed_rad_s: float, acceleration_rad_s2: floa
     return np.where(turns_rad > v**2 / a, turns_rad / v + v / a, 2 * np.sqrt(turns_rad / a))
 
 
-def shortest_order(times_s: Array) -> list[int]:
+def shortest_order(times_s: Array, working: Callable[[], None] = lambda: None) -> list[int]:
     """A short open path from node 0 through all others, for times (K + 1, K + 1); indices 0 … K − 1 of the others.
 
     Starts from the better of the listed order and the nearest-neighbour order and improves it by 2-opt until no
-    reversal helps. It is deterministic and never longer than the listed order.
+    reversal helps. It is deterministic and never longer than the listed order. `working` is called again and again.
     """
     count = len(times_s) - 1
     paths = [list(range(1, count + 1)), _nearest_neighbours(times_s)]
-    best = min((_two_opt(path, times_s) for path in paths), key=lambda path: _length(path, times_s))
+    best = min((_two_opt(path, times_s, working) for path in paths), key=lambda path: _length(path, times_s))
     return [node - 1 for node in best]
 
 
 def _nearest_neighbours(times_s: Array) -> list[int]:
-    left, path, here = set(range(1, len(times_s))), list[int](), 0
-    while left:
-        here = min(left, key=lambda node: (times_s[here, node], node))
-        left.remove(here)
+    left, path, here = np.arange(1, len(times_s)), list[int](), 0
+    while len(left):
+        nearest = int(times_s[here, left].argmin())  # the first of several
+        here = int(left[nearest])
+        left = np.delete(left, nearest)
         path.append(here)
     return path
 
 
-def _two_opt(path: list[int], times_s: Array) -> list[int]:
-    path = list(path)
+def _two_opt(path: Sequence[int], times_s: Array, working: Callable[[], None]) -> list[int]:
+    nodes = np.array(path)
     improved = True
     while improved:
         improved = False
-        for i in range(len(path) - 1):
-            before = path[i - 1] if i else 0
-            for j in range(i + 1, len(path)):
-                old = times_s[before, path[i]]
-                new = times_s[before, path[j]]
-                if j + 1 < len(path):
-                    old += times_s[path[j], path[j + 1]]
-                    new += times_s[path[i], path[j + 1]]
-                if new < old - 1e-9:
-                    path[i : j + 1] = path[i : j + 1][::-1]
-                    improved = True
-    return path
+        for i in range(len(nodes) - 1):
+            working()
+            before = nodes[i - 1] if i else 0
+            leaving_s = np.append(times_s[nodes[i + 1 : -1], nodes[i + 2 :]], 0.0)  # the last has no successor
+            j = i + 1
+            while j < len(nodes):  # each later node, as the end of a stretch that is reversed if that helps
+                old = times_s[before, nodes[i]] + leaving_s[j - i - 1 :]
+                new = times_s[before, nodes[j:]] + np.append(times_s[nodes[i], nodes[j + 1 :]], 0.0)
+                better = new < old - 1e-9
+                if not better.any():
+                    break
+                j += int(better.argmax())
+                nodes[i : j + 1] = nodes[i : j + 1][::-1].copy()
+                improved = True
+                j += 1
+    return [int(node) for node in nodes]
 
 
 def _length(path: Sequence[int], times_s: Array) -> float:
     return float(sum(times_s[a, b] for a, b in zip([0, *path], path)))  # noqa: B905 - the last has no successor
 
 
-def _place(name: str, T_base_camera: Transform, situation: Situation) -> PlannedView:
-    best = best_posture(T_base_camera, situation)
+def _place(name: str, T_base_camera: Transform, best: Array | None, situation: Situation) -> PlannedView:
+    """The view with its best posture (N,); without one, turned until there is one, or refused."""
     if best is not None:
         return PlannedView(name, T_base_camera, "feasible", joints_rad=best)
     nearest = next(iter(_postures(T_base_camera, situation)), None)
@@ -226,17 +248,38 @@ def able_postures(T_base_camera: Transform, situation: Situation) -> Iterator[Ar
     if _blurred(T_base_camera, situation):
         return
     found = _postures(T_base_camera, situation)
-    elbow_is_free = situation.body.model.axes > 6
     for k in range(0, len(found), _AT_ONCE):
         some = found[k : k + _AT_ONCE]
-        contacts = nearest_contacts(situation.body, situation.obstacles, some)
-        clearance_m = np.array([contact.clearance_m for contact in contacts])
-        order = range(len(some))
-        if elbow_is_free:
-            tight = np.clip(1 - (clearance_m - situation.margin_m) / _ROOM_M, 0, None)
-            away = np.sum((some - situation.start_rad) ** 2, axis=1)
-            order = [int(i) for i in np.argsort(away + _ROOM_WEIGHT * tight**2, kind="stable")]
-        yield from (some[i] for i in order if clearance_m[i] >= situation.margin_m)
+        yield from _able(some, _clearances_m(some, situation), situation)
+
+
+def _able(postures_rad: Array, clearances_m: Array, situation: Situation) -> Iterator[Array]:
+    """Those of the postures (K, N), with clearances (K,), that have enough of it, the best ones first."""
+    order = range(len(postures_rad))
+    if situation.body.model.axes > 6:  # the elbow is free
+        tight = np.clip(1 - (clearances_m - situation.margin_m) / _ROOM_M, 0, None)
+        away = np.sum((postures_rad - situation.start_rad) ** 2, axis=1)
+        order = [int(i) for i in np.argsort(away + _ROOM_WEIGHT * tight**2, kind="stable")]
+    yield from (postures_rad[i] for i in order if clearances_m[i] >= situation.margin_m)
+
+
+def _clearances_m(postures_rad: Array, situation: Situation) -> Array:
+    """The clearance (K,) at each of the postures (K, N)."""
+    contacts = nearest_contacts(situation.body, situation.obstacles, postures_rad)
+    return np.array([contact.clearance_m for contact in contacts])
+
+
+def best_postures(T_base_camera: Sequence[Transform], situation: Situation) -> list[Array | None]:
+    """`best_posture` of each of several poses, whose postures are checked together, which takes less time."""
+    found = [_postures(T, situation) for T in T_base_camera]
+    first = [postures_rad[:_AT_ONCE] for postures_rad in found]
+    ends = np.cumsum([len(some) for some in first])[:-1]
+    clearances = np.split(_clearances_m(np.concatenate(first), situation), ends)
+    best: list[Array | None] = []
+    for T, every, some, clearances_m in zip(T_base_camera, found, first, clearances, strict=True):
+        able = None if _blurred(T, situation) else next(_able(some, clearances_m, situation), None)
+        best.append(best_posture(T, situation) if able is None and len(every) > len(some) else able)
+    return best
 
 
 def best_posture(T_base_camera: Transform, situation: Situation) -> Array | None:

@@ -14,6 +14,7 @@ from service.compute.planning.motion_plan import (
     Order,
     PlannedView,
     Situation,
+    Told,
     best_posture,
     plan_motion,
     travel_times_s,
@@ -30,6 +31,7 @@ from service.rig import CollisionSection, OpticsSection
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import StationLayout, StepContext
 
+_LOOK_S = 0.4  # between two looks at the buttons during planning
 _EXPOSURE_S = 3.0  # estimate of settling, exposure and download at each viewpoint
 
 
@@ -129,12 +131,17 @@ def plan_step(
 ) -> StepPlan:
     """Plan from where the arm stands now, and record the plan. An arm of unknown kinematics is not checked.
 
+    Thousands of viewpoints take minutes on a busy machine: meanwhile progress is shown, and pause and abort are heeded.
+
     Args:
         context: of the step.
         viewpoints: to visit.
         T_flange_camera: (4, 4) the best known mounting of the camera.
         order: as listed, or the shortest way.
         sharp_at_m: (N, 3) points that must be sharp, base frame; None: the specimen.
+
+    Raises:
+        StepInterruptedError: paused or aborted meanwhile.
     """
     plans: list[StepPlan] = []
     for station in dict.fromkeys(v.station for v in viewpoints):
@@ -146,13 +153,35 @@ def plan_step(
             continue
         context.busy("planning the motions of the arm")
         start_rad = context.devices.robot(station).state().sample.joints_rad
-        plans.append(plan_station(mine, arm, arm.situation(start_rad, sharp_at_m=sharp_at_m), order))
+        situation = arm.situation(start_rad, sharp_at_m=sharp_at_m)
+        plans.append(plan_station(mine, arm, situation, order, _attending(context)))
     return _recorded(context, plans)
 
 
-def plan_station(viewpoints: Sequence[Viewpoint], arm: ArmAtStation, situation: Situation, order: Order) -> StepPlan:
+def _attending(context: StepContext) -> Told:
+    """Shows how far the planning is and looks at the buttons, at most every `_LOOK_S`."""
+    due_s = context.monotonic_s()
+
+    def told(what: str, done: int, total: int) -> None:
+        nonlocal due_s
+        now_s = context.monotonic_s()
+        if now_s >= due_s:
+            due_s = now_s + _LOOK_S
+            context.checkpoint()
+            context.progress(f"planning the motion: {what}", done, total)
+
+    return told
+
+
+def plan_station(
+    viewpoints: Sequence[Viewpoint],
+    arm: ArmAtStation,
+    situation: Situation,
+    order: Order,
+    told: Told = lambda _what, _done, _total: None,
+) -> StepPlan:
     """Plan the viewpoints of one station for an arm of known kinematics, without a device."""
-    answer = plan_motion([(v.name, v.T_base_camera) for v in viewpoints], situation, order)
+    answer = plan_motion([(v.name, v.T_base_camera) for v in viewpoints], situation, order, told)
     stations = {v.name: v.station for v in viewpoints}
     planned = tuple(
         Viewpoint(v.name, stations[v.name], v.T_base_camera, None if v.outcome == "refused" else v.joints_rad)
