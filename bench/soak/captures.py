@@ -2,8 +2,8 @@
 
 The programs are `simulate rig` (with a sped-up arm), `run` with its driver processes and its worker, and `serve`,
 whose pages are read all the time. A simulated person types the answers to the run's questions (bench/soak/person.py).
-Every few seconds memory (USS and RSS), descriptors and threads of every process are sampled, and the sizes of the
-database, write-ahead log and logs. After a warm-up a line is fitted over the number of captures, which
+Every few seconds memory (its own and resident), descriptors and threads of every process are sampled, and the sizes
+of the database, write-ahead log and logs. After a warm-up a line is fitted over the number of captures, which
 bench/soak/creep.py judges.
 """
 
@@ -245,14 +245,40 @@ def role_of(process: psutil.Process, runner: int) -> str:
 
 
 def figures_of(process: psutil.Process) -> dict[str, float]:
-    """Memory, descriptors and threads of one process. Raises psutil.Error."""
-    memory = process.memory_full_info()
+    """Memory, descriptors and threads of one process. Raises psutil.Error.
+
+    Its own memory is anonymous memory. The unique set size (USS) also counts pages of libraries while no other
+    process maps them, and so changes by megabytes when another program on the machine begins or ends.
+    """
+    descriptors, of_database = _descriptors(process.pid)
     return {
-        "uss_mb": memory.uss / 1e6,
-        "rss_mb": memory.rss / 1e6,
-        "descriptors": float(process.num_fds()),
+        "own_mb": _anonymous_bytes(process.pid) / 1e6,
+        "rss_mb": process.memory_info().rss / 1e6,
+        "descriptors": float(descriptors - of_database),
+        "database_descriptors": float(of_database),
         "threads": float(process.num_threads()),
     }
+
+
+def _anonymous_bytes(pid: int) -> int:
+    """Memory that no file backs, swapped out or not. Raises psutil.Error."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except (FileNotFoundError, ProcessLookupError) as error:
+        raise psutil.NoSuchProcess(pid) from error
+    return sum(1024 * int(line.split()[1]) for line in lines if line.startswith(("Anonymous:", "Swap:")))
+
+
+def _descriptors(pid: int) -> tuple[int, int]:
+    """The number of open descriptors, and how many of them are of the database. Raises psutil.Error."""
+    targets: list[str] = []
+    try:
+        for link in Path(f"/proc/{pid}/fd").iterdir():
+            with suppress(FileNotFoundError):  # closed since
+                targets.append(str(link.readlink()))
+    except (FileNotFoundError, ProcessLookupError) as error:
+        raise psutil.NoSuchProcess(pid) from error
+    return len(targets), sum("orthocapture.sqlite" in target for target in targets)
 
 
 def _size(path: Path) -> int:

@@ -25,10 +25,11 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """The largest allowed growth per 1000 captures, and its reason."""
+    """The largest allowed growth per 1000 captures, or with `total` the largest allowed value, and its reason."""
 
     most: float
     why: str
+    total: bool = False
 
 
 _FLAT = "nothing in it is kept for each capture"
@@ -43,6 +44,9 @@ MEMORY_MB: Mapping[str, Bound] = {
 }
 _OTHERS_MB = Bound(3.0, _FLAT)
 _COUNT = Bound(1.0, _FLAT)
+#: The log's index and, for each of at most 15 connections (5 kept, 10 more), database and log. A connection is made
+#: when several threads read at once for the first time, so their number rises in steps and then stays.
+DATABASE_DESCRIPTORS = Bound(31.0, "15 connections at most, whose number rises in steps", total=True)
 SIZES_MB: Mapping[str, Bound] = {
     "database": Bound(60.0, "it holds every event and row for ever; the same for each capture"),
     "write-ahead log": Bound(1.0, "SQLite uses it again after each checkpoint"),
@@ -72,9 +76,10 @@ def _process(name: str, samples: Sequence[Sample]) -> list[dict[str, Any]]:
     mine = [s for s in samples if name in s.processes]
     rows: list[dict[str, Any]] = []
     for figure, words, bound in (
-        ("uss_mb", "memory of its own (USS), MB", MEMORY_MB.get(name.rstrip(" 0123456789"), _OTHERS_MB)),
+        ("own_mb", "memory of its own, MB", MEMORY_MB.get(name.rstrip(" 0123456789"), _OTHERS_MB)),
         ("rss_mb", "resident memory, MB", MEMORY_MB.get(name.rstrip(" 0123456789"), _OTHERS_MB)),
-        ("descriptors", "descriptors", _COUNT),
+        ("descriptors", "descriptors, but for the database", _COUNT),
+        ("database_descriptors", "descriptors of the database", DATABASE_DESCRIPTORS),
         ("threads", "threads", _COUNT),
     ):
         rows.append(_row(f"{name}: {words}", [(s.captured, s.processes[name][figure]) for s in mine], bound))
@@ -82,11 +87,13 @@ def _process(name: str, samples: Sequence[Sample]) -> list[dict[str, Any]]:
 
 
 def _row(what: str, points: Sequence[tuple[int, float]], bound: Bound) -> dict[str, Any]:
-    """One row; a fault if even the lower end of the growth's 95 % interval exceeds the bound."""
+    """One row; a fault if even the lower end of the growth's 95 % interval, or a value itself, exceeds the bound."""
     values = [y for _x, y in points]
     line: Growth | None = growth([x / 1000 for x, _y in points], values)
     fault = ""
-    if line is not None and line.least > bound.most:
+    if bound.total:
+        fault = f"{what}: {max(values):g}, more than {bound.most:g}" if max(values) > bound.most else ""
+    elif line is not None and line.least > bound.most:
         fault = (
             f"{what}: grows by {line.slope:.2f} ± {line.half_width:.2f} in 1000 captures, more than {bound.most:g}"
         )
@@ -98,6 +105,7 @@ def _row(what: str, points: Sequence[tuple[int, float]], bound: Bound) -> dict[s
         "per_1000": None if line is None else round(line.slope, 3),
         "half_width": None if line is None else round(line.half_width, 3),
         "bound": bound.most,
+        "total": bound.total,
         "why": bound.why,
         "fault": fault,
     }
@@ -117,9 +125,10 @@ def table(found: Mapping[str, Any]) -> list[str]:
         "|---|---:|---:|---:|---:|---:|---|---|",
     ]
     for row in found["rows"]:
+        bound = f"up to {row['bound']:g} in all" if row["total"] else f"{row['bound']:g}"
         grows = "–" if row["per_1000"] is None else f"{row['per_1000']:.2f} ± {row['half_width']:.2f}"
         lines.append(
-            f"| {row['what']} | {row['first']} | {row['last']} | {row['most']} | {grows} | {row['bound']:g} | "
+            f"| {row['what']} | {row['first']} | {row['last']} | {row['most']} | {grows} | {bound} | "
             f"{row['why']} | {'**fault**' if row['fault'] else 'ok'} |"
         )
     return lines

@@ -131,7 +131,7 @@ def plan_step(
 ) -> StepPlan:
     """Plan from where the arm stands now, and record the plan. An arm of unknown kinematics is not checked.
 
-    Thousands of viewpoints take minutes on a busy machine: meanwhile progress is shown, and pause and abort are heeded.
+    Progress is shown meanwhile, and pause and abort are heeded.
 
     Args:
         context: of the step.
