@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.support.rig.rig import REPOSITORY, command, orthocapture, simulated_rig, without_calibration_and_ct
+from tests.support.processes.started import started
+from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig, without_calibration_and_ct
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -40,27 +41,21 @@ def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> Non
         tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3", host="127.0.0.31"
     ) as ready:
         words = ["run", str(short_protocol(tmp_path)), "--rig", ready["rig"], "--data", str(data), "--auto-confirm"]
-        with (tmp_path / "run.log").open("w") as log:
-            runner = subprocess.Popen(
-                command(*words), cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=log, stderr=log
-            )
-        wait_for_captures(data, 2, runner, tmp_path / "run.log")
-        os.kill(runner.pid, signal.SIGKILL)
-        runner.wait(timeout=60)
+        with started(words, tmp_path / "run.log") as runner:
+            wait_for_captures(data, 2, runner, tmp_path / "run.log")
+            os.kill(runner.pid, signal.SIGKILL)
+            runner.wait(timeout=60)
         before = captured(data)
         assert 2 <= len(before) < 6
 
-        with (tmp_path / "resume.log").open("w") as log:
-            again = subprocess.Popen(
-                command("resume", "latest", "--data", str(data), "--screens"),
-                cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-            )  # fmt: skip
-        wait_for(lambda: "session_started" in kinds(data)[-2:], again, tmp_path / "resume.log")
-        time.sleep(5)
-        assert captured(data) == before, "the arm moves for nobody"
-        answer = orthocapture("act", "confirm", "--data", str(data), "--operator", "Grace")
-        assert answer.returncode == 0, answer.stdout + answer.stderr
-        assert again.wait(timeout=240) == 0, (tmp_path / "resume.log").read_text()
+        words = ["resume", "latest", "--data", str(data), "--screens"]
+        with started(words, tmp_path / "resume.log") as again:
+            wait_for(lambda: "session_started" in kinds(data)[-2:], again, tmp_path / "resume.log")
+            time.sleep(5)
+            assert captured(data) == before, "the arm moves for nobody"
+            answer = orthocapture("act", "confirm", "--data", str(data), "--operator", "Grace")
+            assert answer.returncode == 0, answer.stdout + answer.stderr
+            assert again.wait(timeout=240) == 0, (tmp_path / "resume.log").read_text()
     shown = events(data)
     released = next(e for e in shown if e["kind"] == "operator_action" and e["actor"] == "Grace")
     assert [e["seq"] > released["seq"] for e in shown if e["kind"] == "viewpoint_captured"].index(True) == len(before)

@@ -21,6 +21,7 @@ from service.steps import params_models
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.web.launch import Launcher
+from tests.support.processes.runners import no_runner_left
 from tests.support.processes.waiting import until
 from tests.support.protocols.short_protocol import short_protocol
 from tests.support.rig.rig import press_pedal, simulated_rig
@@ -62,6 +63,7 @@ def test_a_run_driven_from_screens_and_pedal_survives_its_starter(tmp_path: Path
         simulated_rig(
             tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3", host="127.0.0.41"
         ) as ready,
+        no_runner_left(data),
         Store.open(data) as store,
     ):
         loaded = load_protocol(short_protocol(tmp_path / "protocols"), params_models())

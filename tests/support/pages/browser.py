@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 import signal
 import socket
@@ -24,6 +23,7 @@ from playwright.sync_api import Browser, BrowserContext, Locator, Page, expect, 
 from service.people.roles import Role
 from service.people.sessions import People
 from service.store.store import Store
+from tests.support.processes.runners import end_runners
 from tests.support.rig.rig import REPOSITORY, command
 
 TABLET = (1024, 768)
@@ -112,19 +112,7 @@ class Served:
 
     def end_runners(self) -> None:
         """End the processes that drive runs, and wait for them."""
-        for path in (self.data / "monitor").glob("*.json"):
-            pid = json.loads(path.read_text()).get("pid")
-            if pid is None:  # this is a verification's result
-                continue
-            try:
-                os.kill(pid, signal.SIGTERM)
-            except ProcessLookupError:
-                continue
-            deadline_s = time.monotonic() + 20
-            while Path(f"/proc/{pid}/status").exists() and time.monotonic() < deadline_s:
-                if "State:\tZ" in Path(f"/proc/{pid}/status").read_text():
-                    break
-                time.sleep(0.1)
+        end_runners(self.data)
 
 
 class Cable:
