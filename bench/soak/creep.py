@@ -113,11 +113,16 @@ def _row(what: str, points: Sequence[tuple[int, float]], bound: Bound) -> dict[s
 
 def table(found: Mapping[str, Any]) -> list[str]:
     """Format the findings as Markdown lines."""
+    stops = "The arm's watchdog never stopped it."
+    if found["stops"]:
+        stops = (
+            f"The arm's watchdog stopped it {found['stops']} times because the machine was busy, and a simulated person "
+            "let it go on."
+        )
     lines = [
         f"{found['minutes']:g} minutes of captures with the arm at 20 times its speed: {found['captured']:,} "
         f"viewpoints, {found['events']:,} events, {found['jobs']:,} jobs, {found['pages']:,} rounds of pages, "
-        f"{found['samples']:,} samples; the first quarter is warm-up. The arm's watchdog stopped it "
-        f"{found['stops']} times because the machine was busy, and a simulated person let it go on. Growth per 1000 "
+        f"{found['samples']:,} samples; the first quarter is warm-up. {stops} Growth per 1000 "
         "captures with its 95 % interval; a fault is what exceeds its bound for certain."
         + ("" if found["judged"] else " **This was too short to judge**, and nothing below is a fault yet."),
         "",
