@@ -116,8 +116,8 @@ def table(found: Mapping[str, Any]) -> list[str]:
     stops = "The arm's watchdog never stopped it."
     if found["stops"]:
         stops = (
-            f"The arm's watchdog stopped it {found['stops']} times because the machine was busy, and a simulated person "
-            "let it go on."
+            f"Because the machine was busy, the arm's watchdog stopped it {found['stops']} times, and a simulated "
+            "person let it go on."
         )
     lines = [
         f"{found['minutes']:g} minutes of captures with the arm at 20 times its speed: {found['captured']:,} "
