@@ -1,6 +1,6 @@
 """A whole small run with two simulated KUKAs, with a hand-eye calibration of the first alone and with one of each.
 
-`.venv/bin/python -m bench.whole_runs.two_kukas` prints the table as Markdown; seven minutes, half an hour beside other work.
+`.venv/bin/python -m bench.whole_runs.two_kukas` prints the table as Markdown; seven minutes on a quiet machine.
 """
 
 from __future__ import annotations
