@@ -19,7 +19,7 @@ CENTRES = ((12.0, 12.0, 12.0), (44.0, 12.0, 12.0))  # voxels k, j, i
 
 def volume(slices: int) -> np.ndarray[tuple[int, ...], np.dtype[np.int16]]:
     """Two spheres of 1000 HU in air, in the first `slices` of 56 slices."""
-    at = np.stack(np.indices((56, 24, 24)), axis=-1).astype(np.float64)
+    at = np.moveaxis(np.indices((56, 24, 24)), 0, -1).astype(np.float64)
     inside = np.zeros(at.shape[:3])
     for centre in CENTRES:
         depth = RADIUS_M / VOXEL_M - np.linalg.norm(at - centre, axis=-1)
