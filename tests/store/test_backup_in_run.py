@@ -11,8 +11,9 @@ import pytest
 
 from service.core.records.events import ViewpointCaptured
 from service.store.store import Store
+from tests.support.processes.started import started
 from tests.support.protocols.short_protocol import short_protocol
-from tests.support.rig.rig import REPOSITORY, command, orthocapture, simulated_rig
+from tests.support.rig.rig import orthocapture, simulated_rig
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 VIEWS = 16
@@ -50,16 +51,11 @@ def test_a_run_is_backed_up_in_its_capture_and_finished_where_it_was_restored(tm
             str(data),
             "--auto-confirm",
         ]
-        with (tmp_path / "run.log").open("w") as log:
-            runner = subprocess.Popen(
-                command(*words), cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=log, stderr=log
-            )
-        try:
+        with started(words, tmp_path / "run.log") as runner:
             wait_for_captures(data, 2, runner, tmp_path / "run.log")
             made = orthocapture("store", "backup", str(tmp_path / "backup"), "--data", str(data), "--json")
             assert made.returncode == 0, made.stdout + made.stderr
             wait_for_captures(data, len(captured(data)) + 1, runner, tmp_path / "run.log")
-        finally:
             runner.kill()
             runner.wait(timeout=60)
         lost = captured(data)

@@ -15,8 +15,8 @@ from service.compute.planning.optics import DepthOfField, depths_m
 from service.core.geometry import Array, Transform, inverse, transform
 
 Order = Literal["as_listed", "shortest"]
-#: Told how far the planning is: the work, done, of how many (0 if unknown). What it raises ends the planning.
-Told = Callable[[str, int, int], None]
+#: Called with the stage, done and total (0: unknown). What it raises ends the planning.
+Progress = Callable[[str, int, int], None]
 
 _NUDGES_DEG = tuple(sign * step for step in (2.5, 5.0, 7.5, 10.0, 12.5, 15.0) for sign in (1, -1))
 #: Spacing of the configurations that are checked on the way from one viewpoint to the next.
@@ -81,11 +81,11 @@ def plan_motion(
     views: Sequence[tuple[str, Transform]],
     situation: Situation,
     order: Order,
-    told: Told = lambda _what, _done, _total: None,
+    progress: Progress = lambda _what, _done, _total: None,
 ) -> MotionPlan:
     """Check, nudge and order camera poses (name, T_base_camera).
 
-    `told` is called before each few viewpoints.
+    `progress` is called before each few viewpoints.
 
     A pose that is out of reach, in collision or out of focus is turned about the vertical through the scene's centre,
     by up to 15°, until it is feasible; otherwise it is refused with the reason of the original pose. A viewpoint
@@ -93,7 +93,7 @@ def plan_motion(
     """
     placed: list[PlannedView] = []
     for k in range(0, len(views), _VIEWS_AT_ONCE):
-        told("checking the viewpoints", k, len(views))
+        progress("checking the viewpoints", k, len(views))
         some = views[k : k + _VIEWS_AT_ONCE]
         best = best_postures([T for _, T in some], situation)
         placed += [_place(name, T, joints, situation) for (name, T), joints in zip(some, best, strict=True)]
@@ -102,13 +102,13 @@ def plan_motion(
     way = np.vstack([situation.start_rad, *(view.joints_rad for view in able)])
     sequence: Sequence[int] = range(len(able))
     if order == "shortest" and len(able) > 2:
-        told("finding a short way", 0, 0)
-        sequence = shortest_order(travel_times_s(way, situation), lambda: told("finding a short way", 0, 0))
+        progress("finding a short way", 0, 0)
+        sequence = shortest_order(travel_times_s(way, situation), lambda: progress("finding a short way", 0, 0))
     kept: list[PlannedView] = []
     here = situation.start_rad
     total = 0.0
     for number, i in enumerate(sequence):
-        told("checking the way between the viewpoints", number, len(able))
+        progress("checking the way between the viewpoints", number, len(able))
         blocked = _blocked(here, able[i].joints_rad, situation)
         free = _other_way(here, able[i], situation) if blocked else None
         if free is not None:

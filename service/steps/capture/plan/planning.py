@@ -13,8 +13,8 @@ from service.compute.planning.motion_plan import (
     MotionPlan,
     Order,
     PlannedView,
+    Progress,
     Situation,
-    Told,
     best_posture,
     plan_motion,
     travel_times_s,
@@ -158,11 +158,11 @@ def plan_step(
     return _recorded(context, plans)
 
 
-def _attending(context: StepContext) -> Told:
+def _attending(context: StepContext) -> Progress:
     """Shows how far the planning is and looks at the buttons, at most every `_LOOK_S`."""
     due_s = context.monotonic_s()
 
-    def told(what: str, done: int, total: int) -> None:
+    def progress(what: str, done: int, total: int) -> None:
         nonlocal due_s
         now_s = context.monotonic_s()
         if now_s >= due_s:
@@ -170,7 +170,7 @@ def _attending(context: StepContext) -> Told:
             context.checkpoint()
             context.progress(f"planning the motion: {what}", done, total)
 
-    return told
+    return progress
 
 
 def plan_station(
@@ -178,10 +178,10 @@ def plan_station(
     arm: ArmAtStation,
     situation: Situation,
     order: Order,
-    told: Told = lambda _what, _done, _total: None,
+    progress: Progress = lambda _what, _done, _total: None,
 ) -> StepPlan:
     """Plan the viewpoints of one station for an arm of known kinematics, without a device."""
-    answer = plan_motion([(v.name, v.T_base_camera) for v in viewpoints], situation, order, told)
+    answer = plan_motion([(v.name, v.T_base_camera) for v in viewpoints], situation, order, progress)
     stations = {v.name: v.station for v in viewpoints}
     planned = tuple(
         Viewpoint(v.name, stations[v.name], v.T_base_camera, None if v.outcome == "refused" else v.joints_rad)
