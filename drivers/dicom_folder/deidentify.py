@@ -18,7 +18,8 @@ from drivers.dicom_folder.nifti import is_nifti, without_texts
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import CleanFile
 
-METHOD = "orthocapture: all attributes removed but those of the images; UIDs replaced"
+# Two values, because DICOM allows 64 characters for each (PS3.5, value representation LO).
+_METHOD = ("orthocapture: all attributes removed but those of the images", "UIDs replaced")
 # What stays, here and in nested items: modality, geometry, pixels, acquisition, segments. Everything else goes,
 # private attributes too: a list of what is known to be harmless is safer than one of what is known to name people.
 _KEPT = frozenset(
@@ -98,7 +99,7 @@ def _write_clean(source: Path, target: Path, removed: set[str]) -> None:
         for name in _EMPTY:
             setattr(clean, name, "")
         clean.PatientIdentityRemoved = "YES"
-        clean.DeidentificationMethod = METHOD
+        clean.DeidentificationMethod = list(_METHOD)
         pydicom.dcmwrite(target, clean, enforce_file_format=True)
 
 

@@ -198,6 +198,8 @@ def main() -> None:
     # slower on a busy machine. The library reads this when it is loaded, here and in every child process.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    # It warns of every unusual value in every slice of a CT; what matters about a series is reported in words.
+    logging.getLogger("pydicom").setLevel(logging.ERROR)
     app()
 
 

@@ -35,6 +35,15 @@ def secret(ds: Dataset, k: int) -> None:
     ds.RequestAttributesSequence = [nested]
 
 
+def strictly_valid(path: Path, monkeypatch: pytest.MonkeyPatch) -> Dataset:
+    """A file's data set, every value of which is as long and of the form that DICOM allows."""
+    with monkeypatch.context() as strict:
+        strict.setattr(pydicom.config.settings, "reading_validation_mode", pydicom.config.RAISE)
+        dataset = pydicom.dcmread(path)
+        dataset.walk(lambda _parent, element: element.value)
+    return dataset
+
+
 def driver(folder: Path, *, deidentify: bool = True) -> DicomFolder:
     return DicomFolder(DicomFolderConfig(folder=folder, stable_s=0.0, deidentify=deidentify))
 
@@ -156,3 +165,12 @@ def test_a_slice_without_a_header_of_its_own_is_copied_too(tmp_path: Path) -> No
     copies = clean_copies(tmp_path / "ct", tmp_path / "clean")
     assert len(copies) == 5
     assert pydicom.dcmread(copies[2].path).PixelData == ds.PixelData
+
+
+def test_a_copy_states_its_method_in_values_that_dicom_allows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_series(tmp_path / "ct", change=secret)
+    first = clean_copies(tmp_path / "ct", tmp_path / "clean")[0]
+    dataset = strictly_valid(first.path, monkeypatch)
+    assert "UIDs replaced" in dataset.DeidentificationMethod
