@@ -207,7 +207,7 @@ class Controller:
         return motion.stopping or End(motion.number)
 
     def _feel_load(self) -> None:
-        """The torque sensors see a load that is not the one that was set as a collision."""
+        """Stop if the load is not the one that was set: the torque sensors take the difference for a collision."""
         mass_kg = self.tool["mass_kg"]
         assert isinstance(mass_kg, float)
         if self.true_load_kg is None or self.safety != "normal":

@@ -164,7 +164,7 @@ class PictureFiles:
         return Moment(counter, None, {})
 
     def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
-        """Return the counter's file with the settings' brightness."""
+        """Return the picture file of that moment, as bright as the settings make it."""
         return expose(self._load(moment.counter), exposure_gain(settings))
 
     def light(self, moment: Moment, settings: ExposureSettings) -> Light:

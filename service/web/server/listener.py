@@ -75,7 +75,7 @@ class _AcceptedSocket(socket.socket):
 
 
 def _nothing() -> None:
-    """Do nothing, while nobody has asked to be told."""
+    """Stand in until somebody asks to be told that a connection was closed."""
 
 
 def affordable_connections(wanted: int) -> int:
