@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
@@ -15,6 +16,7 @@ from service.core.run.lifecycle import (
     STEP_RULES,
     lifecycle,
     redo,
+    state_machine,
     state_name,
     transition_table,
 )
@@ -94,6 +96,25 @@ def test_the_table_is_exactly_the_rules() -> None:
                 expected |= {(here, redo(earlier)) for earlier in STEPS[: index + 1]}
     assert set(MACHINE.table) == expected
     assert set(MACHINE.table.values()) <= set(MACHINE.states)
+
+
+class Model:
+    """What the library's machine moves; the library adds `state` and `trigger`."""
+
+    state: str
+    trigger: Callable[[str], bool]
+
+
+def test_the_table_is_what_the_machine_does() -> None:
+    machine, model = state_machine(STEPS), Model()
+    machine.add_model(model, initial=MACHINE.initial)
+    done: dict[tuple[str, str], str] = {}
+    for state in MACHINE.states:
+        for trigger in machine.events:
+            machine.set_state(state, model)
+            if model.trigger(trigger):
+                done[state, trigger] = model.state
+    assert done == MACHINE.table
 
 
 def test_an_illegal_transition_says_what_is_possible() -> None:

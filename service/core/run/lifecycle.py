@@ -6,7 +6,7 @@ library, and flattened once into the pure function (state, trigger) → state th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
@@ -126,17 +126,6 @@ class _Machine(HierarchicalMachine):
     state_cls = _State
 
 
-class _Probe:
-    """The machine's model while the table is flattened; only `_compile` uses it.
-
-    The library adds convenience methods to its model. Its option `model_override` fails with nested states and a
-    separator other than "_" in version 0.9.3.
-    """
-
-    state: str
-    trigger: Callable[[str], bool]
-
-
 def lifecycle(steps: Iterable[str]) -> Lifecycle:
     """The machine for these step identifiers, in the protocol's order (cached)."""
     return _compile(tuple(steps))
@@ -173,35 +162,38 @@ def transition_table(steps: tuple[str, ...]) -> list[tuple[str, str, str]]:
     return rows
 
 
-@lru_cache(maxsize=32)
-def _compile(steps: tuple[str, ...]) -> Lifecycle:
+def state_machine(steps: tuple[str, ...]) -> HierarchicalMachine:
+    """The library's machine with all rows, which it checks; without a model, because nothing runs on it."""
     nested: list[dict[str, Any]] = [{"name": step, "initial": "ready", "children": list(PHASES)} for step in steps]
-    rows = transition_table(steps)
-    probe = _Probe()
-    machine = _Machine(
-        model=probe,
+    return _Machine(
+        model=None,
         states=[*nested, {"name": PAUSED, "children": nested}, COMPLETED, ABORTED],
-        transitions=[{"trigger": trigger, "source": source, "dest": target} for trigger, source, target in rows],
+        transitions=[
+            {"trigger": trigger, "source": source, "dest": target}
+            for trigger, source, target in transition_table(steps)
+        ],
         initial=state_name(steps[0], "ready"),
         auto_transitions=False,
         ignore_invalid_triggers=True,
     )
+
+
+@lru_cache(maxsize=32)
+def _compile(steps: tuple[str, ...]) -> Lifecycle:
     places = {
         state_name(step, phase, paused=paused): Place(step, phase, paused)
         for paused in (False, True)
         for step in steps
         for phase in PHASES
     }
-    # The triggers that concern a state are those of rows that start at it or at an enclosing state.
-    sources: dict[str, list[str]] = {}
-    for trigger, source, _ in rows:
-        sources.setdefault(source, []).append(trigger)
+    outgoing: dict[str, list[tuple[str, str]]] = {}  # of a state or an enclosing state: (trigger, target)
+    for trigger, event in state_machine(steps).events.items():
+        for source, transitions in event.transitions.items():
+            outgoing.setdefault(source, []).append((trigger, str(transitions[0].dest)))
     targets: dict[tuple[str, str], str] = {}
     for state in places:
         parts = state.split(SEPARATOR)
-        for depth in range(len(parts), 0, -1):
-            for trigger in sources.get(SEPARATOR.join(parts[:depth]), ()):
-                machine.set_state(state, probe)
-                if probe.trigger(trigger):
-                    targets.setdefault((state, trigger), probe.state)
+        for depth in range(len(parts), 0, -1):  # the innermost state that knows a trigger decides
+            for trigger, target in outgoing.get(SEPARATOR.join(parts[:depth]), ()):
+                targets.setdefault((state, trigger), target)
     return Lifecycle(state_name(steps[0], "ready"), targets, places, steps)
