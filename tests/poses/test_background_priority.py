@@ -16,7 +16,7 @@ _SAYS = (
 
 
 def of_the_session() -> int | None:
-    """Niceness of this process' session; None where sessions are not scheduled as groups (that file is empty then)."""
+    """Niceness of this process' session; None where sessions are not scheduled as groups (an empty file)."""
     group = Path("/proc/self/autogroup")
     words = group.read_text(encoding="ascii").split() if group.exists() else []
     return int(words[-1]) if words else None
