@@ -40,6 +40,10 @@ COMMANDS = {
         "--output_path /w/fused.ply",
         "colmap poisson_mesher --input_path /w/fused.ply --output_path /w/mesh.ply",
     ],
+    "pycolmap": [
+        TRIANGULATED,
+        "python -m service.benchmark.programs.patch_match /w/dense /w/fused.ply /w/mesh.ply",
+    ],
     "openmvs": [
         TRIANGULATED,
         "InterfaceCOLMAP -w /w -i /w/dense -o scene.mvs --image-folder /w/dense/images",
