@@ -18,6 +18,8 @@ from service.core.geometry import Array, transform
 from service.dataset.posed.exporter import exporter, write_data_set
 from tests.support.scenes.slab_data_set import SLABS, slab_data_set, slab_mesh
 
+pytestmark = pytest.mark.slow
+
 
 def write_map(path: Path, values: Array) -> None:
     """Write an array (H, W, C) as COLMAP writes depth and normal maps."""
