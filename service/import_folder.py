@@ -66,7 +66,6 @@ class Places:
     scan: Path | None = None
     control_scan: Path | None = None
     ct: Path | None = None
-    ct_first_number: int = 1  # number of the first slice of a whole series
 
 
 def find_places(
@@ -94,8 +93,12 @@ def find_places(
     return Places(folder.resolve(), **found)
 
 
-def list_import(places: Places, progress: Progress = lambda _what, _done, _total: None) -> ImportList:
+def list_import(
+    places: Places, progress: Progress = lambda _what, _done, _total: None, *, ct_first_number: int = 1
+) -> ImportList:
     """Every file to be imported, with its hash, and the files left out, with the reasons.
+
+    `ct_first_number` is the number of the first slice of a whole series.
 
     Raises:
         DataError: photographs are damaged or missing, or there is not exactly one complete scan or CT series.
@@ -111,7 +114,7 @@ def list_import(places: Places, progress: Progress = lambda _what, _done, _total
             left_out += others
     if places.ct is not None:
         progress("CT", 0, 1)
-        series, others = _ct(places.ct, places.ct_first_number)
+        series, others = _ct(places.ct, ct_first_number)
         files["ct"] = tuple(_file(listed(path), places, "application/dicom") for path in series)
         left_out += others
     left_out += _elsewhere(places)

@@ -86,12 +86,13 @@ class DicomFolder:
             for text in one.problems
         ]
         problems += [text for text in self._headers.values() if isinstance(text, str)]
+        usable = [str(one.slices) for one in series if not one.problems]
         return DeviceReport(
             identity=self._identity(),
             free_bytes=free_bytes(self._config.folder),
             details={
                 "series": str(len(series)),
-                "usable": str(sum(not one.problems for one in series)),
+                "usable": f"{len(usable)}, of {', '.join(usable)} slices" if usable else "0",
                 "arriving": str(len(arriving)),
                 "stable_s": f"{self._config.stable_s:g}",
             },

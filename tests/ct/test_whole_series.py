@@ -129,6 +129,13 @@ def test_a_missing_file_of_several_with_frames_is_known_by_its_number(
     assert "incomplete: 1 of the 2 files of which it consists" in " ".join(only(target).problems)
 
 
+def test_the_doctor_counts_the_slices_of_each_usable_series(tmp_path: Path) -> None:
+    write_series(tmp_path / "whole", uid="1.2.3")
+    write_series(tmp_path / "short", uid="1.2.4", skip=(3, 4))
+    write_series(tmp_path / "half", uid="1.2.5", skip=(0, 1))
+    assert source(tmp_path).report().details["usable"] == "2, of 5, 3 slices"
+
+
 def test_an_acquisition_that_was_reconstructed_into_two_series_is_no_half_series(tmp_path: Path) -> None:
     write_series(tmp_path / "one", change=stated(AcquisitionNumber=4, ImagesInAcquisition=2 * SHAPE[0]), uid="1.2.3")
     write_series(tmp_path / "none", uid="1.2.4")

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +61,7 @@ def folder(small: Path, tmp_path: Path) -> Path:
 
 
 def listed(folder: Path, first_number: int = 1) -> Any:
-    return list_import(replace(find_places(folder, {}, PARTS), ct_first_number=first_number))
+    return list_import(find_places(folder, {}, PARTS), ct_first_number=first_number)
 
 
 def left_out(folder: Path) -> dict[str, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import getpass
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -108,7 +108,7 @@ def import_command(
         loaded = load_protocol(protocol, params_models())
         with progress_bar(quiet=json) as progress:
             places = find_places(folder, given, _parts_of(loaded.protocol))
-            listing = list_import(replace(places, ct_first_number=ct_first_number), progress)
+            listing = list_import(places, progress, ct_first_number=ct_first_number)
         _require_wanted(loaded.protocol, listing)
         if not json:
             _show(listing)

@@ -19,7 +19,8 @@ def cut_voxels(ends: NDArray[np.bool_], T_ct_voxel: Transform, centres_m: Array)
         T_ct_voxel: (4, 4) affine from voxel indices (i, j, k) to metres in the CT frame.
         centres_m: (N, 3) centres of the spheres in the CT frame, at least one.
     """
-    ij = apply(np.linalg.inv(T_ct_voxel), centres_m)[:, :2]
+    T_voxel_ct: Transform = np.asarray(np.linalg.inv(T_ct_voxel), dtype=np.float64)
+    ij = apply(T_voxel_ct, centres_m)[:, :2]
     size = np.array(ends.shape[:0:-1])
     low = np.clip(np.ceil(ij.min(axis=0)), 0, size).astype(int)
     high = np.clip(np.floor(ij.max(axis=0)) + 1, 0, size).astype(int)
