@@ -328,4 +328,11 @@ def layout_of(rig: Rig, station: str) -> StationLayout:
     azimuth = math.radians(section.approach_azimuth_deg)
     approach = (math.cos(azimuth), math.sin(azimuth), 0.0)
     obstacles = tuple(section.obstacles.items())
-    return StationLayout(station, section.robot, section.scene_centre_m, approach, obstacles)
+    is_arm = _is_arm(rig.section.devices.get(section.robot, {}).get("driver"))
+    return StationLayout(station, section.robot, section.scene_centre_m, approach, obstacles, is_arm=is_arm)
+
+
+def _is_arm(driver: object) -> bool:
+    """Whether a driver is of an arm, not of other axes; also of a missing one, which opening the device names."""
+    point = _installed().get(driver) if isinstance(driver, str) else None
+    return point is None or cast(DriverSpec, point.load()).is_arm
