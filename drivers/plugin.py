@@ -47,6 +47,7 @@ class DriverSpec:
         hosted: whether the driver must run in a supervised child process (for native libraries).
         call_timeout_s: longest time that one call may take before the child is killed; a config may ask for more.
         reading_timeout_s: the same for calls that only read what the device knows (`report`, `settings`), if shorter.
+        is_arm: of a robot, whether it is an arm. The motions of other axes are not planned; their driver finds them.
     """
 
     kind: str
@@ -55,3 +56,4 @@ class DriverSpec:
     hosted: bool = False
     call_timeout_s: float = 60.0
     reading_timeout_s: float = READING_TIMEOUT_S
+    is_arm: bool = True

@@ -93,8 +93,12 @@ def find_places(
     return Places(folder.resolve(), **found)
 
 
-def list_import(places: Places, progress: Progress = lambda _what, _done, _total: None) -> ImportList:
+def list_import(
+    places: Places, progress: Progress = lambda _what, _done, _total: None, *, ct_first_number: int = 1
+) -> ImportList:
     """Every file to be imported, with its hash, and the files left out, with the reasons.
+
+    `ct_first_number` is the number of the first slice of a whole series.
 
     Raises:
         DataError: photographs are damaged or missing, or there is not exactly one complete scan or CT series.
@@ -110,7 +114,7 @@ def list_import(places: Places, progress: Progress = lambda _what, _done, _total
             left_out += others
     if places.ct is not None:
         progress("CT", 0, 1)
-        series, others = _ct(places.ct)
+        series, others = _ct(places.ct, ct_first_number)
         files["ct"] = tuple(_file(listed(path), places, "application/dicom") for path in series)
         left_out += others
     left_out += _elsewhere(places)
@@ -122,7 +126,7 @@ def list_import(places: Places, progress: Progress = lambda _what, _done, _total
     )
 
 
-def import_rig(listing: ImportList, *, simulated: bool) -> Rig:
+def import_rig(listing: ImportList, *, simulated: bool, ct_first_number: int = 1) -> Rig:
     """The rig of an import's run: the list, with the folders of scan and CT as devices."""
     devices: dict[str, dict[str, Any]] = {}
     for role in _SCANS:
@@ -132,7 +136,7 @@ def import_rig(listing: ImportList, *, simulated: bool) -> Rig:
     if listing.holds("ct"):
         folders = {Path(listing.absolute(file)).parent for file in listing.files["ct"]}
         common = min(folders, key=lambda folder: len(folder.parts))
-        devices["ct"] = {"driver": "dicom_folder", "folder": str(common), "stable_s": 0}
+        devices["ct"] = _ct_device(common, ct_first_number)
     section = RigSection(
         name=f"import of {Path(listing.folder).name}", simulated=simulated, devices=devices, imported=listing
     )
@@ -278,9 +282,14 @@ def _scan(place: Path, role: str) -> tuple[tuple[Path, ...], list[LeftOut]]:
     return export, left_out
 
 
-def _ct(folder: Path) -> tuple[tuple[Path, ...], list[LeftOut]]:
+def _ct_device(folder: Path, first_number: int) -> dict[str, Any]:
+    device: dict[str, Any] = {"driver": "dicom_folder", "folder": str(folder), "stable_s": 0}
+    return device if first_number == 1 else {**device, "first_number": first_number}
+
+
+def _ct(folder: Path, first_number: int) -> tuple[tuple[Path, ...], list[LeftOut]]:
     """The slices of the only complete series in a folder, and the other files there."""
-    section = RigSection(name="CT", devices={"ct": {"driver": "dicom_folder", "folder": str(folder), "stable_s": 0}})
+    section = RigSection(name="CT", devices={"ct": _ct_device(folder, first_number)})
     station = Station(Rig(section, folder / "import-list.json", b""))
     try:
         found = station.ct().series()
@@ -290,7 +299,8 @@ def _ct(folder: Path) -> tuple[tuple[Path, ...], list[LeftOut]]:
     if len(sound) != 1:
         problems = "; ".join(f"{one.description or one.uid}: {', '.join(one.problems)}" for one in found)
         what = f"{len(sound)} CT series" if sound else f"no complete CT series ({problems or 'no DICOM file'})"
-        raise DataError(what, where=str(folder), remedy="Name the folder of one complete series with --ct")
+        remedy = "Name the folder of one complete series with --ct, and with --ct-first-number where it begins"
+        raise DataError(what, where=str(folder), remedy=remedy)
     chosen = set(sound[0].files)
     others = [path for path in files_below(folder) if path not in chosen]
     return sound[0].files, [LeftOut(path, odd(path, folder) or "no slice of the series") for path in others]

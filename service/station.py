@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from pydantic import ValidationError
 
-from drivers.errors import DeviceUnavailableError
+from drivers.errors import DeviceUnavailableError, SafetyStopError
 from drivers.host.device_lock import DeviceLock
 from drivers.host.hosted_device import hosted
 from drivers.interfaces import (
@@ -83,6 +83,25 @@ class Station:
                 raise
             self._open[name] = device
         return self._open[name]
+
+    def report(self, name: str) -> DeviceReport:
+        """The report of a device, also of an arm that stands stopped and takes no payload.
+
+        Raises ConfigurationError or DeviceError.
+        """
+        try:
+            return self.device(name).report()
+        except SafetyStopError:
+            if name in self._open:
+                raise
+        device = self._build(name)
+        self._lock(name)
+        try:
+            device.open()
+            return device.report()
+        finally:
+            device.close()
+            self._unlock(name)
 
     def opened(self, kind: str) -> dict[str, Device]:
         """The open devices of a kind, by name."""
@@ -309,4 +328,11 @@ def layout_of(rig: Rig, station: str) -> StationLayout:
     azimuth = math.radians(section.approach_azimuth_deg)
     approach = (math.cos(azimuth), math.sin(azimuth), 0.0)
     obstacles = tuple(section.obstacles.items())
-    return StationLayout(station, section.robot, section.scene_centre_m, approach, obstacles)
+    is_arm = _is_arm(rig.section.devices.get(section.robot, {}).get("driver"))
+    return StationLayout(station, section.robot, section.scene_centre_m, approach, obstacles, is_arm=is_arm)
+
+
+def _is_arm(driver: object) -> bool:
+    """Whether a driver is of an arm, not of other axes; also of a missing one, which opening the device names."""
+    point = _installed().get(driver) if isinstance(driver, str) else None
+    return point is None or cast(DriverSpec, point.load()).is_arm

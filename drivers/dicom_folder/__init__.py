@@ -21,6 +21,12 @@ class DicomFolderConfig(DriverConfig):
     stable_s: float = Field(
         default=10.0, ge=0, description="how long a series or a segmented mesh must stay unchanged; 10 s on a share"
     )
+    first_number: int = Field(
+        default=1,
+        ge=0,
+        description="number of the first slice of a whole series (InstanceNumber); a series that begins later is "
+        "incomplete",
+    )
     deidentify: bool = Field(
         default=True,
         description="keep copies of series and segmentations that name no person, instead of the files themselves",

@@ -48,7 +48,8 @@ _KEPT = frozenset(
     SegmentLabel SegmentAlgorithmType SegmentIdentificationSequence ReferencedSegmentNumber
     SegmentedPropertyCategoryCodeSequence SegmentedPropertyTypeCodeSequence CodeValue CodingSchemeDesignator
     CodeMeaning SegmentsOverlap ReferencedSeriesSequence ReferencedInstanceSequence ReferencedSOPClassUID
-    ReferencedSOPInstanceUID DerivationImageSequence SourceImageSequence
+    ReferencedSOPInstanceUID DerivationImageSequence SourceImageSequence ImagesInAcquisition ConcatenationUID
+    InConcatenationNumber InConcatenationTotalNumber ConcatenationFrameOffsetNumber
     """,
     )
 )

@@ -19,7 +19,7 @@ from drivers.dicom_folder.labels import placed
 from drivers.dicom_folder.nifti import check_nifti, is_nifti, read_nifti
 from drivers.dicom_folder.pixels import hounsfield
 from drivers.dicom_folder.segmentation import read_segmentation
-from drivers.dicom_folder.slices import arrange, problems_of
+from drivers.dicom_folder.slices import acquired_images, arrange, problems_of
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import (
     CleanFile,
@@ -86,12 +86,13 @@ class DicomFolder:
             for text in one.problems
         ]
         problems += [text for text in self._headers.values() if isinstance(text, str)]
+        usable = [str(one.slices) for one in series if not one.problems]
         return DeviceReport(
             identity=self._identity(),
             free_bytes=free_bytes(self._config.folder),
             details={
                 "series": str(len(series)),
-                "usable": str(sum(not one.problems for one in series)),
+                "usable": f"{len(usable)}, of {', '.join(usable)} slices" if usable else "0",
                 "arriving": str(len(arriving)),
                 "stable_s": f"{self._config.stable_s:g}",
             },
@@ -123,7 +124,9 @@ class DicomFolder:
         """
         found = [self._header(path) for path in series.files]
         sound = [header for headers in found if not isinstance(headers, str) for header in headers]
-        problems = [headers for headers in found if isinstance(headers, str)] + list(problems_of(sound))
+        problems = [headers for headers in found if isinstance(headers, str)] + list(
+            problems_of(sound, self._config.first_number)
+        )
         if problems:
             raise UnreadableFileError(
                 f"the series cannot be used: {'; '.join(problems)}",
@@ -237,8 +240,9 @@ class DicomFolder:
             modality=headers[0].modality,
             slices=len(headers),
             files=tuple(dict.fromkeys(header.path for header in headers)),
-            problems=arriving + problems_of(headers),
+            problems=arriving + problems_of(headers, self._config.first_number),
             frame_of_reference=headers[0].frame_of_reference,
+            acquired_images=acquired_images(headers),
         )
 
     def _identity(self) -> DeviceIdentity:

@@ -20,6 +20,15 @@ SEGMENTATION = "SEG"
 
 
 @dataclass(frozen=True, slots=True)
+class Part:
+    """Which file of a concatenation this is: several multi-frame files that belong together."""
+
+    concatenation_uid: str
+    number: int  # from 1
+    total: int | None  # where it is stated
+
+
+@dataclass(frozen=True, slots=True)
 class SliceHeader:
     """The relevant header fields of one slice; missing geometry is None and is reported as a problem."""
 
@@ -42,6 +51,9 @@ class SliceHeader:
     rescale: tuple[float, float] | None  # slope and intercept: stored values to Hounsfield units
     cut_short: bool
     stated_instances: int | None  # NumberOfSeriesRelatedInstances: the files of the whole series, where it is stated
+    number: int | None  # of the slice in its series: InstanceNumber, or the frame's place in its stack
+    part: Part | None  # of a series whose frames were divided among several files
+    acquisition: tuple[int, int] | None  # AcquisitionNumber and ImagesInAcquisition, where both are stated
 
     @property
     def name(self) -> str:
@@ -112,13 +124,34 @@ def _header(path: Path, dataset: FileDataset, groups: Sequence[Dataset], frame: 
         position_mm=grouped(groups, "PlanePositionSequence", "ImagePositionPatient", 3),
         rescale=None if slope is None or intercept is None else (slope[0], intercept[0]),
         cut_short=syntax in _UNCOMPRESSED and path.stat().st_size < pixel_bytes,
-        stated_instances=_stated_instances(dataset),
+        stated_instances=_count(dataset, "NumberOfSeriesRelatedInstances"),
+        number=_number(groups),
+        part=_part(dataset),
+        acquisition=_acquisition(dataset),
     )
 
 
-def _stated_instances(dataset: Dataset) -> int | None:
-    number = _numbers(dataset, "NumberOfSeriesRelatedInstances", 1)
+def _count(dataset: Dataset, name: str) -> int | None:
+    """A number of at least 1, or None."""
+    number = _numbers(dataset, name, 1)
     return None if number is None or number[0] < 1 else int(number[0])
+
+
+def _number(groups: Sequence[Dataset]) -> int | None:
+    """The number of a slice; that which it had before its series was written as multi-frame counts first."""
+    number = grouped(groups, "UnassignedPerFrameConvertedAttributesSequence", "InstanceNumber", 1)
+    number = number or grouped(groups, "FrameContentSequence", "InStackPositionNumber", 1)
+    return None if number is None else int(number[0])
+
+
+def _part(dataset: Dataset) -> Part | None:
+    uid, number = str(dataset.get("ConcatenationUID") or ""), _count(dataset, "InConcatenationNumber")
+    return Part(uid, number, _count(dataset, "InConcatenationTotalNumber")) if uid and number is not None else None
+
+
+def _acquisition(dataset: Dataset) -> tuple[int, int] | None:
+    number, images = _numbers(dataset, "AcquisitionNumber", 1), _count(dataset, "ImagesInAcquisition")
+    return None if number is None or images is None else (int(number[0]), images)
 
 
 def _image_type(dataset: Dataset, groups: Sequence[Dataset]) -> tuple[str, ...]:

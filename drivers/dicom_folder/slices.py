@@ -21,8 +21,11 @@ _POSITION_TOLERANCE_MM = 0.01
 _MAX_NAMED = 5
 
 
-def problems_of(headers: Sequence[SliceHeader]) -> tuple[str, ...]:
-    """Why these slices do not form a uniform CT volume, one text per problem; empty if they do."""
+def problems_of(headers: Sequence[SliceHeader], first_number: int) -> tuple[str, ...]:
+    """Why these slices do not form a uniform CT volume, one text per problem; empty if they do.
+
+    `first_number` is the number of the first slice of a whole series.
+    """
     if all(header.rows == 0 or header.columns == 0 for header in headers):
         return (f"it holds no images (modality {headers[0].modality})",)
     problems: list[str] = []
@@ -51,7 +54,7 @@ def problems_of(headers: Sequence[SliceHeader]) -> tuple[str, ...]:
         for syntax in sorted({h.transfer_syntax for h in headers})
         if (remedy := lacking_decoder(syntax)) is not None
     ]
-    problems += _count_problems(headers)
+    problems += _count_problems(headers, first_number)
     images = [header for header in headers if header.rows * header.columns > 0]
     placed = [header for header in images if _placed(header) and "LOCALIZER" not in header.image_type]
     if placed:
@@ -59,14 +62,44 @@ def problems_of(headers: Sequence[SliceHeader]) -> tuple[str, ...]:
     return tuple(problems)
 
 
-def _count_problems(headers: Sequence[SliceHeader]) -> list[str]:
-    """Whether fewer files are here than the series states; most scanners state no number.
-
-    ImagesInAcquisition is not used: one acquisition may be reconstructed into several series.
-    """
+def _count_problems(headers: Sequence[SliceHeader], first_number: int) -> list[str]:
+    """Whether slices are missing, by what the files state; for most series only that the first ones are."""
+    problems: list[str] = []
     stated = max((header.stated_instances or 0 for header in headers), default=0)
     found = len({header.instance_uid for header in headers})
-    return [f"incomplete: {found} of the {stated} files that the series states"] if found < stated else []
+    if found < stated:
+        problems.append(f"incomplete: {found} of the {stated} files that the series states")
+    numbers = [header.number for header in headers if header.number is not None]
+    first, last = min(numbers, default=first_number), max(numbers, default=first_number)
+    if first > first_number and len(headers) > 1 and sorted(numbers) == list(range(first, first + len(headers))):
+        problems.append(
+            f"incomplete: its slices are numbered {first} to {last}, not from {first_number}; if there never were "
+            f"others, set first_number: {first} for this device in rig.yaml"
+        )
+    parts = {header.part for header in headers if header.part is not None}
+    for uid in sorted({part.concatenation_uid for part in parts}):
+        own = [part for part in parts if part.concatenation_uid == uid]
+        here = {part.number for part in own}
+        total = max(max(part.number, part.total or 0) for part in own)
+        if len(here) < total:
+            problems.append(
+                f"incomplete: {len(here)} of the {total} files of which it consists (concatenation {uid})"
+            )
+    return problems
+
+
+def acquired_images(headers: Sequence[SliceHeader]) -> int | None:
+    """How many images the series' acquisitions have, as the files state; None unless all of them do.
+
+    An acquisition may be reconstructed into several series, so a series with fewer is not incomplete for that.
+    """
+    stated: dict[int, int] = {}
+    for header in headers:
+        if header.acquisition is None:
+            return None
+        number, images = header.acquisition
+        stated[number] = max(images, stated.get(number, 0))
+    return sum(stated.values())
 
 
 def _placed(header: SliceHeader) -> bool:

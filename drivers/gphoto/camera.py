@@ -147,7 +147,11 @@ class GphotoCamera:
             clock_offset_s=self._clock_offset_s,
             free_bytes=free,
             battery_fraction=battery,
-            details={"profile": self._profile_name, **{one.name: self._link.value(one.name) for one in names}},
+            details={
+                "profile": self._profile_name,
+                **{one.name: self._link.value(one.name) for one in names},
+                "serial number": "its photographs may state only the last digits",
+            },
             problems=self._problems(battery, free),
         )
 

@@ -112,4 +112,4 @@ def _build(config: GrblConfig) -> Device:
 
 
 # Hosted although there is no native library: the heartbeat of the program reaches only a driver's own process.
-DRIVER = DriverSpec(kind="robot", config=GrblConfig, build=_build, hosted=True, call_timeout_s=30.0)
+DRIVER = DriverSpec(kind="robot", config=GrblConfig, build=_build, hosted=True, call_timeout_s=30.0, is_arm=False)

@@ -67,6 +67,9 @@ class CtSeries:
     files: tuple[Path, ...]
     problems: tuple[str, ...]  # localiser, gap, mixed orientation, …; a series with problems is not read
     frame_of_reference: str = ""  # its UID; "" if the series states none
+    acquired_images: int | None = (
+        None  # of its acquisition, as the files state: more than slices if it has other series
+    )
 
 
 @dataclass(frozen=True, slots=True)

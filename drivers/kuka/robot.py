@@ -36,7 +36,7 @@ from drivers.kuka import KukaConfig
 from drivers.kuka.fri.poses import FriPoses
 from drivers.kuka.link import Link
 from drivers.kuka.speeds import Speeds
-from drivers.kuka.wire import JOINTS, State, agree, to_abc
+from drivers.kuka.wire import JOINTS, State, agree, flange_words, to_abc
 from service.core.arms.known import known_arms
 from service.core.arms.model import ArmModel
 from service.core.geometry import to_rotation_vector
@@ -157,6 +157,7 @@ class KukaRobot:
                 "override": f"{100 * state.override:.0f} %",
                 "tool centre point (m, rad)": " ".join(f"{v:.4f}" for v in tcp),
                 "joints (rad)": " ".join(f"{v:.4f}" for v in sample.joints_rad),
+                "flange (X Y Z in mm, A B C in °)": flange_words(state.T_base_flange),
                 **(self._fri.details() if self._fri is not None else {}),
             },
             problems=tuple(problems),

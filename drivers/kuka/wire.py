@@ -11,6 +11,7 @@ import numpy as np
 
 from drivers.interfaces import Array, SafetyState
 from service.core.geometry import Transform
+from service.core.units import deg, mm
 
 PROTOCOL = 1
 JOINTS = 7
@@ -124,6 +125,12 @@ def to_abc(T: Transform) -> tuple[list[float], list[float]]:
     if np.hypot(R[0, 0], R[1, 0]) < 1e-9:  # A and C turn about the same axis: C is taken as 0
         return T[:3, 3].tolist(), [float(np.arctan2(-R[0, 1], R[1, 1])), b, 0.0]
     return T[:3, 3].tolist(), [float(np.arctan2(R[1, 0], R[0, 0])), b, float(np.arctan2(R[2, 1], R[2, 2]))]
+
+
+def flange_words(T_base_flange: Transform) -> str:
+    """A pose (4, 4) as the smartPAD shows it: X, Y, Z in millimetres, A, B, C in degrees."""
+    xyz_m, abc_rad = to_abc(T_base_flange)
+    return " ".join([*(f"{mm(x):.1f}" for x in xyz_m), *(f"{deg(a):.2f}" for a in abc_rad)])
 
 
 def agree(answer: object, values: list[float]) -> bool:

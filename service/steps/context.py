@@ -41,6 +41,7 @@ class StationLayout:
     scene_centre_m: tuple[float, float, float]
     approach: tuple[float, float, float]  # horizontal unit vector from the scene towards the base
     obstacles: tuple[tuple[str, ObstacleSection], ...] = ()  # what else stands there, by name
+    is_arm: bool = True  # not axes of another kind, whose motions are not planned
 
 
 @dataclass(frozen=True, slots=True)

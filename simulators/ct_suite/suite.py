@@ -128,6 +128,7 @@ def write_series(
         fault = faults.check("ct", "slice")
         kind = fault.kind if fault else ""
         if kind == "drop":
+            number += 1
             continue
         if kind == "disk_full":
             raise SimulatorError(f"no space left in {folder}: the series is incomplete")
@@ -161,7 +162,7 @@ def _common(shape: tuple[int, ...], grid: Grid, T_ct_grid: Array, series: str) -
     common.SeriesInstanceUID = series
     common.FrameOfReferenceUID = generate_uid(entropy_srcs=[series, "frame"])
     common.SeriesDescription = f"specimen {mm(grid.voxel_m):.2f} mm"
-    common.SeriesNumber = 2
+    common.SeriesNumber, common.AcquisitionNumber, common.ImagesInAcquisition = 2, 1, shape[0]
     common.Rows, common.Columns = shape[1], shape[2]
     common.PixelSpacing = [_decimal(mm(grid.voxel_m))] * 2
     common.SliceThickness = _decimal(mm(grid.voxel_m))

@@ -115,6 +115,7 @@ def test_the_shell_completes_commands() -> None:
 def test_simulators_explain_themselves_as_every_command_does() -> None:
     done = _run("simulate", "rig", "--help")
     assert done.returncode == 0, done.stderr
+    assert "Usage: orthocapture simulate rig [OPTIONS]" in done.stdout
     assert "╭─ Options" in done.stdout
     for words in ("--scene", "--image-width", "--speed-up", "seed of the scene"):
         assert words.lower() in done.stdout.lower()

@@ -112,6 +112,7 @@ def test_the_surface_is_that_of_the_segment_and_the_record_names_nobody(
     assert ct.measures["radius_residual_max_mm"] < 0.12  # voxels of 0.8 mm, smoothed
     assert ct.measures["label_voxels"] == np.count_nonzero(spheres[1])
     assert ct.measures["label_contrast_hu"] > 1000
+    assert ct.measures["cut_by_ends_mm2"] == ct.measures["images_elsewhere"] == 0
 
     kept = [event.payload for event in bench.store.events(bench.run_id) if isinstance(event.payload, FilesKept)]
     files = [ref for payload in kept for ref in payload.artefacts if ref.kind in ("ct_slice", "ct_segmentation")]

@@ -60,8 +60,8 @@ def folder(small: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(small, tmp_path / "brought"))
 
 
-def listed(folder: Path) -> Any:
-    return list_import(find_places(folder, {}, PARTS))
+def listed(folder: Path, first_number: int = 1) -> Any:
+    return list_import(find_places(folder, {}, PARTS), ct_first_number=first_number)
 
 
 def left_out(folder: Path) -> dict[str, str]:
@@ -128,6 +128,18 @@ def test_one_whole_series_is_the_ct(folder: Path) -> None:
     assert [file.path for file in listed(folder).files["ct"]] == [f"ct/{path.name}" for path in slices]
     slices[len(slices) // 2].unlink()
     assert "no complete CT series" in refusal(str(folder), "--dry-run")
+
+
+def test_a_series_whose_first_slices_are_missing_is_taken_only_on_purpose(folder: Path, tmp_path: Path) -> None:
+    first, second, *rest = sorted((folder / "ct").glob("*.dcm"))
+    for path in (first, second):
+        path.unlink()
+    assert f"numbered 3 to {len(rest) + 2}, not from 1" in refusal(str(folder), "--dry-run")
+    words = ["import", str(folder), "--dry-run", "--ct-first-number", "3", "--json"]
+    shown = CliRunner().invoke(app, words, catch_exceptions=False)
+    assert len(json.loads(shown.output)["files"]["ct"]) == len(rest)
+    rig = import_rig(listed(folder, 3), simulated=True, ct_first_number=3)
+    assert rig.section.devices["ct"]["first_number"] == 3
 
 
 def test_a_file_that_changed_since_it_was_listed_is_refused(folder: Path) -> None:

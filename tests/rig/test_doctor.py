@@ -22,11 +22,8 @@ class _Devices:
     def names(self) -> list[str]:
         return list(self.reports)
 
-    def device(self, name: str) -> _Devices:
-        return _Devices({"": self.reports[name]})
-
-    def report(self) -> DeviceReport:
-        return self.reports[""]
+    def report(self, name: str) -> DeviceReport:
+        return self.reports[name]
 
     def close(self) -> None:
         pass
@@ -53,3 +50,21 @@ def test_doctor_tells_what_a_device_reports(
     result = CliRunner().invoke(app, words_typed, catch_exceptions=False)
     assert f"{mark} camera model" in result.output
     assert words in result.output
+
+
+@pytest.mark.parametrize(
+    ("who", "shown"),
+    [
+        (DeviceIdentity("scanner", "export folder", "", "", "scan_folder", "1", "/scans"), "✓ it export folder\n"),
+        (DeviceIdentity("camera", "GE-1", "22334455", "", "genicam", "1", "host"), "✓ it GE-1, serial 22334455\n"),
+        (DeviceIdentity("camera", "EOS", "42", "1.8", "gphoto", "1", "usb:"), "✓ it EOS, serial 42, 1.8\n"),
+    ],
+)
+def test_doctor_names_a_device_by_what_it_states(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, who: DeviceIdentity, shown: str
+) -> None:
+    monkeypatch.setattr("service.cli.site.doctor.Station", lambda _rig: _Devices({"it": DeviceReport(who)}))
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("name: bare\ndevices:\n  it: {driver: gphoto}\n")
+    words = ["doctor", "--rig", str(rig), "--data", str(tmp_path / "data")]
+    assert shown in CliRunner().invoke(app, words, catch_exceptions=False).output

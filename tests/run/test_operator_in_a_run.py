@@ -62,6 +62,23 @@ class PlanningRig(BenchRig):
         return CollisionSection(arm="UR10e"), None
 
 
+@dataclass
+class MistakenRig(BenchRig):
+    """A rig whose file names another arm than stands there."""
+
+    def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
+        return CollisionSection(arm="LBR Med 14"), None
+
+
+def test_an_arm_that_is_not_the_one_of_the_rig_file_is_told_before_it_moves(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL)
+    bench.rig = MistakenRig()
+    bench.operator.script = {("capture", "recovery"): [say("abort", reason="the rig file is wrong")]}
+    assert bench.run().status == "aborted"
+    (question,) = [asked for asked in bench.operator.asked if asked.for_ == "recovery"]
+    assert "has 6 axes, and the rig file has the planner take it for a LBR Med 14 with 7" in question.text
+
+
 def test_a_long_planning_shows_its_progress_and_heeds_pause(begin: Callable[[str], Bench]) -> None:
     bench = begin(PROTOCOL.replace("count: 4, distance_m: 0.6", "count: 400, distance_m: 0.6"))
     bench.rig, operator = PlanningRig(), Watching()

@@ -71,6 +71,10 @@ def import_command(
         Path | None, typer.Option("--control-scan", help="The mesh that also shows the control spheres.")
     ] = None,
     ct: Annotated[Path | None, typer.Option("--ct", metavar="DIR", help="Folder of one DICOM series.")] = None,
+    ct_first_number: Annotated[
+        int,
+        typer.Option("--ct-first-number", min=0, help="Number of the series' first slice, if it is not 1."),
+    ] = 1,
     simulated: Annotated[
         bool, typer.Option("--simulated", help="The files come from simulators; all results are marked accordingly.")
     ] = False,
@@ -103,7 +107,8 @@ def import_command(
         about = about_run(specimen=specimen, purpose=purpose, site=site, text=remarks)
         loaded = load_protocol(protocol, params_models())
         with progress_bar(quiet=json) as progress:
-            listing = list_import(find_places(folder, given, _parts_of(loaded.protocol)), progress)
+            places = find_places(folder, given, _parts_of(loaded.protocol))
+            listing = list_import(places, progress, ct_first_number=ct_first_number)
         _require_wanted(loaded.protocol, listing)
         if not json:
             _show(listing)
@@ -111,7 +116,7 @@ def import_command(
             if json:
                 print_json(listing_record(listing))
             return
-        rig = import_rig(listing, simulated=simulated)
+        rig = import_rig(listing, simulated=simulated, ct_first_number=ct_first_number)
         with Store.open(data) as store:
             name = operator or getpass.getuser()
             run_id = _run_of(store, loaded, rig, operator=name, again=again, about=about)

@@ -93,7 +93,7 @@ def _reports(station: Station, *, quiet: bool) -> dict[str, DeviceReport | Ortho
             for i, name in enumerate(station.names()):
                 progress(f"opening {name}", i, len(station.names()))
                 try:
-                    found[name] = station.device(name).report()
+                    found[name] = station.report(name)
                 except (DeviceError, ConfigurationError) as error:
                     found[name] = error
     finally:
@@ -148,10 +148,9 @@ def _record(report: DeviceReport | OrthocaptureError) -> dict[str, Any]:
     return {"ok": not report.problems, **dataclasses.asdict(report)}
 
 
-def _serial_note(who: DeviceIdentity) -> str:
-    """A note that a camera's serial number over USB may have extra digits before that in its photographs."""
-    known = who.kind == "camera" and who.serial
-    return " (as stated over USB; its photographs may state only the last digits)" if known else ""
+def _identity_words(who: DeviceIdentity) -> str:
+    """Model, serial number and firmware, as far as the device states them."""
+    return ", ".join(part for part in (who.model, f"serial {who.serial}" if who.serial else "", who.firmware) if part)
 
 
 def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:
@@ -161,10 +160,7 @@ def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:
     who = report.identity
     late = report.clock == "utc" and abs(report.clock_offset_s or 0.0) > DEVICE_LIMIT_S
     mark = "[bold yellow]!" if report.problems or late else "[bold green]✓"
-    console.print(
-        f"{mark} {escape(name)}[/] {escape(who.model)}, serial {escape(who.serial)}{_serial_note(who)}, "
-        f"{escape(who.firmware)}"
-    )
+    console.print(f"{mark} {escape(name)}[/] {escape(_identity_words(who))}")
     console.print(f"    {escape(who.driver)} {escape(who.driver_version)} at {escape(who.address)}")
     if report.clock_offset_s is not None:
         console.print(f"    {_offset_words(report.clock_offset_s, report.clock, late=late)}")

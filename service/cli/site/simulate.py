@@ -35,9 +35,8 @@ def simulate_command(context: typer.Context) -> None:
     app = _all(described["simulators"], context.command.help or "") if options is None else _one(described)
     command = typer.main.get_command(app)
     if not words or {"--help", "-h"} & set(words):
-        with command.make_context(
-            chosen or "simulate", ["--help"], parent=context.parent, resilient_parsing=True
-        ) as shown:
+        name, parent = (chosen, context) if chosen else ("simulate", context.parent)
+        with command.make_context(name, ["--help"], parent=parent, resilient_parsing=True) as shown:
             typer.echo(command.get_help(shown), nl=False)
         return
     if options is None:

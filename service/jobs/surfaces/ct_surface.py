@@ -10,6 +10,7 @@ class Arguments(JobRecord):
     """The decoded volume: `hounsfield` is a NumPy array, `T_ct_voxel` maps its indices to metres.
 
     With `labels`, an array of the same shape, the surface is that of the segmented voxels, not at `threshold_hu`.
+    With `measure_cut`, the measures say how much the first and the last slice cut.
     """
 
     radius_m: float
@@ -19,6 +20,7 @@ class Arguments(JobRecord):
     T_ct_voxel: Matrix
     threshold_hu: float
     labels: Hash | None = None
+    measure_cut: bool = False  # jobs of earlier versions did not
 
 
 KIND = JobKind(

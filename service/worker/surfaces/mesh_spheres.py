@@ -10,6 +10,7 @@ import numpy as np
 from service.compute.layout.ambiguity import check_layout, layout_measures
 from service.compute.layout.confusions import SUBSET as LAYOUT_SUBSET
 from service.compute.surfaces.constellations import match_constellations
+from service.compute.surfaces.cut_ends import cut_voxels
 from service.compute.surfaces.isosurface import surface
 from service.compute.surfaces.label_surface import LEAST_CONTRAST_HU, label_surface, sphere_contrasts
 from service.compute.surfaces.loop_closure import LoopClosure, close_loop
@@ -37,9 +38,11 @@ def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
     T_ct_voxel = np.array(arguments.T_ct_voxel)
     if arguments.labels is None:
         vertices_m, faces = surface(hounsfield, T_ct_voxel, arguments.threshold_hu)
+        ends = hounsfield[[0, -1]] >= arguments.threshold_hu
     else:
         labels = np.load(context.input(arguments.labels), allow_pickle=False, mmap_mode="r")
         vertices_m, faces = label_surface(labels, T_ct_voxel)
+        ends = labels[[0, -1]] != 0
     buffer = io.BytesIO()
     np.savez(buffer, vertices_m=vertices_m, faces=faces)
     mesh = context.keep_bytes(
@@ -57,6 +60,9 @@ def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
             "otherwise check the threshold, and the number and radius of the spheres in the protocol",
         ) from error
     measures["surface_faces"] = float(len(faces))
+    if arguments.measure_cut:
+        voxel_mm2 = float(np.linalg.norm(np.cross(*mm(T_ct_voxel[:3, :2]).T)))
+        measures["cut_by_ends_mm2"] = voxel_mm2 * cut_voxels(ends, T_ct_voxel, np.array(found.spheres_m))
     if arguments.labels is not None:
         measures["label_contrast_hu"] = _contrast(arguments, hounsfield, T_ct_voxel, np.array(found.spheres_m))
     return JobAnswer(measures, (mesh,), found)

@@ -32,6 +32,8 @@ from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import StationLayout, StepContext
 
 _LOOK_S = 0.4  # between two looks at the buttons during planning
+_NOT_PLANNED = "the kinematics of the arm are not known; its controller checks the reach at each viewpoint"
+_OTHER_AXES = "no arm stands there; the driver of its axes checks the reach at each viewpoint"
 _EXPOSURE_S = 3.0  # estimate of settling, exposure and download at each viewpoint
 
 
@@ -112,12 +114,14 @@ class ArmAtStation:
 
 
 def arm_at_station(context: StepContext, station: str, T_flange_camera: Transform) -> ArmAtStation | None:
-    """The arm at a station; None if its kinematics are not known."""
+    """The arm at a station; None if its kinematics are not known, or if it is no arm."""
+    layout = context.devices.layout(station)
+    if not layout.is_arm:
+        return None
     collision, optics = context.devices.surroundings()
     model = known_arm(collision.arm or context.devices.robot(station).report().identity.model)
     if model is None:
         return None
-    layout = context.devices.layout(station)
     return ArmAtStation(layout, model, T_flange_camera, collision, optics, context.protocol.motion)
 
 
@@ -148,11 +152,18 @@ def plan_step(
         mine = [v for v in viewpoints if v.station == station]
         arm = arm_at_station(context, station, T_flange_camera)
         if arm is None:
-            why = "the kinematics of the arm are not known; its controller checks the reach at each viewpoint"
+            why = _NOT_PLANNED if context.devices.layout(station).is_arm else _OTHER_AXES
             plans.append(StepPlan(tuple(mine), {}, f"{station}: {why}", ()))
             continue
         context.busy("planning the motions of the arm")
         start_rad = context.devices.robot(station).state().sample.joints_rad
+        if len(start_rad) != arm.model.axes:
+            raise ConfigurationError(
+                f"the arm of {station} has {len(start_rad)} axes, and the rig file has the planner take it for a "
+                f"{arm.model.name} with {arm.model.axes}",
+                where=f"rig file, station {station}",
+                remedy="Take `arm` out of `collision`: each arm is then planned as its controller names it",
+            )
         situation = arm.situation(start_rad, sharp_at_m=sharp_at_m)
         plans.append(plan_station(mine, arm, situation, order, _attending(context)))
     return _recorded(context, plans)

@@ -69,7 +69,8 @@ def preview_plans(
 ) -> tuple[StepPlan, ...]:
     """One plan for each station, from the arm's usual posture above the scene.
 
-    Empty for steps of other kinds, and if the rig file names no arm of known kinematics.
+    Empty for steps of other kinds, and if the rig file names no arm of known kinematics. Stations without an arm are
+    left out.
 
     Raises ConfigurationError for a station that the rig does not have, and for a scene out of reach.
     """
@@ -78,6 +79,8 @@ def preview_plans(
     plans: list[StepPlan] = []
     for station in dict.fromkeys(one.station for one in step.params.viewpoints):
         there = layout(station)
+        if not there.is_arm:
+            continue
         arm = _arm(protocol, rig, there)
         if arm is None:
             return ()
@@ -88,9 +91,9 @@ def preview_plans(
 
 
 def _arm(protocol: Protocol, rig: Rig, layout: StationLayout) -> ArmAtStation | None:
-    """The arm that the rig file names; None if it names none, or one of unknown kinematics."""
+    """The arm that the rig file names; None if it names none, or one of unknown kinematics, or no arm is there."""
     collision = rig.section.collision
-    model = None if collision.arm is None else known_arm(collision.arm)
+    model = known_arm(collision.arm) if collision.arm is not None and layout.is_arm else None
     if model is None:
         return None
     nominal = rig.nominal_T_flange_camera()

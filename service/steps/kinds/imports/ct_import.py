@@ -37,6 +37,14 @@ class Measures(SphereMeasures):
     """Of the series, and of the spheres in its surface."""
 
     slices: Annotated[Count, "slices of the series"] = None
+    images_elsewhere: Annotated[
+        Count, "images of the acquisition beyond those of the series: of another reconstruction, or missing"
+    ] = None
+    cut_by_ends_mm2: Annotated[
+        float | None,
+        Measure("mm²", 1, 1e6),
+        "area between the spheres that the first and the last slice cut: above 0 if the object goes on beyond them",
+    ] = None
     slice_spacing_mm: Annotated[float | None, Measure("mm", 0.01, 10), "distance between slices"] = None
     voxel_mm: Annotated[float | None, Measure("mm", 0.01, 10), "longest side of a voxel"] = None
     label_voxels: Annotated[Count, "voxels of the segments"] = None
@@ -90,9 +98,12 @@ def _series(context: StepContext, params: Params) -> tuple[JobRequest, tuple[Art
         hounsfield=array.sha256,
         T_ct_voxel=volume.T_ct_voxel.tolist(),
         threshold_hu=params.threshold_hu,
+        measure_cut=True,
     )
     if labels:
         arguments = arguments.model_copy(update={"labels": labels[-1].sha256})
+    if series.acquired_images is not None:
+        found = {**found, "images_elsewhere": float(max(0, series.acquired_images - series.slices))}
     measures = {
         **found,
         "slices": float(series.slices),

@@ -1,0 +1,84 @@
+"""A turntable beside an arm: the planner leaves its motions to its driver."""
+
+from __future__ import annotations
+
+import json
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from typer.testing import CliRunner
+
+from service.cli.main import app
+from service.core.geometry import inverse
+from tests.support.arms.grbl_simulator import CENTRE_M, TURN, mount
+from tests.support.protocols.one_side import one_side
+
+TURNED = 5  # views of the turntable
+STAND: dict[str, Any] = {
+    "id": "to_the_stand",
+    "kind": "checklist",
+    "title": "Put the camera on its stand",
+    "checklist": ["The camera stands before the turntable"],
+    "gates": [{"measure": "checklist_items_open", "max": 0, "unit": "items"}],
+    "simulated_hands": [{"action": "hold_camera"}],
+}
+
+
+def protocol(path: Path) -> Path:
+    """The arm takes the first photographs and those of the board, the turntable the others."""
+    document = one_side("spheres")
+    by_id = {step["id"]: step for step in document["steps"]}
+    arm, control, registration = (
+        by_id[name] for name in ("viewpoint_capture_1", "control_capture_1", "registration")
+    )
+    turned = {**deepcopy(arm), "id": "around", "title": "Photographs from all sides"}
+    for step, prefix, count in ((turned, "t", TURNED), (control, "c", 4)):
+        arc = {"tilt_deg": 35, "azimuth_from_deg": 20, "azimuth_to_deg": 310, "count": count, "distance_m": 0.62}
+        step["params"]["viewpoints"] = [{"station": "table", "prefix": prefix, "image_top": "up", "arcs": [arc]}]
+        step["gates"][0]["min"] = count
+    registration["params"]["images_of"].append("around")
+    at = document["steps"].index(control)
+    document["steps"][at:at] = [STAND, turned]
+    path.write_text(yaml.safe_dump(document, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    return path
+
+
+def add_table(rig: Path, port: str) -> None:
+    """Add the turntable to a rig file with an arm, which the planner knows as a UR10e."""
+    record = yaml.safe_load(rig.read_text(encoding="utf-8"))
+    assert record["collision"]["arm"] == "UR10e"
+    record["devices"]["turntable"] = {
+        "driver": "grbl", "port": port, "axes": [TURN.model_dump(mode="json", exclude_none=True)],
+        "T_base_flange_zero": (mount() @ inverse(np.array(record["T_flange_camera_nominal"]))).tolist(),
+        "connect_timeout_s": 30.0, "answer_timeout_s": 20.0, "stale_after_s": 20.0, "unattended_s": 20.0,
+    }  # fmt: skip
+    record["stations"]["table"] = {
+        "robot": "turntable", "scene_centre_m": CENTRE_M.tolist(), "approach_azimuth_deg": -90.0
+    }  # fmt: skip
+    rig.write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")
+
+
+RIG = """\
+name: an arm and a turntable
+devices:
+  robot: {driver: ur, host: 127.0.0.1}
+stations:
+  station_1: {robot: robot, scene_centre_m: [0.0, 0.8, 0.02], approach_azimuth_deg: -90}
+T_flange_camera_nominal: [[1, 0, 0, 0.0], [0, 1, 0, 0.0], [0, 0, 1, 0.1], [0, 0, 0, 1]]
+collision: {arm: UR10e}
+"""
+
+
+def test_motions_are_planned_of_the_arm_and_not_of_the_table(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG, encoding="utf-8")
+    add_table(rig, "table")
+    words = ["plan", "show", str(protocol(tmp_path / "both.yaml")), "--rig", str(rig), "--json"]
+    done = CliRunner().invoke(app, words, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    plans = json.loads(done.stdout)
+    assert [plan["station"] for plan in plans["viewpoint_capture_1"]] == ["station_1"]
+    assert "around" not in plans
