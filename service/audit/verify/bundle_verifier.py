@@ -71,6 +71,8 @@ UNPROVEN = (
     *(ValueError, IndexError, KeyError, TypeError, OverflowError, AttributeError, InvalidSignature),
     *(UnsupportedAlgorithm, x509.ExtensionNotFound, x509.DuplicateExtension, x509.InvalidVersion),
 )
+SIGNED_AT_ONCE = ("step_passed", "run_completed", "run_aborted")
+AFTER_A_SIGNATURE = ("step_started", "session_started", "run_completed", "run_aborted")  # recorded once that is done
 JOB_FIELDS = {"job": "job_id", "job_kind": "kind", "step": "step", "attempt": "attempt"}
 
 
@@ -556,6 +558,13 @@ class Check:
             last[run_id] = max(last[run_id], seq)
         self.counts["checkpoints"] = len(signatures)
         for run_id, chain in chains.items():
+            signed = sorted(item["seq"] for item in signatures if item.get("run_id") == run_id)
+            late = [seq for seq, before in chain.to_sign.items() if not any(seq <= at < before for at in signed)]
+            if late:
+                self.notes.append(
+                    f"{run_id}: not signed at once, but only with a later event: {', '.join(map(str, late))}; "
+                    "a change before that leaves no trace."
+                )
             if chain.end[0] > last[run_id]:
                 self.notes.append(
                     f"{run_id}: {chain.end[0] - last[run_id]} events after the last checkpoint; "
@@ -676,6 +685,8 @@ class Chain:
         self.starts: list[tuple[int, dict[str, tuple[int, str]]]] = []
         self.signed: list[tuple[int, dict[str, Any]]] = []  # runs, up to which event
         self.jobs: list[tuple[int, dict[str, Any]]] = []
+        self.to_sign: dict[int, int] = {}  # events that are signed at once → the event before which they are signed
+        self._passed = 0  # the last event that is signed at once
         self.accepted: list[tuple[int, dict[str, Any], str]] = []  # figures outside their limits, and by whom
         self.first: dict[str, Any] | None = None
         self.end: tuple[Any, str] = (0, ROOT)
@@ -704,6 +715,10 @@ class Chain:
         self.hashes[seq] = sha256
         self.first = self.first or payload
         kind = payload.get("kind")
+        if kind in AFTER_A_SIGNATURE and self._passed:
+            self.to_sign.setdefault(self._passed, seq)
+        if kind in SIGNED_AT_ONCE:
+            self._passed = seq
         if kind == "key_changed" and self.run_id == SITE:
             self.key_changes.append((seq, payload))
         elif kind == "run_signed":
