@@ -24,7 +24,8 @@ UNSIGNED = PROTOCOL.replace(
 )  # a person's signature of a step holds the hash of the record
 COUNTED_AGAIN = (
     "UPDATE event_index SET position = position + 100000",
-    "UPDATE event_index SET position = (SELECT count(*) FROM event_index AS i WHERE i.position <= event_index.position)",
+    "UPDATE event_index SET position = (SELECT count(*) FROM event_index AS i "
+    "WHERE i.position <= event_index.position)",
 )
 
 

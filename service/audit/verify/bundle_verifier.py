@@ -558,18 +558,21 @@ class Check:
             last[run_id] = max(last[run_id], seq)
         self.counts["checkpoints"] = len(signatures)
         for run_id, chain in chains.items():
-            signed = sorted(item["seq"] for item in signatures if item.get("run_id") == run_id)
-            late = [seq for seq, before in chain.to_sign.items() if not any(seq <= at < before for at in signed)]
-            if late:
-                self.notes.append(
-                    f"{run_id}: not signed at once, but only with a later event: {', '.join(map(str, late))}; "
-                    "a change before that leaves no trace."
-                )
+            self._note_late(chain, [item["seq"] for item in signatures if item.get("run_id") == run_id])
             if chain.end[0] > last[run_id]:
                 self.notes.append(
                     f"{run_id}: {chain.end[0] - last[run_id]} events after the last checkpoint; "
                     "the signature of the bundle covers them."
                 )
+
+    def _note_late(self, run: Chain, signed: Sequence[int]) -> None:
+        """Note events that had to be signed at once, and were signed only later."""
+        late = [seq for seq, before in run.to_sign.items() if not any(seq <= at < before for at in signed)]
+        if late:
+            self.notes.append(
+                f"{run.run_id}: not signed at once, but only with a later event: {', '.join(map(str, late))}; "
+                "a change before that leaves no trace."
+            )
 
     def _check_key_file(self, bundle: Bundle, whole: frozenset[str]) -> None:
         listed = [record.get("key_id") for record in self.records(bundle, "keys.jsonl", whole)]
@@ -715,10 +718,7 @@ class Chain:
         self.hashes[seq] = sha256
         self.first = self.first or payload
         kind = payload.get("kind")
-        if kind in AFTER_A_SIGNATURE and self._passed:
-            self.to_sign.setdefault(self._passed, seq)
-        if kind in SIGNED_AT_ONCE:
-            self._passed = seq
+        self._await_signature(seq, kind)
         if kind == "key_changed" and self.run_id == SITE:
             self.key_changes.append((seq, payload))
         elif kind == "run_signed":
@@ -732,6 +732,12 @@ class Chain:
         references = [canonical(reference) for reference in references_in(payload)]
         if references:
             self.references[seq] = references
+
+    def _await_signature(self, seq: int, kind: Any) -> None:
+        if kind in AFTER_A_SIGNATURE and self._passed:
+            self.to_sign.setdefault(self._passed, seq)
+        if kind in SIGNED_AT_ONCE:
+            self._passed = seq
 
 
 def _heads(value: Any) -> dict[str, tuple[int, str]]:
