@@ -16,6 +16,8 @@ from service.store.verification.verify import show
 from service.web.capture.view import views_of
 from tests.support.record.counting import lines_of
 
+pytestmark = pytest.mark.slow
+
 SMALL, LARGE = 100, 200
 MOST = 2.3  # limit of the ratio for twice as many viewpoints
 
@@ -58,7 +60,6 @@ def held_already(record: LargeRecord) -> Callable[[], object]:
     return lambda: evidence.holds(last)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("asked", [audit_show, capture_page])
 def test_twice_as_many_viewpoints_are_twice_the_work(
     records: tuple[LargeRecord, LargeRecord], asked: Callable[[LargeRecord], Callable[[], object]]

@@ -56,6 +56,7 @@ def test_it_verifies(data: Path) -> None:
     assert report.ok
 
 
+@pytest.mark.slow
 def test_its_computations_give_the_same_again(data: Path) -> None:
     kinds = ("locate_spheres", "live_summary", "evaluate")  # others take minutes
     report = replay(read_run(data, "latest"), kinds=kinds, end_to_end=True, progress=quiet)

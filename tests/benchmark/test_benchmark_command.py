@@ -33,6 +33,7 @@ def answer(*arguments: object) -> Any:
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_methods_are_run_scored_and_put_into_the_table(folder: Path) -> None:
     common = ("--scenario", "dense", "--out", folder / "benchmark", "--spacing-mm", "1")
     mesh = ("--mesh", folder / "15000.obj")

@@ -40,6 +40,10 @@ COMMANDS = {
         "--output_path /w/fused.ply",
         "colmap poisson_mesher --input_path /w/fused.ply --output_path /w/mesh.ply",
     ],
+    "pycolmap": [
+        TRIANGULATED,
+        "python -m service.benchmark.programs.patch_match /w/dense /w/fused.ply /w/mesh.ply",
+    ],
     "openmvs": [
         TRIANGULATED,
         "InterfaceCOLMAP -w /w -i /w/dense -o scene.mvs --image-folder /w/dense/images",
@@ -171,6 +175,7 @@ def test_a_method_is_run_and_its_mesh_comes_back_into_the_world(name: str, datas
     assert len(json.loads((tmp_path / "out" / f"{name}-sparse" / "data" / "splits.json").read_text())["dense"]) == 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("simulated", [True, False])
 @pytest.mark.usefixtures("stand_ins")
 def test_meshes_and_pictures_of_a_simulated_data_set_say_so(
@@ -185,6 +190,7 @@ def test_meshes_and_pictures_of_a_simulated_data_set_say_so(
         assert (b"SIMULATED: made by a simulated rig" in data) == simulated
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("stand_ins")
 def test_a_mesh_made_elsewhere_is_scored_and_another_frame_is_noticed(dataset: DataSet, tmp_path: Path) -> None:
     ngp, neus2 = methods()["instant-ngp"], methods()["neus2"]

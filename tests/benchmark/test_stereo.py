@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from service.benchmark.method import methods, missing
 from service.benchmark.records import SCENARIOS, Scenario
@@ -15,7 +13,6 @@ from service.benchmark.running import Trial, run_trial
 from service.compute.camera_model import CameraModel
 from service.compute.ground_truth.distances.chamfer import ChamferSettings
 from service.compute.pixels.ray_mesh import RayMesh
-from service.compute.pixels.splits import splits
 from service.compute.stereo.fusion import fused
 from service.compute.stereo.guided import guided_depth
 from service.compute.stereo.matching import depth_of_pair
@@ -24,30 +21,19 @@ from service.compute.stereo.rectify import rectified
 from service.compute.stereo.surface import surface_of
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, look_at
-from service.dataset.posed.pixels import Photographs
-from service.dataset.posed.records import DataSet, Mesh, PosedView
+from service.dataset.posed.records import DataSet
 from tests.support.scenes.depth_of_sphere import depth_of_sphere
-from tests.support.scenes.textured_scene import camera_of_width, render, ring_of_poses, slabs
+from tests.support.scenes.slab_data_set import SLABS, slab_data_set, slab_mesh
+from tests.support.scenes.textured_scene import render
 
-SCENE = slabs(3)
 PINHOLE = CameraModel(320, 240, 450.0, 450.0, 159.5, 119.5)
 UP = np.array([0.0, 1.0, 0.1])
-
-
-def truth() -> Mesh:
-    """The upper faces of the slabs, as far as the images show the table."""
-    corners: list[tuple[float, float, float]] = []
-    for slab in SCENE:
-        (x0, y0), (x1, y1) = np.clip(slab.low, -0.2, 0.2), np.clip(slab.high, -0.2, 0.2)
-        corners += [(x, y, slab.z) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
-    first = 4 * np.arange(len(SCENE), dtype=np.int64)[:, None]
-    return Mesh(np.array(corners), np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])]))
 
 
 def height_m(places: Array) -> Array:
     """Height of the uppermost slab at places (N, 2)."""
     out = np.zeros(len(places))
-    for slab in SCENE:
+    for slab in SLABS:
         inside = ((places > slab.low) & (places < slab.high)).all(axis=1)
         out[inside] = np.maximum(out[inside], slab.z)
     return out
@@ -60,7 +46,7 @@ def eye_at(angle_deg: float, tilt_deg: float = 25.0) -> Transform:
 
 
 def seen_from(T_world_camera: Transform) -> StereoView:
-    return StereoView(render(SCENE, PINHOLE, T_world_camera, 1), PINHOLE, T_world_camera)
+    return StereoView(render(SLABS, PINHOLE, T_world_camera, 1), PINHOLE, T_world_camera)
 
 
 def blank(T_world_camera: Transform) -> StereoView:
@@ -69,16 +55,7 @@ def blank(T_world_camera: Transform) -> StereoView:
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> DataSet:
-    """Distorted photographs of the slabs, twelve around them."""
-    folder, camera, mesh = tmp_path_factory.mktemp("slabs"), camera_of_width(320), truth()
-    poses = {f"view_{k:02d}": T for k, T in enumerate(ring_of_poses(12))}
-    views = tuple(PosedView(name, ".png", camera, T, np.zeros((6, 6))) for name, T in poses.items())
-    for k, view in enumerate(views):
-        assert cv2.imwrite(str(folder / view.file), render(SCENE, camera, view.T_world_camera, k))
-    files = {view.name: folder / view.file for view in views}
-    sees: dict[str, NDArray[np.bool_]] = {view.name: np.ones(5, dtype=np.bool_) for view in views}
-    pixels = Photographs(files, RayMesh(mesh.vertices_m, mesh.faces), ())
-    return DataSet("slabs", True, {}, views, pixels, mesh, splits(sees))
+    return slab_data_set(tmp_path_factory.mktemp("slabs"))
 
 
 def test_the_cameras_look_at_one_point() -> None:
@@ -116,7 +93,7 @@ def test_the_depth_of_a_pair_is_that_of_the_scene() -> None:
 
 def test_near_a_guess_that_is_wrong_by_millimetres_the_depth_is_found() -> None:
     pair = rectified(seen_from(eye_at(0)), seen_from(eye_at(30)), np.array([0.0, 0.0, 0.02]))
-    guess = truth()
+    guess = slab_mesh()
     lifted = RayMesh(guess.vertices_m + np.array([0.0, 0.0, 0.012]), guess.faces)
     found = guided_depth(pair, lifted, 0.58)
     assert found is not None

@@ -34,6 +34,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Generator[Page]:
         assert not complaints, complaints
 
 
+@pytest.mark.slow
 def test_the_scene_is_turned_by_pointer_and_keys(page: Page) -> None:
     scene = page.locator(".turned")
     expect(scene).to_be_visible()

@@ -58,6 +58,7 @@ def test_exact_data_gives_the_exact_answer(method: Method) -> None:
     assert result.held_out_mm.max() < 1e-5
 
 
+@pytest.mark.slow
 def test_noisy_robot_stays_within_the_bootstrap_sigma() -> None:
     ratios: list[float] = []
     for seed in range(6):
@@ -73,6 +74,7 @@ def test_noisy_robot_stays_within_the_bootstrap_sigma() -> None:
     assert 0.3 < float(np.sqrt(np.mean(np.square(ratios)))) < 2.0
 
 
+@pytest.mark.slow
 @given(flips=st.lists(st.booleans(), min_size=14, max_size=14), seed=st.integers(0, 50))
 @settings(max_examples=15, deadline=None)
 def test_half_turned_boards_are_turned_back(flips: list[bool], seed: int) -> None:

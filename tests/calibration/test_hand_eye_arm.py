@@ -77,6 +77,7 @@ def _with_joints(session: Session, arm: ArmModel = UR10E) -> HandEyeResult:
     )
 
 
+@pytest.mark.slow
 def test_sixty_images_of_a_good_arm_place_the_camera_within_a_twentieth_of_a_millimetre() -> None:
     worst, ratios = 0.0, list[float]()
     for seed in range(4):
@@ -138,6 +139,7 @@ def test_corners_numbered_from_the_other_end_are_renumbered() -> None:
     assert _error_mm(result.methods["reprojection"]) < 0.5
 
 
+@pytest.mark.slow
 def test_the_arms_own_error_is_found_and_pays_on_viewpoints_it_never_saw() -> None:
     scene = Scene.generate(4)
     result = _with_joints(board_session(scene, plan(scene, "exvivo_spine", "hand_eye")))
@@ -158,6 +160,7 @@ def test_the_arms_own_error_is_found_and_pays_on_viewpoints_it_never_saw() -> No
     assert np.all((np.array(record.observed) >= 0) & (corrected.correction.observed <= 1))
 
 
+@pytest.mark.slow
 def test_an_arm_that_errs_otherwise_still_gains() -> None:
     scene = OddScene.generate(1)
     result = _with_joints(board_session(scene, plan(scene, "exvivo_spine", "hand_eye")))
@@ -169,6 +172,7 @@ def test_an_arm_that_errs_otherwise_still_gains() -> None:
     assert scene_error_mm(scene, views, poses @ result.corrected.T_flange_camera) < 0.7 * best
 
 
+@pytest.mark.slow
 def test_an_arm_of_seven_axes_with_errors_of_another_kind_gains_as_well() -> None:
     """Its links are displaced in all directions, its gears have no whole waves, and its joints yield to gravity."""
     scene = Scene.generate(7, arm="LBR Med 14")
@@ -200,6 +204,7 @@ def test_a_correction_of_seven_joints_does_not_fit_an_arm_of_six() -> None:
         corrected_T_base_flange(q, forward(UR10E, q[None])[0], nothing)
 
 
+@pytest.mark.slow
 def test_no_correction_where_the_arm_has_only_noise() -> None:
     scene = Scene.generate(3)
     shots = plan(scene, "exvivo_spine", "hand_eye")

@@ -218,6 +218,7 @@ def test_leaving_a_view_out_is_what_a_new_adjustment_without_it_gives() -> None:
     assert validation.five_fold_rms_px == pytest.approx(validation.leave_one_out_rms_px, rel=0.1)
 
 
+@pytest.mark.slow
 def test_projection_uncertainty_is_the_spread_of_projections_over_calibrations() -> None:
     """Each calibrated camera is moved to fit the boards, as happens when its pose is estimated."""
     projected: list[Array] = []

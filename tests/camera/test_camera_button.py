@@ -19,6 +19,8 @@ from simulators.scene.world import Scene
 from tests.support.rig.camera_simulator import camera_simulator
 from tests.support.rig.gphoto_rig import PAPER, driver
 
+pytestmark = pytest.mark.slow
+
 
 @contextmanager
 def _world() -> Generator[tuple[World, str]]:
@@ -61,7 +63,6 @@ def held(request: pytest.FixtureRequest) -> Iterator[tuple[World, Camera]]:
             camera.close()
 
 
-@pytest.mark.slow
 def test_nothing_comes_while_nobody_presses(held: tuple[World, Camera], tmp_path: Path) -> None:
     assert held[1].released_images(tmp_path, 0.1) == ()
 
@@ -78,7 +79,6 @@ def test_a_press_of_the_button_brings_an_image(held: tuple[World, Camera], tmp_p
     assert released_by_software.counter == image.counter + 1
 
 
-@pytest.mark.slow
 def test_an_image_announced_while_the_camera_is_asked_something_else_is_not_lost(
     held: tuple[World, Camera], tmp_path: Path
 ) -> None:

@@ -94,6 +94,7 @@ def test_an_empty_value_is_refused_and_the_link_goes_on(camera: RunningCamera) -
     assert isinstance(seconds, float)
 
 
+@pytest.mark.slow
 def test_a_value_that_is_not_offered_is_refused_and_nothing_changes(camera: RunningCamera) -> None:
     # The client caches a setting for two seconds.
     words = (["set", "iso", "100"], ["set", "iso", "123"], ["sleep", 2.2], ["value", "iso"])
@@ -153,6 +154,7 @@ def test_live_view(camera: RunningCamera) -> None:
     assert frame["size"] > 5000
 
 
+@pytest.mark.slow
 def test_autofocus_and_exposure_time_are_waited_for() -> None:
     with camera_simulator() as camera:
         answers = vendor_session(

@@ -123,6 +123,7 @@ def test_sphere_outlines_in_the_picture_lie_on_the_analytic_cone(plain: Picture,
     assert abs(centre_and_size_px[2]) < 0.03
 
 
+@pytest.mark.slow
 def test_checkerboard_corners_lie_where_the_lens_projects_them(renderer: Renderer, scene: Scene) -> None:
     T_world_board = scene.board_placement(1)
     lens = scene.camera_intrinsics(WIDTH)

@@ -215,6 +215,7 @@ def test_a_wrong_rig_file_is_refused_by_field(tmp_path: Path) -> None:
     assert str(rig) in result.output
 
 
+@pytest.mark.slow
 def test_a_run_that_is_told_to_end_takes_its_worker_with_it(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text("name: bench\ndevices: {}\n")
     (tmp_path / "bench.yaml").write_text(PROTOCOL)

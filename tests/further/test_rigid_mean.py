@@ -41,6 +41,7 @@ def chi2(found: RigidMean, truth: Transform) -> float:
     return float(e @ np.linalg.solve(found.covariance, e))
 
 
+@pytest.mark.slow
 def test_the_error_is_as_large_as_the_covariance_says() -> None:
     rng = np.random.default_rng(1)
     found: list[float] = []

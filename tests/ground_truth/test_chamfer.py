@@ -49,6 +49,7 @@ BALL = surface(trimesh.creation.icosphere(subdivisions=2, radius=0.008))
 BUMPY = Surface(BALL.vertices_m * (1 + 0.02 * np.sin(800 * BALL.vertices_m[:, :1])), BALL.faces)
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 1000), spacing=st.floats(1.5e-4, 3e-4))
 @settings(max_examples=5, deadline=None)
 def test_equal_surfaces_have_the_floor_and_no_distance_to_the_faces(seed: int, spacing: float) -> None:
@@ -125,6 +126,7 @@ def test_the_score_is_that_of_brute_force_over_the_same_samples() -> None:
     assert score.f_scores[1] == pytest.approx(2 * p * r / (p + r))
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 1000), n=st.integers(1, 60), spread=st.floats(0.001, 0.1))
 @settings(max_examples=25, deadline=None)
 def test_the_distance_to_the_faces_is_exact(seed: int, n: int, spread: float) -> None:
@@ -223,6 +225,7 @@ def test_the_command_prints_the_scores_of_meshes_of_any_format(tmp_path: Path, s
     assert (record["excluded"], record["n_pred"], record["n_gt"]) == (0, 9_600, 9_600)
 
 
+@pytest.mark.slow
 def test_the_command_writes_heat_maps_in_the_unit_of_the_surface(tmp_path: Path) -> None:
     tilted = plane().moved(transform(Rotation.from_rotvec([0, 0.12, 0]), np.zeros(3)))
     pred, gt = written(tmp_path / "pred.ply", tilted), written(tmp_path / "gt.ply", plane())
@@ -241,6 +244,7 @@ def test_the_command_writes_heat_maps_in_the_unit_of_the_surface(tmp_path: Path)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spacing_mm", [0.1, 0.4])
 def test_the_picture_of_a_small_surface_has_no_paper_between_its_samples(tmp_path: Path, spacing_mm: float) -> None:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=10.0)

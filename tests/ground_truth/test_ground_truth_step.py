@@ -218,6 +218,7 @@ def test_a_region_that_a_person_drew_is_used_with_the_name(bench: Bench) -> None
     assert np.all(columns["source"][within] == 0)
 
 
+@pytest.mark.slow
 def test_a_sphere_that_was_taken_away_before_the_scan_is_not_in_the_ground_truth(bench: Bench) -> None:
     state, _, points = fused(bench)
     (number,) = state.steps["ground_truth"].result["details"]["taken_away"]
@@ -238,6 +239,7 @@ def test_without_a_ct_the_step_says_so_and_passes(bench: Bench) -> None:
     assert not state.steps["ground_truth"].artefacts
 
 
+@pytest.mark.slow
 def test_the_way_through_the_cameras_is_compared_with_the_spheres(bench: Bench, tmp_path: Path) -> None:
     fused(bench)
     (job,) = (j for j in bench.state().steps["ground_truth"].jobs.values() if j.kind == "fuse")

@@ -201,6 +201,7 @@ def test_an_arm_whose_brakes_closed_moves_once_they_are_released() -> None:
         assert left[0].monotonic_s - begin > 0.12, "the brakes take 0.6 s, here 0.15 s"
 
 
+@pytest.mark.slow
 def test_a_wrong_load_is_felt_as_a_collision() -> None:
     host = address(74)
     with simulated_kuka(host, "--true-load-kg", "1.6"), opened(host) as arm:
@@ -213,6 +214,7 @@ def test_a_wrong_load_is_felt_as_a_collision() -> None:
         travel(arm, turned(arm, 0.2))
 
 
+@pytest.mark.slow
 def test_t1_keeps_the_flange_below_250_mm_per_second() -> None:
     host = address(75)
     with simulated_kuka(host, "--mode", "T1"), opened(host) as arm:
@@ -223,6 +225,7 @@ def test_t1_keeps_the_flange_below_250_mm_per_second() -> None:
         assert 0.2 < fastest < 0.26
 
 
+@pytest.mark.slow
 def test_a_lost_link_is_unavailable_and_opens_again() -> None:
     host = address(76)
     plan = json.dumps([{"device": "robot", "on": "move", "kind": "drop"}])

@@ -193,6 +193,7 @@ def test_its_samples_are_the_pose_stream(version: str) -> None:
         assert "MONITORING_READY" in report.details["FRI"], "it has commanded nothing"
 
 
+@pytest.mark.slow
 def test_lost_messages_are_told_and_an_interruption_falls_back_to_the_application() -> None:
     host = address(92)
     faults = [
@@ -211,6 +212,7 @@ def test_lost_messages_are_told_and_an_interruption_falls_back_to_the_applicatio
         assert arm.settle(SettleCriteria()).samples > 10
 
 
+@pytest.mark.slow
 def test_a_stop_shows_in_its_samples() -> None:
     host = address(93)
     with simulated_kuka(host), opened(host) as arm:
@@ -219,6 +221,7 @@ def test_a_stop_shows_in_its_samples() -> None:
         until(lambda: not last_second(arm)[-1].safety.may_move, "the stop does not show", 30)
 
 
+@pytest.mark.slow
 def test_an_application_without_fri_and_a_port_in_use_are_refused() -> None:
     host = address(94)
     with (
@@ -236,6 +239,7 @@ def test_an_application_without_fri_and_a_port_in_use_are_refused() -> None:
             pass
 
 
+@pytest.mark.slow
 def test_doctor_says_how_fri_fares(tmp_path: Path) -> None:
     host = address(96)
     rig = tmp_path / "rig.yaml"
@@ -250,6 +254,7 @@ def test_doctor_says_how_fri_fares(tmp_path: Path) -> None:
     assert "every 10 ms" in told["details"]["FRI"]
 
 
+@pytest.mark.slow
 def test_its_process_ends_with_the_driver() -> None:
     host = address(95)
     with simulated_kuka(host), opened(host):

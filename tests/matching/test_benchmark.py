@@ -22,6 +22,8 @@ from service.core.geometry import Array
 from service.dataset.posed.exporter import exporter, write_data_set
 from tests.support.scenes.posed import posed_data_set
 
+pytestmark = pytest.mark.slow
+
 CAMERA = CameraModel(480, 360, 700.0, 702.0, 238.0, 181.0, -0.05, 0.01, 3e-4, -2e-4)
 _GRID_M, _FROM_M = (0.0025, 0.006), -0.15
 
@@ -71,7 +73,6 @@ def scored(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     return out, json.loads(printed)
 
 
-@pytest.mark.slow
 def test_sift_finds_poses_and_fewer_matches_of_difficult_pairs(scored: tuple[Path, Any]) -> None:
     classes = scored[1]["classes"]
     assert len(classes) >= 3

@@ -186,6 +186,7 @@ def test_damaged_pieces_are_refused() -> None:
         unpack_matches(bytes(claims_encryption))
 
 
+@pytest.mark.slow
 def test_wrong_size_or_broken_image_is_named(
     camera: CameraModel, views: dict[str, tuple[Path, Transform]], tmp_path: Path
 ) -> None:

@@ -68,6 +68,7 @@ def test_robot_poses_of_two_frames_are_noticed_and_not_believed(
     assert np.linalg.eigvalsh(np.array(covariance["covariance"]["v0.png"])).min() > 0
 
 
+@pytest.mark.slow
 def test_wrong_principal_point_is_refined(capture: tuple[Path, dict[str, Transform]], tmp_path: Path) -> None:
     """Six pixels off: held fixed it would turn the cameras; refined, most of it is found."""
     folder, poses = capture

@@ -20,6 +20,8 @@ from service.core.errors import DataError
 from service.core.geometry import inverse
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, Scene, render, scene
 
+pytestmark = pytest.mark.slow
+
 Captured = tuple[Scene, list[Path], tuple[tuple[SphereOutline, ...], ...]]
 
 

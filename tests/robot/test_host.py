@@ -124,6 +124,7 @@ def test_the_child_is_told_that_its_parent_lives_during_long_calls_too(fake: Fak
     assert np.median(gaps) < 0.1
 
 
+@pytest.mark.slow
 def test_no_beat_while_the_parent_stands_still() -> None:
     program = (
         "import sys\n"
@@ -155,6 +156,7 @@ def test_no_beat_while_the_parent_stands_still() -> None:
         assert float(parent.stdout.readline()) > 1.5
 
 
+@pytest.mark.slow
 def test_a_child_that_does_not_read_holds_its_parent_up_for_no_beat(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(heartbeat, "BEAT_S", 0.001)
     device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=20.0, name="stopped")

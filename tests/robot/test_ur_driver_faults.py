@@ -101,6 +101,7 @@ def test_a_stop_that_came_and_was_released_between_two_motions_is_not_forgotten(
         assert watch.moved_for_s(since) > 0.0
 
 
+@pytest.mark.slow
 def test_a_motion_ended_at_the_controller_did_not_arrive_and_waits_for_a_person() -> None:
     host = address(63)
     with simulated_ur(host), opened(host) as arm, watched_arm(host) as watch:
@@ -151,6 +152,7 @@ def test_emergency_stop() -> None:
         travel(arm, turned(arm, 0.1))
 
 
+@pytest.mark.slow
 def test_refused_motion_is_an_error_and_the_next_one_works() -> None:
     with faulty(53, {"on": "move", "kind": "reject"}), opened(address(53)) as arm:
         with pytest.raises(DeviceRefusedError, match="did not start the joint motion"):
@@ -177,6 +179,7 @@ def test_reconnect_after_the_controller_restarted() -> None:
             arm.close()
 
 
+@pytest.mark.slow
 def test_dropped_link_ends_in_an_error_and_a_reconnect() -> None:
     host = address(60)
     with faulty(60, {"on": "move", "kind": "drop"}), opened(host, stale_after_s=0.5) as arm:
@@ -198,6 +201,7 @@ def test_motion_that_ended_on_a_dead_stream_is_not_taken_for_an_arm_at_rest() ->
         travel(arm, turned(arm, 0.1))
 
 
+@pytest.mark.slow
 def test_stalled_stream_is_not_taken_for_a_still_arm() -> None:
     with faulty(55, {"on": "move", "kind": "stall"}), opened(address(55), stale_after_s=0.5) as arm:
         with pytest.raises(DeviceUnavailableError, match="no new sample"):

@@ -65,6 +65,7 @@ def banner(state: RunState, **fields: object) -> Banner:
     return robot_banner(state, Snapshot.model_validate({"at_utc_s": time.time(), **fields}), driven=True)
 
 
+@pytest.mark.slow
 def test_a_long_call_is_told_while_it_lasts(bench: Bench) -> None:
     bench.reporter.attend("working", "capture", 1)
     bench.reporter.show("viewpoints", 12, 54)
@@ -83,12 +84,14 @@ def test_a_long_call_is_told_while_it_lasts(bench: Bench) -> None:
     until(lambda: bench.told.activity == "", lambda: str(bench.told), 10)
 
 
+@pytest.mark.slow
 def test_a_call_of_which_nothing_was_said_is_seen_to_last(bench: Bench) -> None:
     bench.reporter.attend("working", "capture", 1)
     until(lambda: bench.told.quiet_s > 2, lambda: str(bench.told), 10)
     assert bench.told.age_s() < 2
 
 
+@pytest.mark.slow
 def test_the_arm_is_watched_from_beside_the_call(bench: Bench, arm: BenchArm) -> None:
     bench.reporter.attend("working", "capture", 1)
     assert bench.told.robot == "standing"

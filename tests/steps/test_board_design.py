@@ -46,6 +46,7 @@ def nominal(tolerances: Tolerances = USUAL) -> BoardKnowledge:
     return nominal_knowledge(CAMERA, MOUNT, MIDDLE, APPROACH, BOARD, tolerances=tolerances)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wishes", "tolerances"), [(FIRST, Tolerances()), pytest.param(ViewRange(), SMALL, marks=pytest.mark.slow)]
 )

@@ -351,6 +351,7 @@ def test_many_stretches_compared_at_once_give_the_order_of_one_by_one(digits: in
     assert len(calls) >= len(best), "whoever waits for it is told that it goes on"
 
 
+@pytest.mark.slow
 def test_a_plan_in_the_listed_order_does_not_compare_every_viewpoint_with_every_other(situation: Situation) -> None:
     poses = [camera_at((0.001 * number, -0.1, 0.62)) for number in range(400)]
     planned(situation, *poses[:2])  # loads once what must not be counted

@@ -98,6 +98,7 @@ def test_parts_of_the_page_come_alone(shown: tuple[WebSite, Browser, Bench]) -> 
     assert answer.text.count("<template") == 4
 
 
+@pytest.mark.slow
 def test_an_image_that_could_not_be_looked_at_says_why_and_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -121,6 +121,7 @@ def test_only_who_controls_the_run_draws(shown: tuple[WebSite, Browser, str]) ->
     assert not drawn(site, run)
 
 
+@pytest.mark.slow
 def test_without_a_fusion_to_come_there_is_nothing_to_draw(tmp_path: Path) -> None:
     run = record_run(tmp_path)
     with web_site(tmp_path) as site:

@@ -1,6 +1,6 @@
 """Gaussian splatting with gsplat, and a mesh of its depth maps, as a program of its own: needs torch and CUDA.
 
-Run: python -m service.benchmark.programs.gaussians DATA MESH
+Run: python -m service.benchmark.programs.gaussians DATA MESH [STEPS]
 """
 
 from __future__ import annotations
@@ -27,12 +27,15 @@ from service.core.errors import OrthocaptureError
 from service.core.geometry import Array, inverse
 
 STEPS = 15_000
+_REFINED = 0.5  # part of the steps in which Gaussians are split, added and removed
+_LAST_RATE = 0.01  # of the means, as a part of the first
+_TOLD = 1000  # steps between two lines of progress
 OPAQUE = 0.5  # a pixel's depth counts where the Gaussians before it are as opaque
 VOXEL_PX = 1.5
 LEAST_MAPS = 3
 # Learning rates of 3D Gaussian splatting (Kerbl et al., SIGGRAPH 2023); that of the means is for a scene of size 1.
 _RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "colors": 2.5e-3}
-_USAGE = "usage: python -m service.benchmark.programs.gaussians DATA MESH"
+_USAGE = "usage: python -m service.benchmark.programs.gaussians DATA MESH [STEPS]"
 
 
 def first_gaussians(torch: Any, points_m: Array) -> Any:
@@ -63,14 +66,15 @@ class Splatting:
         self._gaussians = first_gaussians(self._torch, points_m)
 
     def train(self, pictures: Sequence[NDArray[np.uint8]], steps: int) -> None:
-        """Fit to pictures (H, W, 3), one for each view."""
+        """Fit to pictures (H, W, 3), one for each view, and print the progress."""
         torch = self._torch
         rates = _RATES | {"means": _RATES["means"] * self._extent_m}
         optimizers = {
             name: torch.optim.Adam([{"params": self._gaussians[name], "lr": rate, "name": name}], eps=1e-15)
             for name, rate in rates.items()
         }
-        strategy = self._gsplat.DefaultStrategy()
+        decay = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], _LAST_RATE ** (1 / steps))
+        strategy = self._gsplat.DefaultStrategy(refine_stop_iter=round(_REFINED * steps))
         strategy.check_sanity(self._gaussians, optimizers)
         state = strategy.initialize_state(scene_scale=self._extent_m)
         order = np.random.default_rng(0)
@@ -79,11 +83,17 @@ class Splatting:
             wanted = torch.tensor(pictures[k], device="cuda").float() / 255
             rendered, _, about = self._rendered(self._views[k], "RGB")
             strategy.step_pre_backward(self._gaussians, optimizers, state, step, about)
-            (rendered[0] - wanted).abs().mean().backward()
+            error = (rendered[0] - wanted).abs().mean()
+            error.backward()
             for optimizer in optimizers.values():
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)
+            decay.step()
             strategy.step_post_backward(self._gaussians, optimizers, state, step, about, packed=False)
+            if (step + 1) % _TOLD == 0:
+                count = len(self._gaussians["means"])
+                sys.stdout.write(f"step {step + 1} of {steps}: {count} Gaussians, mean error {error.item():.4f}\n")
+                sys.stdout.flush()
 
     def depth_map(self, view: StereoView) -> DepthMap:
         """Expected depth of a view, where it is opaque."""
@@ -114,16 +124,16 @@ class Splatting:
 
 def main() -> None:
     """Reconstruct the folder that the command line names."""
-    if len(sys.argv) != 3:
+    if not 3 <= len(sys.argv) <= 4 or not all(word.isdigit() for word in sys.argv[3:]):
         raise SystemExit(_USAGE)
-    data = Path(sys.argv[1])
+    data, steps = Path(sys.argv[1]), int(sys.argv[3]) if sys.argv[3:] else STEPS
     try:
         views = views_of(data)
         model = pycolmap.Reconstruction(str(data / "sparse" / "0"))
         points = np.array([point.xyz for point in model.points3D.values()])
         names = sorted(image.name for image in model.images.values())
         splatting = Splatting(views, points)
-        splatting.train([read_image(data / "images" / name)[..., ::-1].copy() for name in names], STEPS)
+        splatting.train([read_image(data / "images" / name)[..., ::-1].copy() for name in names], steps)
         maps = [splatting.depth_map(view) for view in views]
         depth = float(np.nanmedian(np.concatenate([one.depth_m.ravel()[::97] for one in maps])))
         field = fused(maps, VOXEL_PX * depth / views[0].camera.fx, min(LEAST_MAPS, len(maps)))

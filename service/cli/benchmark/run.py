@@ -34,7 +34,7 @@ def run_command(
         typer.Option(
             "--method",
             metavar="NAME",
-            help="stereo, colmap, openmvs, instant-ngp, neus2, sugar, gsplat, or that of a plug-in.",
+            help="stereo, colmap, pycolmap, openmvs, instant-ngp, neus2, sugar, gsplat, or that of a plug-in.",
         ),
     ],
     scenario: Annotated[_Scenario, typer.Option("--scenario", help="All images, or the split of a few.")],

@@ -7,7 +7,6 @@ in a base frame of its own, so only the new image's station is solved again.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -26,7 +25,6 @@ from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 
-_POINTS = 25  # per outline in the provisional solution: enough for its three parameters
 _FULL_SCALE = 254  # of 255: JPEG changes a clipped 255 by one
 _MARGIN = 1.1  # of the outline's radius: spheres nearer to the image's border are not expected to be found
 
@@ -97,7 +95,7 @@ def register_station(
     Raises:
         ComputeError: the outlines do not determine an answer yet.
     """
-    outlines = [tuple(_fewer_points(o) for o in view.outlines) for view in views]
+    outlines = [view.outlines for view in views]
     poses = np.array([view.T_base_camera for view in views]).reshape(-1, 4, 4)
     if T_base_scan is None:
         assignments = identify(
@@ -164,8 +162,3 @@ def image_measures(
         "clipped_fraction": clipped_fraction(image_bgr),
     }
     return measures, whole.black
-
-
-def _fewer_points(outline: SphereOutline) -> SphereOutline:
-    step = max(1, len(outline.points) // _POINTS)
-    return dataclasses.replace(outline, points=outline.points[::step], points_px=outline.points_px[::step])

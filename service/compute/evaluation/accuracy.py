@@ -141,7 +141,7 @@ def leave_one_out(registration: RegistrationResult, *, refined: bool = False) ->
             i, j, _ = problem.members[o]
             base = rest.solution.state.bases[problem.group[o]]
             centre = apply(inverse(T[i]) @ base, problem.centres[m])
-            distances = _distances(problem.points[o], centre, problem.radius_m, problem.camera)
+            distances = _distances(problem.outlines[o].points, centre, problem.radius_m, problem.camera)
             errors.append(_error((i, j, m), distances, centre, prediction))
     if not errors:
         raise ComputeError("no sphere can be left out: each is needed", remedy="Use more registration spheres")

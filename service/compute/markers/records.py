@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -39,23 +40,22 @@ class DetectionOptions:
 DEFAULTS = DetectionOptions()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SphereOutline:
     """The outline of one sphere in one image.
 
-    `points` are (L, 2) undistorted normalised coordinates (z = 1), equidistant on the fitted conic; `points_px` are
-    the same in pixels of an ideal pinhole with the camera's K. `centre_px` is the conic's centre in the image as
-    captured; it is not the projection of the sphere's centre, whose direction is `cone.axis`.
+    `centre_px` is the conic's centre in the image as captured; it is not the projection of the sphere's centre, whose
+    direction is `cone.axis`.
 
     `cone_covariance` (3, 3), rad²: of the displacement of the cone's axis along the first and the second column of
     `cone.frame()` and of the half angle, in this order (true axis ~ axis + frame[:, :2] @ d[:2], true half angle ~
     half angle + d[2]). It includes the noise of the edge points and the systematic error of one outline.
     """
 
-    points: Array = field(repr=False)
-    points_px: Array = field(repr=False)
-    conic: Array = field(repr=False)  # (3, 3) of normalised coordinates, x^T E x = 0, negative inside
     cone: Cone
+    n_points: int  # L
+    focal_px: tuple[float, float] = field(repr=False)  # of the camera, along x and y
+    principal_px: tuple[float, float] = field(repr=False)
     centre_px: tuple[float, float]
     semi_axes_px: tuple[float, float]
     angle_rad: float  # of the major axis from x
@@ -68,6 +68,21 @@ class SphereOutline:
     colour_bgr: tuple[float, float, float]  # median inside, 0..255
     score: float  # 0..1, how much it looks like a sphere
     cone_covariance: Array = field(repr=False)
+
+    @cached_property
+    def points(self) -> Array:
+        """(L, 2) undistorted normalised coordinates (z = 1), equidistant on the fitted conic."""
+        return cone_ellipse(self.cone).equidistant(self.n_points)
+
+    @property
+    def points_px(self) -> Array:
+        """(L, 2) the same points in pixels of an ideal pinhole with the camera's K."""
+        return self.points * self.focal_px + self.principal_px
+
+    @property
+    def conic(self) -> Array:
+        """(3, 3) of normalised coordinates, x^T E x = 0, negative inside."""
+        return self.cone.conic
 
     def captured_px(self, camera: CameraModel) -> Array:
         """(L, 2) points of the outline in pixels of the image as captured (with distortion)."""
@@ -94,17 +109,15 @@ class OutlineEvidence:
 
 
 def outline_from_cone(cone: Cone, camera: CameraModel, n_points: int, evidence: OutlineEvidence) -> SphereOutline:
-    """The outline of a cone, with its conic and `n_points` equidistant points."""
+    """The outline of a cone, which has `n_points` equidistant points."""
     ellipse = cone_ellipse(cone)
-    points = ellipse.equidistant(n_points)
-    focal = np.array([camera.fx, camera.fy])
     centre = camera.project(np.array([[*ellipse.centre, 1.0]]))[0]
-    f = float(focal.mean())
+    f = 0.5 * (camera.fx + camera.fy)
     return SphereOutline(
-        points=points,
-        points_px=points * focal + [camera.cx, camera.cy],
-        conic=cone.conic,
         cone=cone,
+        n_points=n_points,
+        focal_px=(camera.fx, camera.fy),
+        principal_px=(camera.cx, camera.cy),
         centre_px=(float(centre[0]), float(centre[1])),
         semi_axes_px=(ellipse.semi_major * f, ellipse.semi_minor * f),
         angle_rad=ellipse.angle_rad,

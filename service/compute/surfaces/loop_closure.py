@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from service.compute.descent import gauss_newton
 from service.compute.surfaces.constellations import ConstellationMatch
@@ -97,7 +97,7 @@ def close_loop(
     while staying.sum() > _LEAST:
         z2 = np.array([_against_others(pa, pb, C, staying, int(i), match.T_a_b)[1] for i in np.flatnonzero(staying)])
         worst = int(z2.argmax())
-        if chi2.sf(float(z2[worst]), 3) >= limit:
+        if chdtrc(3, float(z2[worst])) >= limit:
             break
         staying[np.flatnonzero(staying)[worst]] = False
     T, _ = _weighted(pa[staying], pb[staying], C[staying], match.T_a_b)

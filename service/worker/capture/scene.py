@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -72,9 +74,13 @@ def live_scene(context: JobContext[_L]) -> CaptureScene:
 def kept_surface(context: JobContext[_A]) -> CoverageSurface | None:
     """The specimen's surface from the file of the job `coverage_points`; None without such a file."""
     sha256 = context.arguments.surface
-    if sha256 is None:
-        return None
-    with np.load(context.input(sha256), allow_pickle=False) as arrays:
+    return None if sha256 is None else _surface_in(context.input(sha256))
+
+
+@lru_cache(maxsize=1)
+def _surface_in(artefact: Path) -> CoverageSurface:
+    """The surface in an artefact, whose file never changes, with its tree of rays, which takes long to build."""
+    with np.load(artefact, allow_pickle=False) as arrays:
         return CoverageSurface(**{name: arrays[name] for name in arrays.files})
 
 

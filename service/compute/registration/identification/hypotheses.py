@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
@@ -23,6 +24,7 @@ _CHUNK = 4000  # triples refined at a time
 _TRIPLE_CHI2 = 30.0  # 3 degrees of freedom
 _OUTLINE_CHI2 = 30.0  # 3 degrees of freedom
 _EVIDENCE = 14.0  # log likelihood ratio of a marker to a false detection at an expected place; a low estimate
+_MOST_KEPT = 512  # images whose hypotheses are kept
 _MARGIN = 9.0  # log odds at which an assignment counts as unique
 
 
@@ -50,28 +52,50 @@ def image_hypotheses(
     and the apparent size give depth to about one per cent). Each pair gives a pose from the nine parameters of its
     three outlines. Poses that fit must predict a fourth detection, and all further ones. The survivors are solved
     from all their outlines and judged by their residuals in standard deviations.
+
+    The answer does not depend on camera poses, so it is kept for the registrations of the same images with others.
     """
+    if len(outlines) < 4 or len(centres_scan_m) < 4:
+        return []
     seen = sightings(outlines, radius_m, camera)
-    D = min(len(seen.cones), _MOST_DETECTIONS)
-    if D < 4 or len(centres_scan_m) < 4:
-        return []
-    model, image = _triples(seen, D, centres_scan_m)
+    return list(_answered(_Question(seen, np.asarray(centres_scan_m), radius_m, camera.fx)))
+
+
+class _Question:
+    """What the hypotheses of an image follow from; equal if all its numbers are."""
+
+    def __init__(self, seen: Sightings, centres: Array, radius_m: float, focal_px: float) -> None:
+        self.seen, self.centres, self.radius_m, self.focal_px = seen, centres, radius_m, focal_px
+        cones = (seen.cones.axes, seen.cones.half_angles, seen.depth_sigma_m, seen.sigma_rad)
+        self._numbers = (radius_m, focal_px, *(array.tobytes() for array in (*cones, centres)))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Question) and self._numbers == other._numbers
+
+    def __hash__(self) -> int:
+        return hash(self._numbers)
+
+
+@lru_cache(maxsize=_MOST_KEPT)
+def _answered(question: _Question) -> tuple[Hypothesis, ...]:
+    seen, centres, radius_m = question.seen, question.centres, question.radius_m
+    model, image = _triples(seen, min(len(seen.cones), _MOST_DETECTIONS), centres)
     if len(model) == 0:
-        return []
-    R, t = _fitting(seen, model, image, centres_scan_m, radius_m)
-    counts, error = _support(seen, R, t, centres_scan_m, radius_m)
+        return ()
+    R, t = _fitting(seen, model, image, centres, radius_m)
+    counts, error = _support(seen, R, t, centres, radius_m)
     order = np.lexsort((error, -counts))
     results: dict[frozenset[tuple[int, int]], Hypothesis] = {}
     tried: set[frozenset[tuple[int, int]]] = set()
     for h in order[:4000]:
         if counts[h] < 4 or len(tried) >= _MOST_REFINED:
             break
-        pairs = match(seen, centres_scan_m @ R[h].T + t[h], radius_m, _LOOSE)
+        pairs = match(seen, centres @ R[h].T + t[h], radius_m, _LOOSE)
         key = frozenset((d, m) for d, m, _ in pairs)
         if len(pairs) < 4 or key in tried:
             continue
         tried.add(key)
-        refined = _refine(seen, {d: m for d, m, _ in pairs}, R[h], t[h], centres_scan_m, radius_m, camera.fx)
+        refined = _refine(seen, {d: m for d, m, _ in pairs}, R[h], t[h], centres, radius_m, question.focal_px)
         if refined is not None:
             results.setdefault(frozenset(refined.markers.items()), refined)
     found = sorted(results.values(), key=lambda r: -r.score)
@@ -80,7 +104,7 @@ def image_hypotheses(
     for r in found:
         if not any(set(r.markers.items()) <= set(k.markers.items()) for k in kept):
             kept.append(r)
-    return kept
+    return tuple(kept)
 
 
 def rivals(readings: Sequence[Hypothesis]) -> list[Hypothesis]:

@@ -40,7 +40,7 @@ class Problem:
     focal_px: float
     cones: ObservedCones  # (O,)
     whiten: Array  # (O, 3, 3): whiten @ residual has unit covariance
-    points: list[Array] = field(repr=False)  # (L, 2) normalised; only for costs on points
+    outlines: list[SphereOutline] = field(repr=False)  # (O,) their points are only for costs on points
     point_sigma: Array = field(repr=False)  # (O,) of each of the L points if they were independent
     common: Array = field(repr=False)  # (O, 3, K) displacement of a cone by each common error of the images
     common_prior: Array = field(repr=False)  # (K, K) information
@@ -171,7 +171,7 @@ def assemble(
         focal_px=f,
         cones=ObservedCones.of(()),
         whiten=np.zeros((0, 3, 3)),
-        points=[],
+        outlines=[],
         point_sigma=np.zeros(0),
         common=np.zeros((0, 3, len(prior) - 3)),
         common_prior=prior,
@@ -212,7 +212,7 @@ def with_outlines(
         group=problem.station[image],
         cones=cones,
         whiten=_whitening(np.array([o.cone_covariance for o in used])),
-        points=[o.points for o in used],
+        outlines=used,
         point_sigma=np.array([_point_sigma(o) for o in used]) / problem.focal_px,
         common=common,
     )
@@ -226,7 +226,7 @@ def _point_sigma(o: SphereOutline) -> float:
     # L points on a fitted conic have the information of its n edge points, no more. In addition the outline has a
     # systematic error as a whole, shared by two of its parameters.
     variance = max(o.sigma_px, 0.03) ** 2 / max(o.n_edges, 12) + o.systematic_px**2 / 2
-    return float(np.sqrt(variance * len(o.points)))
+    return float(np.sqrt(variance * o.n_points))
 
 
 def _block_inverse(covariances: Array) -> Array:
@@ -310,8 +310,8 @@ def _point_rows(problem: Problem, centres: Array, cost: PointCost) -> tuple[Arra
     N, b = np.zeros((n, 3, 3)), np.zeros((n, 3))
     for start in range(0, n, _CHUNK):
         part = range(start, min(n, start + _CHUNK))
-        counts = np.array([len(problem.points[o]) for o in part])
-        flat = np.concatenate([problem.points[o] for o in part])
+        counts = np.array([problem.outlines[o].n_points for o in part])
+        flat = np.concatenate([problem.outlines[o].points for o in part])
         flat = np.column_stack([flat, np.ones(len(flat))])
         owner = np.repeat(np.arange(start, start + len(counts)), counts)
         r, D = residuals_and_derivative(flat, centres[owner], problem.radius_m, cost)

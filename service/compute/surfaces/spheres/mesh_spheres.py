@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from service.compute.surfaces.spheres.candidates import candidates, rough_centre, vote_peaks
+from service.compute.surfaces.spheres.candidates import candidates, vote_peaks
 from service.compute.surfaces.spheres.fit import SphereFit, SphereSamples, fit_sphere, sample_weights
 from service.compute.surfaces.spheres.noise import CentreUncertainty, centre_uncertainties
+from service.compute.surfaces.spheres.rough_fits import rough_centres
 from service.compute.surfaces.surfels import CHUNK, IntArray, Surfels, surfels
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
@@ -367,8 +368,9 @@ def _at_seeds(
         close = peaks[np.argsort(distance)][: int(np.sum(distance < _SEED_REACH * radius))]
         surfel = int(tree.query(seed)[1])
         beside = [seed + side * radius * patches.normal[surfel] for side in (1.0, -1.0)]
-        starts = [rough_centre(patches, tree, s, radius, limits.min_coverage) for s in (*close, seed, *beside)]
-        usable = np.array([s for s in starts if s is not None]).reshape(-1, 3)
+        starts = np.array([*close, seed, *beside])
+        rough = rough_centres(patches, tree, starts, radius, limits.min_coverage)
+        usable = np.array([centre for centre in rough if centre is not None]).reshape(-1, 3)
         fits = [
             f
             for f in _fits(usable, vertices, faces, patches, tree, radius)

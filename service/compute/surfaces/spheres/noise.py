@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eigh, null_space
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from service.compute.surfaces.spheres.fit import Patches
 from service.core.geometry import Array
@@ -124,7 +124,7 @@ def centre_uncertainties(
     extra = 0.0
     if np.any(known):
         z2 = (residuals[known] / sigmas[known]) ** 2
-        if float(np.sum(z2)) > float(chi2.ppf(0.99, len(z2))):
+        if float(np.sum(z2)) > float(chdtri(len(z2), 0.01)):
             w = 1 / sigmas[known] ** 4
             extra = max(float(np.sum(w * (residuals[known] ** 2 - sigmas[known] ** 2)) / np.sum(w)), 0.0)
     floor = (_FLOOR * radius) ** 2 * np.eye(3)

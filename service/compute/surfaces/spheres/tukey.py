@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from service.core.geometry import Array
 
-_LEAST_SPREAD = (
-    1e-3  # of the directions: least eigenvalue over the trace; below it, a cap is too flat to fix the centre
-)
+# Of the directions: least eigenvalue over the trace; below it, a cap is too flat to fix the centre.
+LEAST_SPREAD = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +74,11 @@ class CentreFit:
     last: TukeyStep
 
 
+def tukey_weights(residual: Array, half_width: float | Array) -> Array:
+    """Tukey's weights (N,) of residuals (N,) that lie in a band of this half-width (N,)."""
+    return (1 - (residual / half_width) ** 2) ** 2
+
+
 def fit_centre(
     surface: OrientedPoints,
     start: Array,
@@ -116,16 +120,16 @@ def fit_centre(
 def _step(surface: OrientedPoints, centre: Array, radius: float, band: Band) -> TukeyStep | None:
     """Weighted Gauss–Newton step of the centre; None if too few samples lie in the band, or in too flat a cap."""
     ray = surface.points - centre
-    distance = np.linalg.norm(ray, axis=1)
+    distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
     unit = ray / np.maximum(distance, 1e-300)[:, None]
     residual = distance - radius
-    cosine = np.abs(np.sum(unit * surface.normals, axis=1))
+    cosine = np.abs(np.einsum("ij,ij->i", unit, surface.normals))
     eligible = (np.abs(residual) < band.half_width) & (cosine > band.min_cosine)
     if np.count_nonzero(eligible) < band.min_samples:
         return None
-    weights = np.where(eligible, (1 - (residual / band.half_width) ** 2) ** 2, 0.0) * surface.area
+    weights = np.where(eligible, tukey_weights(residual, band.half_width), 0.0) * surface.area
     weighted = unit * weights[:, None]
     H = weighted.T @ unit
-    if np.linalg.eigvalsh(H)[0] < _LEAST_SPREAD * np.trace(H):
+    if np.linalg.eigvalsh(H)[0] < LEAST_SPREAD * np.trace(H):
         return None
     return TukeyStep(unit, residual, cosine, eligible, weights, np.linalg.solve(H, weighted.T @ residual))
