@@ -123,6 +123,7 @@ def test_what_the_protocol_needs_must_be_there(folder: Path) -> None:
     assert "there is no such place for ct" in refusal(str(folder), "--ct", "nowhere", "--dry-run")
 
 
+@pytest.mark.slow
 def test_nobody_imports_in_the_name_of_an_account_without_its_password(folder: Path, tmp_path: Path) -> None:
     with web_site(tmp_path):
         pass

@@ -80,6 +80,7 @@ def test_a_failed_job_shows_the_workers_reason_and_a_repeated_step_enqueues_it_a
     bench.must_verify()
 
 
+@pytest.mark.slow
 def test_that_nobody_computes_is_told_and_again_when_the_worker_has_gone(begin: Callable[[str], Bench]) -> None:
     bench = begin(PROTOCOL + CALIBRATION)
     sign = SignOfLife(bench.data)
