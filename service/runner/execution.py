@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 
 from drivers.errors import DeviceError
 from service.core.errors import OrthocaptureError
@@ -12,13 +14,48 @@ from service.core.protocol.models import Protocol, Step
 from service.core.records.base import recorded
 from service.core.records.events import DeviceTrouble, Payload, StepFailed, StepMeasured
 from service.core.recovery.policy import recovery_policy
+from service.core.run.state import JobState
+from service.core.text.counts import counted
 from service.logs.where import at
+from service.monitor.worker_sign import living_workers
 from service.run_record import StepEvidence
 from service.runner.disk import DiskWatch
 from service.runner.held_run import HeldRun
 from service.runner.operator import Operator
 from service.steps import step_kinds
 from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
+
+_NOBODY_S = 30.0  # a worker that died has been replaced by then
+_TOLD_AGAIN_S = 300.0
+_EVERY_S = 5.0
+
+
+@dataclass
+class WorkerWatch:
+    """Notices that jobs of a step wait and no worker runs, and tells the operator, from time to time again."""
+
+    data: Path
+    tell: Callable[[str], None]
+    monotonic_s: Callable[[], float]
+    _look_at_s: float = field(default=-math.inf, init=False)
+    _tell_at_s: float | None = field(default=None, init=False)
+
+    def look(self, jobs: Collection[JobState]) -> None:
+        """Look at the jobs of the step under way. Called again and again; looks every few seconds."""
+        now_s = self.monotonic_s()
+        if now_s < self._look_at_s:
+            return
+        self._look_at_s = now_s + _EVERY_S
+        open_jobs = sum(job.status == "enqueued" for job in jobs)
+        if not open_jobs or living_workers(self.data):
+            self._tell_at_s = None
+            return
+        if self._tell_at_s is None:
+            self._tell_at_s = now_s + _NOBODY_S
+        if now_s >= self._tell_at_s:
+            self._tell_at_s = now_s + _TOLD_AGAIN_S
+            waiting = f"{counted(open_jobs, 'computation')} wait{'s' if open_jobs == 1 else ''}"
+            self.tell(f"{waiting}, and no worker is running. Start one with `orthocapture worker --data {self.data}`")
 
 
 @dataclass(frozen=True)
@@ -30,6 +67,7 @@ class StepExecution:
     devices: Devices
     operator: Operator
     disk: DiskWatch
+    workers: WorkerWatch
     monotonic_s: Callable[[], float]
     wait: Callable[[float], None]
 
@@ -109,6 +147,7 @@ class StepExecution:
         """Called by steps wherever they may stop. Raises StepInterruptedError if an operator paused or ended it."""
         state = self.run.refresh()
         self.operator.attend("pausing" if state.paused else "working", state, pedal_armed=False)
+        self.workers.look(state.steps[step].jobs.values())
         if state.paused:
             raise StepInterruptedError("paused")
         if state.terminal or (state.current, state.step.attempt, state.phase) != (step, attempt, "running"):

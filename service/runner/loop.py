@@ -41,7 +41,7 @@ from service.core.run.state import RunState
 from service.monitor.host_clock import host_clock
 from service.runner.clocks import ClockWatch
 from service.runner.disk import DiskWatch
-from service.runner.execution import StepExecution
+from service.runner.execution import StepExecution, WorkerWatch
 from service.runner.held_run import HeldRun, held_run
 from service.runner.memory import short_collections
 from service.runner.operator import AnswerBy, Operator
@@ -94,8 +94,9 @@ class Runner:
             disk = DiskWatch(self._run, self.protocol, operator.tell, self.monotonic_s)
             self._pedal = Pedal(self._presses, self.monotonic_s, operator.tell)
             self._clocks = ClockWatch(self._run.follower, operator.tell)
+            workers = WorkerWatch(self.store.database_path.parent, operator.tell, self.monotonic_s)
             self._steps = StepExecution(
-                self._run, self.protocol, self.devices, operator, disk, self.monotonic_s, self.wait
+                self._run, self.protocol, self.devices, operator, disk, workers, self.monotonic_s, self.wait
             )
             self._begin_session()
             disk.forecast()

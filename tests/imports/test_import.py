@@ -123,6 +123,16 @@ def test_what_the_protocol_needs_must_be_there(folder: Path) -> None:
     assert "there is no such place for ct" in refusal(str(folder), "--ct", "nowhere", "--dry-run")
 
 
+@pytest.mark.slow
+def test_nobody_imports_in_the_name_of_an_account_without_its_password(folder: Path, tmp_path: Path) -> None:
+    with web_site(tmp_path):
+        pass
+    words = ["--data", str(tmp_path / "data"), "--operator", "emmy", "--password-stdin"]
+    assert "name and password do not belong together" in refusal(str(folder), *words)
+    with Store.open(tmp_path / "data") as store:
+        assert store.runs() == []
+
+
 def test_one_whole_series_is_the_ct(folder: Path) -> None:
     slices = sorted((folder / "ct").glob("*.dcm"))
     assert [file.path for file in listed(folder).files["ct"]] == [f"ct/{path.name}" for path in slices]

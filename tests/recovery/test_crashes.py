@@ -20,6 +20,7 @@ from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.jobs.calibration import board_view, calibrate
 from service.jobs.records import Camera
+from service.monitor.worker_sign import SignOfLife
 from tests.support.rig.bench_rig import answer
 from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, KilledError
 
@@ -77,6 +78,42 @@ def test_a_failed_job_shows_the_workers_reason_and_a_repeated_step_enqueues_it_a
     assert state.steps["intrinsics"].result["camera"] == SOLVED["camera"]
     assert bench.captured() == [*VIEWS, "b001"]
     bench.must_verify()
+
+
+@pytest.mark.slow
+def test_that_nobody_computes_is_told_and_again_when_the_worker_has_gone(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL + CALIBRATION)
+    sign = SignOfLife(bench.data)
+    waited: list[int] = []
+
+    def work(what: str) -> None:
+        if what != "looking for the board":
+            return
+        waited.append(len([told for told in bench.operator.told if "no worker is running" in told]))
+        bench.ahead_s += 6
+        match len(waited):
+            case 20:
+                sign.give(0)
+            case 30:
+                sign.close()
+            case 50:
+                bench.operator.on_show = finish
+            case _:
+                pass
+
+    def finish(_what: str) -> None:
+        job = bench.store.claim_job("worker 1", 30)
+        if job is not None:
+            looked = job.kind == "board_view"
+            measures = {} if looked else {"rms_px": 0.2}
+            bench.store.finish_job(job, measures=measures, duration_s=0.1, result=NO_BOARD if looked else SOLVED)
+
+    bench.operator.on_show = work
+    assert bench.run().status == "completed"
+    assert [waited[at] for at in (3, 10, 28, 33, 40)] == [0, 1, 1, 1, 2]
+    assert (
+        f"1 computation waits, and no worker is running. Start one with `orthocapture worker --data {bench.data}`"
+    ) in bench.operator.told
 
 
 def test_what_a_worker_has_computed_is_not_computed_again_after_a_crash(begin: Callable[[str], Bench]) -> None:

@@ -54,6 +54,7 @@ stations:
         (RIG + "signing: {pin: yes}\n", r"valid boolean \(it is \"yes\"\) \[rig.yaml:4 signing.pin\]"),
         ('{"name": "a", "simulated": false, "simulated": true}', "'simulated' is given twice"),
         ('{"import": ' + "[" * 100_000, "nested more than 100 deep"),
+        ('{"import": ' + "[" * 150 + "]" * 150 + "}", "nested more than 100 deep"),
         ("devices: " + "[" * 100_000, r"nested more than 50 deep \[.*rig.yaml:1\]"),
         ("name: a: b\n", r"not valid YAML.* \[.*rig.yaml:1\]"),
         ('{"name": ', "not valid JSON"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from service.core.errors import ConfigurationError, StoreError
@@ -16,7 +18,7 @@ from service.store.records import Checkpoint
 from service.store.signatures import timestamps as timestamping
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.runs.bench_run import VIEWS, Bench
+from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, begin_run
 
 
 def test_a_run_goes_from_its_checklist_through_the_captures_to_its_end(bench: Bench) -> None:
@@ -78,3 +80,24 @@ def test_one_run_has_one_runner(bench: Bench) -> None:
     with bench.store.lease(bench.run_id, "another runner", 30), pytest.raises(LeaseHeldError):
         bench.run()
     assert not bench.payloads(SessionStarted)
+
+
+@pytest.mark.slow
+def test_a_database_that_is_moved_away_in_the_capture_ends_the_run_loudly(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+
+    def move_away(_seconds: float) -> None:
+        if bench.captured():
+            for path in data.glob("orthocapture.sqlite*"):
+                path.rename(path.with_name(f"gone-{path.name}"))
+
+    with Store.open(data) as store:
+        bench = begin_run(store, PROTOCOL, tmp_path)
+        bench.on_wait = move_away
+        with pytest.raises(StoreError, match=r"orthocapture\.sqlite was removed while it was in use"):
+            bench.run()
+    for path in data.glob("gone-*"):
+        path.rename(path.with_name(path.name.removeprefix("gone-")))
+    report = verify(data)
+    assert report.faults == ()
+    assert any(note.startswith("artefacts/") for note in report.notes), report.notes

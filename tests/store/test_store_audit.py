@@ -222,6 +222,20 @@ def test_a_schema_that_is_not_ours_is_a_fault(data: Path, statements: list[str])
     assert "software" in fault.what or "missing" in fault.what
 
 
+def test_an_index_that_finds_nothing_is_a_fault(data: Path) -> None:
+    """Emptied under another definition, which is then put back: SQLite's quick_check does not see it."""
+    made = "CREATE INDEX jobs_open ON jobs (state, position)"
+    for definition, version, last in ((f"{made} WHERE 0", 1001, "REINDEX jobs_open"), (made, 1002, "")):
+        with closing(sqlite3.connect(database_path(data), isolation_level=None)) as connection:
+            connection.execute("PRAGMA writable_schema = ON")
+            connection.execute("UPDATE sqlite_master SET sql = ? WHERE name = 'jobs_open'", (definition,))
+            connection.execute(f"PRAGMA schema_version = {version}")
+        with closing(sqlite3.connect(database_path(data), isolation_level=None)) as connection:
+            connection.execute(last)
+    assert rows(data, "PRAGMA quick_check") == [("ok",)]
+    assert any("row 1 missing from index jobs_open" in str(fault) for fault in verify(data).faults)
+
+
 def test_an_account_that_nobody_made_is_a_fault(data: Path) -> None:
     columns = "account, full_name, role, state, password_hash, pin_hash, failures, locked_until_utc_s, created_utc"
     values = "'eve', 'Eve', 'administrator', 'active', 'x', '', 0, 0.0, '2026-11-21T12:00:00.250000Z'"

@@ -140,6 +140,19 @@ def test_every_attack_shows(data: Path, attack: Callable[[Path], None]) -> None:
     assert faults(data)
 
 
+@pytest.mark.parametrize(
+    ("attack", "said"),
+    [
+        (delete_a_run, "and is no longer here: it was deleted"),
+        (cut_a_run, "says (event 4) that another event was signed here: it was cut or rewritten"),
+        (forge, "says (event 3) that another event was signed here: it was cut or rewritten"),
+    ],
+)
+def test_the_sites_chain_tells_it_too(data: Path, attack: Callable[[Path], None], said: str) -> None:
+    attack(data)
+    assert any(said in fault for fault in faults(data)), faults(data)
+
+
 @pytest.mark.parametrize("attack", [forge, forge_with_the_site, cut_a_run, take_the_log_away, alter_a_line])
 def test_nothing_is_signed_after_it(data: Path, attack: Callable[[Path], None]) -> None:
     attack(data)

@@ -71,6 +71,8 @@ UNPROVEN = (
     *(ValueError, IndexError, KeyError, TypeError, OverflowError, AttributeError, InvalidSignature),
     *(UnsupportedAlgorithm, x509.ExtensionNotFound, x509.DuplicateExtension, x509.InvalidVersion),
 )
+SIGNED_AT_ONCE = ("step_passed", "run_completed", "run_aborted")
+AFTER_A_SIGNATURE = ("step_started", "session_started", "run_completed", "run_aborted")  # recorded once that is done
 JOB_FIELDS = {"job": "job_id", "job_kind": "kind", "step": "step", "attempt": "attempt"}
 
 
@@ -556,11 +558,21 @@ class Check:
             last[run_id] = max(last[run_id], seq)
         self.counts["checkpoints"] = len(signatures)
         for run_id, chain in chains.items():
+            self._note_late(chain, [item["seq"] for item in signatures if item.get("run_id") == run_id])
             if chain.end[0] > last[run_id]:
                 self.notes.append(
                     f"{run_id}: {chain.end[0] - last[run_id]} events after the last checkpoint; "
                     "the signature of the bundle covers them."
                 )
+
+    def _note_late(self, run: Chain, signed: Sequence[int]) -> None:
+        """Note events that had to be signed at once, and were signed only later."""
+        late = [seq for seq, before in run.to_sign.items() if not any(seq <= at < before for at in signed)]
+        if late:
+            self.notes.append(
+                f"{run.run_id}: not signed at once, but only with a later event: {', '.join(map(str, late))}; "
+                "a change before that leaves no trace."
+            )
 
     def _check_key_file(self, bundle: Bundle, whole: frozenset[str]) -> None:
         listed = [record.get("key_id") for record in self.records(bundle, "keys.jsonl", whole)]
@@ -676,6 +688,8 @@ class Chain:
         self.starts: list[tuple[int, dict[str, tuple[int, str]]]] = []
         self.signed: list[tuple[int, dict[str, Any]]] = []  # runs, up to which event
         self.jobs: list[tuple[int, dict[str, Any]]] = []
+        self.to_sign: dict[int, int] = {}  # events that are signed at once → the event before which they are signed
+        self._passed = 0  # the last event that is signed at once
         self.accepted: list[tuple[int, dict[str, Any], str]] = []  # figures outside their limits, and by whom
         self.first: dict[str, Any] | None = None
         self.end: tuple[Any, str] = (0, ROOT)
@@ -704,6 +718,7 @@ class Chain:
         self.hashes[seq] = sha256
         self.first = self.first or payload
         kind = payload.get("kind")
+        self._await_signature(seq, kind)
         if kind == "key_changed" and self.run_id == SITE:
             self.key_changes.append((seq, payload))
         elif kind == "run_signed":
@@ -717,6 +732,12 @@ class Chain:
         references = [canonical(reference) for reference in references_in(payload)]
         if references:
             self.references[seq] = references
+
+    def _await_signature(self, seq: int, kind: Any) -> None:
+        if kind in AFTER_A_SIGNATURE and self._passed:
+            self.to_sign.setdefault(self._passed, seq)
+        if kind in SIGNED_AT_ONCE:
+            self._passed = seq
 
 
 def _heads(value: Any) -> dict[str, tuple[int, str]]:

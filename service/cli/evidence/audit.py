@@ -29,6 +29,7 @@ from service.cli.common import (
 )
 from service.cli.evidence.audit_figures import figures_command
 from service.cli.evidence.audit_report import report_command
+from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.text.counts import counted
 from service.core.units import megabytes
 from service.store.durable_effects import utc_text
@@ -150,7 +151,8 @@ def keys_command(data: DataOption = DEFAULT_DATA, json: JsonOption = False) -> N
 def rotate_key_command(
     reason: Annotated[str, typer.Option(help="Why the key is replaced; it is recorded.")],
     data: DataOption = DEFAULT_DATA,
-    operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
     lost: Annotated[
         bool, typer.Option("--lost", help="The old key's file is gone and cannot vouch for the new one.")
     ] = False,
@@ -158,7 +160,8 @@ def rotate_key_command(
 ) -> None:
     """Replace the signing key. The old key signs the new one, and then its file is destroyed."""
     with reporting_errors(json), Store.open(data, create=False) as store:
-        key = rotate_key(store, reason=reason, actor=operator or getpass.getuser(), lost=lost)
+        who = acting_person(store, operator, password_stdin=password_stdin)
+        key = rotate_key(store, reason=reason, actor=who.name, lost=lost)
     if json:
         print_json(_key_json(key))
     else:
@@ -175,7 +178,8 @@ def export_command(
     hashes_only: Annotated[
         bool, typer.Option("--hashes-only", help="Leave out the recorded files; the records hold their hashes.")
     ] = False,
-    operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
     json: JsonOption = False,
 ) -> None:
     """Write a run's evidence to one zip file that anybody can verify, with a report and the verifier inside.
@@ -186,21 +190,19 @@ def export_command(
     from service.audit.bundle.export import export_bundle  # noqa: PLC0415
     from service.audit.bundle.report import bundle_report  # noqa: PLC0415
 
-    with (
-        reporting_errors(json),
-        Store.open(data, create=False) as store,
-        progress_bar(quiet=json) as report_progress,
-    ):
+    with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
-        made = export_bundle(
-            store,
-            run_id,
-            bundle,
-            actor=operator or getpass.getuser(),
-            hashes_only=hashes_only,
-            report=bundle_report(data, run_id, with_pictures=not hashes_only),
-            progress=report_progress,
-        )
+        who = acting_person(store, operator, password_stdin=password_stdin)
+        with progress_bar(quiet=json) as report_progress:
+            made = export_bundle(
+                store,
+                run_id,
+                bundle,
+                actor=who.name,
+                hashes_only=hashes_only,
+                report=bundle_report(data, run_id, with_pictures=not hashes_only),
+                progress=report_progress,
+            )
     if json:
         print_json({**asdict(made), "path": str(made.path)})
         return

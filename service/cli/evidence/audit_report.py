@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import os
 import tempfile
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
 )
+from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.errors import ConfigurationError
 from service.store.database.engine import database_path
 from service.store.run_rows import resolve_run
@@ -42,7 +42,8 @@ def report_command(
             "--html", metavar="FILE", help="Write it as one HTML file, with the scene in 3D.", dir_okay=False
         ),
     ] = None,
-    operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
     json: JsonOption = False,
 ) -> None:
     """Write a report of a run: deviations, accuracy, gates, signatures, certificates, pictures, verification.
@@ -55,6 +56,7 @@ def report_command(
         if pdf is None and html is None:
             raise ConfigurationError("no file to write", remedy="Give --pdf FILE, --html FILE, or both")
         run_id = resolve_run(audit.list_runs(data), run)
+        actor = _actor(data, operator, password_stdin=password_stdin) if _writable(data) else ""
         with progress_bar(quiet=json) as progress:
             verified = audit.verify(data, run_id, progress)
             # Numerics, pictures and fonts take a second to load, and `audit verify` does not need them.
@@ -65,10 +67,10 @@ def report_command(
 
             progress("writing the report", 0, 1)
             report = report_content(read_run(data, run_id), verified, with_scene=html is not None)
-            recorded = verified.ok and _writable(data)
+            recorded = verified.ok and bool(actor)
             for path, write in ((pdf, write_pdf), (html, write_html)):
                 if path is not None:
-                    leave = partial(_record, data, run_id, report.head_sha256, operator or getpass.getuser())
+                    leave = partial(_record, data, run_id, report.head_sha256, actor)
                     _write(path, partial(write, report), leave if recorded else None)
     written = [str(path) for path in (pdf, html) if path is not None]
     if json:
@@ -90,6 +92,12 @@ def report_command(
         if not json:
             error_console.print(f"[bold red]The evidence does NOT verify:[/] {escape(str(verified.first_fault))}")
         raise typer.Exit(1)
+
+
+def _actor(data: Path, operator: str, *, password_stdin: bool) -> str:
+    """The name of the person for whom the report is recorded. Raises ConfigurationError, SignInRefusedError."""
+    with Store.open(data, create=False) as store:
+        return acting_person(store, operator, password_stdin=password_stdin).name
 
 
 def _write(path: Path, write: Callable[[Path], None], leave: Callable[[Path, str], None] | None) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +19,7 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
 )
+from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.errors import ConfigurationError
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement
 from service.store.store import Store
@@ -65,7 +65,8 @@ def export_command(
     ] = None,
     cite: Annotated[str, typer.Option(help="How to cite the data set.")] = "",
     data_version: Annotated[str, typer.Option(help="Version of the data set.")] = FIRST_VERSION,
-    operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
     json: JsonOption = False,
 ) -> None:
     """Write the data set of a completed run in a format that others read: images, poses, depth, masks, mesh.
@@ -75,18 +76,16 @@ def export_command(
     is recorded in the run with the hash of its list of checksums, SHA256SUMS. Beside the format's files, the folder
     has a data card, Croissant and RO-Crate metadata, and an index of the views.
     """
-    with (
-        reporting_errors(json),
-        Store.open(data, create=False) as store,
-        progress_bar(quiet=json) as progress,
-    ):
+    with reporting_errors(json), Store.open(data, create=False) as store:
         from service.audit.export.posed import export_data_set  # noqa: PLC0415 - loads the numerics
 
         target = out.resolve()
         run_id = store.find_run(run)
         stated = _stated(title, licence, ethics, creator or [], cite)
         wanted = WantedExport(form, crop, crops, anonymous, stated, data_version)
-        dataset = export_data_set(store, run_id, wanted, target, operator or getpass.getuser(), progress)
+        who = acting_person(store, operator, password_stdin=password_stdin)
+        with progress_bar(quiet=json) as progress:
+            dataset = export_data_set(store, run_id, wanted, target, who.name, progress)
     if json:
         print_json(
             {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 from dataclasses import asdict
 from typing import Annotated
 
@@ -18,8 +17,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.evidence.store_backup import backup_command, restore_command
-from service.people.authorisation import who_acts
-from service.people.sessions import People
+from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.store.files.leftovers import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint
@@ -44,7 +42,8 @@ def gc_command(
     min_age_min: Annotated[
         float, typer.Option("--min-age-min", min=0, help="Keep files younger than this many minutes.")
     ] = USUAL_AGE_S / 60,
-    operator: Annotated[str, typer.Option("--operator", help="Your name, as it goes into the record.")] = "",
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
     json: JsonOption = False,
 ) -> None:
     """List files left by crashes, to which no record refers. With --remove, remove them and record the removal.
@@ -55,8 +54,7 @@ def gc_command(
         age_s = 60 * min_age_min
         gone = []
         if remove:
-            name = operator or getpass.getuser()
-            who = who_acts(People(opened), name, lambda: getpass.getpass(f"Password of {name}: "))
+            who = acting_person(opened, operator, password_stdin=password_stdin)
             gone = remove_leftovers(opened, actor=who.name, min_age_s=age_s)
             if gone:
                 checkpoint(opened, SITE)

@@ -12,7 +12,7 @@ import typer
 from rich.markup import escape
 
 from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
-from service.cli.run.person import OperatorOption, PasswordOption, typed_password
+from service.cli.run.person import OperatorOption, PasswordOption, acting_person, typed_password
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.protocol.models import Protocol
 from service.core.records.events import CaptureAsked, OperatorAction
@@ -135,8 +135,7 @@ def note_command(
         run_id = store.find_run(run)
         protocol, _ = recorded_run(store, run_id)
         photograph = None if photo is None else _photograph(photo)
-        name = operator or getpass.getuser()
-        name = who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin)).name
+        name = acting_person(store, operator, password_stdin=password_stdin).name
         log = read_log(store, run_id, protocol)
         event = take_note(log, text, photograph, step=step, actor=name, via="cli")
         _report_recorded(run_id, "note", step or log.state.current, name, json=json, seq=event.seq)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -23,7 +22,7 @@ from service.cli.common import (
 from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption
 from service.cli.run.beside import worker_beside
 from service.cli.run.ending import sigterm_like_ctrl_c
-from service.cli.run.person import OperatorOption, PasswordOption, typed_password
+from service.cli.run.person import OperatorOption, PasswordOption, acting_person, typed_password
 from service.cli.run.status import status_record
 from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.import_operator import ImportOperator
@@ -91,8 +90,7 @@ def run_command(
         loaded = load_protocol(protocol, params_models())
         rig_file = load_rig(rig)
         with Store.open(data) as store:
-            name = operator or getpass.getuser()
-            who = who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin))
+            who = acting_person(store, operator, password_stdin=password_stdin)
             if not auto_confirm:  # simulated rigs need no approval
                 approve(store, loaded, who.name, reason=approve_change, identified=who.identified)
             run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm, about=about)

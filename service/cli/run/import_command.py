@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -26,7 +25,7 @@ from service.cli.common import (
 )
 from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption
 from service.cli.run.commands import WorkerOption, drive
-from service.cli.run.person import OperatorOption
+from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.cli.run.terminal.import_operator import part_of
 from service.cli.shipped_protocols import shipped_protocols
 from service.core.errors import ConfigurationError
@@ -84,6 +83,7 @@ def import_command(
     again: Annotated[bool, typer.Option("--again", help="Import the same files again as another run.")] = False,
     data: DataOption = DEFAULT_DATA,
     operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
     worker: WorkerOption = True,
     specimen: SpecimenOption = "",
     purpose: PurposeOption = "",
@@ -118,8 +118,8 @@ def import_command(
             return
         rig = import_rig(listing, simulated=simulated, ct_first_number=ct_first_number)
         with Store.open(data) as store:
-            name = operator or getpass.getuser()
-            run_id = _run_of(store, loaded, rig, operator=name, again=again, about=about)
+            who = acting_person(store, operator, password_stdin=password_stdin)
+            run_id = _run_of(store, loaded, rig, operator=who.name, again=again, about=about)
             state = drive(store, run_id, rig, data=data, auto_confirm=False, worker=worker)
             summary = summarise(store, run_id, loaded.protocol)
             table, note = summary.table(), shared_adjustment_note(loaded.protocol, summary.state)

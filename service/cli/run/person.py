@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import getpass
 import sys
+from functools import partial
 from typing import Annotated
 
 import typer
 
 from service.core.errors import ConfigurationError
+from service.people.authorisation import Identity, who_acts
+from service.people.sessions import People
+from service.store.store import Store
 
 OperatorOption = Annotated[str, typer.Option("--operator", help="Your name, as it goes into the record.")]
 PasswordOption = Annotated[
     bool, typer.Option("--password-stdin", help="Read the password, if one is needed, from stdin.")
 ]
+
+
+def acting_person(store: Store, operator: str, *, password_stdin: bool) -> Identity:
+    """The person who acts at this terminal: the given name, or that of the machine's user.
+
+    The name of an account needs its password. Raises ConfigurationError, SignInRefusedError.
+    """
+    name = operator or getpass.getuser()
+    return who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin))
 
 
 def typed_password(name: str, *, from_stdin: bool) -> str:

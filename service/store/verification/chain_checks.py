@@ -19,6 +19,9 @@ Rows = Sequence[Mapping[str, Any]]
 _REF_COLUMNS = tuple(ArtefactRef.model_fields)
 _CLOCK_READ_TWICE_S = 5.0
 _OF_JOBS = frozenset({"job_enqueued", "job_finished", "job_failed"})
+_SIGNED_AT_ONCE = frozenset({"step_passed", "run_completed", "run_aborted"})
+# A runner records these only after it has signed; other processes may record other events at any moment.
+_AFTER_A_SIGNATURE = frozenset({"step_started", "session_started", "run_completed", "run_aborted"})
 _JOB_COLUMNS = {"job": "job_id", "job_kind": "kind", "step": "step", "attempt": "attempt"}
 
 
@@ -68,6 +71,9 @@ class ChainFacts:
     runs_signed: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # run_signed, of the site
     to_sign: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])  # events that are signed at once
     last_own: int = 0  # seq of the last event that is not about a job
+    to_sign_before: dict[int, int] = field(
+        default_factory=dict[int, int]
+    )  # of `to_sign`: seq → signed before this seq
     first: Mapping[str, Any] | None = None
 
     def add(self, seq: int, payload: Any, at_utc: str) -> None:
@@ -78,6 +84,10 @@ class ChainFacts:
             self.jobs_utc[seq] = at_utc
             return
         self.last_own = seq
+        if kind in _AFTER_A_SIGNATURE and self.to_sign:
+            self.to_sign_before.setdefault(self.to_sign[-1][0], seq)
+        if kind in _SIGNED_AT_ONCE:
+            self.to_sign.append((seq, kind))
         if kind == "key_changed":
             self.key_changes.append((seq, payload))
         elif kind == "account_changed" or (kind == "sign_in_recorded" and payload["screen"]):
@@ -86,8 +96,6 @@ class ChainFacts:
             self.stamps.append((seq, payload))
         elif kind == "run_signed":
             self.runs_signed.append((seq, payload))
-        elif kind in ("step_passed", "run_completed", "run_aborted"):
-            self.to_sign.append((seq, kind))
         elif kind == "service_started":
             self.heads_at_start.append((seq, payload["heads"]))
 

@@ -174,6 +174,25 @@ def unsigned_end_faults(run_id: str, checkpoints: Sequence[Checkpoint], chain: C
             yield Fault(run_id, seq, "", what)
 
 
+def late_signatures(run_id: str, checkpoints: Sequence[Checkpoint], chain: ChainFacts) -> Iterator[str]:
+    """Notes on events that are always signed at once and have no signature of their own, only a later one.
+
+    Signing may have failed then, or a signature may have been taken away, the events rewritten, and signed again.
+    """
+    late: dict[int, list[int]] = {}
+    for seq, _kind in chain.to_sign:
+        covering = next((item.seq for item in checkpoints if item.seq >= seq), None)
+        if covering is not None and chain.to_sign_before.get(seq, covering + 1) <= covering:
+            late.setdefault(covering, []).append(seq)
+    for covering, events in late.items():
+        several = len(events) != 1
+        named = ", ".join(map(str, events))
+        yield (
+            f"{run_id}: event{'s' if several else ''} {named}, signed at once as a rule, "
+            f"{'were' if several else 'was'} signed only with event {covering}: a change before that leaves no trace"
+        )
+
+
 def unsigned(run_id: str, checkpoints: Sequence[Checkpoint], events: int) -> tuple[int, str]:
     """Number of events after the last checkpoint, and a note on them; (0, "") if there are none."""
     last = checkpoints[-1].seq if checkpoints else 0

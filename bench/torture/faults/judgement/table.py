@@ -25,6 +25,9 @@ device is opened again; *retry*, the step is tried again after a wait; *skip*, a
 waits for a person; *told*, the person reads it, and the run goes on; *stop*, the program ends with these words and
 the run is resumed later. Where nothing is done, the case does no harm: what comes out is right all the same.
 
+The words are those of the revision on which the case was tried last (see `bench/results/torture_faults-*.json`).
+A message may have been reworded since. What is done, how it ends and the errors are compared at every sweep.
+
 """
 _COLUMNS = "| case | what goes wrong | what is done | how it ends | errors | words on the screen |"
 _LONGEST = 140  # length of a command in the results; the JSON has all of it
