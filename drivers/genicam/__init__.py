@@ -1,6 +1,6 @@
 """Driver for industrial cameras with GenICam: by the library Aravis, or by a maker's GenTL producer and harvesters.
 
-Every exposure is one of its own: the camera is told to take a single frame after the call. The exposure time is set
+Each call makes the camera take one new frame. The exposure time is set
 and read back; aperture and gain stay as rig.yaml states them, because the lens of such a camera is set by hand and a
 protocol's ISO has no meaning to it. Why two ways: docs/decisions/0020-genicam-by-aravis.md.
 """
@@ -119,7 +119,7 @@ class GenicamCamera:
             link.close()
 
     def report(self) -> DeviceReport:
-        """Return what the camera reports of itself."""
+        """Return what the camera reports about itself."""
         link = self._connected()
         try:
             details = {

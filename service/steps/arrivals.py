@@ -37,7 +37,7 @@ def wait_for(
         context: of the step.
         find: looks for what is wanted, oldest first.
         wait_s: longest wait.
-        what: it is, in words.
+        what: what is waited for, in words.
         report: of the device, with its problems.
 
     Raises:

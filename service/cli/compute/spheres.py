@@ -166,7 +166,7 @@ def spheres_of(
 
 
 def _of_another_radius(error: ComputeError, seen: SeenRadius, radius_m: float) -> ComputeError:
-    """The error, which names the radius of the spheres that are in the mesh."""
+    """The error for spheres of another radius, which it names."""
     count = len(seen.spheres)
     where = ", ".join("({:.1f}, {:.1f}, {:.1f})".format(*mm(s.centre_m)) for s in seen.spheres[:_NAMED])
     more = ", …" if count > _NAMED else ""

@@ -96,7 +96,7 @@ def _intersect(
 ) -> SeenSphere:
     """Intersect the viewing cones of one sphere by Gauss–Newton.
 
-    Inliers and the variance factor are chosen anew before each step, so there is no fixed cost that
+    Inliers and the variance factor are chosen again before each step, so there is no fixed cost that
     `service.compute.descent` could minimise, and the covariance is that of the last step's equations.
     """
     T = T_scan_camera[[i for i, _ in seen]]

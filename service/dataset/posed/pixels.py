@@ -69,7 +69,7 @@ class Photographs:
         self._colours = _Last(lambda view: read_image_of(files[view.name], view.camera))
 
     def picture(self, view: PosedView) -> bytes:
-        """The file as the camera wrote it, but for what was asked to be removed or marked."""
+        """The file as the camera wrote it, except what was to be removed or marked."""
         try:
             data = self._files[view.name].read_bytes()
         except OSError as error:
@@ -148,7 +148,7 @@ class Cropped:
         self._originals = _Last(whole.pixels.picture)
 
     def picture(self, view: PosedView) -> bytes:
-        """Cut out and encoded anew, with the photograph's metadata."""
+        """Cut out and encoded again, with the photograph's metadata."""
         original = self._originals.of(self._crops[view.name][0])
         return _encoded(view, self.colours(view), original, self._personal)
 

@@ -53,7 +53,7 @@ class Live(Record):
     # Scatter of the camera's positions before any image is taken; without it, as the held-out views of the
     # hand-eye calibration show it.
     arm_sigma_mm: Annotated[float, Field(gt=0)] | None = None
-    arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None  # the same of the camera's rotations
+    arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None  # likewise for the camera's rotations
     coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
     wait_s: Annotated[float, Field(ge=0)] = 60.0  # at the end of the step, for jobs that have not finished
 

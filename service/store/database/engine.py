@@ -80,7 +80,7 @@ class Database:
                 self._files.commit(transaction.commit)
 
     def _begun(self, connection: Connection) -> RootTransaction:
-        """Begin to write as soon as the other processes let it."""
+        """Begin a write transaction as soon as no other process writes."""
         began_s = time.monotonic()
         while True:
             try:

@@ -46,7 +46,7 @@ class Calibration:
     Attributes:
         steps: those that solved something, in order.
         camera: with its distortion.
-        intrinsics: what is known of the camera beside its parameters; None: not solved yet.
+        intrinsics: what is known about the camera besides its parameters; None: not solved yet.
         hand_eye: None: not solved yet.
         best: the answer that the registration uses: with the arm's correction where there is one.
         captures: the board images, of the step whose images were used.

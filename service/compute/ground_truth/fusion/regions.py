@@ -77,7 +77,7 @@ class Balls:
 
 @dataclass(frozen=True, slots=True)
 class RegionCorrection:
-    """A region in which a person decides.
+    """A region in which a person has chosen CT or scan.
 
     Attributes:
         region: where.

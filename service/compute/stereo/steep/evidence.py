@@ -183,7 +183,7 @@ def _likeness(patches: Floats, seen: NDArray[np.bool_]) -> Floats:
 def _patches(photographs: Sequence[Photograph], points_m: Array, axes: Array, chosen: Ints, moves_m: Array) -> Floats:
     """(N, VIEWS, L, samples) what each view shows of each moved patch, less its mean.
 
-    The patch is projected with its derivative in the middle: it is small beside its distance.
+    The patch is projected with the derivative at its middle, since it is small compared with its distance.
     """
     out = np.zeros((*chosen.shape, len(moves_m), len(_U)), dtype=np.float32)
     for k in np.unique(chosen[chosen >= 0]):

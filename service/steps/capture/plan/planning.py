@@ -31,7 +31,7 @@ from service.rig import CollisionSection, OpticsSection
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import StationLayout, StepContext
 
-_LOOK_S = 0.4  # between two looks at the buttons during planning
+_LOOK_S = 0.4  # between two checks of the buttons during planning
 _EXPOSURE_S = 3.0  # estimate of settling, exposure and download at each viewpoint
 
 
