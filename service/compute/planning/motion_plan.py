@@ -25,7 +25,7 @@ _VIEWS_AT_ONCE = 16  # viewpoints that are checked together: one by one, most of
 _AT_ONCE = 24  # postures that are checked together: seven axes have hundreds for one pose
 _MOST_WAYS = 36  # postures to which a way is looked for if the straight one to the best posture is blocked
 _ROOM_M = 0.05  # clearance beyond which more is not better
-_ROOM_WEIGHT = 1.0  # rad²: what no clearance at all costs against turning the joints
+_ROOM_WEIGHT = 1.0  # rad²: cost of zero clearance, compared with squared joint travel
 
 
 @dataclass(frozen=True, slots=True)

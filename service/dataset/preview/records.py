@@ -171,7 +171,7 @@ def read_preview(folder: Path) -> Preview | None:
 
 
 def put(folder: Path, name: str, content: bytes) -> str:
-    """Write a file, whole at every moment. Returns its name."""
+    """Write or replace a file atomically. Returns its name."""
     part = folder / f"{name}.{os.getpid()}.part"
     part.write_bytes(content)
     part.replace(folder / name)

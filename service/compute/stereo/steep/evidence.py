@@ -20,7 +20,7 @@ from service.core.geometry import Array, apply, inverse
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-VIEWS = 4  # that are compared at a place
+VIEWS = 4  # compared at each place
 _HALF = 4  # of a patch's edge, in samples
 _LEAST_COSINE = 0.13  # between the normal and the ray
 _LEAST_PARALLAX = 0.2  # of two views, in the surface: metres for a metre along the normal
@@ -141,8 +141,8 @@ def evidence(
 ) -> tuple[Floats, Array]:
     """How alike the photographs are, 0 to 1 (N, L), with each place moved along its normal; and the views' cosines.
 
-    It is the mean over pairs of views of the correlation of patches, with noise, so that what is plain says little;
-    0 where fewer than two views see a place.
+    It is the correlation of patches, averaged over pairs of views. A noise is added to each variance, so that patches
+    without texture correlate little. It is 0 where fewer than two views see a place.
     """
     out = np.zeros((len(points_m), len(moves_m)), dtype=np.float32)
     views, cosines = best_views(photographs, points_m, normals)

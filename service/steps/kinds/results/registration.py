@@ -85,7 +85,7 @@ class Params(StepParams):
 
 
 class OneRegistration(MeasureRecord):
-    """Of one registration."""
+    """The measures of one registration."""
 
     rms_px: Annotated[Px, "rms distance of the outlines' points from the predicted outlines"] = None
     chi2_reduced: Annotated[
