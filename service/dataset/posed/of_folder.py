@@ -43,7 +43,7 @@ def data_set_of_folder(folder: Path) -> DataSet:
         raise DataError(f"the data set cannot be read: {error}", where=str(folder), remedy=_REMEDY) from error
 
 
-class Stored:
+class StoredPixels:
     """The pixel data of views, as `hdf5` holds them."""
 
     def __init__(self, folder: Path, mark: str) -> None:
@@ -149,8 +149,8 @@ def _read(folder: Path) -> DataSet:
         mesh = _mesh(file["mesh"])
     views = tuple(_view(folder, name) for name in sorted({*of.dense, *of.train, *of.test}))
     identity = hashlib.sha256((folder / SUMS).read_bytes()).hexdigest()
-    dataset = DataSet(identity, simulated, statement, views, Stored(folder, ""), mesh, of)
-    return dataclasses.replace(dataset, pixels=Stored(folder, dataset.mark))
+    dataset = DataSet(identity, simulated, statement, views, StoredPixels(folder, ""), mesh, of)
+    return dataclasses.replace(dataset, pixels=StoredPixels(folder, dataset.mark))
 
 
 def _mesh(stored: Any) -> Mesh:

@@ -25,7 +25,7 @@ from service.web.calibration.view import (
     held_out_mm,
     image_rows,
 )
-from service.web.page.charts import Dots
+from service.web.page.charts import DotPlot
 from service.web.page.rendering import render
 from service.web.page.run_frame import RunFrame, run_frame
 from service.web.page.run_words import gate_word, limit, measure_name
@@ -62,7 +62,7 @@ class CalibrationPage:
     run_id: str
     found: Calibration
     charts: Charts | None
-    hand_eye_chart: Dots | None
+    hand_eye_chart: DotPlot | None
     images: list[ImageRow]
     held_out: tuple[float, float] | None
     depends: list[AcceptedGate]

@@ -144,13 +144,13 @@ def _overlay(here: Matrix, there: Matrix) -> Overlay:
     return Overlay((round(reach * x, 1), round(reach * y, 1)), z)
 
 
-def _lowest(places: Sequence[hand_view.ShownPlace]) -> float:
+def _lowest(places: Sequence[hand_view.PlaceStatus]) -> float:
     """Largest distance of a place from the vertical through the middle, metres."""
     radii = [math.hypot(p.T_level_camera[0][3], p.T_level_camera[1][3]) for p in places]
     return max([0.05, *radii])
 
 
-def _spots(places: Sequence[hand_view.ShownPlace], target: str) -> tuple[PlanMarker, ...]:
+def _spots(places: Sequence[hand_view.PlaceStatus], target: str) -> tuple[PlanMarker, ...]:
     lowest = _lowest(places)
     return tuple(
         _spot(

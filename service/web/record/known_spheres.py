@@ -30,7 +30,7 @@ class Sphere:
 
 
 @dataclass(frozen=True, slots=True)
-class ShownRegistration:
+class DisplayedRegistration:
     """The registration that pages show: see service.dataset.registrations.best_registration."""
 
     name: str
@@ -44,13 +44,13 @@ def last_step(log: RunRecord, gives: Gives) -> str:
     return next((step for step in steps if log.state.steps[step].result), "")
 
 
-def best_registration(log: RunRecord) -> ShownRegistration | None:
+def best_registration(log: RunRecord) -> DisplayedRegistration | None:
     """The registration to show; None before there is one."""
     name = best_registration_name(log.protocol, log.state)
     if name is None:
         return None
     record = registrations(log.protocol, log.state)[name]
-    return ShownRegistration(name, record, last_step(log, "registrations"))
+    return DisplayedRegistration(name, record, last_step(log, "registrations"))
 
 
 def scan_spheres(log: RunRecord) -> tuple[Sphere, ...]:

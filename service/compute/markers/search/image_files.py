@@ -19,7 +19,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_image_of
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
-from service.compute.markers.search.anchors import AnchorRegistration, MapOver, register_anchors
+from service.compute.markers.search.anchors import AnchorRegistration, MapFunction, register_anchors
 from service.compute.markers.search.predicted import (
     ImageOutlines,
     PredictedSpheres,
@@ -205,7 +205,7 @@ def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> ImageO
 
 
 @contextmanager
-def _mapping(workers: int, items: int) -> Generator[MapOver]:
+def _mapping(workers: int, items: int) -> Generator[MapFunction]:
     """A map over processes, or the plain one for a single worker."""
     if workers <= 1 or items <= 1:
         yield map
