@@ -50,19 +50,20 @@ def _kind(block: Block) -> str:
     """The name by which the template knows this kind of block; pyright finds a kind that has none."""
     match block:
         case Paragraph():
-            return "paragraph"
+            kind = "paragraph"
         case Heading():
-            return "heading"
+            kind = "heading"
         case DescriptionList():
-            return "description list"
+            kind = "description list"
         case Table():
-            return "table"
+            kind = "table"
         case Pictures():
-            return "pictures"
+            kind = "pictures"
         case Drawings():
-            return "drawings"
+            kind = "drawings"
         case SceneBlock():
-            return "scene"
+            kind = "scene"
+    return kind
 
 
 def _cell(value: TableCell | str) -> Markup:
