@@ -83,7 +83,7 @@ class StoredPixels:
 
 
 def scaled_data_set(dataset: DataSet, width: int) -> DataSet:
-    """The same views with pictures, depth and masks of this width in pixels; wider ones are made smaller.
+    """The data set with pictures, depth and masks reduced to this width in pixels.
 
     Raises:
         DataError: a view is narrower.

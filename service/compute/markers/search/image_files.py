@@ -23,7 +23,7 @@ from service.compute.markers.search.anchors import AnchorRegistration, MapFuncti
 from service.compute.markers.search.predicted import (
     ImageOutlines,
     PredictedSpheres,
-    find_spheres,
+    find_outlines,
 )
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.identification.pairing import paired
@@ -201,7 +201,7 @@ def searched_whole(outlines: Sequence[tuple[SphereOutline, ...]]) -> LocatedOutl
 
 
 def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> ImageOutlines:
-    return find_spheres(read_image_of(task.path, camera), camera, task.expected, options)
+    return find_outlines(read_image_of(task.path, camera), camera, task.expected, options)
 
 
 @contextmanager
