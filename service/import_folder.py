@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.errors import IncompleteExportError, UnreadableFileError
+from drivers.folder_files import files_below
 from drivers.meshes.mesh_file import MESH_SUFFIXES, export_of
 from drivers.photos.photo_file import ExifRecord
 from drivers.photos.photo_folder import (
@@ -17,7 +18,6 @@ from drivers.photos.photo_folder import (
     LeftOut,
     ListedFile,
     Photograph,
-    files_below,
     list_photographs,
     listed,
     odd,

@@ -31,7 +31,7 @@ from drivers.genicam.producer import ProducerCamera
 from drivers.interfaces import CameraSettings, CapturedImage, DeviceIdentity, DeviceReport
 from drivers.photos.frames import FrameFiles, frame_jpeg
 from drivers.plugin import DriverConfig, DriverSpec
-from drivers.stated_settings import TOLERANCE, differences
+from drivers.stated_settings import TOLERANCE, agrees, differences
 
 
 class GenicamConfig(DriverConfig):
@@ -154,7 +154,7 @@ class GenicamCamera:
         except LinkError as error:
             raise self._unavailable(str(error)) from error
         now = self.settings()
-        if abs(now.exposure_s - settings.exposure_s) > TOLERANCE * settings.exposure_s:
+        if not agrees(now.exposure_s, settings.exposure_s):
             raise DeviceRefusedError(
                 f"the camera exposes for {now.exposure_s:g} s instead of {settings.exposure_s:g} s",
                 where=self._where,

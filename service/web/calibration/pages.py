@@ -170,7 +170,7 @@ def _advice(
     """Parts of the image without corners, and board poses worth taking."""
     # The planning of poses brings scipy, which the start of the service does not wait for.
     from service.web.calibration.board_advice import advised_poses, empty_regions  # noqa: PLC0415
-    from service.web.record.planned_poses import recorded_rig  # noqa: PLC0415
+    from service.web.record.planned_poses import recorded_rig_section  # noqa: PLC0415
 
     coverage = None if found.intrinsics is None else found.intrinsics.coverage
     regions = [] if coverage is None else empty_regions(coverage.corners)
@@ -183,7 +183,7 @@ def _advice(
         found.camera,
         [c for c in found.captures if isinstance(c, ViewpointCaptured) and c.viewpoint in used],
         board,
-        recorded_rig(log).collision.arm or "",
+        recorded_rig_section(log).collision.arm or "",
         site.data,
         found.artefact.sha256,
     )

@@ -28,8 +28,8 @@ from service.web.record.images import captures_of, further_of
 from service.web.record.known_spheres import (
     DisplayedRegistration,
     Sphere,
-    best_registration,
     ct_spheres,
+    displayed_registration,
     last_step,
     scan_spheres,
 )
@@ -74,7 +74,7 @@ class MeshFacts:
 
 def scene_of(log: RunRecord) -> KnownScene:
     """The best known scene: registered, else provisional, else planned."""
-    registered = best_registration(log)
+    registered = displayed_registration(log)
     if registered is not None:
         return _registered(log, registered)
     live = _live(log)
