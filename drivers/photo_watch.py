@@ -20,9 +20,10 @@ from drivers.errors import (
     StaleImageError,
     UnreadableFileError,
 )
+from drivers.folder_files import files_below
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
 from drivers.photos.photo_file import ExifRecord, check_jpeg_complete, read_exif, sha256_of, taken_utc_s
-from drivers.photos.photo_folder import JPEG_SUFFIXES, RAW_MEDIA_TYPES, files_below, odd, paired
+from drivers.photos.photo_folder import JPEG_SUFFIXES, RAW_MEDIA_TYPES, odd, paired
 from drivers.plugin import DriverConfig, DriverSpec
 
 _LOOK_S = 0.2  # interval between two polls of the folder

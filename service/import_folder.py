@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.errors import IncompleteExportError, UnreadableFileError
+from drivers.folder_files import files_below
 from drivers.meshes.mesh_file import MESH_SUFFIXES, export_of
 from drivers.photos.photo_file import ExifRecord
 from drivers.photos.photo_folder import (
@@ -17,7 +18,6 @@ from drivers.photos.photo_folder import (
     LeftOut,
     ListedFile,
     Photograph,
-    files_below,
     list_photographs,
     listed,
     odd,
@@ -56,7 +56,7 @@ Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Places:
+class ImportFolders:
     """The folder of each part of an import; for scans also a file. None if there is no such part."""
 
     folder: Path
@@ -70,7 +70,7 @@ class Places:
 
 def find_places(
     folder: Path, given: Mapping[PhotographRole | FileRole, Path | None], wanted: Set[PhotographRole | FileRole]
-) -> Places:
+) -> ImportFolders:
     """The places of the wanted parts: those given, else subfolders with one of the names in FOLDERS.
 
     Raises DataError if the folder or a given place does not exist, or if a part is given that is not wanted.
@@ -90,11 +90,11 @@ def find_places(
         place = named or next((below[name] for name in names if name in below), None)
         if place is not None:
             found[role] = place.resolve()
-    return Places(folder.resolve(), **found)
+    return ImportFolders(folder.resolve(), **found)
 
 
 def list_import(
-    places: Places, progress: Progress = lambda _what, _done, _total: None, *, ct_first_number: int = 1
+    places: ImportFolders, progress: Progress = lambda _what, _done, _total: None, *, ct_first_number: int = 1
 ) -> ImportList:
     """Every file to be imported, with its hash, and the files left out, with the reasons.
 
@@ -148,7 +148,7 @@ def import_rig(listing: ImportList, *, simulated: bool, ct_first_number: int = 1
 # --- photographs ------------------------------------------------------------------------------------------------
 
 
-def _views(places: Places, progress: Progress) -> tuple[list[ImportedView], list[LeftOut]]:
+def _views(places: ImportFolders, progress: Progress) -> tuple[list[ImportedView], list[LeftOut]]:
     left_out: list[LeftOut] = []
     damaged: list[LeftOut] = []
     seen: dict[str, Path] = {}
@@ -210,7 +210,7 @@ def camera_record(exif: ExifRecord) -> dict[str, Any]:
     return {name: value for name, value in stated.items() if value not in (None, "")}
 
 
-def _names(photographs: Sequence[tuple[PhotographRole, Path]], places: Places) -> dict[Path, str]:
+def _names(photographs: Sequence[tuple[PhotographRole, Path]], places: ImportFolders) -> dict[Path, str]:
     """A name for each view: the file's stem, with its folders in front if several files have the same stem."""
     stems = [_plain(path.stem) for _, path in photographs]
     names: dict[Path, str] = {}
@@ -233,7 +233,7 @@ def _plain(text: str) -> str:
     return "".join(c if c.isascii() and (c.isalnum() or c in "_.-+") else "_" for c in text)[-56:]
 
 
-def _damaged(damaged: Sequence[LeftOut], places: Places) -> DataError:
+def _damaged(damaged: Sequence[LeftOut], places: ImportFolders) -> DataError:
     shown = "; ".join(f"{_shown(one.path, places)}: {one.reason}" for one in damaged[:_NAMED])
     more = f"; and {len(damaged) - _NAMED} more" if len(damaged) > _NAMED else ""
     return DataError(
@@ -243,7 +243,7 @@ def _damaged(damaged: Sequence[LeftOut], places: Places) -> DataError:
     )
 
 
-def _none(role: PhotographRole, places: Places, left_out: Sequence[LeftOut]) -> DataError:
+def _none(role: PhotographRole, places: ImportFolders, left_out: Sequence[LeftOut]) -> DataError:
     place: Path | None = getattr(places, role)
     option = "--calibration-images" if role == "calibration" else "--images"
     if place is None:
@@ -306,7 +306,7 @@ def _ct(folder: Path, first_number: int) -> tuple[tuple[Path, ...], list[LeftOut
     return sound[0].files, [LeftOut(path, odd(path, folder) or "no slice of the series") for path in others]
 
 
-def _elsewhere(places: Places) -> list[LeftOut]:
+def _elsewhere(places: ImportFolders) -> list[LeftOut]:
     """Files of the folder that are in none of its parts."""
     parts = [
         place
@@ -331,7 +331,7 @@ def _companions(mesh: Path) -> Iterable[Path]:
 # --- words and records ------------------------------------------------------------------------------------------
 
 
-def _file(file: ListedFile, places: Places, media_type: str = "application/octet-stream") -> ImportedFile:
+def _file(file: ListedFile, places: ImportFolders, media_type: str = "application/octet-stream") -> ImportedFile:
     return ImportedFile(
         path=_shown(file.path, places),
         sha256=file.sha256,
@@ -341,7 +341,7 @@ def _file(file: ListedFile, places: Places, media_type: str = "application/octet
     )
 
 
-def _shown(path: Path, places: Places) -> str:
+def _shown(path: Path, places: ImportFolders) -> str:
     """A path relative to the import's folder, or absolute if outside it."""
     return str(path.relative_to(places.folder) if path.is_relative_to(places.folder) else path)
 

@@ -91,7 +91,8 @@ def _checked(photograph: NotePhotograph) -> tuple[str, str]:
     """Media type and file suffix, after decoding the picture. Raises DataError."""
     # The decoder takes long to load, and a web process starts without it.
     import cv2  # noqa: PLC0415
-    import numpy as np  # noqa: PLC0415
+
+    from service.compute.images.decode import decode  # noqa: PLC0415
 
     content, name = photograph.content, _plain(photograph.name)
     require_size(len(content), name)
@@ -106,10 +107,5 @@ def _checked(photograph: NotePhotograph) -> tuple[str, str]:
         check_png(content, name)
     else:
         raise DataError("the file is neither a JPEG nor a PNG picture", where=name, remedy=_REMEDY)
-    try:
-        picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8)
-    except cv2.error as error:
-        raise DataError("the picture cannot be decoded", where=name, remedy=_REMEDY) from error
-    if picture is None:
-        raise DataError("the picture cannot be decoded", where=name, remedy=_REMEDY)
+    decode(content, cv2.IMREAD_REDUCED_GRAYSCALE_8, name=name, remedy=_REMEDY)
     return kind

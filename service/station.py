@@ -306,7 +306,7 @@ class Station:
 
 
 def _one_name(field: str, address: str) -> str:
-    """The same text for a device whatever name it is given: a link to its port, the name of its host."""
+    """A device's address in one form, however it was written: the port behind a link, the IP address of a host."""
     if field == "port":
         return address if ":" in address else os.path.realpath(address)
     if field != "host":

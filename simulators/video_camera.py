@@ -18,8 +18,8 @@ from simulators.still_camera.exif import ExposureSettings
 from simulators.still_camera.scene import ImageSource, Moment, StillLife, WorldSource
 
 _WIDTH, _QUALITY = 960, 95
-# With this comment every image begins. It goes out behind the image before, which for FFmpeg is whole when another
-# one begins; and FFmpeg reads blocks of this size.
+# Every image begins with a comment of this size, which is sent together with the previous image: FFmpeg reads in
+# blocks of this size, and takes an image as complete once the next one begins.
 _BLOCK = 4096
 _START = b"\xff\xd8"
 _HEAD = _START + b"\xff\xfe" + (_BLOCK + 2).to_bytes(2, "big") + bytes(_BLOCK)
@@ -105,7 +105,7 @@ class _Film:
         return _HEAD + encoded.tobytes().removeprefix(_START)
 
     def note(self, data: bytes) -> None:
-        """Write the truth about an image that goes out."""
+        """Log the truth about an image that is sent."""
         if self._log is None:
             return
         line = {"sha256": hashlib.sha256(data).hexdigest(), "T_world_camera": self._moment.T_world_camera}

@@ -74,7 +74,7 @@ class Room:
         self.mount = nominal_hand_eye()
         arm = arm_model("UR10e")
         station = ArmAtStation(self.layout, arm, self.mount, CollisionSection(arm="UR10e"), None, Motion())
-        self.situation = station.situation(usual_posture(arm, self.layout, self.mount))
+        self.planning_scene = station.scene(usual_posture(arm, self.layout, self.mount))
         # The simulator's board has its 23 corners along x; ours has them along y.
         there = self.scene.board_placement(0)
         turn = np.array([[0, 1, 0, 0], [-1, 0, 0, 15 * 0.015], [0, 0, 1, 0], [0, 0, 0, 1.0]])
@@ -88,11 +88,11 @@ class Room:
 
     def feasible(self, T_base_camera: Transform) -> bool:
         """Whether the arm can reach a pose T_base_camera (4, 4)."""
-        return best_posture(T_base_camera, self.situation) is not None
+        return best_posture(T_base_camera, self.planning_scene) is not None
 
     def photograph(self, sent: Transform, shoot: Shoot) -> None:
         """Take an image from the pose where a camera on the nominal mount would be at `sent`."""
-        q = best_posture(sent, self.situation)
+        q = best_posture(sent, self.planning_scene)
         assert q is not None
         T_camera_board = inverse(self.scene.true_camera(q, _STATION)) @ self.T_world_board
         pixels = self.camera.project(apply(T_camera_board, _BOARD.points()))

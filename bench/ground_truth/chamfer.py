@@ -120,7 +120,7 @@ def _page(
             "",
             f"{record['points']} samples at 0.1 mm, both directions, trees built in the time. `ours` must take at",
             f"most {LIMIT} times as long as the fastest library. The machine was shared; CPU seconds count.",
-            "Each was measured several times in turns, and the least is told.",
+            "Each was measured several times in turn; the table has the smallest value.",
             "",
             "| samples in | tree | wall s | CPU s | to the fastest library |",
             "|---|---|---:|---:|---:|",

@@ -38,7 +38,8 @@ _ALIKE = 0.7  # least cosine to the place's normal: others are another surface
 _BOUND = 2.576  # standard errors, 99 %
 _HALF = 0.05  # of the weight, about one half: such vertices are on the seam
 _STRIP_M, _FEWEST_OF_STRIP = 5e-4, 5
-_BESIDE_M, _ON_M = 3e-3, 5e-5  # from the overlap, where no seam is; and from the line there, to be on it
+_BESIDE_M = 3e-3  # distance from the overlap of the line for comparison, where there is no seam
+_ON_M = 5e-5  # vertices nearer to that line are on it
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from service.benchmark.matching.result import record
-from service.benchmark.matching.running import WantedRun, run_matching
+from service.benchmark.matching.running import MatchingTask, run_matching
 from service.benchmark.matching.table import markdown
 from service.compute.matching.methods.method import matcher
 
@@ -31,7 +31,7 @@ def main() -> None:
     args = parser.parse_args()
     work = _WORK / args.out
     work.mkdir(parents=True, exist_ok=True)
-    wanted = WantedRun(args.dataset, matcher(args.method), args.weights, args.pairs_per_class, work)
+    wanted = MatchingTask(args.dataset, matcher(args.method), args.weights, args.pairs_per_class, work)
     results = run_matching(wanted, lambda what, done, total: print(what, done, total, flush=True))
     about = json.loads((args.dataset / "dataset.json").read_text(encoding="utf-8"))
     document = {

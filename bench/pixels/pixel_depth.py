@@ -1,4 +1,4 @@
-"""Speed and memory of depth and normals at 60 megapixels, beside raw embreex on the same rays in the same run."""
+"""Speed and memory of depth and normals at 60 megapixels, and those of raw embreex on the same rays."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.masks import Ball
+from service.compute.pixels.masks import WorldSphere
 from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.splits import splits
 from service.compute.poses.files.pose_files import read_poses_csv
@@ -32,7 +32,7 @@ def simulated_data_set(folder: Path) -> DataSet:
     mesh = Mesh(metres(np.asarray(scan.vertices, dtype=np.float64)), np.asarray(scan.faces, dtype=np.int64))
     spheres = json.loads((folder / "spheres.json").read_text(encoding="utf-8"))
     centres_mm = np.array([*spheres["registration_mm"], *spheres["control_mm"]])
-    balls = tuple(Ball(metres(centre), metres(float(spheres["radius_mm"]))) for centre in centres_mm)
+    balls = tuple(WorldSphere(metres(centre), metres(float(spheres["radius_mm"]))) for centre in centres_mm)
     poses = {name: T_scan_world @ T for name, T in read_poses_csv(folder / "poses.csv").items()}
     views = tuple(
         PosedView(Path(n).stem, Path(n).suffix, camera, T, np.zeros((6, 6))) for n, T in sorted(poses.items())

@@ -29,7 +29,7 @@ TITLES: Mapping[str, str] = {
     "captures": "Captures for a long time",
     "large": "A large run",
     "together": "Many on one database file",
-    "speed": "Speed beside the usual tools",
+    "speed": "Speed compared with the usual tools",
 }
 TABLES: Mapping[str, Callable[[dict[str, Any]], list[str]]] = {
     "captures": creep.table,

@@ -15,20 +15,20 @@ from scipy.stats import t as student
 BLOCKS = 12
 
 
-class Took(NamedTuple):
+class Duration(NamedTuple):
     """A duration: wall time, and CPU time of this process, which other load does not lengthen."""
 
     wall_s: float
     cpu_s: float
 
     @classmethod
-    def now(cls) -> Took:
+    def now(cls) -> Duration:
         """The current clock readings."""
         return cls(time.perf_counter(), time.process_time())
 
-    def since(self, earlier: Took) -> Took:
+    def since(self, earlier: Duration) -> Duration:
         """The difference to earlier readings."""
-        return Took(self.wall_s - earlier.wall_s, self.cpu_s - earlier.cpu_s)
+        return Duration(self.wall_s - earlier.wall_s, self.cpu_s - earlier.cpu_s)
 
 
 @dataclass(frozen=True, slots=True)

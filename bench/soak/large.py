@@ -16,7 +16,7 @@ from typing import Any
 
 from typer.testing import CliRunner
 
-from bench.soak.fit import Took, exponent
+from bench.soak.fit import Duration, exponent
 from bench.soak.large_record import STEP, TIMED, LargeRecord
 from service.cli.main import app
 from service.core.records.events import StepNote
@@ -30,7 +30,7 @@ SMALL_S = 0.05  # operations faster than this at the largest size need no order 
 _LOOKS = 3  # repetitions; the fastest counts, since other load only adds time
 _SHEET = 60
 
-Times = dict[str, Took]
+Times = dict[str, Duration]
 
 
 def large(folder: Path, sizes: Sequence[int], gigabytes: float) -> dict[str, Any]:
@@ -121,13 +121,13 @@ def pages(record: LargeRecord) -> Times:
             assert answer.status_code == 200, (address, answer.status_code, answer.text[-500:])
             return answer.text
 
-        began = Took.now()
+        began = Duration.now()
         get("/")
-        found["first page of a server"] = Took.now().since(began)
+        found["first page of a server"] = Duration.now().since(began)
         get(f"/audit/runs/{run}", auditor)
         while "data-pending" in get(f"/audit/runs/{run}", auditor):
             time.sleep(0.05)
-        found["auditor's first page filled in"] = Took.now().since(began)
+        found["auditor's first page filled in"] = Duration.now().since(began)
         for name, address in _addresses(record).items():
             who = auditor if address.startswith("/audit") else browser
             get(address, who)
@@ -188,18 +188,20 @@ def table(found: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _shortest(act: Callable[[], object], *, looks: int = _LOOKS, before: Callable[[], object] = lambda: None) -> Took:
-    took: list[Took] = []
+def _shortest(
+    act: Callable[[], object], *, looks: int = _LOOKS, before: Callable[[], object] = lambda: None
+) -> Duration:
+    took: list[Duration] = []
     for _ in range(looks):
         before()
-        began = Took.now()
+        began = Duration.now()
         act()
-        took.append(Took.now().since(began))
+        took.append(Duration.now().since(began))
     return min(took, key=lambda one: one.cpu_s)
 
 
-def _middle(took: Sequence[Took]) -> Took:
-    return Took(statistics.median(one.wall_s for one in took), statistics.median(one.cpu_s for one in took))
+def _middle(took: Sequence[Duration]) -> Duration:
+    return Duration(statistics.median(one.wall_s for one in took), statistics.median(one.cpu_s for one in took))
 
 
 def _room(data: Path) -> dict[str, int]:

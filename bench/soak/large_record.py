@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.soak.fit import Took
+from bench.soak.fit import Duration
 from bench.soak.sparse import SparseFiles, sparse_photograph
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import ViewpointCaptured
@@ -77,39 +77,39 @@ class LargeRecord:
         """Close the store."""
         self.store.close()
 
-    def grow(self, until: int) -> list[Took]:
+    def grow(self, until: int) -> list[Duration]:
         """Record viewpoints until there are `until`; returns the durations of the last TIMED ones.
 
         The viewpoints before those are not synced one by one, which would take an hour.
         """
-        took: list[Took] = []
+        took: list[Duration] = []
         photograph = self.folder / "photograph.jpg"
         while self.taken < until:
             number = self.taken + 1
             self._files.unhurried = until - self.taken <= TIMED
             sparse_photograph(photograph, number, self.photograph_bytes)
-            began = Took.now()
+            began = Duration.now()
             self._bring(photograph, f"v{number:03d}", number)
             if self._files.unhurried:
-                took.append(Took.now().since(began))
+                took.append(Duration.now().since(began))
             self.taken += 1
         return took
 
-    def take(self, count: int) -> tuple[Took, list[Took]]:
+    def take(self, count: int) -> tuple[Duration, list[Duration]]:
         """Resume the run, take `count` more viewpoints and die.
 
         Returns the times of the first one and of the others.
         """
         bench = Bench(self.store, self.run_id, self.folder / "data")
-        at: list[Took] = []
+        at: list[Duration] = []
 
         def exposed(_number: int) -> None:
-            at.append(Took.now())
+            at.append(Duration.now())
             if len(at) > count:
                 raise _DiedError
 
         bench.rig.shutter.on_capture = exposed
-        began = Took.now()
+        began = Duration.now()
         try:
             bench.run()
         except _DiedError:

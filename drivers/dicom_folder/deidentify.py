@@ -141,7 +141,7 @@ def _replaced(value: object) -> object:
 
 
 def new_uid(uid: str) -> UID:
-    """The UID in place of another: the same for the same, wherever it occurs."""
+    """The UID that replaces another one; the same UID is always replaced by the same one."""
     return UID(f"2.25.{int.from_bytes(hashlib.sha256(uid.encode()).digest()[:16], 'big')}")
 
 

@@ -13,7 +13,7 @@ import pydicom
 from pydicom.dataset import FileDataset
 from pydicom.errors import BytesLengthException, InvalidDicomError
 
-from drivers.errors import DeviceUnavailableError
+from drivers.folder_files import files_below
 from drivers.meshes.mesh_file import MESH_SUFFIXES
 
 _IGNORED_SUFFIXES = (
@@ -52,24 +52,13 @@ def dicom_files(folder: Path) -> list[Path]:
     Leaves out DICOMDIR, hidden files, meshes, NIfTI files, images and texts. Raises DeviceUnavailableError if the
     folder cannot be read.
     """
-    try:
-        root = folder.resolve(strict=True)
-        return [
-            path
-            for path in sorted(folder.rglob("*"))
-            if path.is_file()
-            and not path.name.upper().startswith("DICOMDIR")
-            and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-            and path.suffix.lower() not in _IGNORED_SUFFIXES
-            and not path.name.lower().endswith(".nii.gz")
-            and path.resolve().is_relative_to(root)
-        ]
-    except OSError as error:
-        raise DeviceUnavailableError(
-            f"the folder cannot be read ({error.strerror})",
-            where=str(folder),
-            remedy="Check that the share is mounted and that the path in rig.yaml is right",
-        ) from error
+
+    def belongs(path: Path) -> bool:
+        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        other = path.suffix.lower() in _IGNORED_SUFFIXES or path.name.lower().endswith(".nii.gz")
+        return not hidden and not other and not path.name.upper().startswith("DICOMDIR")
+
+    return files_below(folder, belongs)
 
 
 class _NoFurther(io.BufferedReader):

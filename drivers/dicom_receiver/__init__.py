@@ -51,7 +51,7 @@ _SYNTAXES = (
 # Status of a C-STORE (DICOM PS3.4, B.2.3).
 _SUCCESS, _OUT_OF_RESOURCES, _MISMATCH, _NOT_UNDERSTOOD = 0x0000, 0xA700, 0xA900, 0xC000
 _INVALID_PDU = "Evt19"  # an event of the state machine of DICOM PS3.8, 9.2
-_WAIT_S = 30.0  # for the other side; a connection that says nothing for so long is closed
+_WAIT_S = 30.0  # for the other side; a connection that is silent for longer is closed
 _MOST_ASSOCIATIONS = 32
 _COMMENT = 64  # characters of an error comment
 

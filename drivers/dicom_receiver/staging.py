@@ -1,4 +1,4 @@
-"""Received files of series that are not whole yet: a series appears in the CT folder when its sender has finished."""
+"""Received files of series that are not complete: a series appears in the CT folder when its sender has finished."""
 
 from __future__ import annotations
 

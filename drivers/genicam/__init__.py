@@ -1,6 +1,6 @@
 """Driver for industrial cameras with GenICam: by the library Aravis, or by a maker's GenTL producer and harvesters.
 
-Every exposure is one of its own: the camera is told to take a single frame after the call. The exposure time is set
+Each call makes the camera take one new frame. The exposure time is set
 and read back; aperture and gain stay as rig.yaml states them, because the lens of such a camera is set by hand and a
 protocol's ISO has no meaning to it. Why two ways: docs/decisions/0020-genicam-by-aravis.md.
 """
@@ -31,7 +31,7 @@ from drivers.genicam.producer import ProducerCamera
 from drivers.interfaces import CameraSettings, CapturedImage, DeviceIdentity, DeviceReport
 from drivers.photos.frames import FrameFiles, frame_jpeg
 from drivers.plugin import DriverConfig, DriverSpec
-from drivers.stated_settings import TOLERANCE, differences
+from drivers.stated_settings import TOLERANCE, agrees, differences
 
 
 class GenicamConfig(DriverConfig):
@@ -119,7 +119,7 @@ class GenicamCamera:
             link.close()
 
     def report(self) -> DeviceReport:
-        """Return what the camera reports of itself."""
+        """Return what the camera reports about itself."""
         link = self._connected()
         try:
             details = {
@@ -154,7 +154,7 @@ class GenicamCamera:
         except LinkError as error:
             raise self._unavailable(str(error)) from error
         now = self.settings()
-        if abs(now.exposure_s - settings.exposure_s) > TOLERANCE * settings.exposure_s:
+        if not agrees(now.exposure_s, settings.exposure_s):
             raise DeviceRefusedError(
                 f"the camera exposes for {now.exposure_s:g} s instead of {settings.exposure_s:g} s",
                 where=self._where,

@@ -31,7 +31,7 @@ def release_shutter(
                 raise
             time.sleep(0.2 * attempt)
         except (DeviceUnavailableError, DeviceRefusedError) as error:
-            # A full store, a wrong mode, a lost or spoilt answer and a lost link: ask the camera which it is.
+            # A full card, a wrong mode, a lost or damaged answer or a lost connection: ask the camera which it is.
             check_space()
             return trigger_s, _photograph(link, dials.exposure_s() + UNCONFIRMED_S, error)
         else:

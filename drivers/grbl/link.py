@@ -47,7 +47,7 @@ class Sent:
     sent_s: float  # host time.monotonic()
     answer: Ok | Refused | None = None  # None: none yet, or none to come
     said: list[Setting | Feedback] = field(default_factory=list[Setting | Feedback])
-    dropped: bool = False  # its answer will not come any more: the controller started anew, or it was lost
+    dropped: bool = False  # no answer will come: the controller has restarted, or the connection is lost
 
 
 class Link:
@@ -97,7 +97,7 @@ class Link:
         while True:
             self.act(RESET)
             resets += 1
-            # Some boards start anew when their port is opened and are deaf until then: it is repeated.
+            # Some boards restart when their port is opened and hear nothing until then, so the reset is repeated.
             wait_s = min(1.0, deadline_s - time.monotonic())
             with self._news:
                 if self._news.wait_for(lambda: self._welcomes > before or bool(self.death), wait_s):
@@ -153,7 +153,7 @@ class Link:
         if sent.answer is None:
             if self.death:
                 raise self._lost()
-            why = ": the controller started anew" if sent.dropped else why_none
+            why = ": the controller has restarted" if sent.dropped else why_none
             raise DeviceTimeoutError(f"no answer to {words}{why}", where=self._where, remedy=_CABLE)
         return tuple(sent.said)
 

@@ -19,7 +19,7 @@ from drivers.grbl.setup import Setup
 from drivers.grbl.wire import JOG_CANCEL, Alarm, Message, Refused, Status, Welcome
 from drivers.interfaces import Array, SafetyState
 
-HEARTBEAT_S = 0.2  # the axes are stopped after so long without a sign of life from the program
+HEARTBEAT_S = 0.2  # the axes are stopped if the program gives no sign of life for longer
 # Until the axes brake after the death of program, driver or line: what was handed over, or a heartbeat and a report.
 REACTION_S = max(AHEAD_S + 1.5 * PIECE_S, HEARTBEAT_S + POLL_S) + 0.05
 _UNANSWERED = 3  # lines that fit into the controller's 128 bytes

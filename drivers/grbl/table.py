@@ -260,7 +260,7 @@ class GrblTable:
         if (stop := self._mover.latch.stop) is not None and self._mover.interrupted:
             raise stop
         moving = self._mover.moving
-        # The newest sample is to show what is answered here.
+        # While the newest sample is older than the arrival, a caller would read where the axes were before it.
         return self._latest().monotonic_s < self._mover.arrived_s or moving
 
     def settle(self, criteria: SettleCriteria) -> SettleReport:

@@ -39,7 +39,7 @@ _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class MotionEnd:
     """How a motion ended: `code` is empty if it arrived."""
 
     code: str
@@ -65,7 +65,7 @@ class Link:
         self._sending = threading.Lock()
         self._news = threading.Condition()
         self._answers: dict[int, Line] = {}
-        self._ended: dict[int, Ended] = {}
+        self._ended: dict[int, MotionEnd] = {}
         self._sequence = 0
         self.death = ""  # why the connection ended
         try:
@@ -140,7 +140,7 @@ class Link:
             raise self.error(str(answer.get("code")), str(answer.get("what")))
         return answer
 
-    def ended(self, motion: int) -> Ended | None:
+    def ended(self, motion: int) -> MotionEnd | None:
         """How a motion ended; None while it is under way."""
         with self._news:
             return self._ended.get(motion)
@@ -187,7 +187,7 @@ class Link:
                 self._answers[whole(line, "seq")] = line
             elif line.get("motion") is not None:
                 code, what = (str(line.get("code")), str(line.get("what"))) if line["is"] == "err" else ("", "")
-                self._ended[whole(line, "motion")] = Ended(code, what, now_s)
+                self._ended[whole(line, "motion")] = MotionEnd(code, what, now_s)
             else:
                 _LOG.warning("%s: %s", self._where, line)
             self._news.notify_all()

@@ -44,7 +44,7 @@ from service.core.seven_axes import forward, nearest_posture
 from service.core.units import mm
 
 DRIVER_VERSION = "1"
-HEARTBEAT_S = 0.3  # without a line for so long the application stops the arm (docs/reference/kuka_protocol.md)
+HEARTBEAT_S = 0.3  # the application stops the arm if no line comes for longer (docs/reference/kuka_protocol.md)
 LONGEST_RINGING_S = 10.0
 STOP_S = 5.0
 FRAME_TOLERANCE_M = 0.0005

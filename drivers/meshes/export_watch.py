@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.errors import DeviceUnavailableError, IncompleteExportError, UnreadableFileError
+from drivers.errors import IncompleteExportError, UnreadableFileError
+from drivers.folder_files import files_below
 from drivers.interfaces import ScanExport
 from drivers.meshes.mesh_file import MESH_SUFFIXES, export_of
 from drivers.meshes.mesh_format import check_complete
@@ -104,23 +105,12 @@ def mesh_files(folder: Path, suffixes: tuple[str, ...] = MESH_SUFFIXES) -> list[
 
     Raises DeviceUnavailableError if the folder cannot be read.
     """
-    try:
-        root = folder.resolve(strict=True)
-        found = [
-            path
-            for path in sorted(folder.rglob("*"))
-            if path.suffix.lower() in suffixes
-            and not any(part.startswith((".", "~")) for part in path.relative_to(folder).parts)
-            and path.is_file()
-            and path.resolve().is_relative_to(root)
-        ]
-    except OSError as error:
-        raise DeviceUnavailableError(
-            f"the folder cannot be read ({error.strerror})",
-            where=str(folder),
-            remedy="Check that the share is mounted and that the path in rig.yaml is right",
-        ) from error
-    return found
+
+    def belongs(path: Path) -> bool:
+        hidden = any(part.startswith((".", "~")) for part in path.relative_to(folder).parts)
+        return path.suffix.lower() in suffixes and not hidden
+
+    return files_below(folder, belongs)
 
 
 def _signature(files: tuple[Path, ...]) -> tuple[tuple[str, int, int], ...]:

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.errors import DeviceUnavailableError, UnreadableFileError
+from drivers.errors import UnreadableFileError
+from drivers.folder_files import files_below
 from drivers.photos.photo_file import ExifRecord, check_jpeg_complete, read_exif, sha256_of
 
 JPEG_SUFFIXES = (".jpg", ".jpeg")
@@ -97,20 +98,6 @@ def list_photographs(folder: Path) -> Photographs:
         except UnreadableFileError as error:
             damaged.append(LeftOut(path, error.what))
     return Photographs(tuple(photographs), tuple(left_out), tuple(damaged))
-
-
-def files_below(folder: Path) -> list[Path]:
-    """The files in a folder and its subfolders, sorted, without links that lead out of it.
-
-    Raises DeviceUnavailableError if the folder does not exist or cannot be read.
-    """
-    try:
-        root = folder.resolve(strict=True)
-        return [path for path in sorted(folder.rglob("*")) if path.is_file() and path.resolve().is_relative_to(root)]
-    except OSError as error:
-        raise DeviceUnavailableError(
-            f"the folder cannot be read ({error.strerror})", where=str(folder), remedy="Check the path"
-        ) from error
 
 
 def odd(path: Path, folder: Path) -> str:

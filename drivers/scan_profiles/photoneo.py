@@ -1,4 +1,4 @@
-"""Photoneo PhoXi and MotionCam: single views that PhoXi Control saves as PLY, not measured points as (0, 0, 0)."""
+"""Photoneo PhoXi and MotionCam: single views saved by PhoXi Control as PLY; points not measured are (0, 0, 0)."""
 
 from drivers.scan_profiles.profile import ScanProfile
 

@@ -44,8 +44,8 @@ class Method:
         form: name of the export format that it reads.
         commands: what is run, one after the other; a pure function of the place.
         mesh: finds the mesh that the commands left. Raises DataError if there is none.
-        to_world: vertices (V, 3) of that mesh in the world frame, m, with the help of the exported folder. The meshes
-            of most methods are there already.
+        to_world: transforms vertices (V, 3) of that mesh to the world frame, m; it may read the exported folder. Most
+            methods' meshes are in the world frame already.
         programs: looked for on the path.
         variable: of the environment, with the folder of its source code; "" if it needs none.
         lacking: says what else is missing to run it on this machine; "" if nothing is.

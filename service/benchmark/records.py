@@ -25,7 +25,7 @@ class Machine(Record):
 
 
 class ComputingEffort(Record):
-    """What the commands of a method took.
+    """Time and memory that the commands of a method took.
 
     Attributes:
         wall_s: seconds on the clock.

@@ -83,7 +83,7 @@ def posture_costs(arm: ArmModel, joints_rad: Array, near_rad: Array) -> Array:
     """
     room = arm.limits_rad - np.abs(joints_rad)
     short = np.clip(1.0 - room / _NEAR_LIMIT_RAD, 0.0, None)
-    # A joint of the start counts no more than it must: the start itself may lie near a limit.
+    # Only coming nearer to a limit than the start costs something: the start itself may lie near one.
     here = np.clip(1.0 - (arm.limits_rad - np.abs(near_rad)) / _NEAR_LIMIT_RAD, 0.0, None)
     limits = _LIMIT_WEIGHT * np.sum(np.clip(short - here, 0.0, None) ** 2, axis=1)
     return np.sum((joints_rad - near_rad) ** 2, axis=1) + limits + _singular_costs(joints_rad, near_rad)

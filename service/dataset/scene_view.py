@@ -73,7 +73,7 @@ class SceneMesh:
 
     @property
     def coloured_by(self) -> MeshColours | None:
-        """Its colours; None for one colour."""
+        """What the surface is coloured by; None if it has one colour."""
         if self.colours is not None or self.error_mm is None:
             return self.colours
         return MeshColours(self.error_mm, "predicted error (mm)", "%{intensity:.4f} mm")

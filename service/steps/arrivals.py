@@ -18,7 +18,7 @@ from service.steps.notes import DEIDENTIFIED
 from service.store.records import NewArtefact
 
 T = TypeVar("T")
-_LASTING_S = 3.0  # for so long at least, the same words hold
+_LASTING_S = 3.0  # how long the words must have stayed the same before they are shown
 
 
 def wait_for(
@@ -37,7 +37,7 @@ def wait_for(
         context: of the step.
         find: looks for what is wanted, oldest first.
         wait_s: longest wait.
-        what: it is, in words.
+        what: what is waited for, in words.
         report: of the device, with its problems.
 
     Raises:

@@ -27,8 +27,8 @@ _HALO = 3  # additional rows on each side that the blur needs
 _RESTART_M = 1e-7  # offset past a hit when searching for the next one: the surface may fold closely
 _PAST_M = 2e-6  # the same, when the face that was left is met again
 _BELOW_M = 1e-3  # of a solid, where the rays start
-_ASIDE_M = 2e-6  # by which a ray that lost a crossing is moved at first
-_MOST_ATTEMPTS = 9  # at the last, it is half a millimetre aside, about a voxel
+_ASIDE_M = 2e-6  # displacement in the first attempt of a ray that lost a crossing
+_MOST_ATTEMPTS = 9  # in the last one, the displacement is half a millimetre, about a voxel
 _GOLDEN_ANGLE_RAD = 2.399963
 
 

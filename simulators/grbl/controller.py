@@ -35,7 +35,7 @@ class Controller:
         self._state = "Alarm"
         self._heard = b""
         self._lines: deque[str] = deque()
-        self._waits_for_reset = False  # after an alarm of the limits it hears nothing but a reset
+        self._waits_for_reset = False  # after an alarm of the limits only a reset is heard
         self._asked = False  # for a report while it homes
         self._reports = 0
         self._door_s = 0.0  # how long the door stays open
@@ -152,7 +152,7 @@ class Controller:
             self._say(line)
 
     def _alarm(self, code: int) -> None:
-        """Stop and lock; an alarm of the limits is followed by deafness until a reset."""
+        """Stop and lock; after an alarm of the limits, only a reset is heard."""
         self._machine.halt()
         self._lines.clear()
         self._state = "Alarm"

@@ -32,7 +32,7 @@ class RefusedError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class End:
+class MotionEnd:
     """How a motion ended; `code` is empty if it arrived."""
 
     motion: int
@@ -52,7 +52,7 @@ class _Motion:
     waits_s: float  # until the brakes are released
     s: float = 0.0  # way along the longest joint, rad
     v: float = 0.0
-    stopping: End | None = None
+    stopping: MotionEnd | None = None
 
     @property
     def length(self) -> float:
@@ -156,7 +156,7 @@ class Controller:
     def stop(self, end_code: str = "stopped", what: str = "the motion was stopped") -> None:
         """Decelerate the motion, if there is one."""
         if self.motion is not None and self.motion.stopping is None:
-            self.motion.stopping = End(self.motion.number, end_code, what)
+            self.motion.stopping = MotionEnd(self.motion.number, end_code, what)
 
     def lose_client(self) -> None:
         """The connection ended: stop, and lock until a person permits motion again."""
@@ -177,7 +177,7 @@ class Controller:
 
     # --- cycle ------------------------------------------------------------------------------------------------
 
-    def advance(self, dt_s: float) -> End | None:
+    def advance(self, dt_s: float) -> MotionEnd | None:
         """Advance by dt_s of real time; returns the motion that ended."""
         self.time_s += dt_s
         if dt_s > 0.1:  # this process was not scheduled: the client's lines wait unread, and are not late
@@ -193,7 +193,7 @@ class Controller:
             self.stop("heartbeat", f"the arm was stopped: no line of its client for {HEARTBEAT_S:g} s")
         return self._move(self.motion, dt_s)
 
-    def _move(self, motion: _Motion, dt_s: float) -> End | None:
+    def _move(self, motion: _Motion, dt_s: float) -> MotionEnd | None:
         motion.waits_s -= dt_s
         if motion.waits_s > 0 and motion.stopping is None:
             return None
@@ -204,7 +204,7 @@ class Controller:
         if not over:
             return None
         self.motion = None
-        return motion.stopping or End(motion.number)
+        return motion.stopping or MotionEnd(motion.number)
 
     def _feel_load(self) -> None:
         """Stop if the load is not the one that was set: the torque sensors take the difference for a collision."""

@@ -83,7 +83,7 @@ class Session:
                 self._judge(datagram)
 
     def _judge(self, datagram: bytes) -> None:
-        """A reply has a header with three numbers; anything beside it is a command, which ends the session."""
+        """A reply has a header with three numbers; anything else in it is a command, which ends the session."""
         if self._version == "2.7":
             message = datagram[4:-4]
             if struct.unpack("<I", datagram[:4])[0] != len(message) or struct.unpack("<I", datagram[-4:])[

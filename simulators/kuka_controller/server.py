@@ -9,12 +9,12 @@ import selectors
 import socket
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import cast
 
 import numpy as np
 
-from simulators.kuka_controller.controller import MODES, SAFETY, Controller, End, RefusedError
+from simulators.connection import Connection, accept
+from simulators.kuka_controller.controller import MODES, SAFETY, Controller, MotionEnd, RefusedError
 from simulators.kuka_controller.fri import Session
 from simulators.serve import SimulatorError, Termination, listening
 from simulators.units import seconds
@@ -28,27 +28,18 @@ GIVES_WAY_S = 5.0  # a client that is silent for so long gives way to a new one
 MAX_BACKLOG_BYTES = 1 << 18
 
 
-@dataclass
-class _Client:
-    """An accepted connection, of the application's port or the pendant's."""
+class _Client(Connection):
+    """A client of the application's port or the pendant's; `rest` is the line that has not ended."""
 
-    socket: socket.socket
-    pendant: bool
-    out: bytearray = field(default_factory=bytearray)
-    rest: bytes = b""
-    dead: bool = False
+    def __init__(self, accepted: socket.socket, *, pendant: bool) -> None:
+        super().__init__(accepted)
+        self.pendant = pendant
+        self.rest = b""
 
-    def send(self, line: dict[str, object] | str) -> None:
+    def tell(self, line: dict[str, object] | str) -> None:
         """Send a line now, or later when the peer reads again."""
         text = line if isinstance(line, str) else json.dumps(line, separators=(",", ":"))
-        self.out += text.encode() + b"\n"
-        try:
-            while self.out:
-                del self.out[: self.socket.send(self.out)]
-        except BlockingIOError:
-            return
-        except OSError:
-            self.dead = True
+        self.send(text.encode() + b"\n")
 
 
 class Server:
@@ -100,7 +91,7 @@ class Server:
             if self._world is not None:
                 self._world.push([float(v) for v in self.controller.q], self.controller.time_s, now_s)
 
-    def _stream(self, now_s: float, end: End | None) -> None:
+    def _stream(self, now_s: float, end: MotionEnd | None) -> None:
         fault, self.controller.stream_fault = self.controller.stream_fault, None
         fault = fault or self.controller.faults.check(self.controller.device, "stream")
         client = self._client
@@ -112,12 +103,12 @@ class Server:
             return
         self._number += 1
         if len(client.out) < MAX_BACKLOG_BYTES:
-            client.send(self.controller.state(self._number))
+            client.tell(self.controller.state(self._number))
         if end is not None:
             line: dict[str, object] = {"is": "done", "motion": end.motion}
             if end.code:
                 line = {"is": "err", "seq": None, "motion": end.motion, "code": end.code, "what": end.what}
-            client.send(line)
+            client.tell(line)
 
     @property
     def _client(self) -> _Client | None:
@@ -140,10 +131,7 @@ class Server:
                 self._end_fri()
 
     def _accept(self, listener: socket.socket, *, pendant: bool) -> None:
-        connection, _ = listener.accept()
-        connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        client = _Client(connection, pendant)
+        client = _Client(accept(listener), pendant=pendant)
         if not pendant and self._client is not None:
             self._read(self._client)  # it may have hung up just before
         present = self._client
@@ -151,15 +139,15 @@ class Server:
             present.dead = True
             self.controller.lose_client()
         if not pendant and self._client is not None:
-            client.send(_error(None, "taken", "another client is connected"))
-            connection.close()
+            client.tell(_error(None, "taken", "another client is connected"))
+            client.socket.close()
             return
         self._clients.append(client)
-        self._selector.register(connection, selectors.EVENT_READ, client)
+        self._selector.register(client.socket, selectors.EVENT_READ, client)
         if not pendant:
             self.controller.locked = True
             self.controller.hear()
-            client.send(
+            client.tell(
                 {
                     "is": "hello", "protocol": 1, "model": self.controller.model.name,
                     "serial": self.controller.serial, "software": "Sunrise.OS simulated",
@@ -168,20 +156,14 @@ class Server:
             )  # fmt: skip
 
     def _read(self, client: _Client) -> None:
-        try:
-            data = client.socket.recv(65536)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
+        data = client.read()
         if not data:
-            client.dead = True
             return
         *lines, rest = (client.rest + data).split(b"\n")
         client.rest = rest[-LONGEST_LINE:]
         for raw in lines:
             if client.pendant:
-                client.send(self._pendant(raw.decode("utf-8", "replace").split()))
+                client.tell(self._pendant(raw.decode("utf-8", "replace").split()))
             else:
                 self._line(client, raw)
 
@@ -195,14 +177,14 @@ class Server:
         except (ValueError, RecursionError):
             parsed = None
         if not isinstance(parsed, dict):
-            client.send(_error(None, "bad_line", "the line is not a JSON object"))
+            client.tell(_error(None, "bad_line", "the line is not a JSON object"))
             return
         line = cast("dict[str, object]", parsed)
         if line.get("do") == "beat":
             return
         sequence = line.get("seq")
         if isinstance(sequence, bool) or not isinstance(sequence, int):
-            client.send(_error(None, "bad_line", "seq is not an integer"))
+            client.tell(_error(None, "bad_line", "seq is not an integer"))
             return
         fault = controller.faults.check(controller.device, str(line.get("do"))) if line.get("do") != "move" else None
         if fault is not None and fault.kind in ("drop", "stall"):
@@ -211,9 +193,9 @@ class Server:
         try:
             answer = self._do(line)
         except RefusedError as error:
-            client.send(_error(sequence, error.code, str(error)))
+            client.tell(_error(sequence, error.code, str(error)))
         else:
-            client.send({"is": "ack", "seq": sequence, **answer})
+            client.tell({"is": "ack", "seq": sequence, **answer})
 
     def _do(self, line: dict[str, object]) -> dict[str, object]:
         controller = self.controller

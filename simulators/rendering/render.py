@@ -182,7 +182,7 @@ def _amplification(settings: Mapping[str, float]) -> float:
 
 
 def _with_border(lens: Intrinsics) -> Intrinsics:
-    """The same lens on all exposed photosites, of which the picture is a part."""
+    """The intrinsics of all exposed photosites, of which the picture is a part."""
     b = EXPOSED
     width, height = lens.width + b.left + b.right, lens.height + b.top + b.bottom
     return replace(lens, width=width, height=height, cx=lens.cx + b.left, cy=lens.cy + b.top)

@@ -62,7 +62,7 @@ class LbrErrors:
 class Lbr:
     """An LBR Med 14 or LBR iiwa 14.
 
-    Its repeatability, ±0.15 mm by ISO 9283, is the mean distance and three standard deviations of it: 2.1 times the
+    Its repeatability, ±0.15 mm by ISO 9283, is the mean distance plus three of its standard deviations: 2.1 times the
     rms distance.
     """
 

@@ -8,6 +8,7 @@ import struct
 import time
 from typing import TYPE_CHECKING
 
+from simulators.connection import Connection
 from simulators.serve import SimulatorError
 from simulators.ur_controller import rtde_codec as codec
 from simulators.ur_controller.dashboard import WELCOME, Dashboard
@@ -24,30 +25,17 @@ LONGEST_LINE = 1 << 16
 EARLY_S = 0.0005  # a data package is sent in a cycle that begins this much before it is due
 
 
-class Link:
-    """An accepted connection with its unsent bytes."""
+class Link(Connection):
+    """A connection that a fault can silence."""
 
-    def __init__(self, connection: socket.socket) -> None:
-        self.socket = connection
-        self.out = bytearray()
-        self.dead = False
+    def __init__(self, accepted: socket.socket) -> None:
+        super().__init__(accepted)
         self.muted_until_s = 0.0
 
     def send(self, data: bytes) -> None:
-        """Send now, or later when the peer reads again."""
+        """Send now, or later when the peer reads again; nothing while silenced."""
         if not self.dead and time.monotonic() >= self.muted_until_s:
-            self.out += data
-            self.flush()
-
-    def flush(self) -> None:
-        """Send the queued bytes, as far as the peer reads."""
-        try:
-            while self.out:
-                del self.out[: self.socket.send(self.out)]
-        except BlockingIOError:
-            return
-        except OSError:
-            self.dead = True
+            super().send(data)
 
     def receive(self, data: bytes) -> None:
         """Handle bytes from the peer."""

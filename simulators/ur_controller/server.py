@@ -9,6 +9,7 @@ import socket
 import time
 from collections.abc import Callable
 
+from simulators.connection import accept
 from simulators.serve import SimulatorError, Termination, listening
 from simulators.ur_controller import fields
 from simulators.ur_controller.controller import Controller
@@ -137,26 +138,16 @@ class Server:
         return bool(ready)
 
     def _accept(self, listener: socket.socket, make: Callable[[socket.socket], Link]) -> None:
-        connection, _ = listener.accept()
-        connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        link = make(connection)
+        link = make(accept(listener))
         self._links.append(link)
-        self._selector.register(connection, selectors.EVENT_READ, link)
+        self._selector.register(link.socket, selectors.EVENT_READ, link)
         if isinstance(link, RtdeLink):
             self.faulty(link, "rtde_connect")
 
     def _read(self, link: Link) -> None:
-        try:
-            data = link.socket.recv(65536)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
+        data = link.read()
         if data:
             link.receive(data)
-        else:
-            link.dead = True
 
     def _drop(self, link: Link) -> None:
         self._selector.unregister(link.socket)

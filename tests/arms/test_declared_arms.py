@@ -15,7 +15,13 @@ from hypothesis import strategies as st
 from service.compute.arm.inverse_kinematics import postures, postures_near
 from service.compute.arm.kinematics import chain, dh_jacobian, forward
 from service.compute.planning.collision import Capsule, link_segments, nearest_contacts
-from service.compute.planning.motion_plan import PATH_STEP_RAD, Situation, able_postures, best_posture, plan_motion
+from service.compute.planning.motion_plan import (
+    PATH_STEP_RAD,
+    PlanningScene,
+    able_postures,
+    best_posture,
+    plan_motion,
+)
 from service.core.arms.known import arm_model, known_arms
 from service.core.arms.model import ArmModel
 from service.core.errors import ConfigurationError
@@ -40,9 +46,9 @@ EVERY = pytest.mark.parametrize("arm", known_arms(), ids=lambda arm: arm.name)
 
 
 @pytest.fixture(scope="module")
-def situation() -> Situation:
+def planning_scene() -> PlanningScene:
     start = usual_posture(LBR, LAYOUT, MOUNT)
-    return ArmAtStation(LAYOUT, LBR, MOUNT, CollisionSection(), None, Motion()).situation(start)
+    return ArmAtStation(LAYOUT, LBR, MOUNT, CollisionSection(), None, Motion()).scene(start)
 
 
 def drawn(arm: ArmModel, seed: int) -> Array:
@@ -70,9 +76,9 @@ def test_what_is_declared_of_an_arm_fits_together(arm: ArmModel) -> None:
 @EVERY
 def test_the_links_follow_one_another_from_the_base_to_the_flange(arm: ArmModel) -> None:
     """No gap between neighbouring capsules, wherever the joints are: nothing of the arm is left out."""
-    situation = ArmAtStation(LAYOUT, arm, MOUNT, CollisionSection(), None, Motion()).situation(arm.usual_rad)
+    planning_scene = ArmAtStation(LAYOUT, arm, MOUNT, CollisionSection(), None, Motion()).scene(arm.usual_rad)
     joints = np.stack([drawn(arm, seed) for seed in range(8)])
-    starts, ends, radii = link_segments(situation.body, joints)
+    starts, ends, radii = link_segments(planning_scene.body, joints)
     flange = forward(arm, joints)[:, :3, 3]
     for k in range(len(arm.links) - 1):
         gap = np.linalg.norm(starts[:, k + 1] - ends[:, k], axis=1)
@@ -108,31 +114,33 @@ def test_the_jacobian_of_the_geometry_is_the_derivative_of_the_pose(arm: ArmMode
 
 
 def test_seven_axes_take_every_viewpoint_of_the_papers_protocol_and_the_ways_between_are_free(
-    situation: Situation,
+    planning_scene: PlanningScene,
 ) -> None:
     protocol = load_protocol(PROTOCOL, params_models()).protocol
     params = protocol.step("viewpoint_capture_1").params_as(viewpoint_capture.Params)
     views = [(v.name, v.T_base_camera) for one in params.viewpoints for v in plan_viewpoints(one, LAYOUT)]
-    plan = plan_motion(views, situation, params.order)
+    plan = plan_motion(views, planning_scene, params.order)
     assert [view.outcome for view in plan.views] == ["feasible"] * 54
-    here = situation.start_rad
+    here = planning_scene.start_rad
     for view in plan.views:
         assert np.all(np.abs(view.joints_rad) <= LBR.limits_rad)
         count = int(np.ceil(np.abs(view.joints_rad - here).max() / PATH_STEP_RAD))
         way = here + np.linspace(0, 1, count + 1)[1:, None] * (view.joints_rad - here)
-        clearance_m = [contact.clearance_m for contact in nearest_contacts(situation.body, situation.obstacles, way)]
-        assert min(clearance_m) >= situation.margin_m, view.name
+        clearance_m = [
+            contact.clearance_m for contact in nearest_contacts(planning_scene.body, planning_scene.obstacles, way)
+        ]
+        assert min(clearance_m) >= planning_scene.margin_m, view.name
         here = view.joints_rad
 
 
-def test_the_elbow_gives_way_to_another_arm(situation: Situation) -> None:
+def test_the_elbow_gives_way_to_another_arm(planning_scene: PlanningScene) -> None:
     T = plan_viewpoints(_one(), LAYOUT)[2].T_base_camera
-    usual = best_posture(T, situation)
+    usual = best_posture(T, planning_scene)
     assert usual is not None
-    _, ends, _ = link_segments(situation.body, usual[None])
-    elbow = ends[0, situation.body.parts.index("upper arm")]
+    _, ends, _ = link_segments(planning_scene.body, usual[None])
+    elbow = ends[0, planning_scene.body.parts.index("upper arm")]
     post = Capsule(elbow, elbow + np.array([0.0, 0.0, 0.3]), 0.05)
-    beside = replace(situation, obstacles=replace(situation.obstacles, others=(("other arm", post),)))
+    beside = replace(planning_scene, obstacles=replace(planning_scene.obstacles, others=(("other arm", post),)))
     blocked = nearest_contacts(beside.body, beside.obstacles, usual[None])[0]
     assert str(blocked) == "the upper arm would touch the other arm"
     other = best_posture(T, beside)
@@ -142,9 +150,9 @@ def test_the_elbow_gives_way_to_another_arm(situation: Situation) -> None:
     assert nearest_contacts(beside.body, beside.obstacles, other[None])[0].clearance_m >= beside.margin_m
 
 
-def test_the_elbow_keeps_clear_of_the_table_and_of_the_limits_where_it_can(situation: Situation) -> None:
+def test_the_elbow_keeps_clear_of_the_table_and_of_the_limits_where_it_can(planning_scene: PlanningScene) -> None:
     for view in plan_viewpoints(_one(), LAYOUT):
-        every = list(able_postures(view.T_base_camera, situation))
+        every = list(able_postures(view.T_base_camera, planning_scene))
         assert len(every) > 3
         room = np.degrees((LBR.limits_rad - np.abs(np.array(every))).min(axis=1))
         # The first is not at the edge of what is possible.

@@ -14,7 +14,7 @@ from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
 from service.compute.camera_model import CameraModel
 from service.compute.poses.files.pose_covariance import blocks, similarity_covariance
-from service.compute.poses.hybrid.bundle import BundleState, Data, Sigmas, moved, normal_equations
+from service.compute.poses.hybrid.bundle import AdjustmentData, BundleState, Sigmas, moved, normal_equations
 from service.compute.poses.hybrid.rows import linearise
 from service.compute.poses.sfm.tracks import Tracks
 from service.core.errors import DataError
@@ -60,7 +60,7 @@ def test_hand_eye_states_what_another_calibration_of_the_camera_would_change() -
 
 def _adjusted(tracks: Tracks, poses: Array, camera: CameraModel) -> BundleState:
     """Poses and points that minimise the reprojection errors of the tracks, with the camera held fixed."""
-    state, data = BundleState(poses, tracks.points, np.empty((0, 4, 4)), camera), Data(tracks)
+    state, data = BundleState(poses, tracks.points, np.empty((0, 4, 4)), camera), AdjustmentData(tracks)
     for _ in range(25):
         normal = normal_equations([linearise(state, data, Sigmas())["tracks"]])
         state = moved(state, data, *normal.step(1e-7))

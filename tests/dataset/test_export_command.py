@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from service.audit.record.run import read_run
 from service.cli.main import app
-from service.compute.pixels.masks import Ball, marker_mask
+from service.compute.pixels.masks import WorldSphere, marker_mask
 from service.core.geometry import apply, increment, inverse
 from service.core.records.events import EvidenceExported, RunCompleted, RunReleased
 from service.core.units import metres
@@ -89,9 +89,9 @@ def test_the_masks_cover_the_spheres_that_the_photographs_show(recorded: Path) -
     for view in dataset.views:
         saturation = cv2.cvtColor(dataset.pixels.colours(view), cv2.COLOR_BGR2HSV)[..., 1].astype(np.float64)
         for centre in spheres:
-            mine = marker_mask(view.camera, view.T_world_camera, [Ball(np.array(centre), 0.9 * radius_m)])
-            around = marker_mask(view.camera, view.T_world_camera, [Ball(np.array(centre), 1.5 * radius_m)])
-            around &= ~marker_mask(view.camera, view.T_world_camera, [Ball(np.array(centre), 1.15 * radius_m)])
+            mine = marker_mask(view.camera, view.T_world_camera, [WorldSphere(np.array(centre), 0.9 * radius_m)])
+            around = marker_mask(view.camera, view.T_world_camera, [WorldSphere(np.array(centre), 1.5 * radius_m)])
+            around &= ~marker_mask(view.camera, view.T_world_camera, [WorldSphere(np.array(centre), 1.15 * radius_m)])
             if mine.sum() > 50 and around.sum() > 50:
                 contrast.append(abs(float(np.median(saturation[mine]) - np.median(saturation[around]))))
     assert len(contrast) > 10

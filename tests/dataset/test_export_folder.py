@@ -155,8 +155,8 @@ def test_an_unknown_format_is_refused_with_the_known_ones() -> None:
 @pytest.mark.parametrize("straight", [False, True])
 def test_crops_show_the_specimen_without_markers_and_keep_their_geometry(dataset: DataSet, straight: bool) -> None:
     whole = undistorted_data_set(dataset) if straight else dataset
-    balls = np.array([ball.centre_m for ball in scene().balls])
-    crops = cropped_data_set(whole, lambda v: hull_mask(v.camera, v.T_world_camera, balls), (64, 48))
+    spheres = np.array([sphere.centre_m for sphere in scene().spheres])
+    crops = cropped_data_set(whole, lambda v: hull_mask(v.camera, v.T_world_camera, spheres), (64, 48))
     assert {view.name for view in crops.views} == {f"{view.name}_crop0" for view in dataset.views}
     assert set(crops.splits.dense) == {view.name for view in crops.views}
     for view in crops.views:

@@ -22,7 +22,7 @@ from service.dataset.registrations import own_registration, registrations, signe
 from service.run_record import RunRecord
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.record.known_spheres import best_registration, scan_spheres
+from service.web.record.known_spheres import displayed_registration, scan_spheres
 from service.web.scene.data import scene_of
 from tests.support.recorded.unpacked_run import unpack_recorded_run
 
@@ -78,7 +78,7 @@ def test_every_reader_takes_the_registration_that_the_evaluation_judged_best(run
         judged = with_best(run, name)
         log, summary = page_of(judged, store), judged.summary()
         record = registrations(judged.protocol, judged.state)[name]
-        shown = best_registration(log)
+        shown = displayed_registration(log)
         assert shown is not None
         assert {shown.name, summary.best(), own_registration(judged.protocol, judged.state)} == {name}
         dataset = data_set_of(summary)

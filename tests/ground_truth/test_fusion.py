@@ -155,7 +155,7 @@ def test_what_only_the_scan_shows_is_kept_as_a_part_of_its_own() -> None:
 
 
 def test_surfaces_in_different_frames_are_refused() -> None:
-    with pytest.raises(ComputeError, match="nowhere agree"):
+    with pytest.raises(ComputeError, match="agree nowhere"):
         fuse(ct_mesh(), scan_mesh().moved(transform(np.eye(3), np.array([0.0, 0.0, 0.5]))), UP)
 
 

@@ -22,7 +22,7 @@ from service.core.protocol.models import parse_protocol
 from service.core.records.events import RegionDrawn
 from service.core.run.state import RunState
 from service.dataset.posed.of_run.about_run import about_run
-from service.dataset.preview.surfaces import Simplified, fused_mesh, shown_distances
+from service.dataset.preview.surfaces import SimplifiedMesh, fused_mesh, shown_distances
 from service.dataset.recorded_fusion import recorded_fusion
 from service.dataset.summary import summarise
 from service.steps import params_models
@@ -162,7 +162,7 @@ def test_the_screen_shows_sources_and_sigmas_and_the_recorded_distances(bench: B
     assert exported.source is not None
     assert np.array_equal(exported.source, columns["source"])
     assert exported.sigma_m == pytest.approx(1e-3 * columns["sigma_mm"], rel=1e-6)
-    mesh = Simplified(points, read_ply(bench.store.artefact_path(fusion.files["ground_truth_mesh"].sha256))[1])
+    mesh = SimplifiedMesh(points, read_ply(bench.store.artefact_path(fusion.files["ground_truth_mesh"].sha256))[1])
     truth, measures = fused_mesh(tmp_path, summary, fusion, mesh), state.steps["ground_truth"].measures
     assert (truth.ct_share, truth.sigma_median_mm) == (measures["ct_share"], measures["sigma_median_mm"])
     assert truth.ct_share + truth.scan_share + truth.blend_share == pytest.approx(1)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.pixels.crops import ImageCrop, marker_free_crops
-from service.compute.pixels.masks import Ball, Post, marker_mask, posts_below
+from service.compute.pixels.masks import Cylinder, WorldSphere, marker_mask, posts_below
 from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.rays import pixel_rays
 from service.compute.pixels.render import depth_map, seen
@@ -72,17 +72,17 @@ def covered(camera: CameraModel, mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
 def test_the_mask_of_a_sphere_holds_every_pixel_that_shows_it_and_hardly_more(
     camera: CameraModel, centre: tuple[float, float, float]
 ) -> None:
-    ball = Ball(np.array(centre), 0.03)
-    mesh = trimesh.creation.icosphere(subdivisions=4, radius=ball.radius_m)
-    mesh.apply_translation(ball.centre_m)
-    mask, truth = marker_mask(camera, T, [ball]), covered(camera, mesh)
+    sphere = WorldSphere(np.array(centre), 0.03)
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=sphere.radius_m)
+    mesh.apply_translation(sphere.centre_m)
+    mask, truth = marker_mask(camera, T, [sphere]), covered(camera, mesh)
     assert truth.any()
     assert mask[truth].all()
     assert np.count_nonzero(mask & ~truth) < 2.2 * np.sqrt(4 * np.pi * np.count_nonzero(truth)) + 12
 
 
 def test_the_mask_of_a_post_holds_every_pixel_that_shows_it_and_hardly_more() -> None:
-    (post,) = posts_below([Ball(np.array([0.03, 0.02, 0.1]), 0.015)], UP, 0.1, 0.008)
+    (post,) = posts_below([WorldSphere(np.array([0.03, 0.02, 0.1]), 0.015)], UP, 0.1, 0.008)
     mesh = trimesh.creation.cylinder(post.radius_m, segment=[post.top_m, post.foot_m], sections=64)
     mask, truth = marker_mask(CAMERA, T, [], [post]), covered(CAMERA, mesh)
     assert mask[truth].all()
@@ -92,12 +92,12 @@ def test_the_mask_of_a_post_holds_every_pixel_that_shows_it_and_hardly_more() ->
 def test_what_is_behind_the_camera_or_beside_the_image_is_in_no_mask() -> None:
     behind = T[:3, 3] - 0.3 * T[:3, 2]
     beside = T[:3, 3] + 0.3 * T[:3, 2] + 2.0 * T[:3, 0]
-    posts = [Post(place, place - 0.1 * UP, 0.01) for place in (behind, beside)]
-    assert not marker_mask(CAMERA, T, [Ball(behind, 0.02), Ball(beside, 0.02)], posts).any()
+    posts = [Cylinder(place, place - 0.1 * UP, 0.01) for place in (behind, beside)]
+    assert not marker_mask(CAMERA, T, [WorldSphere(behind, 0.02), WorldSphere(beside, 0.02)], posts).any()
 
 
 def test_a_sphere_that_fills_the_image_is_all_of_it() -> None:
-    assert marker_mask(CAMERA, T, [Ball(T[:3, 3] + 0.2 * T[:3, 2], 0.19)]).all()
+    assert marker_mask(CAMERA, T, [WorldSphere(T[:3, 3] + 0.2 * T[:3, 2], 0.19)]).all()
 
 
 # --- crops ------------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from service.steps.poses.time_left import missing_results
 from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.record.known_spheres import best_registration as shown_registration
+from service.web.record.known_spheres import displayed_registration
 from tests.support.record.store import enqueue
 from tests.support.recorded.registration_record import registration_record
 from tests.support.runs.computing_run import compute_jobs
@@ -264,7 +264,7 @@ def test_page_report_and_export_show_the_same_registration(tmp_path: Path) -> No
     steps["evaluation"] = replace(steps["evaluation"], result={"table": rows, "budgets": {}})
     judged = replace(run.state, steps=steps)
     with Store.open(tmp_path) as store:
-        shown = [shown_registration(RunRecord(store, "a", run.protocol, (), state)) for state in (begun, judged)]
+        shown = [displayed_registration(RunRecord(store, "a", run.protocol, (), state)) for state in (begun, judged)]
         root = cast(RunStarted, None)
         reported = [RunSummary("a", run.protocol, root, state, (), store).best() for state in (begun, judged)]
     assert [None if one is None else one.name for one in shown] == ["colmap", "colmap_640x360"]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from service.compute.camera_covariance import CameraCovariance
 from service.compute.markers.observed_cones import ObservedCones
 from service.compute.poses.files.pose_covariance import similarity_covariance
-from service.compute.poses.hybrid.bundle import BundleState, Data, Sigmas, SphereSightings, moved, width
+from service.compute.poses.hybrid.bundle import AdjustmentData, BundleState, Sigmas, SphereSightings, moved, width
 from service.compute.poses.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses
 from service.compute.poses.hybrid.rows import linearise
 from service.compute.scene import PosedImages
@@ -212,7 +212,7 @@ def test_derivatives_of_every_component() -> None:
     made = tracked_scene(9, points=40, track_px=0.3)
     rng = np.random.default_rng(1)
     found = [(i, o) for i, outlines in enumerate(made.outlines) for o in outlines][:6]
-    data = Data(
+    data = AdjustmentData(
         tracks=made.tracks,
         sightings=SphereSightings(
             np.array([i for i, _ in found]),

@@ -17,7 +17,7 @@ from drivers.interfaces import CameraSettings
 from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm.inverse_kinematics import postures
 from service.compute.capture.live import LiveView, clipped_fraction, register_station, sharpness
-from service.compute.markers.search.predicted import NEAR, ImageOutlines, PredictedSpheres, find_spheres, tone_of
+from service.compute.markers.search.predicted import NEAR, ImageOutlines, PredictedSpheres, find_outlines, tone_of
 from service.compute.planning.coverage import (
     CoverageLimits,
 )
@@ -56,20 +56,20 @@ def pictures() -> tuple[Scene, list[Any]]:
 def test_prediction_finds_what_a_search_of_the_whole_image_finds(pictures: tuple[Scene, list[Any]]) -> None:
     made, images = pictures
     T_camera_scan = inverse(made.T_world_camera[0]) @ made.T_world_scan
-    whole = find_spheres(images[0], made.camera, None).outlines
+    whole = find_outlines(images[0], made.camera, None).outlines
 
     def near_to(off_m: Array) -> PredictedSpheres:
         return PredictedSpheres(
             transform(np.eye(3), off_m) @ T_camera_scan, SPHERES_M, RADIUS_M, NEAR, tone_of(whole)
         )
 
-    near = find_spheres(images[0], made.camera, near_to(np.full(3, 5e-4))).outlines
+    near = find_outlines(images[0], made.camera, near_to(np.full(3, 5e-4))).outlines
     assert len(near) >= len(whole) >= 6
     by_marker = {m: whole[o] for o, m in paired(whole, T_camera_scan, SPHERES_M, RADIUS_M, made.camera).items()}
     for o, m in paired(near, T_camera_scan, SPHERES_M, RADIUS_M, made.camera).items():
         if m in by_marker:
             assert np.allclose(near[o].centre_px, by_marker[m].centre_px, atol=0.2)
-    lost = find_spheres(images[0], made.camera, near_to(np.array([0.1, 0.0, 0.0]))).outlines
+    lost = find_outlines(images[0], made.camera, near_to(np.array([0.1, 0.0, 0.0]))).outlines
     assert len(lost) == len(whole), "a prediction that is wrong is noticed, and the whole image searched"
     quality = sharpness(images[0], near, made.camera)
     blurred = sharpness(cv2.GaussianBlur(images[0], (0, 0), 2.5), near, made.camera)
@@ -93,7 +93,7 @@ def test_images_register_one_after_the_other(pictures: tuple[Scene, list[Any]]) 
         if known is not None:
             shown = tone_of([o for view in views for o in view.outlines])
             expected = PredictedSpheres(inverse(made.T_world_camera[i]) @ known, SPHERES_M, RADIUS_M, NEAR, shown)
-        outlines = find_spheres(image, made.camera, expected).outlines
+        outlines = find_outlines(image, made.camera, expected).outlines
         views.append(LiveView(f"v{i}", made.T_world_camera[i], outlines))
         known = register_station(views, SPHERES_M, RADIUS_M, made.camera, known).T_base_scan
         error = np.linalg.norm(apply(known, CENTRE_M) - apply(made.T_world_scan, CENTRE_M))
@@ -280,7 +280,7 @@ def measured_run(
         compute_jobs(bench.store)
 
     monkeypatch.setitem(HANDLERS, "live_view", look)
-    monkeypatch.setattr("service.worker.capture.live_view.find_spheres", exactly)
+    monkeypatch.setattr("service.worker.capture.live_view.find_outlines", exactly)
     bench.operator.on_show = serve
     return bench
 

@@ -23,7 +23,7 @@ from service.compute.planning.capsules import segment_box_distance_m, segment_di
 from service.compute.planning.collision import Capsule, nearest_contacts
 from service.compute.planning.motion_plan import (
     MotionPlan,
-    Situation,
+    PlanningScene,
     best_posture,
     best_postures,
     infeasible_reason,
@@ -52,9 +52,9 @@ vectors = arrays(np.float64, 3, elements=st.floats(-1, 1, width=32))
 
 
 @pytest.fixture(scope="module")
-def situation() -> Situation:
+def scene() -> PlanningScene:
     start = usual_posture(ARM, LAYOUT, T_FLANGE_CAMERA)
-    return ArmAtStation(LAYOUT, ARM, T_FLANGE_CAMERA, CollisionSection(), None, Motion()).situation(start)
+    return ArmAtStation(LAYOUT, ARM, T_FLANGE_CAMERA, CollisionSection(), None, Motion()).scene(start)
 
 
 def camera_at(eye: tuple[float, float, float]) -> Transform:
@@ -63,8 +63,8 @@ def camera_at(eye: tuple[float, float, float]) -> Transform:
     return look_at(centre + np.array(eye), centre, -np.array(LAYOUT.approach))
 
 
-def planned(situation: Situation, *poses: Transform) -> MotionPlan:
-    return plan_motion([(f"v{i}", T) for i, T in enumerate(poses)], situation, "as_listed")
+def planned(scene: PlanningScene, *poses: Transform) -> MotionPlan:
+    return plan_motion([(f"v{i}", T) for i, T in enumerate(poses)], scene, "as_listed")
 
 
 # --- distances ------------------------------------------------------------------------------------------------
@@ -125,7 +125,7 @@ def test_the_nearest_posture_turns_no_joint_by_a_needless_revolution() -> None:
 # --- feasibility ---------------------------------------------------------------------------------------------------
 
 
-def test_every_viewpoint_of_the_papers_protocol_is_within_reach_and_touches_nothing(situation: Situation) -> None:
+def test_every_viewpoint_of_the_papers_protocol_is_within_reach_and_touches_nothing(scene: PlanningScene) -> None:
     protocol = load_protocol(PROTOCOL, params_models()).protocol
     count = 0
     for step in protocol.steps:
@@ -134,44 +134,44 @@ def test_every_viewpoint_of_the_papers_protocol_is_within_reach_and_touches_noth
         for one in step.params.viewpoints:
             for view in plan_viewpoints(one, LAYOUT):
                 target = view.T_base_camera @ inverse(T_FLANGE_CAMERA)
-                joints = nearest_posture(ARM, target, situation.start_rad)
-                assert infeasible_reason(view.T_base_camera, joints, situation) == "", view.name
+                joints = nearest_posture(ARM, target, scene.start_rad)
+                assert infeasible_reason(view.T_base_camera, joints, scene) == "", view.name
                 count += 1
     assert count == 124
 
 
-def test_the_way_between_the_papers_viewpoints_is_free_and_shorter_than_as_listed(situation: Situation) -> None:
+def test_the_way_between_the_papers_viewpoints_is_free_and_shorter_than_as_listed(scene: PlanningScene) -> None:
     protocol = load_protocol(PROTOCOL, params_models()).protocol
     params = protocol.step("viewpoint_capture_1").params_as(viewpoint_capture.Params)
     views = [(v.name, v.T_base_camera) for one in params.viewpoints for v in plan_viewpoints(one, LAYOUT)]
-    plan = plan_motion(views, situation, params.order)
+    plan = plan_motion(views, scene, params.order)
     assert {view.name for view in plan.feasible} == {name for name, _ in views}
     assert plan.total_s < plan.listed_s
-    few, again = (plan_motion(views[::6], situation, params.order) for _ in range(2))
+    few, again = (plan_motion(views[::6], scene, params.order) for _ in range(2))
     assert [v.name for v in again.views] == [v.name for v in few.views]
 
 
-def test_a_viewpoint_through_the_table_is_refused_and_says_so(situation: Situation) -> None:
-    plan = planned(situation, camera_at((0.35, -0.3, -0.02)), camera_at((0.0, 0.0, 0.62)))
+def test_a_viewpoint_through_the_table_is_refused_and_says_so(scene: PlanningScene) -> None:
+    plan = planned(scene, camera_at((0.35, -0.3, -0.02)), camera_at((0.0, 0.0, 0.62)))
     assert [v.outcome for v in plan.views] == ["feasible", "refused"]
     assert "table" in plan.refused[0].reason or "specimen" in plan.refused[0].reason
 
 
-def test_a_viewpoint_in_the_specimen_is_refused_and_says_so(situation: Situation) -> None:
-    reason = planned(situation, camera_at((0.0, 0.01, 0.14))).refused[0].reason
+def test_a_viewpoint_in_the_specimen_is_refused_and_says_so(scene: PlanningScene) -> None:
+    reason = planned(scene, camera_at((0.0, 0.01, 0.14))).refused[0].reason
     assert "camera would touch the specimen" in reason
 
 
-def test_a_viewpoint_out_of_reach_is_refused_and_says_so(situation: Situation) -> None:
-    assert planned(situation, camera_at((0.0, 1.2, 0.9))).refused[0].reason == "the arm does not reach it"
+def test_a_viewpoint_out_of_reach_is_refused_and_says_so(scene: PlanningScene) -> None:
+    assert planned(scene, camera_at((0.0, 1.2, 0.9))).refused[0].reason == "the arm does not reach it"
 
 
-def test_a_viewpoint_blocked_by_a_sphere_is_carried_along_its_arc(situation: Situation) -> None:
+def test_a_viewpoint_blocked_by_a_sphere_is_carried_along_its_arc(scene: PlanningScene) -> None:
     T = camera_at((0.25, -0.3, 0.5))
     at_lens = T[:3, 3] + 0.1 * T[:3, 2]
     post = Capsule(at_lens, at_lens - np.array([0.0, 0.0, 0.05]), 0.01)
-    blocked = replace(situation, obstacles=replace(situation.obstacles, spheres=(post,)))
-    assert planned(situation, T).views[0].outcome == "feasible"
+    blocked = replace(scene, obstacles=replace(scene.obstacles, spheres=(post,)))
+    assert planned(scene, T).views[0].outcome == "feasible"
     (view,) = planned(blocked, T).views
     assert view.outcome == "nudged"
     assert "spheres" in view.reason
@@ -180,9 +180,9 @@ def test_a_viewpoint_blocked_by_a_sphere_is_carried_along_its_arc(situation: Sit
     assert nearest_contacts(blocked.body, blocked.obstacles, view.joints_rad[None])[0].clearance_m >= 0.01
 
 
-def test_a_viewpoint_with_the_scene_out_of_focus_is_refused_and_says_so(situation: Situation) -> None:
-    sharp = replace(situation, sharp=depth_of_field(0.05, 22, 0.6, 45e-6))
-    assert planned(situation, camera_at((0.0, -0.1, 0.82))).views[0].outcome == "feasible"
+def test_a_viewpoint_with_the_scene_out_of_focus_is_refused_and_says_so(scene: PlanningScene) -> None:
+    sharp = replace(scene, sharp=depth_of_field(0.05, 22, 0.6, 45e-6))
+    assert planned(scene, camera_at((0.0, -0.1, 0.82))).views[0].outcome == "feasible"
     assert planned(sharp, camera_at((0.0, 0.0, 0.62))).views[0].outcome == "feasible"
     assert "the sharp range is" in planned(sharp, camera_at((0.0, -0.1, 0.82))).refused[0].reason
 
@@ -204,7 +204,7 @@ def test_depth_of_field_is_bounded_by_equal_circles_of_confusion() -> None:
 def test_the_shortest_order_is_a_permutation_and_never_longer_than_the_list(joints: Array) -> None:
     start = usual_posture(ARM, LAYOUT, T_FLANGE_CAMERA)
     times = travel_times_s(
-        joints, ArmAtStation(LAYOUT, ARM, T_FLANGE_CAMERA, CollisionSection(), None, Motion()).situation(start)
+        joints, ArmAtStation(LAYOUT, ARM, T_FLANGE_CAMERA, CollisionSection(), None, Motion()).scene(start)
     )
     order = shortest_order(times)
 
@@ -306,17 +306,17 @@ def test_a_step_without_a_board_has_no_board_poses(tmp_path: Path) -> None:
     assert preview_board_poses(protocol, protocol.step("fixation"), rig, partial(layout_of, rig)) is None
 
 
-def test_poses_that_are_checked_together_get_the_postures_of_each_alone(situation: Situation) -> None:
+def test_poses_that_are_checked_together_get_the_postures_of_each_alone(scene: PlanningScene) -> None:
     draw = np.random.default_rng(4)
     poses = [camera_at((x, y, z)) for x, y, z in draw.uniform([-0.5, -0.7, -0.05], [0.5, 0.6, 0.8], (40, 3))]
-    alone = [best_posture(T, situation) for T in poses]
+    alone = [best_posture(T, scene) for T in poses]
     assert 0 < sum(joints is None for joints in alone) < len(poses)
-    for joints, together in zip(alone, best_postures(poses, situation), strict=True):
+    for joints, together in zip(alone, best_postures(poses, scene), strict=True):
         if joints is None or together is None:
             assert joints is together
         else:
             assert np.array_equal(joints, together)
-    assert best_postures([camera_at((0.0, 1.2, 0.9))], situation) == [None], "out of reach"
+    assert best_postures([camera_at((0.0, 1.2, 0.9))], scene) == [None], "out of reach"
 
 
 def two_opt_pair_by_pair(path: list[int], times: Array) -> list[int]:
@@ -352,12 +352,14 @@ def test_many_stretches_compared_at_once_give_the_order_of_one_by_one(digits: in
 
 
 @pytest.mark.slow
-def test_a_plan_in_the_listed_order_does_not_compare_every_viewpoint_with_every_other(situation: Situation) -> None:
+def test_a_plan_in_the_listed_order_does_not_compare_every_viewpoint_with_every_other(
+    scene: PlanningScene,
+) -> None:
     poses = [camera_at((0.001 * number, -0.1, 0.62)) for number in range(400)]
-    planned(situation, *poses[:2])  # loads once what must not be counted
+    planned(scene, *poses[:2])  # loads once what must not be counted
     tracemalloc.start()
     try:
-        plan = planned(situation, *poses)
+        plan = planned(scene, *poses)
         _, most_bytes = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

@@ -17,7 +17,7 @@ from sqlalchemy import text
 from bench.soak.__main__ import main
 from bench.soak.captures import figures_of
 from bench.soak.creep import DATABASE_DESCRIPTORS, JUDGED_S, Sample, judge
-from bench.soak.fit import Took, exponent, growth
+from bench.soak.fit import Duration, exponent, growth
 from bench.soak.large import judge as judge_large
 from service.store.store import Store
 
@@ -153,8 +153,8 @@ def test_what_grows_with_the_square_is_a_fault_and_so_is_a_slow_page() -> None:
     assert exponent(sizes, [1, 4, 16, 64]) == pytest.approx(2)
 
     def found(**seconds: float) -> list[str]:
-        at = {n: {name: Took(s * n / 10_000, s * n / 10_000) for name, s in seconds.items()} for n in sizes}
-        at |= {n: at[n] | {"status": Took(1, (n / 10_000) ** 2)} for n in sizes}
+        at = {n: {name: Duration(s * n / 10_000, s * n / 10_000) for name, s in seconds.items()} for n in sizes}
+        at |= {n: at[n] | {"status": Duration(1, (n / 10_000) ** 2)} for n in sizes}
         return [fault for row in judge_large(at) for fault in row["faults"]]
 
     assert found() == ["status grows with the power 2.00 of the viewpoints"]

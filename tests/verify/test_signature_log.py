@@ -169,7 +169,7 @@ def test_a_database_put_back_as_it_was_shows(data: Path, tmp_path: Path) -> None
     for left in data.glob("orthocapture.sqlite*"):
         left.unlink()
     shutil.copy(copy, database_path(data))
-    assert any("is no longer here: what it signed was taken away" in fault for fault in faults(data))
+    assert any("is no longer here: what it signed was removed" in fault for fault in faults(data))
 
 
 def test_the_log_follows_the_key(data: Path) -> None:

@@ -129,7 +129,7 @@ ALTERED = {
         "UPDATE invitations SET used = 0 WHERE account = 'grace'",
         "a link for the account grace is valid; the events say otherwise",
     ),
-    "a time stamp taken away": ("DELETE FROM timestamps", "was taken away"),
+    "a time stamp removed": ("DELETE FROM timestamps", "was removed"),
     "when a time stamp was asked for": ("UPDATE timestamps SET at_utc = 'x'", "it is not the one that was given"),
     "a time stamp that nobody gave": (
         "INSERT INTO timestamps SELECT run_id, seq, 'http://eve', at_utc, token FROM timestamps",

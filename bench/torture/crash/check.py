@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bench.torture.crash.confirmed import confirmed
 from bench.torture.crash.mortal import read_journal
 from bench.torture.crash.run import Place, Role
 from bench.torture.crash.scene import import_list, planned
-from service.core.records.events import Event, JobFinished, OperatorAction, RecordedView, SessionStarted, StepMeasured
+from service.core.protocol.models import Protocol
+from service.core.records.events import Event, JobFinished, RecordedView, StepMeasured
 from service.run_record import read_log
 from service.run_start import recorded_run
 from service.store.database.engine import database_path
@@ -107,7 +109,7 @@ def at_the_end(place: Place, expected: Outcome | None) -> tuple[list[str], int]:
                 found.append("the results are not those of the undisturbed run")
             if mine.jobs != expected.jobs:
                 found.append(f"jobs were finished {mine.jobs} times, undisturbed {expected.jobs}")
-        found += _surprises(place.motions, log.events, {s.id for s in protocol.steps if s.moves_robot})
+        found += _surprises(place.motions, log.events, protocol)
         report = verify(place.data, signatures_copy=place.signature_copy)
         found += [str(fault) for fault in report.faults]
         found += [f"{count} events of {run} are not signed" for run, count in report.unsigned_events.items() if count]
@@ -136,21 +138,13 @@ def _once(events: Sequence[Event], names: Sequence[str]) -> list[str]:
     return [f"{name} is in the record {count} times" for name, count in sorted(wrong.items())]
 
 
-def _surprises(motions: Path, events: Sequence[Event], moving: set[str]) -> list[str]:
+def _surprises(motions: Path, events: Sequence[Event], protocol: Protocol) -> list[str]:
     """Motions without a person's confirmation since the start of the program that made them."""
     if not motions.exists():
         return ["the arm never moved"]
-    found: list[str] = []
-    for line in motions.read_text().splitlines():
-        moment = float(line)
-        leave = False
-        for event in events:
-            if event.monotonic_s > moment:
-                break
-            if isinstance(event.payload, SessionStarted):
-                leave = False
-            elif isinstance(event.payload, OperatorAction) and event.payload.action == "confirm":
-                leave = leave or (event.payload.step in moving and not event.payload.automatic)
-        if not leave:
-            found.append(f"the arm moved at {moment:.3f} s without a confirmation")
-    return found
+    moments = map(float, motions.read_text().splitlines())
+    return [
+        f"the arm moved at {moment:.3f} s without a confirmation"
+        for moment in moments
+        if not confirmed(events, protocol, moment)
+    ]

@@ -23,6 +23,7 @@ import numpy as np
 import psutil
 import yaml
 
+from bench.torture.crash.confirmed import confirmed
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.events import Event, OperatorAction, SessionStarted, ViewpointCaptured
 from service.core.run.actions import refuse
@@ -233,7 +234,7 @@ class _Run:
             self.faults.append(f"viewpoints were recorded {dict(taken)} times")
         self.faults += [str(fault) for fault in verify(self.data).faults]
         for moment in starts:
-            if not _let(events, moment):
+            if not confirmed(events, protocol, moment):
                 self.faults.append(f"the arm began to move at {moment:.1f} s, which nobody had confirmed")
         remove_leftovers(store, actor="Grace", min_age_s=0)
         if leftovers(store, min_age_s=0) or not verify(self.data).ok:
@@ -270,19 +271,6 @@ def _driver(process: psutil.Process) -> str:
 def _session(events: Sequence[Event]) -> int:
     """The pid of the process that drives the run now, from its last session."""
     return next((e.payload.pid for e in reversed(events) if isinstance(e.payload, SessionStarted)), 0)
-
-
-def _let(events: Sequence[Event], moment: float) -> bool:
-    """Whether a person had confirmed by a moment (monotonic s), after the start of the program that drove the run."""
-    leave = False
-    for event in events:
-        if event.monotonic_s > moment:
-            break
-        if isinstance(event.payload, SessionStarted):
-            leave = False
-        elif isinstance(event.payload, OperatorAction) and event.payload.action == "confirm":
-            leave = not event.payload.automatic
-    return leave
 
 
 class _Eye:

@@ -250,7 +250,7 @@ def _film(trial: Trial) -> Film:
 
 
 def _pulled(trial: Trial, seconds: float | None) -> None:
-    """End the video, and let it begin anew after `seconds` if not None."""
+    """End the video, and start it again after `seconds`; None: never."""
     _film(trial).end()
 
     def back() -> None:

@@ -6,8 +6,8 @@ from drivers.kuka.fri.sample import FriSample
 from drivers.kuka.fri.wire import FriError, Session, decode, reply
 
 _COUNTERS = 1 << 32
-_LONGEST_GAP = 10_000  # messages; a larger step means that the controller began anew
-_SILENCE_S = 2.0  # after which another address may be the controller, and its counter may have begun anew
+_LONGEST_GAP = 10_000  # messages; a larger step means that the controller has restarted
+_SILENCE_S = 2.0  # after this, another address may be the controller, and its counter may have started again
 
 
 class Listener:

@@ -75,7 +75,7 @@ class FriPoses:
             self._process.wait()
 
     def await_first(self, timeout_s: float) -> None:
-        """Wait for the first message, or until it is clear that none comes; `problems` then tells."""
+        """Wait for the first message, or until it is clear that none comes; `problems` then says why."""
         deadline_s = time.monotonic() + timeout_s
         while self._last is None and time.monotonic() < deadline_s:
             time.sleep(0.01)

@@ -39,7 +39,7 @@ _NOT_OF_JOBS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Head:
+class ChainHead:
     """The last event of a chain."""
 
     seq: int
@@ -62,8 +62,8 @@ class BundledRun:
 
     run_id: str
     root: RunStarted
-    head: Head
-    site_head: Head
+    head: ChainHead
+    site_head: ChainHead
     events: Sequence[Event]
     state: RunState
     artefacts: Sequence[Artefact]
@@ -133,10 +133,10 @@ def _require_same(listed: ManifestEntry, sha256: str, path: Path) -> None:
         )
 
 
-def _head(connection: Connection, run_id: str) -> Head:
+def _head(connection: Connection, run_id: str) -> ChainHead:
     last = select(event_table.c.seq, event_table.c.sha256, event_table.c.at_utc).where(event_table.c.run_id == run_id)
     row = connection.execute(last.order_by(event_table.c.seq.desc()).limit(1)).one()
-    return Head(row.seq, row.sha256, row.at_utc)
+    return ChainHead(row.seq, row.sha256, row.at_utc)
 
 
 def _event_lines(connection: Connection, run_id: str) -> Iterator[bytes]:

@@ -91,7 +91,7 @@ def kept_request(target: Path) -> ExportRequest:
         return _REQUEST.validate_json(_path(target).read_bytes())
     except (OSError, ValidationError) as error:
         raise DataError(
-            "what was to be exported is not known any more", where=target.name, remedy="Begin the export anew"
+            "the record of what was to be exported is lost", where=target.name, remedy="Start the export again"
         ) from error
 
 

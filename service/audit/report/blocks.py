@@ -43,7 +43,7 @@ class Heading:
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
+class DescriptionList:
     """A list of names and values."""
 
     rows: tuple[tuple[str, TableCell | str], ...]
@@ -162,7 +162,7 @@ class SceneBlock:
     html: str = field(repr=False)
 
 
-Block = Paragraph | Heading | Facts | Table | Pictures | Drawings | SceneBlock
+Block = Paragraph | Heading | DescriptionList | Table | Pictures | Drawings | SceneBlock
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +184,7 @@ class Report:
     verification: TableCell
     result: TableCell
     deviations: TableCell
-    facts: Facts
+    facts: DescriptionList
     sections: tuple[Section, ...]
     run_id: str
     head_sha256: str

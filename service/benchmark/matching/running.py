@@ -33,7 +33,7 @@ class _Pair:
 
 
 @dataclass(frozen=True, slots=True)
-class WantedRun:
+class MatchingTask:
     """What is to be run.
 
     Attributes:
@@ -54,7 +54,7 @@ class WantedRun:
 _PAIRS = TypeAdapter(tuple[_Pair, ...])
 
 
-def run_matching(wanted: WantedRun, progress: Progress) -> list[MethodResult]:
+def run_matching(wanted: MatchingTask, progress: Progress) -> list[MethodResult]:
     """Run a method, and write METHOD.json, METHOD_CLASS.png, table.md and curves.png of all methods there.
 
     Returns:
@@ -122,7 +122,7 @@ def require_same_pairs(results: Sequence[MethodResult], folder: Path) -> None:
         )
 
 
-def _write_examples(wanted: WantedRun, match: Match, data: MatchingData, pairs: Sequence[Pair]) -> None:
+def _write_examples(wanted: MatchingTask, match: Match, data: MatchingData, pairs: Sequence[Pair]) -> None:
     """The middle pair of each class, with its matches."""
     views = LoadedViews(data)
     for name in CLASSES:

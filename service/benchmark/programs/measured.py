@@ -1,6 +1,6 @@
-"""Runs a command and says what it took, from a small process of its own.
+"""Runs a command and reports the time and memory that it took, from a small process of its own.
 
-Linux counts the memory of the process that starts a command as memory of the command. This one has next to none.
+Linux counts the memory of the process that starts a command as memory of the command. This one has hardly any.
 
 Run: python measured.py DESCRIPTOR COMMAND...; it needs nothing but the standard library.
 """

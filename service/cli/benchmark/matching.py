@@ -42,13 +42,13 @@ def matching_command(
     with reporting_errors(json), progress_bar(quiet=json) as progress:
         # These load the numerics, which take seconds.
         from service.benchmark.matching.result import record  # noqa: PLC0415
-        from service.benchmark.matching.running import WantedRun, run_matching  # noqa: PLC0415
+        from service.benchmark.matching.running import MatchingTask, run_matching  # noqa: PLC0415
         from service.benchmark.matching.table import HEADER, rows  # noqa: PLC0415
         from service.compute.matching.methods.method import matcher  # noqa: PLC0415
 
         how = matcher(method)
         require_writable_folder(out)
-        results = run_matching(WantedRun(dataset, how, weights, pairs_per_class, out), progress)
+        results = run_matching(MatchingTask(dataset, how, weights, pairs_per_class, out), progress)
         if json:
             own = next(result for result in results if result.method == how.name)
             print_json(record(own))

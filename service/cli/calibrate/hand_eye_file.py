@@ -49,7 +49,7 @@ class HandEyeFile(HandEye):
         return json.dumps(self.printed(), indent=1, allow_nan=False) + "\n"
 
     def printed(self) -> Any:
-        """The same as plain data, as `--json` prints it."""
+        """The content of the file as plain data, as `--json` prints it."""
         record = self.plain()
         return record if self.setup == "eye-in-hand" else _renamed(record)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json as json_module
 import shutil
 from collections import Counter
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,10 +69,7 @@ def import_ros_command(
     Writes T_base_flange of every image. Poses are interpolated only with --interpolate-ms.
     """
     with reporting_errors(json):
-        if bool(flange) == bool(pose_topic):
-            raise typer.BadParameter("give --flange, for poses in /tf, or --pose-topic")
-        if camera_frame and not flange:
-            raise typer.BadParameter("--camera-frame needs --flange: both are frames of /tf_static")
+        _require_one_source(flange, pose_topic, camera_frame)
         file = recording_file(recording)
         with _new_folder(out) as part:
             images: dict[str, dict[str, int]] = {}
@@ -106,14 +103,26 @@ def import_ros_command(
                 "left_out": left_out,
                 "not_read": found.other,
             }
-            text = json_module.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)
-            (part / "import.json").write_text(f"{text}\n", encoding="utf-8")
+            _write_record(part / "import.json", record)
         if json:
             print_json(record)
             return
         tell_left_out(left_out)
         console.print(escape(_words(poses)))
         console.print(f"written: {', '.join(written)} in {escape(str(out))}")
+
+
+def _require_one_source(flange: str, pose_topic: str, camera_frame: str) -> None:
+    """Raise BadParameter unless the options name one source of poses."""
+    if bool(flange) == bool(pose_topic):
+        raise typer.BadParameter("give --flange, for poses in /tf, or --pose-topic")
+    if camera_frame and not flange:
+        raise typer.BadParameter("--camera-frame needs --flange: both are frames of /tf_static")
+
+
+def _write_record(path: Path, record: Mapping[str, object]) -> None:
+    text = json_module.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)
+    path.write_text(f"{text}\n", encoding="utf-8")
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from drivers.meshes.mesh_file import MeshUnit, read_mesh_file
 from drivers.meshes.point_cloud import is_point_cloud, read_point_cloud
 from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors, require_writable
 from service.compute.surfaces.spheres.mesh_spheres import MeshSphere, SphereLimits, locate_spheres
-from service.compute.surfaces.spheres.other_radii import SeenRadius, seen_radius
+from service.compute.surfaces.spheres.other_radii import MeasuredRadius, seen_radius
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 from service.core.text.counts import counted
@@ -165,8 +165,8 @@ def spheres_of(
         raise _of_another_radius(error, seen, radius_m) from error
 
 
-def _of_another_radius(error: ComputeError, seen: SeenRadius, radius_m: float) -> ComputeError:
-    """The error, which names the radius of the spheres that are in the mesh."""
+def _of_another_radius(error: ComputeError, seen: MeasuredRadius, radius_m: float) -> ComputeError:
+    """The error for spheres of another radius, which it names."""
     count = len(seen.spheres)
     where = ", ".join("({:.1f}, {:.1f}, {:.1f})".format(*mm(s.centre_m)) for s in seen.spheres[:_NAMED])
     more = ", …" if count > _NAMED else ""

@@ -235,7 +235,7 @@ def _stated(views: Sequence[ImportedView], names: Sequence[str]) -> list[str]:
 
 def _show(listing: ImportList) -> None:
     table = Table(title=f"Found in {escape(listing.folder)}", title_justify="left")
-    for heading in ("what", "files", "camera and lens", "px", "taken, as the files say", "MB"):
+    for heading in ("what", "files", "camera and lens", "px", "taken, according to the files", "MB"):
         table.add_column(heading, justify="right" if heading in ("files", "MB") else "left")
     for role, words in _PARTS.items():
         if not listing.holds(role):

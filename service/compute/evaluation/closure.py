@@ -19,7 +19,7 @@ _OUTLIER_SIGMA = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class SeenSphere:
+class TriangulatedSphere:
     """A sphere located from images alone: centre (3,) and covariance (3, 3) in the scan frame, metres."""
 
     centre_m: Array
@@ -65,7 +65,7 @@ def locate_in_images(
     radius_m: float,
     *,
     least_images: int = 3,
-) -> dict[int, SeenSphere]:
+) -> dict[int, TriangulatedSphere]:
     """Centres of spheres from their outlines and the registered cameras, each sphere on its own.
 
     Weighted least squares of the cones' three parameters (`ObservedCones`); outlines more than 4 sigma from the
@@ -93,10 +93,10 @@ def locate_in_images(
 
 def _intersect(
     seen: Sequence[tuple[int, SphereOutline]], T_scan_camera: Array, start: Array, radius_m: float, least: int
-) -> SeenSphere:
+) -> TriangulatedSphere:
     """Intersect the viewing cones of one sphere by Gauss–Newton.
 
-    Inliers and the variance factor are chosen anew before each step, so there is no fixed cost that
+    Inliers and the variance factor are chosen again before each step, so there is no fixed cost that
     `service.compute.descent` could minimise, and the covariance is that of the last step's equations.
     """
     T = T_scan_camera[[i for i, _ in seen]]
@@ -119,7 +119,7 @@ def _intersect(
         centre = centre + step
         if float(np.linalg.norm(step)) < 1e-9:
             break
-    return SeenSphere(centre, factor * np.linalg.inv(information).astype(np.float64), int(keep.sum()))
+    return TriangulatedSphere(centre, factor * np.linalg.inv(information).astype(np.float64), int(keep.sum()))
 
 
 def compare_in_frame(a: Array, covariance_a: Array, b: Array, covariance_b: Array) -> Closure:

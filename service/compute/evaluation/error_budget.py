@@ -7,7 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from service.compute.evaluation.closure import Alignment, Closure, SeenSphere, compare_in_frame, compare_shapes
+from service.compute.evaluation.closure import (
+    Alignment,
+    Closure,
+    TriangulatedSphere,
+    compare_in_frame,
+    compare_shapes,
+)
 from service.core.geometry import Array
 
 CONTROL_SPHERES = "control spheres"
@@ -105,7 +111,7 @@ def contributions(
 
 
 def control_observation(
-    registration: Alignment, seen: Mapping[int, SeenSphere], control: MeasuredSpheres
+    registration: Alignment, seen: Mapping[int, TriangulatedSphere], control: MeasuredSpheres
 ) -> Observation:
     """Control spheres located in the images, compared with their positions by scan and registration.
 
@@ -131,7 +137,7 @@ def control_observation(
 
 
 def loop_observations(
-    seen: Mapping[int, SeenSphere], scan: MeasuredSpheres, ct_in_scan_order: MeasuredSpheres | None
+    seen: Mapping[int, TriangulatedSphere], scan: MeasuredSpheres, ct_in_scan_order: MeasuredSpheres | None
 ) -> tuple[Observation, ...]:
     """Closures camera ↔ scan, scan ↔ CT and camera ↔ CT: shapes of the spheres that each pair shares.
 

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
+from service.compute.images.decode import REDUCED, decode
 from service.core.errors import DataError
 from service.core.picture_files import check_jpeg, check_picture, picture_size
 
-_REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
+_REMEDY = "Copy the file from the camera again, and use JPEG or PNG images"
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -68,17 +69,7 @@ def _decode(path: Path, how: int) -> NDArray[np.uint8]:
         check_jpeg(data, str(path))
     else:
         check_picture(data, str(path))
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), how | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise DataError(
-            f"the image cannot be decoded: {error.err}", where=str(path), remedy="Copy the file from the camera again"
-        ) from error
-    if image is None:
-        raise DataError(
-            "the file is not an image that can be decoded", where=str(path), remedy="Use JPEG or PNG images"
-        )
-    return np.asarray(image, dtype=np.uint8)
+    return decode(data, how | cv2.IMREAD_IGNORE_ORIENTATION, name=str(path), remedy=_REMEDY)
 
 
 def read_image_of(path: Path, camera: CameraModel) -> NDArray[np.uint8]:
@@ -109,7 +100,7 @@ def read_reduced(path: Path, camera: CameraModel, least_width: int) -> tuple[NDA
     reduction = next((k for k in (8, 4, 2) if camera.width // k >= least_width), 1)
     if reduction == 1:
         return read_image_of(path, camera), camera
-    image = _decode(path, _REDUCED[reduction])
+    image = _decode(path, REDUCED[reduction])
     height, width = image.shape[:2]
     if abs(width - camera.width / reduction) >= 1 or abs(height - camera.height / reduction) >= 1:
         read_image_of(path, camera)  # raises with the size of the image as stored

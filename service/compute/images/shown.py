@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compute.images.decode import REDUCED, decode
 from service.core.errors import DataError
 from service.core.picture_files import check_picture, picture_size
 
-_REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
 _MOST_PIXELS = 250_000_000
 _REMEDY = "Download the recorded file and look at it; it is kept unchanged as evidence"
 
@@ -36,14 +36,8 @@ def decode_reduced(
             f"the picture has {stored_px} × {rows} pixels, which is too many to show", where=name, remedy=_REMEDY
         )
     check_picture(content, name, partly=True)
-    how = next((flag for k, flag in _REDUCED.items() if stored_px // k >= width_px), cv2.IMREAD_COLOR)
-    try:
-        data = np.frombuffer(content, np.uint8)
-        image = cv2.imdecode(data, how if upright else how | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise DataError("the picture cannot be decoded", where=name, remedy=_REMEDY) from error
-    if image is None:
-        raise DataError("the file is not a picture that can be decoded", where=name, remedy=_REMEDY)
+    how = next((flag for k, flag in REDUCED.items() if stored_px // k >= width_px), cv2.IMREAD_COLOR)
+    image = decode(content, how if upright else how | cv2.IMREAD_IGNORE_ORIENTATION, name=name, remedy=_REMEDY)
     height, width = image.shape[:2]
     if width > width_px:
         image = cv2.resize(image, (width_px, max(1, round(height * width_px / width))), interpolation=cv2.INTER_AREA)

@@ -96,7 +96,7 @@ def suggest_moves(
         chosen.append(Move(sphere, by, check_layout(placed, radius_m=radius_m).margin_m))
     if not chosen:
         raise ComputeError(
-            "no single sphere's move makes this layout better", remedy="Place the spheres anew, less regularly"
+            "no single sphere's move makes this layout better", remedy="Place the spheres again, less regularly"
         )
     return tuple(chosen)
 

@@ -27,7 +27,7 @@ def outline_record(outline: SphereOutline) -> dict[str, Any]:
 
 
 def outline_from_record(record: dict[str, Any], camera: CameraModel) -> SphereOutline:
-    """Rebuild an outline from `outline_record`'s data, with its points sampled anew on the same conic."""
+    """Rebuild an outline from `outline_record`'s data, with new sample points on the same conic."""
     values = {name: _value(record[name]) for name in _EVIDENCE}
     values["cone_covariance"] = np.array(record["cone_covariance"], dtype=np.float64)
     evidence = OutlineEvidence(**values)

@@ -21,7 +21,7 @@ _SHIFT = 4  # OpenCV's fixed point: 1/16 px
 
 
 @dataclass(frozen=True, slots=True)
-class Ball:
+class WorldSphere:
     """A sphere in the world frame."""
 
     centre_m: Array  # (3,)
@@ -29,7 +29,7 @@ class Ball:
 
 
 @dataclass(frozen=True, slots=True)
-class Post:
+class Cylinder:
     """A straight cylinder in the world frame, for example the post under a sphere."""
 
     top_m: Array  # (3,) on its axis
@@ -37,13 +37,13 @@ class Post:
     radius_m: float
 
 
-def posts_below(balls: Sequence[Ball], up: Array, length_m: float, radius_m: float) -> tuple[Post, ...]:
+def posts_below(spheres: Sequence[WorldSphere], up: Array, length_m: float, radius_m: float) -> tuple[Cylinder, ...]:
     """A post from the centre of each sphere downwards; `up` (3,) is a unit vector in the world frame."""
-    return tuple(Post(ball.centre_m, ball.centre_m - length_m * up, radius_m) for ball in balls)
+    return tuple(Cylinder(sphere.centre_m, sphere.centre_m - length_m * up, radius_m) for sphere in spheres)
 
 
 def marker_mask(
-    camera: CameraModel, T_world_camera: Transform, balls: Sequence[Ball], posts: Sequence[Post] = ()
+    camera: CameraModel, T_world_camera: Transform, spheres: Sequence[WorldSphere], posts: Sequence[Cylinder] = ()
 ) -> NDArray[np.bool_]:
     """(H, W) pixels that a sphere or post covers or touches, also where something else hides it.
 
@@ -55,10 +55,10 @@ def marker_mask(
     mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
     T_camera_world = inverse(T_world_camera)
     frustum = _frustum(pixel_rays(camera), camera)
-    for ball in balls:
-        centre = apply(T_camera_world, ball.centre_m)
-        if centre[2] > ball.radius_m:
-            _fill(mask, camera, frustum, _ball_outline(centre, ball.radius_m))
+    for sphere in spheres:
+        centre = apply(T_camera_world, sphere.centre_m)
+        if centre[2] > sphere.radius_m:
+            _fill(mask, camera, frustum, _sphere_outline(centre, sphere.radius_m))
     for post in posts:
         ends = apply(T_camera_world, np.stack([post.top_m, post.foot_m]))
         _fill(mask, camera, frustum, _post_outline(ends, post.radius_m))
@@ -88,7 +88,7 @@ def _hull(points: Array) -> Array:
     return np.concatenate([hull, np.ones((len(hull), 1))], axis=1)
 
 
-def _ball_outline(centre: Array, radius_m: float) -> Array:
+def _sphere_outline(centre: Array, radius_m: float) -> Array:
     cone = cone_of_sphere(centre, radius_m)
     azimuth = np.linspace(0.0, 2 * np.pi, _AROUND, endpoint=False)
     # The polygon is drawn around the circle, not within it.

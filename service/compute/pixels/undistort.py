@@ -1,4 +1,4 @@
-"""Undistorted images: a pinhole camera in the place of a distorted one, and the photograph resampled for it."""
+"""Undistorted images: a pinhole camera that replaces a distorted one, and the photograph resampled for it."""
 
 from __future__ import annotations
 

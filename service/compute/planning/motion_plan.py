@@ -25,12 +25,12 @@ _VIEWS_AT_ONCE = 16  # viewpoints that are checked together: one by one, most of
 _AT_ONCE = 24  # postures that are checked together: seven axes have hundreds for one pose
 _MOST_WAYS = 36  # postures to which a way is looked for if the straight one to the best posture is blocked
 _ROOM_M = 0.05  # clearance beyond which more is not better
-_ROOM_WEIGHT = 1.0  # rad²: what no clearance at all costs against turning the joints
+_ROOM_WEIGHT = 1.0  # rad²: cost of zero clearance, compared with squared joint travel
 
 
 @dataclass(frozen=True, slots=True)
-class Situation:
-    """Everything that a plan depends on, in the station's base frame."""
+class PlanningScene:
+    """Everything that a plan of motions depends on, in the station's base frame."""
 
     body: ArmBody
     obstacles: Obstacles
@@ -79,7 +79,7 @@ class MotionPlan:
 
 def plan_motion(
     views: Sequence[tuple[str, Transform]],
-    situation: Situation,
+    scene: PlanningScene,
     order: Order,
     progress: Progress = lambda _what, _done, _total: None,
 ) -> MotionPlan:
@@ -95,66 +95,66 @@ def plan_motion(
     for k in range(0, len(views), _VIEWS_AT_ONCE):
         progress("checking the viewpoints", k, len(views))
         some = views[k : k + _VIEWS_AT_ONCE]
-        best = best_postures([T for _, T in some], situation)
-        placed += [_place(name, T, joints, situation) for (name, T), joints in zip(some, best, strict=True)]
+        best = best_postures([T for _, T in some], scene)
+        placed += [_place(name, T, joints, scene) for (name, T), joints in zip(some, best, strict=True)]
     able = [view for view in placed if view.outcome != "refused"]
     refused = [view for view in placed if view.outcome == "refused"]
-    way = np.vstack([situation.start_rad, *(view.joints_rad for view in able)])
+    way = np.vstack([scene.start_rad, *(view.joints_rad for view in able)])
     sequence: Sequence[int] = range(len(able))
     if order == "shortest" and len(able) > 2:
         progress("finding a short way", 0, 0)
-        sequence = shortest_order(travel_times_s(way, situation), lambda: progress("finding a short way", 0, 0))
+        sequence = shortest_order(travel_times_s(way, scene), lambda: progress("finding a short way", 0, 0))
     kept: list[PlannedView] = []
-    here = situation.start_rad
+    here = scene.start_rad
     total = 0.0
     for number, i in enumerate(sequence):
         progress("checking the way between the viewpoints", number, len(able))
-        blocked = _blocked(here, able[i].joints_rad, situation)
-        free = _other_way(here, able[i], situation) if blocked else None
+        blocked = _blocked(here, able[i].joints_rad, scene)
+        free = _other_way(here, able[i], scene) if blocked else None
         if free is not None:
             able[i], blocked = replace(able[i], joints_rad=free), ""
         if blocked:
             refused.append(replace(able[i], outcome="refused", reason=f"on the way there {blocked}"))
             continue
-        travel_s = float(_legs_s(np.stack([here, able[i].joints_rad]), situation)[0])
+        travel_s = float(_legs_s(np.stack([here, able[i].joints_rad]), scene)[0])
         kept.append(replace(able[i], travel_s=travel_s))
-        total += travel_s + situation.pause_s
+        total += travel_s + scene.pause_s
         here = able[i].joints_rad
-    listed_s = float(_legs_s(way, situation).sum())
-    return MotionPlan((*kept, *refused), order, total, listed_s + situation.pause_s * len(able))
+    listed_s = float(_legs_s(way, scene).sum())
+    return MotionPlan((*kept, *refused), order, total, listed_s + scene.pause_s * len(able))
 
 
-def infeasible_reason(T_base_camera: Transform, joints_rad: Array | None, situation: Situation) -> str:
+def infeasible_reason(T_base_camera: Transform, joints_rad: Array | None, scene: PlanningScene) -> str:
     """Why a pose cannot be taken; "" if it can."""
     if joints_rad is None:
         return "the arm does not reach it"
-    contact = nearest_contacts(situation.body, situation.obstacles, joints_rad[None])[0]
-    return str(contact) if contact.clearance_m < situation.margin_m else _blurred(T_base_camera, situation)
+    contact = nearest_contacts(scene.body, scene.obstacles, joints_rad[None])[0]
+    return str(contact) if contact.clearance_m < scene.margin_m else _blurred(T_base_camera, scene)
 
 
-def _blurred(T_base_camera: Transform, situation: Situation) -> str:
-    if situation.sharp is not None and len(situation.must_be_sharp_m):
-        near, far = depths_m(T_base_camera, situation.must_be_sharp_m)
-        if near < situation.sharp.near_m or far > situation.sharp.far_m:
+def _blurred(T_base_camera: Transform, scene: PlanningScene) -> str:
+    if scene.sharp is not None and len(scene.must_be_sharp_m):
+        near, far = depths_m(T_base_camera, scene.must_be_sharp_m)
+        if near < scene.sharp.near_m or far > scene.sharp.far_m:
             return (
                 f"the scene lies {near:.2f} to {far:.2f} m from the camera, "
-                f"the sharp range is {situation.sharp.near_m:.2f} to {situation.sharp.far_m:.2f} m"
+                f"the sharp range is {scene.sharp.near_m:.2f} to {scene.sharp.far_m:.2f} m"
             )
     return ""
 
 
-def travel_times_s(joints_rad: Array, situation: Situation) -> Array:
+def travel_times_s(joints_rad: Array, scene: PlanningScene) -> Array:
     """(K, K) time between joint positions (K, N), by the joint that turns farthest: ramp up, constant, ramp down."""
     distance = np.zeros((len(joints_rad), len(joints_rad)))
     for turns in joints_rad.T:
         np.maximum(distance, np.abs(turns[:, None] - turns[None]), out=distance)
-    return turn_times_s(distance, situation.speed_rad_s, situation.acceleration_rad_s2)
+    return turn_times_s(distance, scene.speed_rad_s, scene.acceleration_rad_s2)
 
 
-def _legs_s(joints_rad: Array, situation: Situation) -> Array:
+def _legs_s(joints_rad: Array, scene: PlanningScene) -> Array:
     """(K - 1,) time from each of the joint positions (K, N) to the next."""
     turns = np.abs(np.diff(joints_rad, axis=0)).max(axis=1)
-    return turn_times_s(turns, situation.speed_rad_s, situation.acceleration_rad_s2)
+    return turn_times_s(turns, scene.speed_rad_s, scene.acceleration_rad_s2)
 
 
 def turn_times_s(turns_rad: Array, speed_rad_s: float, acceleration_rad_s2: float) -> Array:
@@ -212,15 +212,15 @@ def _length(path: Sequence[int], times_s: Array) -> float:
     return float(sum(times_s[a, b] for a, b in zip([0, *path], path)))  # noqa: B905 - the last has no successor
 
 
-def _place(name: str, T_base_camera: Transform, best: Array | None, situation: Situation) -> PlannedView:
+def _place(name: str, T_base_camera: Transform, best: Array | None, scene: PlanningScene) -> PlannedView:
     """The view with its best posture (N,); without one, turned until there is one, or refused."""
     if best is not None:
         return PlannedView(name, T_base_camera, "feasible", joints_rad=best)
-    nearest = next(iter(_postures(T_base_camera, situation)), None)
-    reason = infeasible_reason(T_base_camera, nearest, situation)
+    nearest = next(iter(_postures(T_base_camera, scene)), None)
+    reason = infeasible_reason(T_base_camera, nearest, scene)
     for nudge in _NUDGES_DEG:
-        turned = turned_about_scene(T_base_camera, situation.centre_m, float(np.radians(nudge)))
-        best = best_posture(turned, situation)
+        turned = turned_about_scene(T_base_camera, scene.centre_m, float(np.radians(nudge)))
+        best = best_posture(turned, scene)
         if best is not None:
             return PlannedView(name, turned, "nudged", reason, nudge, best)
     return PlannedView(name, T_base_camera, "refused", reason)
@@ -233,71 +233,71 @@ def turned_about_scene(T_base_camera: Transform, centre_m: Array, angle_rad: flo
     return transform(R, centre_m - R @ centre_m) @ T_base_camera
 
 
-def _postures(T_base_camera: Transform, situation: Situation) -> Array:
+def _postures(T_base_camera: Transform, scene: PlanningScene) -> Array:
     """Joints (K, N) that reach a pose, those nearest to the arm's current ones first."""
-    T_base_flange = T_base_camera @ inverse(situation.body.T_flange_camera)
-    return postures_near(situation.body.model, T_base_flange, situation.start_rad)
+    T_base_flange = T_base_camera @ inverse(scene.body.T_flange_camera)
+    return postures_near(scene.body.model, T_base_flange, scene.start_rad)
 
 
-def able_postures(T_base_camera: Transform, situation: Situation) -> Iterator[Array]:
+def able_postures(T_base_camera: Transform, scene: PlanningScene) -> Iterator[Array]:
     """Joints (N,) that reach a pose free of collisions and in focus, the best ones first.
 
     With six axes these are nearest to the arm's current ones. With seven, whose elbow is free, more clearance also
     counts, among postures about equally near.
     """
-    if _blurred(T_base_camera, situation):
+    if _blurred(T_base_camera, scene):
         return
-    found = _postures(T_base_camera, situation)
+    found = _postures(T_base_camera, scene)
     for k in range(0, len(found), _AT_ONCE):
         some = found[k : k + _AT_ONCE]
-        yield from _able(some, _clearances_m(some, situation), situation)
+        yield from _able(some, _clearances_m(some, scene), scene)
 
 
-def _able(postures_rad: Array, clearances_m: Array, situation: Situation) -> Iterator[Array]:
+def _able(postures_rad: Array, clearances_m: Array, scene: PlanningScene) -> Iterator[Array]:
     """Those of the postures (K, N), with clearances (K,), that have enough of it, the best ones first."""
     order = range(len(postures_rad))
-    if situation.body.model.axes > 6:  # the elbow is free
-        tight = np.clip(1 - (clearances_m - situation.margin_m) / _ROOM_M, 0, None)
-        away = np.sum((postures_rad - situation.start_rad) ** 2, axis=1)
+    if scene.body.model.axes > 6:  # the elbow is free
+        tight = np.clip(1 - (clearances_m - scene.margin_m) / _ROOM_M, 0, None)
+        away = np.sum((postures_rad - scene.start_rad) ** 2, axis=1)
         order = [int(i) for i in np.argsort(away + _ROOM_WEIGHT * tight**2, kind="stable")]
-    yield from (postures_rad[i] for i in order if clearances_m[i] >= situation.margin_m)
+    yield from (postures_rad[i] for i in order if clearances_m[i] >= scene.margin_m)
 
 
-def _clearances_m(postures_rad: Array, situation: Situation) -> Array:
+def _clearances_m(postures_rad: Array, scene: PlanningScene) -> Array:
     """The clearance (K,) at each of the postures (K, N)."""
-    contacts = nearest_contacts(situation.body, situation.obstacles, postures_rad)
+    contacts = nearest_contacts(scene.body, scene.obstacles, postures_rad)
     return np.array([contact.clearance_m for contact in contacts])
 
 
-def best_postures(T_base_camera: Sequence[Transform], situation: Situation) -> list[Array | None]:
+def best_postures(T_base_camera: Sequence[Transform], scene: PlanningScene) -> list[Array | None]:
     """`best_posture` of each of several poses, whose postures are checked together, which takes less time."""
-    found = [_postures(T, situation) for T in T_base_camera]
+    found = [_postures(T, scene) for T in T_base_camera]
     first = [postures_rad[:_AT_ONCE] for postures_rad in found]
     ends = np.cumsum([len(some) for some in first])[:-1]
-    clearances = np.split(_clearances_m(np.concatenate(first), situation), ends)
+    clearances = np.split(_clearances_m(np.concatenate(first), scene), ends)
     best: list[Array | None] = []
     for T, every, some, clearances_m in zip(T_base_camera, found, first, clearances, strict=True):
-        able = None if _blurred(T, situation) else next(_able(some, clearances_m, situation), None)
-        best.append(best_posture(T, situation) if able is None and len(every) > len(some) else able)
+        able = None if _blurred(T, scene) else next(_able(some, clearances_m, scene), None)
+        best.append(best_posture(T, scene) if able is None and len(every) > len(some) else able)
     return best
 
 
-def best_posture(T_base_camera: Transform, situation: Situation) -> Array | None:
+def best_posture(T_base_camera: Transform, scene: PlanningScene) -> Array | None:
     """The best of `able_postures`; None if there is none."""
-    return next(able_postures(T_base_camera, situation), None)
+    return next(able_postures(T_base_camera, scene), None)
 
 
-def _other_way(here: Array, view: PlannedView, situation: Situation) -> Array | None:
+def _other_way(here: Array, view: PlannedView, scene: PlanningScene) -> Array | None:
     """Joints (N,) of another posture for a view that can be reached straight from `here`; None if there is none."""
-    others = islice(able_postures(view.T_base_camera, situation), 1, _MOST_WAYS)
-    return next((q for q in others if not _blocked(here, q, situation)), None)
+    others = islice(able_postures(view.T_base_camera, scene), 1, _MOST_WAYS)
+    return next((q for q in others if not _blocked(here, q, scene)), None)
 
 
-def _blocked(here: Array, there: Array, situation: Situation) -> str:
+def _blocked(here: Array, there: Array, scene: PlanningScene) -> str:
     # Both ends are free, or the arm is there already.
     way = straight_path(here, there, float(PATH_STEP_RAD))[1:-1]
     if not len(way):
         return ""
-    contacts = nearest_contacts(situation.body, situation.obstacles, way)
+    contacts = nearest_contacts(scene.body, scene.obstacles, way)
     worst = min(contacts, key=lambda contact: contact.clearance_m)
-    return str(worst) if worst.clearance_m < situation.margin_m else ""
+    return str(worst) if worst.clearance_m < scene.margin_m else ""

@@ -35,7 +35,7 @@ class Field:
         blocks: (B, 3) integer place of each block; voxel (i, j, k) of it is at (SIDE block + (i, j, k)) voxel_m.
         distance: (B, SIDE³) in voxels, within ±TRUNCATION.
         weight: (B, SIDE³).
-        maps: (B, SIDE³) how many depth maps said something.
+        maps: (B, SIDE³) number of depth maps that contributed.
         voxel_m: edge of a voxel.
     """
 

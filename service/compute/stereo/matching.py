@@ -49,8 +49,8 @@ class DepthMap:
 def depth_of_pair(pair: Rectified, distance_m: float) -> DepthMap | None:
     """Depth of the left image of a pair that looks at an object at this distance; None if too little agrees.
 
-    The range of disparities is found in small images first. The weight is the square of pixels of disparity for a
-    metre of depth at the object: the inverse variance, but for the matching's own error.
+    The range of disparities is found in small images first. The weight of a depth is the square of the change of
+    disparity (px) per metre of depth at the object: the inverse variance, up to the variance of the matching.
     """
     first = pair.disparity(_FAR * distance_m) / _COARSE
     last = pair.disparity(_NEAR * distance_m) / _COARSE
@@ -135,7 +135,7 @@ def _without_edges(disparity: Disparity) -> Disparity:
     filled = np.nan_to_num(disparity, nan=-1e6)
     kernel = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(filled, kernel), cv2.dilate(filled, kernel)
-    # Next to a pixel without disparity is an edge too: both give a large difference.
+    # A pixel beside one without disparity is an edge too: both have a large difference.
     out = disparity.copy()
     out[high - low > _JUMP_PX] = np.nan
     return out

@@ -18,7 +18,7 @@ class Link:
     """A capsule around a part of the arm: all points within `radius_m` of a segment fixed to one of the DH frames.
 
     Attributes:
-        name: of the part, as a technician is told it.
+        name: of the part, as technicians know it.
         frame: 0 is the base, k the frame after joint k.
         start_m: (3,) one end of the segment in that frame.
         end_m: (3,) the other end.

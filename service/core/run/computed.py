@@ -9,9 +9,9 @@ from service.core.run.state import JobState, StepState
 
 
 def computed_by(state: StepState) -> tuple[ComputedBy, ...]:
-    """The jobs whose figures a step gave as its own, as its event names them.
+    """The jobs whose figures a step reported as its own, as its event names them.
 
-    Events of older versions do not name them; in these, a job is known by the values that it shares with the step.
+    Events of older versions do not name them; there, a job is recognised by the values that it shares with the step.
     """
     return tuple(_by_values(state)) if state.computed_by is None else state.computed_by
 

@@ -47,7 +47,7 @@ STEP_RULES: tuple[Rule, ...] = (
 
 
 @dataclass(frozen=True)
-class Place:
+class MachineState:
     """A state of the machine by its parts: step, phase, and whether paused."""
 
     step: str
@@ -72,7 +72,7 @@ class Lifecycle:
         self,
         initial: str,
         targets: Mapping[tuple[str, str], str],
-        places: Mapping[str, Place],
+        places: Mapping[str, MachineState],
         steps: tuple[str, ...],
     ) -> None:
         self.initial = initial
@@ -109,7 +109,7 @@ class Lifecycle:
         """The triggers that the table has for a state."""
         return tuple(trigger for source, trigger in self._targets if source == state)
 
-    def place(self, state: str) -> Place | None:
+    def place(self, state: str) -> MachineState | None:
         """Step, phase and whether paused; None once the run has ended."""
         return self._places.get(state)
 
@@ -181,7 +181,7 @@ def state_machine(steps: tuple[str, ...]) -> HierarchicalMachine:
 @lru_cache(maxsize=32)
 def _compile(steps: tuple[str, ...]) -> Lifecycle:
     places = {
-        state_name(step, phase, paused=paused): Place(step, phase, paused)
+        state_name(step, phase, paused=paused): MachineState(step, phase, paused)
         for paused in (False, True)
         for step in steps
         for phase in PHASES

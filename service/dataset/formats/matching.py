@@ -41,7 +41,7 @@ def write(dataset: DataSet, folder: ExportFolder) -> None:
     """`images/`, `depth/NAME.npz`, `views.json`, `pairs.json`, `pairs.csv`, `covisibility.json` and `loader.py`.
 
     Metres, pixels with their centres at integers, z-depth, T_world_camera and T_second_first. Correspondences are not
-    stored: `loader.py`, which needs numpy alone, computes them of any pair from depth and poses. Overlap is the share
+    stored: `loader.py`, which needs only numpy, computes them for any pair from depth and poses. Overlap is the share
     of the surface's points that both images show. Markers have no depth.
     """
     truth = _DepthOfViews(dataset)

@@ -164,5 +164,5 @@ def _metadata(stamps: dict[str, int]) -> str:
 
 
 KIND = Exporter(
-    "mcap", "rosbag2/MCAP: images, camera, poses and frames for ROS 2, which is not needed", write, one_camera=True
+    "mcap", "rosbag2/MCAP: images, camera, poses and frames for ROS 2, written without ROS", write, one_camera=True
 )

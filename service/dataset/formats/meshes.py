@@ -14,7 +14,7 @@ from service.dataset.posed.records import Mesh
 
 
 def ply(vertices: Array, faces: NDArray[np.int64], comment: str) -> bytes:
-    """A binary PLY with vertices (V, 3) in double precision and faces (F, 3), in the unit that they have."""
+    """A binary PLY with vertices (V, 3) in double precision and faces (F, 3), in the vertices' own unit."""
     columns = {name: vertices[:, k].astype("<f8") for k, name in enumerate("xyz")}
     return ply_bytes(columns, faces, [comment] if comment else [])
 

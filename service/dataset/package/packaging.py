@@ -1,4 +1,4 @@
-"""Writes what every exported folder has beside the files of its format."""
+"""Writes what every exported folder has besides the files of its format."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _DESCRIBED = {
 def write_package(dataset: DataSet, folder: ExportFolder, *, form: str, words: str, description: str) -> None:
     """dataset.json, splits.json, views.csv, the data card, Croissant and RO-Crate; the format's files come before.
 
-    They are written anew when an interrupted export goes on: they rest on the whole record, and cost little.
+    They are written again when an interrupted export goes on, because they depend on the whole record.
 
     Args:
         dataset: as the format got it.

@@ -63,7 +63,7 @@ class ExportFolder:
     """Where a format's writer puts its files."""
 
     def __init__(self, root: Path, told: Callable[[int], None] = lambda _count: None) -> None:
-        """Take the folder, and who is told how many files are there, after each of them."""
+        """Write into `root`; `told` is called with the number of files after each of them."""
         self._root, self._told = root, told
         self._written: dict[str, ListedFile | None] = {}
         self.parts: dict[str, dict[str, str]] = {}  # what belongs to views: role → view → file
@@ -86,7 +86,7 @@ class ExportFolder:
         self.file(name, lambda: json_bytes(document))
 
     def written_by(self, name: str, write: Callable[[Path], object], part: Part | None = None) -> None:
-        """Let `write` make a file at a path beside it; it has its name only when it is whole.
+        """Let `write` make a file at a temporary path; the file gets its name only when it is complete.
 
         Args:
             name: of the file, relative, with `/`.
@@ -172,8 +172,8 @@ def export_folder(
 ) -> Generator[ExportFolder]:
     """A folder that appears at `target` when the block ends without an error.
 
-    Until then it is `.NAME.part` beside it. After an interruption the same export goes on with the files that are
-    whole; another one begins anew.
+    Until then it is `.NAME.part` beside it. After an interruption the same export keeps the files that are complete;
+    another export starts again.
 
     Args:
         target: a new folder in an existing one.
@@ -263,7 +263,7 @@ def _begin(root: Path, about: Path, identity: str) -> None:
     """Keep the files of the same export, remove those of another."""
     if root.is_dir() and about.read_text(encoding="utf-8") == identity:
         return
-    about.write_text("", encoding="utf-8")  # an interruption from here on begins anew
+    about.write_text("", encoding="utf-8")  # an export that is interrupted from here on starts again
     if root.exists():
         shutil.rmtree(root)
     root.mkdir()

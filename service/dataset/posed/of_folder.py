@@ -43,7 +43,7 @@ def data_set_of_folder(folder: Path) -> DataSet:
         raise DataError(f"the data set cannot be read: {error}", where=str(folder), remedy=_REMEDY) from error
 
 
-class Stored:
+class StoredPixels:
     """The pixel data of views, as `hdf5` holds them."""
 
     def __init__(self, folder: Path, mark: str) -> None:
@@ -83,7 +83,7 @@ class Stored:
 
 
 def scaled_data_set(dataset: DataSet, width: int) -> DataSet:
-    """The same views with pictures, depth and masks of this width in pixels; wider ones are made smaller.
+    """The data set with pictures, depth and masks reduced to this width in pixels.
 
     Raises:
         DataError: a view is narrower.
@@ -149,8 +149,8 @@ def _read(folder: Path) -> DataSet:
         mesh = _mesh(file["mesh"])
     views = tuple(_view(folder, name) for name in sorted({*of.dense, *of.train, *of.test}))
     identity = hashlib.sha256((folder / SUMS).read_bytes()).hexdigest()
-    dataset = DataSet(identity, simulated, statement, views, Stored(folder, ""), mesh, of)
-    return dataclasses.replace(dataset, pixels=Stored(folder, dataset.mark))
+    dataset = DataSet(identity, simulated, statement, views, StoredPixels(folder, ""), mesh, of)
+    return dataclasses.replace(dataset, pixels=StoredPixels(folder, dataset.mark))
 
 
 def _mesh(stored: Any) -> Mesh:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.compute.images.files import read_image_of
 from service.compute.pixels.crops import FULL_HD, ImageCrop, marker_free_crops
-from service.compute.pixels.masks import Ball, Post, marker_mask
+from service.compute.pixels.masks import Cylinder, WorldSphere, marker_mask
 from service.compute.pixels.metadata import described, with_metadata_of, without_personal_data
 from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.render import depth_map, seen
@@ -48,8 +48,8 @@ class Photographs:
         self,
         files: Mapping[str, Path],
         surface: RayMesh,
-        balls: Sequence[Ball],
-        posts: Sequence[Post] = (),
+        spheres: Sequence[WorldSphere],
+        posts: Sequence[Cylinder] = (),
         *,
         personal: bool = True,
         mark: str = "",
@@ -59,17 +59,17 @@ class Photographs:
         Args:
             files: JPEG or PNG, by name of the view.
             surface: the mesh in the world frame.
-            balls: spheres in the world frame.
+            spheres: spheres in the world frame.
             posts: that carry them.
             personal: False removes GPS, owner and serial numbers from the pictures.
             mark: written into the pictures' description where it is not empty.
         """
-        self._files, self._surface, self._balls, self._posts = files, surface, balls, posts
+        self._files, self._surface, self._spheres, self._posts = files, surface, spheres, posts
         self._personal, self._mark = personal, mark
         self._colours = _Last(lambda view: read_image_of(files[view.name], view.camera))
 
     def picture(self, view: PosedView) -> bytes:
-        """The file as the camera wrote it, but for what was asked to be removed or marked."""
+        """The file as the camera wrote it, except what was to be removed or marked."""
         try:
             data = self._files[view.name].read_bytes()
         except OSError as error:
@@ -98,7 +98,7 @@ class Photographs:
 
     def markers(self, view: PosedView) -> NDArray[np.bool_]:
         """(H, W) which pixels show a sphere or a post."""
-        return marker_mask(view.camera, view.T_world_camera, self._balls, self._posts)
+        return marker_mask(view.camera, view.T_world_camera, self._spheres, self._posts)
 
 
 class UndistortedViews:
@@ -148,7 +148,7 @@ class Cropped:
         self._originals = _Last(whole.pixels.picture)
 
     def picture(self, view: PosedView) -> bytes:
-        """Cut out and encoded anew, with the photograph's metadata."""
+        """Cut out and encoded again, with the photograph's metadata."""
         original = self._originals.of(self._crops[view.name][0])
         return _encoded(view, self.colours(view), original, self._personal)
 

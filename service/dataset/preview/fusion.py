@@ -13,7 +13,7 @@ from service.compute.ground_truth.ply import read_ply
 from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.units import metres
-from service.dataset.preview.records import DecidedRegion, ShownGroundTruth
+from service.dataset.preview.records import DecidedRegion, GroundTruthPreview
 from service.dataset.recorded_fusion import RecordedFusion
 from service.dataset.scene_view import MeshColours
 
@@ -31,10 +31,10 @@ class VertexFigures:
     sigmas: MeshColours
 
 
-def shown_ground_truth(fusion: RecordedFusion, sources: str, sigmas: str, sigma_high_mm: float) -> ShownGroundTruth:
+def shown_ground_truth(fusion: RecordedFusion, sources: str, sigmas: str, sigma_high_mm: float) -> GroundTruthPreview:
     """The figures of a fusion as it was recorded, with the names of the files of its two coloured meshes."""
     measures = fusion.measures
-    return ShownGroundTruth(
+    return GroundTruthPreview(
         step=fusion.step,
         ct_share=measures["ct_share"],
         scan_share=measures["scan_share"],

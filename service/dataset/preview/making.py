@@ -15,8 +15,8 @@ from service.core.errors import ComputeError, DataError
 from service.dataset.posed.of_run.data_set import data_set_of, specimen_pixels
 from service.dataset.posed.records import DataSet
 from service.dataset.preview.pictures import CROPS, crop_size, small_pictures
-from service.dataset.preview.records import Preview, ShownView, write_preview
-from service.dataset.preview.surfaces import Simplified, fused_mesh, shown_coverage, shown_distances
+from service.dataset.preview.records import Preview, ViewPreview, write_preview
+from service.dataset.preview.surfaces import SimplifiedMesh, fused_mesh, shown_coverage, shown_distances
 from service.dataset.recorded_fusion import RecordedFusion, recorded_fusion
 from service.dataset.summary import RunSummary
 
@@ -40,7 +40,7 @@ def make_preview(summary: RunSummary, folder: Path, progress: Progress) -> Previ
     wanted = partial(specimen_pixels, summary)
     preview = _begun(dataset, crop_size(dataset, wanted))
     write_preview(folder, preview)
-    mesh = Simplified.of(dataset.mesh)
+    mesh = SimplifiedMesh.of(dataset.mesh)
     counts, views = np.zeros(len(mesh.points_m), dtype=np.int64), list(preview.views)
     for k, view in enumerate(dataset.views):
         progress("pictures", k, len(views))
@@ -68,7 +68,7 @@ def _begun(dataset: DataSet, crop: tuple[int, int]) -> Preview:
     """All views, with the names of the files that they will have."""
     named = dataset.splits.named()
     views = tuple(
-        ShownView(
+        ViewPreview(
             name=view.name,
             width=view.camera.width,
             height=view.camera.height,

@@ -16,7 +16,7 @@ from service.compute.pixels.crops import FULL_HD, ImageCrop, marker_free_crops
 from service.core.errors import DataError
 from service.core.units import mm
 from service.dataset.posed.records import DataSet, Pixels, PosedView
-from service.dataset.preview.records import ShownCrop, ShownView, put
+from service.dataset.preview.records import CropPreview, ViewPreview, put
 
 THUMBNAIL_PX, IMAGE_PX = 320, 1280  # widths
 CROPS = 2  # of each view
@@ -58,8 +58,8 @@ def crop_size(dataset: DataSet, wanted: Callable[[PosedView], Mask]) -> tuple[in
 
 
 def small_pictures(
-    folder: Path, shown: ShownView, view: PosedView, pixels: Pixels, crops: Sequence[ImageCrop]
-) -> tuple[ShownView, SmallDepth]:
+    folder: Path, shown: ViewPreview, view: PosedView, pixels: Pixels, crops: Sequence[ImageCrop]
+) -> tuple[ViewPreview, SmallDepth]:
     """Write the pictures of a view. Returns the view with what they tell, and its depth.
 
     Args:
@@ -98,11 +98,11 @@ def depth_colours(depth_m: NDArray[np.float32], near_m: float, far_m: float) -> 
     return np.dstack([colours, np.where(depth_m > 0, 255, 0).astype(np.uint8)])
 
 
-def _part(folder: Path, shown: ShownView, colours: Colours, crop: ImageCrop, number: int) -> ShownCrop:
+def _part(folder: Path, shown: ViewPreview, colours: Colours, crop: ImageCrop, number: int) -> CropPreview:
     """Write the small picture of a crop."""
     name = shown.thumbnail.replace("-thumb.", f"-crop{number}.")
     put(folder, name, _encoded(".jpg", _reduced(colours[crop.slices], THUMBNAIL_PX), _JPEG))
-    return ShownCrop(crop.x, crop.y, crop.width, crop.height, name)
+    return CropPreview(crop.x, crop.y, crop.width, crop.height, name)
 
 
 def _ends(depth_m: NDArray[np.float32]) -> tuple[float, float]:

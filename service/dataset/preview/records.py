@@ -15,7 +15,7 @@ AT_LEAST = (1, 2, 4, 8)  # views, of which the coverage is told
 
 
 @dataclass(frozen=True, slots=True)
-class ShownCrop:
+class CropPreview:
     """A part of a view without spheres and posts: its place in pixels of the photograph, and its small picture."""
 
     x: int
@@ -26,7 +26,7 @@ class ShownCrop:
 
 
 @dataclass(frozen=True, slots=True)
-class ShownView:
+class ViewPreview:
     """A view. Its files are there when `ready`.
 
     Attributes:
@@ -47,12 +47,12 @@ class ShownView:
     depth: str
     near_mm: float = 0.0
     far_mm: float = 0.0
-    crops: tuple[ShownCrop, ...] = ()
+    crops: tuple[CropPreview, ...] = ()
     ready: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class ShownCoverage:
+class CoveragePreview:
     """Share of the surface that at least AT_LEAST views see; `figure`: file of the coloured mesh."""
 
     shares: tuple[float, ...]
@@ -68,7 +68,7 @@ class DecidedRegion:
 
 
 @dataclass(frozen=True, slots=True)
-class ShownGroundTruth:
+class GroundTruthPreview:
     """The mesh that was fused from CT and scan, as its step recorded it.
 
     Attributes:
@@ -98,7 +98,7 @@ class ShownGroundTruth:
 
 
 @dataclass(frozen=True, slots=True)
-class ShownDistances:
+class DistancePreview:
     """The CT against the scan, in the frame of the scan.
 
     Attributes:
@@ -145,11 +145,11 @@ class Preview:
         whole: nothing more will come.
     """
 
-    views: tuple[ShownView, ...]
+    views: tuple[ViewPreview, ...]
     crop: tuple[int, int]
-    coverage: ShownCoverage | None = None
-    ground_truth: ShownGroundTruth | None = None
-    distances: ShownDistances | None = None
+    coverage: CoveragePreview | None = None
+    ground_truth: GroundTruthPreview | None = None
+    distances: DistancePreview | None = None
     no_distances: str = ""
     whole: bool = False
 
@@ -171,7 +171,7 @@ def read_preview(folder: Path) -> Preview | None:
 
 
 def put(folder: Path, name: str, content: bytes) -> str:
-    """Write a file, whole at every moment. Returns its name."""
+    """Write or replace a file atomically. Returns its name."""
     part = folder / f"{name}.{os.getpid()}.part"
     part.write_bytes(content)
     part.replace(folder / name)

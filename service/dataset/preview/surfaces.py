@@ -21,7 +21,7 @@ from service.core.geometry import Array, Transform
 from service.core.units import metres, mm
 from service.dataset.posed.records import DataSet, Mesh
 from service.dataset.preview.fusion import PICTURE, shown_ground_truth, vertex_figures
-from service.dataset.preview.records import AT_LEAST, ShownCoverage, ShownDistances, ShownGroundTruth, put
+from service.dataset.preview.records import AT_LEAST, CoveragePreview, DistancePreview, GroundTruthPreview, put
 from service.dataset.recorded_fusion import MESH, RecordedFusion
 from service.dataset.registrations import last_result
 from service.dataset.scene_view import MeshColours, Scene, SceneMesh, SceneSphere, decimated, scene_json
@@ -34,30 +34,30 @@ _FULL_M = 2e-3  # end of the colours: parts that only one of the two shows do no
 
 
 @dataclass(frozen=True, slots=True)
-class Simplified:
+class SimplifiedMesh:
     """The mesh for the screen: points (V, 3) in metres, triangles (F, 3)."""
 
     points_m: Array
     triangles: NDArray[np.int64]
 
     @classmethod
-    def of(cls, mesh: Mesh) -> Simplified:
+    def of(cls, mesh: Mesh) -> SimplifiedMesh:
         """About as many triangles as a browser draws smoothly."""
         return cls(*decimated(mesh.vertices_m, mesh.faces))
 
 
 def shown_coverage(
-    folder: Path, summary: RunSummary, dataset: DataSet, mesh: Simplified, counts: NDArray[np.int64]
-) -> ShownCoverage:
+    folder: Path, summary: RunSummary, dataset: DataSet, mesh: SimplifiedMesh, counts: NDArray[np.int64]
+) -> CoveragePreview:
     """Write the mesh coloured by the number of views (V,) that see it, with the cameras."""
     poses = {view.name: view.T_world_camera for view in dataset.views}
     colours = MeshColours(counts.astype(np.float64), "views that see it", "%{intensity:.0f} views")
     figure = scene_json(_scene(summary, mesh, colours, poses))
     shares = covered_shares(counts, mesh.points_m, mesh.triangles, AT_LEAST)
-    return ShownCoverage(shares, put(folder, "coverage.json", figure.encode()))
+    return CoveragePreview(shares, put(folder, "coverage.json", figure.encode()))
 
 
-def fused_mesh(folder: Path, summary: RunSummary, fusion: RecordedFusion, mesh: Simplified) -> ShownGroundTruth:
+def fused_mesh(folder: Path, summary: RunSummary, fusion: RecordedFusion, mesh: SimplifiedMesh) -> GroundTruthPreview:
     """Write the fused mesh coloured by source and by standard deviation. Raises DataError if it has neither."""
     figures, high_mm = vertex_figures(summary.store.artefact_path(fusion.files[MESH].sha256), mesh.points_m)
     sources, sigmas = (
@@ -67,7 +67,7 @@ def fused_mesh(folder: Path, summary: RunSummary, fusion: RecordedFusion, mesh: 
     return shown_ground_truth(fusion, sources, sigmas, high_mm)
 
 
-def shown_distances(folder: Path, summary: RunSummary, fusion: RecordedFusion | None) -> ShownDistances:
+def shown_distances(folder: Path, summary: RunSummary, fusion: RecordedFusion | None) -> DistancePreview:
     """How far CT and scan are from each other, and the scan coloured by it.
 
     The figures and the picture are those that the fusion recorded. Without a fusion, CT and scan are brought together
@@ -92,7 +92,7 @@ def shown_distances(folder: Path, summary: RunSummary, fusion: RecordedFusion | 
     if picture is None:
         raise DataError("the recorded picture of the fusion cannot be read", where=summary.run_id)
     m = fusion.measures
-    return ShownDistances(
+    return DistancePreview(
         chamfer_mm=m["chamfer_ct_scan_mm"],
         ct_to_scan_mm=m["ct_to_scan_mm"],
         scan_to_ct_mm=m["scan_to_ct_mm"],
@@ -110,7 +110,7 @@ def shown_distances(folder: Path, summary: RunSummary, fusion: RecordedFusion | 
     )
 
 
-def _compared(folder: Path, summary: RunSummary, ct: Surface, scan: Surface) -> ShownDistances:
+def _compared(folder: Path, summary: RunSummary, ct: Surface, scan: Surface) -> DistancePreview:
     """CT and scan, aligned by their spheres and compared, and the CT in its own frame."""
     found = last_result(summary.protocol, summary.state, "ct_surface", SpheresFound)
     if found is None:
@@ -121,7 +121,7 @@ def _compared(folder: Path, summary: RunSummary, ct: Surface, scan: Surface) -> 
     score = chamfer(ct, scan, settings)
     picture = heat_picture(ct, scan, score, HeatScale(_FULL_M, settings.outlier_m), ("CT", "scan"))
     n = score.pred_to_gt.n + score.gt_to_pred.n
-    return ShownDistances(
+    return DistancePreview(
         chamfer_mm=mm(score.chamfer_m),
         ct_to_scan_mm=mm(score.pred_to_gt.mean_m),
         scan_to_ct_mm=mm(score.gt_to_pred.mean_m),
@@ -144,7 +144,7 @@ def _spacing_m(ct: Surface, scan: Surface) -> float:
 
 def _distance_figure(folder: Path, summary: RunSummary, scan: Surface, ct_points_m: Array) -> str:
     """Write the scan coloured by its distance to points (N, 3) on the CT. Returns the file's name."""
-    shown = Simplified(*decimated(scan.vertices_m, scan.faces))
+    shown = SimplifiedMesh(*decimated(scan.vertices_m, scan.faces))
     distance_m, _ = PointIndex(ct_points_m).nearest(shown.points_m)
     title = f"distance to the CT (mm, at most {mm(_FULL_M):g})"
     colours = MeshColours(mm(np.minimum(distance_m, _FULL_M)), title, "%{intensity:.3f} mm")
@@ -156,7 +156,7 @@ def _put_picture(folder: Path, picture: NDArray[np.uint8]) -> str:
     return put(folder, "distances.jpg", encoded.tobytes())
 
 
-def _scene(summary: RunSummary, mesh: Simplified, colours: MeshColours, poses: dict[str, Transform]) -> Scene:
+def _scene(summary: RunSummary, mesh: SimplifiedMesh, colours: MeshColours, poses: dict[str, Transform]) -> Scene:
     """The coloured mesh with its spheres, and cameras if there are poses."""
     centres = summary.scan_spheres_m()
     spheres = [SceneSphere(str(k), "registration", centre) for k, centre in enumerate(centres)]

@@ -106,7 +106,7 @@ class Tilt(JobRecord):
 
 
 class Intrinsics(JobRecord):
-    """What is known of the calibrated camera beside its parameters.
+    """What is known about the calibrated camera besides its parameters.
 
     Attributes:
         model: of the distortion.

@@ -63,7 +63,7 @@ class Arguments(HeldArguments, SpecimenArguments):
     """Arguments for an image of the specimen."""
 
 
-class ShownPlace(JobRecord):
+class PlaceStatus(JobRecord):
     """A place of the hemisphere, and whether it has an image."""
 
     name: str
@@ -78,10 +78,10 @@ class Answer(JobRecord):
     used: bool
     why: str
     words: str
-    target: ShownPlace | None = None
+    target: PlaceStatus | None = None
     T_scene_camera: Matrix | None = None
     T_level_camera: Matrix | None = None
-    places: tuple[ShownPlace, ...] = ()
+    places: tuple[PlaceStatus, ...] = ()
     cells: tuple[tuple[int, ...], ...] = ()  # number of board corners in each cell of the frame
     spheres_m: tuple[Point, ...] = ()  # as the images up to this one locate them
     T_scene_cameras: dict[str, Matrix] = Field(

@@ -33,7 +33,7 @@ class Suggestion(JobRecord):
     coverage: float
 
 
-class StationSoFar(JobRecord):
+class StationPrediction(JobRecord):
     """The predicted error from the images of a station so far."""
 
     predicted_target_error_mm: float
@@ -45,7 +45,7 @@ class Answer(JobRecord):
 
     next_best_views: tuple[Suggestion, ...]
     reasons: dict[str, str]
-    stations: dict[str, StationSoFar]
+    stations: dict[str, StationPrediction]
 
 
 KIND = JobKind(

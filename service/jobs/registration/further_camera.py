@@ -1,4 +1,4 @@
-"""Job kind `further_camera`: where a further camera stood, or sat beside the first one, by the spheres it saw."""
+"""Job kind `further_camera`: the pose of a further camera, in the room or on the mount, from the spheres it saw."""
 
 from __future__ import annotations
 

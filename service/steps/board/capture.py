@@ -226,8 +226,8 @@ class BoardCapture:
         if arm is None:
             return lambda _T: True
         start = usual_posture(arm.model, arm.layout, self._mount)
-        situation = arm.situation(start, sharp_at_m=apply(known.T_base_board, self.board.points()))
-        return lambda T: best_posture(T, situation) is not None
+        scene = arm.scene(start, sharp_at_m=apply(known.T_base_board, self.board.points()))
+        return lambda T: best_posture(T, scene) is not None
 
     def _taken(self, looks: Sequence[SearchedBoardImage], known: BoardKnowledge, planner: Planner) -> ChosenViews:
         """The images that show the board, and the planned poses without an image."""

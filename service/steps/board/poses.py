@@ -30,5 +30,5 @@ class BoardPoses(Record):
 
     @property
     def wishes(self) -> ViewRange:
-        """The range of views for the planner."""
+        """The range of board views, as the planner takes it."""
         return ViewRange(self.tilts_deg, self.rolls_deg, self.distances_m)

@@ -13,6 +13,7 @@ import numpy as np
 
 from drivers.errors import DeviceBusyError, DeviceUnavailableError
 from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, RobotSample, SettleReport
+from drivers.stated_settings import agrees
 from drivers.stillness import PoseSpread, pose_spread
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, Transform
@@ -236,10 +237,10 @@ def exposure_pose(window: Sequence[RobotSample]) -> ExposurePose:
 
 
 def settings_agree(actual: CameraSettings, wanted: CameraSettings) -> bool:
-    """Whether an image's EXIF shows the protocol's settings (aperture and time to 2 %, ISO exactly)."""
+    """Whether an image's EXIF shows the protocol's settings: ISO exactly, aperture and time up to rounding."""
     return (
-        abs(actual.aperture_f / wanted.aperture_f - 1) < 0.02
-        and abs(actual.exposure_s / wanted.exposure_s - 1) < 0.02
+        agrees(actual.aperture_f, wanted.aperture_f)
+        and agrees(actual.exposure_s, wanted.exposure_s)
         and actual.iso == wanted.iso
     )
 

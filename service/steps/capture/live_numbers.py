@@ -42,7 +42,7 @@ class CoverageRule(Record):
     max_distance_m: Annotated[float, Field(gt=0)] = 1.0  # from the camera
 
 
-class Live(Record):
+class LiveParams(Record):
     """What the numbers after each image are computed from, and how."""
 
     calibration: str  # step with the intrinsics
@@ -53,7 +53,7 @@ class Live(Record):
     # Scatter of the camera's positions before any image is taken; without it, as the held-out views of the
     # hand-eye calibration show it.
     arm_sigma_mm: Annotated[float, Field(gt=0)] | None = None
-    arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None  # the same of the camera's rotations
+    arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None  # likewise, the scatter of the camera's rotations
     coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
     wait_s: Annotated[float, Field(ge=0)] = 60.0  # at the end of the step, for jobs that have not finished
 
@@ -63,17 +63,17 @@ class LiveAnalysis:
     """The live numbers of one execution of one capture step."""
 
     context: StepContext
-    params: Live
-    shared: Shared
+    params: LiveParams
+    shared: SharedArguments
     told: set[str] = field(default_factory=set[str])
 
     @classmethod
-    def begin(cls, context: StepContext, params: Live | None) -> LiveAnalysis | None:
+    def begin(cls, context: StepContext, params: LiveParams | None) -> LiveAnalysis | None:
         """Read the results of earlier steps; None, with a note, if one of them was skipped."""
         if params is None:
             return None
         try:
-            shared = Shared.of(context, params)
+            shared = SharedArguments.of(context, params)
             mesh = artefact_of(context, params.spheres_of, "ct_mesh").sha256
         except ConfigurationError as error:
             context.note("no_live_numbers", why=str(error))
@@ -305,7 +305,7 @@ _DESCRIBED = {live_view.KIND.name: describe_view, further_view.KIND.name: descri
 
 
 @dataclass(frozen=True, slots=True)
-class Shared:
+class SharedArguments:
     """The arguments that all jobs of a capture share, and the references that are recorded in their place.
 
     The covariance of T_flange_camera and the scatter of the camera's poses are those of the hand-eye calibration with
@@ -323,7 +323,7 @@ class Shared:
     taken: Mapping[str, Reference | Each | None]
 
     @classmethod
-    def of(cls, context: StepContext, params: Live) -> Shared:
+    def of(cls, context: StepContext, params: LiveParams) -> SharedArguments:
         """From the results of earlier steps. Raises ConfigurationError if one is missing."""
         scan = earlier_answer(context, params.spheres_of, locate_spheres.KIND)
         calibration = earlier_answer(context, params.calibration, calibrate.KIND)

@@ -11,7 +11,7 @@ from service.steps.context import JobRequest, StepContext
 
 
 @dataclass(frozen=True, slots=True)
-class Exposed:
+class ExposureFiles:
     """The two files of an exposure, by their SHA-256."""
 
     viewpoint: str
@@ -19,7 +19,7 @@ class Exposed:
     raw: str
 
 
-def developed(context: StepContext, exposures: Sequence[Exposed]) -> dict[str, str]:
+def developed(context: StepContext, exposures: Sequence[ExposureFiles]) -> dict[str, str]:
     """The developed raw file of each exposure of one camera, by viewpoint."""
     parameters = develop.Parameters.model_validate(asdict(PARAMETERS))
     requests = [

@@ -12,7 +12,7 @@ from service.jobs.records import ImageFile
 from service.jobs.registration import further_camera
 from service.steps.context import JobRequest, JobResult, StepContext
 from service.steps.inputs import raw_of
-from service.steps.poses.developed import Exposed, developed
+from service.steps.poses.developed import ExposureFiles, developed
 from service.steps.poses.sources import most_preferred
 
 _SHARED = ("spheres_m", "sphere_covariance_m2", "radius_m", "colour")  # arguments of the search for outlines
@@ -79,7 +79,9 @@ def _request(
         **{name: recorded[name] for name in _SHARED if name in recorded},
     }
     raws = [(viewpoint, one, raw_of(one.artefacts)) for viewpoint, one in exposures]
-    taken = [Exposed(viewpoint, one.artefacts[0].sha256, raw) for viewpoint, one, raw in raws if raw is not None]
+    taken = [
+        ExposureFiles(viewpoint, one.artefacts[0].sha256, raw) for viewpoint, one, raw in raws if raw is not None
+    ]
     if on_raw and len(taken) == len(exposures):
         arguments["developed"] = developed(context, taken)
     if last.mounted == "rigid":

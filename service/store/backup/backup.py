@@ -48,7 +48,7 @@ class BackupReport:
 
 @dataclass(frozen=True, slots=True)
 class BackupOptions:
-    """What a backup does beside copying what is new.
+    """What a backup does besides copying what is new.
 
     Attributes:
         with_keys: also copy the private signing key.

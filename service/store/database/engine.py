@@ -21,7 +21,7 @@ from service.store.durable_effects import Files
 from service.store.errors import StoreVersionError
 
 DATABASE_NAME = "orthocapture.sqlite"
-BUSY_TIMEOUT_S = 30.0  # SQLite waits so long for another process that writes; then a warning is logged
+BUSY_TIMEOUT_S = 30.0  # how long SQLite waits for another process that writes; then a warning is logged
 PATIENCE_S = 300.0  # for all such waits of one write: a process that is starved may hold the database for minutes
 _LOG = logging.getLogger(__name__)
 REVISIONS = ("0001", "0002", "0003", "0004", "0005")  # of migrations/versions, in order
@@ -80,7 +80,7 @@ class Database:
                 self._files.commit(transaction.commit)
 
     def _begun(self, connection: Connection) -> RootTransaction:
-        """Begin to write as soon as the other processes let it."""
+        """Begin a write transaction as soon as no other process writes."""
         began_s = time.monotonic()
         while True:
             try:

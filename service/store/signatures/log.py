@@ -200,7 +200,7 @@ def log_findings(
         awaited: whether there must be a log, because something was signed here.
     """
     if lines is None:
-        missing = Fault(None, None, NAME, "the log of signatures is missing: it was taken away")
+        missing = Fault(None, None, NAME, "the log of signatures is missing: it was removed")
         return ([missing] if awaited else []), []
     faults: list[Fault] = []
     held: set[tuple[str, int]] = set()
@@ -216,7 +216,7 @@ def log_findings(
         held.add((signed.run_id, signed.seq))
         if signed.run_id in present and here.get((signed.run_id, signed.seq)) != signed:
             gone = (signed.run_id, signed.seq) not in here
-            change = "is no longer here: what it signed was taken away" if gone else "is another one here"
+            change = "is no longer here: what it signed was removed" if gone else "is another one here"
             faults.append(Fault(signed.run_id, signed.seq, "", f"the signature of {place}, {change}"))
     # A power failure between a signature and its line leaves out the newest lines; the next signature adds them.
     newest = max((line.checkpoint.site_seq for line in lines if line.checkpoint is not None), default=0)

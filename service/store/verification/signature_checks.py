@@ -144,7 +144,7 @@ def stamp_faults(
             yield Fault(*place[:2], "", f"time stamp of {place[2]}: no event records that it was given")
     for place in told:
         if place[0] in stamps and place not in present:
-            yield Fault(*place[:2], "", f"the time stamp of {place[2]} was taken away")
+            yield Fault(*place[:2], "", f"the time stamp of {place[2]} was removed")
 
 
 def signed_run_faults(site: ChainFacts, chains: Mapping[str, ChainFacts], *, every_run: bool) -> Iterator[Fault]:
@@ -170,7 +170,7 @@ def unsigned_end_faults(run_id: str, checkpoints: Sequence[Checkpoint], chain: C
     signed = checkpoints[-1].seq if checkpoints else 0
     for seq, kind in chain.to_sign:
         if signed < seq < chain.last_own:
-            what = f"{kind.replace('_', ' ')} was never signed, or its signature was taken away"
+            what = f"{kind.replace('_', ' ')} was never signed, or its signature was removed"
             yield Fault(run_id, seq, "", what)
 
 

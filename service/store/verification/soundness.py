@@ -59,7 +59,7 @@ def _signature_fault(connection: Connection, run_id: str, lines: Sequence[LogLin
         return Fault(run_id, wrong, "", "a signature is for another event than the one that is here")
     has_signed = select(events.c.seq).where(events.c.run_id == SITE, events.c.kind == "key_changed").limit(1)
     if lines is None and connection.execute(has_signed).first() is not None:
-        return Fault(None, None, NAME, "the log of signatures is missing: it was taken away")
+        return Fault(None, None, NAME, "the log of signatures is missing: it was removed")
     signed = {item.seq: item for item in read_checkpoints(connection, run_id)}
     for line in lines or ():
         if line.checkpoint is None or line.problem:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -109,8 +110,8 @@ def verify(
     try:
         # Before the database's snapshot: a signature made meanwhile is in the database first, and then in the log.
         lines = read_log(data_dir / LOG_NAME)
-        with database.reading() as connection:
-            report = _verify_readable(data_dir, connection, lines, run_id, progress, certificates, with_files=files)
+        with database.reading() as connection, _damage_named(data_dir, connection):
+            report = _verify(data_dir, connection, lines, run_id, progress, certificates, with_files=files)
     finally:
         database.close()
     report = replace(report, faults=(*report.faults, *of_wal), notes=(*report.notes, *notes_of_wal))
@@ -120,19 +121,11 @@ def verify(
     return replace(report, faults=(*report.faults, *faults), notes=(*report.notes, *notes))
 
 
-def _verify_readable(
-    data_dir: Path,
-    connection: Connection,
-    lines: Sequence[LogLine] | None,
-    run_id: str | None,
-    progress: Progress | None,
-    certificates: Path | None,
-    *,
-    with_files: bool,
-) -> AuditReport:
-    """Verify; raises StoreError if the check fails on rows that only a damaged database can hold."""
+@contextmanager
+def _damage_named(data_dir: Path, connection: Connection) -> Generator[None]:
+    """Raise StoreError, with the damage, if a check fails on rows that only a damaged database can hold."""
     try:
-        return _verify(data_dir, connection, lines, run_id, progress, certificates, with_files=with_files)
+        yield
     except (TypeError, ValueError, LookupError, ArithmeticError) as error:
         damage = database_damage(connection)
         if not damage:

@@ -17,7 +17,7 @@ from service.steps.kinds.captures.calibration import Params
 from service.steps.notes import BOARD_POSES, board_plans
 from service.web.calibration.board_plan_drawing import board_plan_svg
 from service.web.record.pictures import cached
-from service.web.record.planned_poses import recorded_rig, station_of
+from service.web.record.planned_poses import recorded_rig_section, station_of
 
 
 def board_plan_of(log: RunRecord, step_id: str, data: Path) -> bytes:
@@ -49,7 +49,7 @@ def board_plan_of(log: RunRecord, step_id: str, data: Path) -> bytes:
             text = f"{counted(len(poses), 'board pose')} so far; predicted {describe_prediction(predicted, solve)}"
             return board_plan_svg(text, predicted.coverage_map, poses, approach).encode()
         try:
-            found = preview_board_poses(log.protocol, step, Rig(recorded_rig(log), Path(), b""), layout)
+            found = preview_board_poses(log.protocol, step, Rig(recorded_rig_section(log), Path(), b""), layout)
         except OrthocaptureError as error:
             return board_plan_svg(str(error), [[0] * 12] * 8, np.zeros((0, 4, 4)), approach).encode()
         assert found is not None  # the step plans board images

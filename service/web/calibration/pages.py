@@ -25,7 +25,7 @@ from service.web.calibration.view import (
     held_out_mm,
     image_rows,
 )
-from service.web.page.charts import Dots
+from service.web.page.charts import DotPlot
 from service.web.page.rendering import render
 from service.web.page.run_frame import RunFrame, run_frame
 from service.web.page.run_words import gate_word, limit, measure_name
@@ -62,7 +62,7 @@ class CalibrationPage:
     run_id: str
     found: Calibration
     charts: Charts | None
-    hand_eye_chart: Dots | None
+    hand_eye_chart: DotPlot | None
     images: list[ImageRow]
     held_out: tuple[float, float] | None
     depends: list[AcceptedGate]
@@ -170,7 +170,7 @@ def _advice(
     """Parts of the image without corners, and board poses worth taking."""
     # The planning of poses brings scipy, which the start of the service does not wait for.
     from service.web.calibration.board_advice import advised_poses, empty_regions  # noqa: PLC0415
-    from service.web.record.planned_poses import recorded_rig  # noqa: PLC0415
+    from service.web.record.planned_poses import recorded_rig_section  # noqa: PLC0415
 
     coverage = None if found.intrinsics is None else found.intrinsics.coverage
     regions = [] if coverage is None else empty_regions(coverage.corners)
@@ -183,7 +183,7 @@ def _advice(
         found.camera,
         [c for c in found.captures if isinstance(c, ViewpointCaptured) and c.viewpoint in used],
         board,
-        recorded_rig(log).collision.arm or "",
+        recorded_rig_section(log).collision.arm or "",
         site.data,
         found.artefact.sha256,
     )

@@ -17,7 +17,7 @@ from service.jobs.calibration.records import ArmAnswer, HandEye, Intrinsics, Res
 from service.jobs.records import Camera
 from service.run_record import RunRecord
 from service.steps.kinds.captures.calibration import Params
-from service.web.page.charts import Dots, HeatMap, VectorField, dots, heat_map, vector_field
+from service.web.page.charts import DotPlot, HeatMap, VectorField, dots, heat_map, vector_field
 from service.web.record.board_images import BoardUse, board_use
 from service.web.record.images import StatedCamera, captures_of, stated_camera
 
@@ -46,7 +46,7 @@ class Calibration:
     Attributes:
         steps: those that solved something, in order.
         camera: with its distortion.
-        intrinsics: what is known of the camera beside its parameters; None: not solved yet.
+        intrinsics: what is known about the camera besides its parameters; None: not solved yet.
         hand_eye: None: not solved yet.
         best: the answer that the registration uses: with the arm's correction where there is one.
         captures: the board images, of the step whose images were used.
@@ -71,7 +71,7 @@ class Charts:
 
     coverage: HeatMap
     residuals: VectorField
-    per_image: Dots
+    per_image: DotPlot
     sigma_px: HeatMap
     sigma_mm: HeatMap
 
@@ -159,7 +159,7 @@ def charts_of(calibration: Calibration) -> Charts | None:
     )  # fmt: skip
 
 
-def hand_eye_chart(calibration: Calibration) -> Dots | None:
+def hand_eye_chart(calibration: Calibration) -> DotPlot | None:
     """Distance of the board as each image places it from its place by the others; None without a hand-eye."""
     best = calibration.best
     if best is None:

@@ -20,7 +20,7 @@ from service.run_record import RunRecord
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.record.board_images import BoardUse, board_uses
-from service.web.record.images import Capture, captures_of
+from service.web.record.images import Capture, captures_of, step_to_show
 from service.web.record.rig_cameras import rig_cameras
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
@@ -165,11 +165,12 @@ def _shown(site: Site, person: Person, run_id: str, wanted: CaptureQuery) -> Cap
     from service.web.capture import view as capture_view  # noqa: PLC0415
 
     log = site.run(run_id)
-    step = capture_view.step_to_show(log, wanted.step)
+    steps = capture_view.capture_steps(log.protocol)
+    step = step_to_show(log, steps, wanted.step)
     return CapturePage(
         run_id=run_id,
         log=log,
-        steps=capture_view.capture_steps(log.protocol),
+        steps=steps,
         held=any(s.by_hand for s in log.protocol.steps),
         further_cameras=rig_cameras(log),
         images=None if step is None else _of_step(site, person, log, step, wanted),
@@ -263,7 +264,7 @@ def _image(
     """The large image, with what is known about it."""
     from service.web.capture import view as capture_view  # noqa: PLC0415
     from service.web.capture.cameras import camera_images  # noqa: PLC0415
-    from service.web.record.known_spheres import best_registration  # noqa: PLC0415
+    from service.web.record.known_spheres import displayed_registration  # noqa: PLC0415
 
     valid = [c for c in captures if c.replaced is None]
     cameras: list[CameraImage] = []
@@ -274,7 +275,7 @@ def _image(
         camera=next((one for one in cameras if one.device == device), cameras[0] if cameras else None),
         cameras=cameras,
         sums=[] if chosen is None else capture_view.summary_of(step, chosen),
-        registered=best_registration(log) is not None and (chosen is None or chosen.replaced is None),
+        registered=displayed_registration(log) is not None and (chosen is None or chosen.replaced is None),
     )
 
 

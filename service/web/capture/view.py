@@ -95,17 +95,6 @@ def capture_steps(protocol: Protocol) -> list[Step]:
     ]
 
 
-def step_to_show(log: RunRecord, wanted: str) -> Step | None:
-    """The step asked for; else the current one, the last one with images, or the first; None without any."""
-    steps = {step.id: step for step in capture_steps(log.protocol)}
-    if wanted in steps:
-        return steps[wanted]
-    if log.state.current in steps:
-        return steps[log.state.current]
-    done = [step for step in steps.values() if log.state.steps[step.id].captured]
-    return done[-1] if done else next(iter(steps.values()), None)
-
-
 def views_of(log: RunRecord, step: Step) -> list[StepViewpoint]:
     """Every viewpoint of a step in the order of capture: planned, suggested, and taken without either."""
     state = log.state.steps[step.id]

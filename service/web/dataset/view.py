@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.dataset.preview.records import AT_LEAST, Preview, ShownView
+from service.dataset.preview.records import AT_LEAST, Preview, ViewPreview
 
 SPLITS = ("dense", "sparse", "train", "test")
 SPLIT_WORDS = {
@@ -40,10 +40,10 @@ class DataSetView:
         covered: (at least so many views, share of the surface).
     """
 
-    views: tuple[ShownView, ...]
+    views: tuple[ViewPreview, ...]
     split: str
     splits: tuple[SplitTab, ...]
-    chosen: ShownView | None
+    chosen: ViewPreview | None
     before: str
     after: str
     done: int

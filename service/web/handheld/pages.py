@@ -16,6 +16,7 @@ from service.people.person import Person
 from service.run_record import RunRecord
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
+from service.web.record.images import step_to_show
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
@@ -81,12 +82,13 @@ def _shown(site: Site, person: Person, run_id: str, wanted: str) -> HandheldPage
     from service.web.handheld import view as held_view  # noqa: PLC0415 - brings numerics that the start does not wait for
 
     log = site.run(run_id)
-    step = held_view.step_to_show(log, wanted)
+    steps = held_view.held_steps(log.protocol)
+    step = step_to_show(log, steps, wanted)
     holder = Control(site.store).holder(run_id)
     return HandheldPage(
         run_id=run_id,
         log=log,
-        steps=held_view.held_steps(log.protocol),
+        steps=steps,
         step=step,
         now=None if step is None else held_view.held_now(log, step),
         attempt=1 if step is None else log.state.steps[step.id].attempt,

@@ -83,17 +83,6 @@ def held_steps(protocol: Protocol) -> list[Step]:
     return [step for step in protocol.steps if step.by_hand]
 
 
-def step_to_show(log: RunRecord, wanted: str) -> Step | None:
-    """The step asked for, else the current one, else the last one that has begun; None without any."""
-    steps = {step.id: step for step in held_steps(log.protocol)}
-    if wanted in steps:
-        return steps[wanted]
-    if log.state.current in steps:
-        return steps[log.state.current]
-    begun = [step for step in steps.values() if log.state.steps[step.id].captured]
-    return begun[-1] if begun else next(iter(steps.values()), None)
-
-
 def held_now(log: RunRecord, step: Step) -> HandheldView:
     """Collect the state of the step from the record."""
     state = log.state.steps[step.id]
@@ -144,13 +133,13 @@ def _overlay(here: Matrix, there: Matrix) -> Overlay:
     return Overlay((round(reach * x, 1), round(reach * y, 1)), z)
 
 
-def _lowest(places: Sequence[hand_view.ShownPlace]) -> float:
+def _lowest(places: Sequence[hand_view.PlaceStatus]) -> float:
     """Largest distance of a place from the vertical through the middle, metres."""
     radii = [math.hypot(p.T_level_camera[0][3], p.T_level_camera[1][3]) for p in places]
     return max([0.05, *radii])
 
 
-def _spots(places: Sequence[hand_view.ShownPlace], target: str) -> tuple[PlanMarker, ...]:
+def _spots(places: Sequence[hand_view.PlaceStatus], target: str) -> tuple[PlanMarker, ...]:
     lowest = _lowest(places)
     return tuple(
         _spot(

@@ -78,7 +78,7 @@ class ChartPoint:
 
 
 @dataclass(frozen=True, slots=True)
-class Dots:
+class DotPlot:
     """Values of several series for each name, along the x axis; told apart by shape."""
 
     title: str
@@ -174,7 +174,7 @@ def dots(
     title: str,
     limit: float | None = None,
     limit_text: str = "",
-) -> Dots:
+) -> DotPlot:
     """A dot plot with one mark for each name and series. A limit far above all values is stated, not drawn."""
     height = 300.0
     inner = height - _TOP - _BOTTOM
@@ -199,7 +199,7 @@ def dots(
     spacing = _nice(top / 4)
     y_ticks = tuple(Tick(y(k * spacing), f"{k * spacing:g}") for k in range(int(top / spacing) + 1))
     at = y(limit) if limit is not None and drawn else None
-    return Dots(title, height, tuple(marks), tuple(n for n, _ in series), x_ticks, y_ticks, at, limit_text)
+    return DotPlot(title, height, tuple(marks), tuple(n for n, _ in series), x_ticks, y_ticks, at, limit_text)
 
 
 def _pixel_ticks(image_px: tuple[int, int], inner: float) -> tuple[tuple[Tick, ...], tuple[Tick, ...]]:

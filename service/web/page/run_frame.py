@@ -123,11 +123,11 @@ def _attention(  # noqa: PLR0911 - one return a case
 def driven_frames(site: Site, *, but: str = "") -> list[RunFrame]:
     """The frames of all runs that a living process drives now, for the banners of pages that are not theirs.
 
-    Raises nothing: what cannot be told is unknown.
+    Never raises: a run whose state cannot be read is shown as unknown.
 
     Args:
         site: the site.
-        but: a run whose own banner the page has already.
+        but: a run to leave out, because the page has its banner already; "" for none.
     """
     try:
         driven = [run_id for run_id in site.launcher.driven_runs() if run_id != but]

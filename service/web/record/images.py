@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
 
+from service.core.protocol.models import Step
 from service.core.records.events import FurtherExposure, RecordedView, ViewpointCaptured, ViewpointFailed
 from service.core.run.state import JobState, StepState, Superseded
 from service.jobs.capture import further_view, live_view
@@ -40,6 +41,17 @@ class StatedCamera(BaseModel):
 def stated_camera(view: RecordedView | FurtherExposure) -> StatedCamera:
     """What the photograph of a view states about the camera."""
     return StatedCamera.model_validate(view.camera)
+
+
+def step_to_show(log: RunRecord, steps: Sequence[Step], wanted: str) -> Step | None:
+    """The step asked for; else the current one, the last one with images, or the first; None without any."""
+    by_id = {step.id: step for step in steps}
+    if wanted in by_id:
+        return by_id[wanted]
+    if log.state.current in by_id:
+        return by_id[log.state.current]
+    begun = [step for step in steps if log.state.steps[step.id].captured]
+    return begun[-1] if begun else next(iter(steps), None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,7 @@ from typing import Literal
 from service.core.protocol.step_params import Gives
 from service.dataset.control_spheres import control_centres
 from service.dataset.registered_scan import control_scan, registered_scan
-from service.dataset.registrations import best_registration as best_registration_name
-from service.dataset.registrations import registrations
+from service.dataset.registrations import best_registration, registrations
 from service.jobs.records import SpheresFound
 from service.jobs.registration.register import Registration
 from service.jobs.surfaces import locate_spheres
@@ -30,7 +29,7 @@ class Sphere:
 
 
 @dataclass(frozen=True, slots=True)
-class ShownRegistration:
+class DisplayedRegistration:
     """The registration that pages show: see service.dataset.registrations.best_registration."""
 
     name: str
@@ -44,13 +43,13 @@ def last_step(log: RunRecord, gives: Gives) -> str:
     return next((step for step in steps if log.state.steps[step].result), "")
 
 
-def best_registration(log: RunRecord) -> ShownRegistration | None:
+def displayed_registration(log: RunRecord) -> DisplayedRegistration | None:
     """The registration to show; None before there is one."""
-    name = best_registration_name(log.protocol, log.state)
+    name = best_registration(log.protocol, log.state)
     if name is None:
         return None
     record = registrations(log.protocol, log.state)[name]
-    return ShownRegistration(name, record, last_step(log, "registrations"))
+    return DisplayedRegistration(name, record, last_step(log, "registrations"))
 
 
 def scan_spheres(log: RunRecord) -> tuple[Sphere, ...]:

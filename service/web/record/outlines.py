@@ -20,7 +20,7 @@ from service.dataset.registrations import further_cameras
 from service.jobs.capture import further_view, live_view
 from service.run_record import RunRecord
 from service.web.record.images import Capture, further_of
-from service.web.record.known_spheres import Sphere, best_registration, ct_spheres, scan_spheres
+from service.web.record.known_spheres import Sphere, ct_spheres, displayed_registration, scan_spheres
 from service.web.record.live_files import LiveOutlines, read_live_outlines, read_outlines
 from service.web.record.pictures import DrawnOutline
 
@@ -52,7 +52,7 @@ def outlines_of(log: RunRecord, capture: Capture, device: str = "") -> OutlineSo
     """
     if device:
         return _of_further(log, capture, device)
-    registered = best_registration(log)
+    registered = displayed_registration(log)
     if registered is not None and capture.replaced is None:
         T = registered.record.T_scan_camera.get(capture.payload.viewpoint)
         artefact = registered.record.outlines
@@ -79,7 +79,7 @@ def _of_further(log: RunRecord, capture: Capture, device: str) -> OutlineSource 
     """The outlines in the image of a further camera, as the registration measured them, or as it arrived."""
     mine = next((one for one in further_of(log, capture) if one.exposure.device == device), None)
     located = further_cameras(log.protocol, log.state).get(device)
-    registered, viewpoint = best_registration(log), capture.payload.viewpoint
+    registered, viewpoint = displayed_registration(log), capture.payload.viewpoint
     if capture.replaced is None and located is not None and located.outlines and registered is not None:
         camera = CameraModel.from_record(located.camera.plain())
         T_scan_camera = further_pose(located, registered.record.T_scan_camera.get(viewpoint))

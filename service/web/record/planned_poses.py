@@ -45,7 +45,7 @@ class StationPlan:
 
 def station_of(log: RunRecord, name: str) -> StationPlan | None:
     """A station of the rig as it was when the run began; None if the rig has no such station."""
-    section = recorded_rig(log)
+    section = recorded_rig_section(log)
     there = section.stations.get(name)
     if there is None:
         return None
@@ -116,7 +116,7 @@ def place(T_base_camera: Transform) -> tuple[Vector, Vector]:
 
 def nominal_T_flange_camera(log: RunRecord) -> tuple[tuple[float, float, float, float], ...] | None:
     """T_flange_camera by the design of the camera's mount; None if the rig file does not state it."""
-    return recorded_rig(log).T_flange_camera_nominal
+    return recorded_rig_section(log).T_flange_camera_nominal
 
 
 def _vector(values: Transform) -> Vector:
@@ -124,7 +124,7 @@ def _vector(values: Transform) -> Vector:
     return x, y, z
 
 
-def recorded_rig(log: RunRecord) -> RigSection:
+def recorded_rig_section(log: RunRecord) -> RigSection:
     """The rig file as it was when the run began."""
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # checked when the record was read

@@ -27,9 +27,9 @@ RunId = Annotated[str, Path(max_length=64)]
 
 @router.get("/runs/{run_id}/stream", name="stream", dependencies=[Depends(requires("read"))])
 async def stream(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId) -> StreamingResponse:
-    """`changed` with {"seq", "monitor", "locked"} whenever one of them is another than before.
+    """`changed` with {"seq", "monitor", "locked"} whenever one of them has changed.
 
-    `replaced` is the end: the sign-in has opened more streams than it may have, and this is the oldest.
+    `replaced` ends the stream: the sign-in has opened more streams than it may have, and this is the oldest.
     """
     await run_in_threadpool(site.store.head, run_id)  # an unknown run is refused before the stream begins
     return StreamingResponse(

@@ -98,7 +98,7 @@ class StepView:
     started_utc: str
     ended_utc: str
     table: Sequence[Row]  # of an evaluation
-    depends: tuple[AcceptedGate, ...]  # what was accepted outside its limits and this rests on
+    depends: tuple[AcceptedGate, ...]  # figures accepted outside their limits that this step depends on
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ class Acceptance:
     figures: tuple[str, ...]
     role: str
     another: bool  # neither who began the run nor who confirmed the step
-    affects: tuple[str, ...]  # later steps that will say that they rest on it
+    affects: tuple[str, ...]  # later steps whose results depend on it, and will say so
 
 
 @dataclass(frozen=True, slots=True)

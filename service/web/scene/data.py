@@ -26,10 +26,10 @@ from service.jobs.surfaces import fuse
 from service.run_record import RunRecord
 from service.web.record.images import captures_of, further_of
 from service.web.record.known_spheres import (
-    ShownRegistration,
+    DisplayedRegistration,
     Sphere,
-    best_registration,
     ct_spheres,
+    displayed_registration,
     last_step,
     scan_spheres,
 )
@@ -58,7 +58,7 @@ class KnownScene:
     how: str
     missing: tuple[str, ...] = ()
     mesh: ArtefactRef | None = None
-    registered: ShownRegistration | None = None
+    registered: DisplayedRegistration | None = None
     sphere_images: Mapping[str, int] = field(default_factory=dict[str, int])
 
 
@@ -74,7 +74,7 @@ class MeshFacts:
 
 def scene_of(log: RunRecord) -> KnownScene:
     """The best known scene: registered, else provisional, else planned."""
-    registered = best_registration(log)
+    registered = displayed_registration(log)
     if registered is not None:
         return _registered(log, registered)
     live = _live(log)
@@ -84,7 +84,7 @@ def scene_of(log: RunRecord) -> KnownScene:
 # --- after the registration -------------------------------------------------------------------------------------
 
 
-def _registered(log: RunRecord, registered: ShownRegistration) -> KnownScene:
+def _registered(log: RunRecord, registered: DisplayedRegistration) -> KnownScene:
     record = registered.record
     cameras = {name: np.array(T, dtype=np.float64) for name, T in record.T_scan_camera.items()}
     spheres = scan_spheres(log)
@@ -262,7 +262,7 @@ def with_mesh(now: KnownScene, log: RunRecord, data: Path) -> Scene:
     return replace(now.scene, mesh=SceneMesh(points, triangles, error_mm))
 
 
-def predicted_error_mm(registered: ShownRegistration, points_m: Array) -> Array:
+def predicted_error_mm(registered: DisplayedRegistration, points_m: Array) -> Array:
     """3D standard deviation (N,) of points (N, 3) of the scan, due to the registration with the images, mm."""
     placed = Alignment(np.array(registered.record.T_world_scan), np.array(registered.record.covariance)[:6, :6])
     return np.asarray(mm(np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2))), dtype=np.float64)

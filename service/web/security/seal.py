@@ -23,7 +23,7 @@ _SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 async def sealed(request: Request, site: CurrentSite) -> AsyncGenerator[None]:
     """Dependency of all routes (`scope="function"`): signs before the answer is sent, also for refused requests.
 
-    Accounts, invitations, sign-ins and their refusals, wrong passwords of a signature: all of it comes with a POST.
+    Only requests such as POST need it: accounts, invitations, sign-ins and signatures, refused ones included.
     """
     try:
         yield

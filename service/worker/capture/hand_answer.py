@@ -96,11 +96,11 @@ def _result(guide: HandGuide, why: str) -> job.Answer:
         used=new.used,
         why=why,
         words=next_words,
-        target=None if target is None else job.ShownPlace(name=target.name, T_level_camera=_pose(target)),
+        target=None if target is None else job.PlaceStatus(name=target.name, T_level_camera=_pose(target)),
         T_scene_camera=None if T is None else matrix(T),
         T_level_camera=None if T is None or level is None else matrix(inverse(level) @ T),
         places=tuple(
-            job.ShownPlace(name=place.name, T_level_camera=_pose(place), done=place.name in done)
+            job.PlaceStatus(name=place.name, T_level_camera=_pose(place), done=place.name in done)
             for place in guide.places()
         ),
         cells=np.sum(cells, axis=0).tolist() if new.cells.size else (),

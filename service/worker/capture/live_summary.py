@@ -35,7 +35,7 @@ def live_summary(context: JobContext[job.Arguments]) -> JobAnswer:
         next_best_views=() if here is None else _suggestions(context.arguments, scene, here, records),
         reasons=reasons,
         stations={
-            name: job.StationSoFar(predicted_target_error_mm=mm(s.error_m()), images=len(s.solved.used))
+            name: job.StationPrediction(predicted_target_error_mm=mm(s.error_m()), images=len(s.solved.used))
             for name, s in stations.items()
         },
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from service.compute.capture.live import LiveView, expected_spheres, image_measures
 from service.compute.images.files import read_image
-from service.compute.markers.search.predicted import NEAR, PredictedSpheres, find_spheres, tone_of
+from service.compute.markers.search.predicted import NEAR, PredictedSpheres, find_outlines, tone_of
 from service.compute.planning.coverage import covered_fraction
 from service.core.errors import ComputeError
 from service.core.geometry import Transform, inverse
@@ -31,7 +31,7 @@ def live_view(context: JobContext[job.Arguments]) -> JobAnswer:
     known = last_known(mine)
     (T_base_camera,) = robot_camera_poses(arguments, [image])
     pixels = read_image(context.input(image.sha256))
-    outlines = find_spheres(pixels, scene.camera, _prediction(scene, mine, known, T_base_camera)).outlines
+    outlines = find_outlines(pixels, scene.camera, _prediction(scene, mine, known, T_base_camera)).outlines
     measures, black = image_measures(pixels, outlines, scene.camera)
     view = LiveView(image.viewpoint, T_base_camera, outlines)
     reason, T_base_scan, visible = "", known, scene.seen_from(None)

@@ -201,7 +201,7 @@ def _control(scan: MeasuredSpheres, control_scan: SpheresFound | None) -> Measur
     )
     extra = list(found.missing_b)
     if not extra:
-        raise ComputeError("the control scan shows no sphere beside the registration spheres")
+        raise ComputeError("the control scan shows no sphere except the registration spheres")
     R = alignment.T_a_b[:3, :3]
     return MeasuredSpheres(
         apply(alignment.T_a_b, both.centres_m[extra]),

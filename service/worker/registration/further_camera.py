@@ -154,7 +154,7 @@ def _views(
 
 
 def _frames(first: job.FirstCamera, own: Mapping[str, Array]) -> Mapping[str, OuterFrame]:
-    """The first camera's poses, with what many of them share: the registration's covariance, and their `own`."""
+    """The first camera's poses, each with the sum of the registration's covariance and the pose's `own` one."""
     T_world_scan, covariance = np.array(first.T_world_scan), np.array(first.covariance)[:6, :6]
     of_world = of_inverse(T_world_scan, covariance)
     nothing = np.zeros((6, 6))

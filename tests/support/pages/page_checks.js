@@ -1,4 +1,4 @@
-// What a test measures in a page: sizes of what is touched, sideways scrolling, the way of the focus.
+// What tests measure in a page: sizes of touch targets, horizontal scrolling, the order of the focus.
 (() => {
   const shown = (e) => e.checkVisibility({ visibilityProperty: true, opacityProperty: true }) && e.getClientRects().length > 0;
   const behind = () => [...document.querySelectorAll("dialog:modal")].at(-1);

@@ -12,7 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.masks import Ball, posts_below
+from service.compute.pixels.masks import WorldSphere, posts_below
 from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.rays import pixel_rays
 from service.compute.pixels.splits import splits
@@ -30,7 +30,7 @@ class Scene:
     """An L-shaped solid, so that no turn and no mirror maps it to itself, among four spheres."""
 
     mesh: trimesh.Trimesh
-    balls: tuple[Ball, ...]
+    spheres: tuple[WorldSphere, ...]
 
     def tone(self, world: Array) -> Array:
         """Brightness of surface points (..., 3): it names the place."""
@@ -53,7 +53,7 @@ def scene() -> Scene:
     faces = np.concatenate([first.faces, second.faces + len(first.vertices)])
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     at = [(-0.15, -0.1, 0.03), (0.15, -0.11, 0.04), (0.14, 0.15, 0.03), (-0.13, 0.12, 0.05)]
-    return Scene(mesh, tuple(Ball(np.array(centre), 0.012) for centre in at))
+    return Scene(mesh, tuple(WorldSphere(np.array(centre), 0.012) for centre in at))
 
 
 def reach(eye: Array, directions: Array) -> Array:
@@ -90,7 +90,7 @@ def posed_data_set(
     covariance = np.diag([1e-10, 1e-10, 2e-10, 1e-9, 1e-9, 3e-9])
     views = tuple(PosedView(name, ".png", camera, T, covariance) for name, T in poses(count).items())
     files = {view.name: folder / view.file for view in views}
-    blank = Photographs(files, surface, shown.balls)
+    blank = Photographs(files, surface, shown.spheres)
     for view in views:
         depth = blank.depth_m(view).astype(np.float64)[..., None]
         xy = pixel_rays(camera).xy(0, camera.height)
@@ -103,5 +103,5 @@ def posed_data_set(
         pixels_px = camera.project(apply(inverse(view.T_world_camera), points))
         sees[view.name] = np.asarray((pixels_px > 0).all(axis=1), dtype=np.bool_)
     mark = "simulated" if simulated else ""
-    pixels = Photographs(files, surface, shown.balls, posts_below(shown.balls, UP, 0.05, 0.004), mark=mark)
+    pixels = Photographs(files, surface, shown.spheres, posts_below(shown.spheres, UP, 0.05, 0.004), mark=mark)
     return DataSet(f"run-1 {count}", simulated, {"run": "run-1"}, views, pixels, Mesh(vertices, faces), splits(sees))

@@ -19,9 +19,9 @@ from service.core.records.events import EvidenceExported
 from service.dataset.posed.of_run.data_set import data_set_of
 from service.dataset.preview.records import (
     DecidedRegion,
+    GroundTruthPreview,
     Preview,
-    ShownGroundTruth,
-    ShownView,
+    ViewPreview,
     read_preview,
     write_preview,
 )
@@ -166,7 +166,7 @@ def test_the_figures_of_a_fused_mesh_are_told(web: WebSite, run: str, auditor: B
     folder = next((web.site.data / "cache" / "dataset").glob(f"{run}-*"))
     before = preview_of(web, run)
     assert before.distances is not None
-    truth = ShownGroundTruth(
+    truth = GroundTruthPreview(
         step="Fuse <both>", ct_share=0.125, scan_share=0.75, blend_share=0.125, sigma_median_mm=0.031,
         sigma_high_mm=0.222, distance_change_max_mm=0.017, loop_closure_mm=0.043, faces=4711,
         regions=(DecidedRegion("ct", "grace <b>"),), sources="sources.json", sigmas="sigmas.json",
@@ -196,7 +196,7 @@ def test_a_name_on_the_page_is_escaped(web: WebSite, run: str, auditor: Browser)
     before = read_preview(folder)
     assert before is not None
     hostile = '"><script>alert(1)</script>&view=x'
-    view = ShownView(hostile, 10, 10, ("dense", hostile), "a.jpg", "b.jpg", "c.webp", 1, 2, ready=True)
+    view = ViewPreview(hostile, 10, 10, ("dense", hostile), "a.jpg", "b.jpg", "c.webp", 1, 2, ready=True)
     try:
         write_preview(folder, Preview((view,), (4, 4), no_distances=hostile, whole=True))
         assert previews(web).ready(state) is not None

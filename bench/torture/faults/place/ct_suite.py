@@ -56,7 +56,7 @@ class Suite:
         return self._host[:-1] + "2"
 
     def listen(self, *, full: bool = False) -> None:
-        """Start the receiver, or start it anew. Raises RuntimeError if it does not start."""
+        """Start or restart the receiver. Raises RuntimeError if it does not start."""
         self._end_receiver()
         command = [sys.executable, "-m", "service.cli.main", "dicom-listen", "--json", "--folder", str(self._folder)]
         options = ["--host", self._host, "--port", str(_PORT), "--reserve-gb", _FULL_GB if full else "0"]

@@ -129,7 +129,7 @@ class Film:
         self._process: BaseProcess | None = None
 
     def run(self, how: str = "") -> None:
-        """Begin, or begin anew: `frozen`, `damaged`, `other_size` or `noise` say what is wrong with the images."""
+        """Start or restart, with images that are `frozen`, `damaged`, `other_size` or `noise`; "" for good ones."""
         self.end()
         process = multiprocessing.get_context("fork").Process(target=_write, args=(self.pipe, how), daemon=True)
         process.start()

@@ -18,7 +18,7 @@ from service.runner.operator import AnswerBy
 from tests.support.rig.bench_rig import ScriptedOperator, agree, answer
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
-_STILL_S = 0.25  # a motion after a longer rest is another one; a place is told ten times a second at least
+_STILL_S = 0.25  # a motion after a longer rest is another one; positions arrive at least ten times a second
 _MAY_MOVE = 0b11  # safety_status_bits: normal, reduced
 
 

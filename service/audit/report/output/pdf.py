@@ -18,9 +18,9 @@ import typst
 
 from service.audit.report.blocks import (
     Block,
+    DescriptionList,
     Drawing,
     Drawings,
-    Facts,
     Heading,
     Paragraph,
     Picture,
@@ -118,7 +118,7 @@ def _block(block: Block, folder: Path, numbers: Iterator[int]) -> dict[str, Any]
             made: dict[str, Any] = {"kind": "heading", "text": text}
         case Paragraph(text, tone):
             made = {"kind": "paragraph", **_cell(TableCell(text, tone))}
-        case Facts():
+        case DescriptionList():
             made = {"kind": "facts", "rows": _facts(block)}
         case Table():
             made = _table(block)
@@ -132,7 +132,7 @@ def _block(block: Block, folder: Path, numbers: Iterator[int]) -> dict[str, Any]
     return made
 
 
-def _facts(facts: Facts) -> list[dict[str, Any]]:
+def _facts(facts: DescriptionList) -> list[dict[str, Any]]:
     return [{"name": name, **_cell(value)} for name, value in facts.rows]
 
 

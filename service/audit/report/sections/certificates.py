@@ -7,7 +7,17 @@ from collections.abc import Iterator
 import numpy as np
 
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Column, Drawings, Facts, Heading, Paragraph, Section, Table, TableCell
+from service.audit.report.blocks import (
+    Block,
+    Column,
+    DescriptionList,
+    Drawings,
+    Heading,
+    Paragraph,
+    Section,
+    Table,
+    TableCell,
+)
 from service.audit.report.drawings.charts import bars_drawing, coverage_drawing, residual_drawing, uncertainty_drawing
 from service.audit.report.words import judged, limit, measured, utc
 from service.core.equipment.recorded_devices import RecordedOptics, recorded_optics
@@ -41,7 +51,7 @@ def certificate_sections(run: RecordedRun) -> Iterator[Section]:
             yield Section(f"Calibration certificate: {step.title}", blocks)
 
 
-def _facts(run: RecordedRun, step_id: str, sha256: str, solved: calibrate.Answer) -> Facts:
+def _facts(run: RecordedRun, step_id: str, sha256: str, solved: calibrate.Answer) -> DescriptionList:
     state = run.state.steps[step_id]
     first = next((run.events[seq - 1].payload for seq in sorted(state.captured.values())), None)
     camera = recorded_optics(first.camera if isinstance(first, RecordedView) else {})
@@ -54,7 +64,7 @@ def _facts(run: RecordedRun, step_id: str, sha256: str, solved: calibrate.Answer
         rows += _intrinsics_facts(solved.details.intrinsics)
     if solved.hand_eye is not None:
         rows += _hand_eye_facts(solved.hand_eye)
-    return Facts(tuple(rows))
+    return DescriptionList(tuple(rows))
 
 
 def _camera_and_lens(camera: RecordedOptics) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from service.audit.overview.shots import failed_exposures, shots_by_step, together
 from service.audit.record.missing_results import not_in_yet
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Facts, TableCell
+from service.audit.report.blocks import DescriptionList, TableCell
 from service.audit.report.sections.notes import about_facts
 from service.audit.report.words import duration, utc
 from service.core.errors import OrthocaptureError
@@ -16,13 +16,13 @@ from service.dataset.late_results import late_results
 from service.rig import parse_recorded_rig
 
 
-def facts(run: RecordedRun) -> Facts:
+def facts(run: RecordedRun) -> DescriptionList:
     """Names and values for the first page."""
     root, state, events = run.root, run.state, run.events
     shots = shots_by_step(run.protocol, state, failed_exposures(events))
     others = sorted(run.named(person) for person in state.people - {root.operator})
     status = {"active": "not finished"}.get(state.status, state.status)
-    return Facts(
+    return DescriptionList(
         (
             *_of_what_and_where(run),
             ("Run", run.run_id),

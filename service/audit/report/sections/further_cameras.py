@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Column, Facts, Heading, Paragraph, Section, Table, TableCell
+from service.audit.report.blocks import Block, Column, DescriptionList, Heading, Paragraph, Section, Table, TableCell
 from service.core.text.counts import counted
 from service.dataset.further_cameras import KnownFurtherCamera, known_further_cameras
 
@@ -54,7 +54,7 @@ def _row(camera: KnownFurtherCamera) -> tuple[TableCell | str, ...]:
     return camera.name, place, str(len(camera.images)), camera.outer, *sigmas, clock
 
 
-def _facts(camera: KnownFurtherCamera) -> Facts:
+def _facts(camera: KnownFurtherCamera) -> DescriptionList:
     optics, located = camera.optics, camera.located
     body = ", ".join(filter(None, (optics.model, optics.lens, f"body {optics.body_serial}")))
     rows: list[tuple[str, TableCell | str]] = [
@@ -74,4 +74,4 @@ def _facts(camera: KnownFurtherCamera) -> Facts:
     if camera.clock is not None:
         unlike = "; two models, whose delays differ" if camera.clock.unlike else ""
         rows.append(("Clocks compared by", counted(camera.clock.photographs, "pair") + " of photographs" + unlike))
-    return Facts(tuple(rows))
+    return DescriptionList(tuple(rows))

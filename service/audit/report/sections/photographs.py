@@ -12,7 +12,15 @@ from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Column, Heading, Paragraph, Pictures, Section, Table, TableCell
 from service.audit.report.drawings.pictures import LARGE_PX, THUMBNAIL_PX, picture
 from service.audit.report.drawings.scene import report_scene
+from service.core.protocol.models import Step
 from service.core.records.events import FurtherExposure, RecordedView, ViewpointCaptured
+
+_ORIGINALS = (
+    Column("event", 0.5, "number"),
+    Column("view", 0.9),
+    Column("original file name", 1.4),
+    Column("SHA-256, its name in the evidence", 4.2, "code"),
+)
 
 
 def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
@@ -36,32 +44,34 @@ def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
         blocks += [Heading(scene.drawing.title), scene]
     originals: list[tuple[TableCell | str, ...]] = []
     for step in run.protocol.steps:
-        seqs = sorted(run.state.steps[step.id].captured.values())
-        captures = [(seq, run.events[seq - 1].payload) for seq in seqs]
-        views = [(seq, capture) for seq, capture in captures if isinstance(capture, RecordedView)]
-        if views:
-            sheet = tuple(picture(run, view.artefacts[0].sha256, _caption(view), THUMBNAIL_PX) for _, view in views)
-            blocks += [Heading(f"Contact sheet: {step.title}"), Pictures(sheet, 5)]
-        further = _further(views)
-        for device, mine in further.items():
-            sheet = tuple(picture(run, one.artefacts[0].sha256, caption, THUMBNAIL_PX) for _, caption, one in mine)
-            blocks += [Heading(f"Contact sheet: {step.title}, {device}"), Pictures(sheet, 5)]
-        shown = [(seq, view.viewpoint, view.artefacts[0]) for seq, view in views]
-        shown += [(seq, f"{name}, {one.device}", one.artefacts[0]) for m in further.values() for seq, name, one in m]
-        originals += [(str(seq), name, ref.original_name, ref.sha256) for seq, name, ref in shown]
+        sheets, of_step = _contact_sheets(run, step)
+        blocks += sheets
+        originals += of_step
     if originals:
-        columns = (
-            Column("event", 0.5, "number"),
-            Column("view", 0.9),
-            Column("original file name", 1.4),
-            Column("SHA-256, its name in the evidence", 4.2, "code"),
-        )
         text = (
             "The pictures above are small copies. The original photographs are in the folder "
             "artefacts of the evidence, and of a bundle made from it, each under its SHA-256."
         )
-        blocks += [Heading("Originals"), Paragraph(text), Table(columns, tuple(originals), small=True)]
+        blocks += [Heading("Originals"), Paragraph(text), Table(_ORIGINALS, tuple(originals), small=True)]
     return Section("Pictures", tuple(blocks) or (Paragraph("No photograph was taken."),))
+
+
+def _contact_sheets(run: RecordedRun, step: Step) -> tuple[list[Block], list[tuple[str, str, str, str]]]:
+    """The contact sheets of a step, one for each camera, and a row of `_ORIGINALS` for each of their pictures."""
+    blocks: list[Block] = []
+    seqs = sorted(run.state.steps[step.id].captured.values())
+    captures = [(seq, run.events[seq - 1].payload) for seq in seqs]
+    views = [(seq, capture) for seq, capture in captures if isinstance(capture, RecordedView)]
+    if views:
+        sheet = tuple(picture(run, view.artefacts[0].sha256, _caption(view), THUMBNAIL_PX) for _, view in views)
+        blocks += [Heading(f"Contact sheet: {step.title}"), Pictures(sheet, 5)]
+    further = _further(views)
+    for device, mine in further.items():
+        sheet = tuple(picture(run, one.artefacts[0].sha256, caption, THUMBNAIL_PX) for _, caption, one in mine)
+        blocks += [Heading(f"Contact sheet: {step.title}, {device}"), Pictures(sheet, 5)]
+    shown = [(seq, view.viewpoint, view.artefacts[0]) for seq, view in views]
+    shown += [(seq, f"{name}, {one.device}", one.artefacts[0]) for m in further.values() for seq, name, one in m]
+    return blocks, [(str(seq), name, ref.original_name, ref.sha256) for seq, name, ref in shown]
 
 
 def _further(views: Sequence[tuple[int, RecordedView]]) -> dict[str, list[tuple[int, str, FurtherExposure]]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from service.audit.record.run import RecordedRun
-from service.audit.report.blocks import Block, Column, Facts, Heading, Paragraph, Section, Table, TableCell
+from service.audit.report.blocks import Block, Column, DescriptionList, Heading, Paragraph, Section, Table, TableCell
 from service.core.text.counts import counted
 from service.core.units import megabytes
 from service.store.verification.verify import AuditReport
@@ -36,7 +36,7 @@ def verification_section(run: RecordedRun, audit: AuditReport) -> Section:
     return Section("Verification", tuple(blocks))
 
 
-def _checked(run: RecordedRun, audit: AuditReport) -> Facts:
+def _checked(run: RecordedRun, audit: AuditReport) -> DescriptionList:
     """How much was checked, the chain head, and the keys."""
     head = run.events[-1]
     unsigned = audit.unsigned_events.get(run.run_id, 0)
@@ -61,7 +61,7 @@ def _checked(run: RecordedRun, audit: AuditReport) -> Facts:
     ]
     names = ("Public key, fingerprint (SHA-256)", "Later public key, fingerprint")
     rows += [(names[min(n, 1)], key_id) for n, key_id in enumerate(audit.key_ids)]
-    return Facts(tuple(rows))
+    return DescriptionList(tuple(rows))
 
 
 def _faults(audit: AuditReport) -> Iterator[Block]:

@@ -28,7 +28,7 @@ from service.core.geometry import Array, Transform, increment, skew
 FLOOR_M = 2e-7
 _ITERATIONS = 8
 _SETTLED = 1e-10  # largest step of the transforms (m, rad) at convergence
-_SETTLED_ARM = 1e-5  # the same of the arm's parameters, in tolerances
+_SETTLED_ARM = 1e-5  # likewise for the arm's parameters, in units of their tolerances
 _SELECTION_ROUNDS = 80
 _UNDETERMINED = "the views do not determine the hand-eye transform"
 _SINGULAR = 3e-7  # smallest accepted pivot of the scaled normal matrix

@@ -16,7 +16,7 @@ _PAIRS = 2_000_000  # of a query and a face, compared at a time
 
 
 @dataclass(frozen=True, slots=True)
-class OnSurface:
+class NearestPoints:
     """The places on a mesh that are nearest to some points: distance (Q,), place (Q, 3), face (Q,)."""
 
     distance_m: Array = field(repr=False)
@@ -40,7 +40,7 @@ class TriangleTree:
             low, high = np.minimum.reduceat(low, pairs, axis=0), np.maximum.reduceat(high, pairs, axis=0)
             self._levels.append((low, high))
 
-    def nearest(self, queries_m: Array, bounds_m: Array | None = None) -> OnSurface:
+    def nearest(self, queries_m: Array, bounds_m: Array | None = None) -> NearestPoints:
         """Find the point of the surface nearest to each query (Q, 3).
 
         Args:
@@ -48,7 +48,7 @@ class TriangleTree:
             bounds_m: (Q,) distances from each query to some place of the surface, such as a sample of it. The
                 closer these are to the answer, the faster it is found; None: found by descending the tree.
         """
-        out = OnSurface(
+        out = NearestPoints(
             np.empty(len(queries_m)), np.empty((len(queries_m), 3)), np.empty(len(queries_m), dtype=np.int64)
         )
         for begin in range(0, len(queries_m), _QUERIES):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from service.compute.ground_truth.align import Aligned
 from service.compute.ground_truth.fusion.fuse import outside, without_specks
-from service.compute.ground_truth.fusion.regions import Balls
+from service.compute.ground_truth.fusion.regions import SphereRegion
 from service.compute.ground_truth.surface import Surface
 
 _MARGIN_M = 0.001  # around a sphere that was taken away: the CT's surface beside it is drawn towards it
@@ -19,10 +19,10 @@ class CommonPart:
     """A CT without the spheres that were taken away before the scan; `taken` is where they were."""
 
     ct: Surface = field(repr=False)
-    taken: Balls = field(repr=False)
+    taken: SphereRegion = field(repr=False)
 
 
 def common_part(ct: Surface, aligned: Aligned, radius_m: float) -> CommonPart:
     """Leave out of a CT, in the scan's frame, the spheres of a radius that the scan lacks, and small loose parts."""
-    taken = Balls(aligned.taken_away_m, radius_m + _MARGIN_M)
+    taken = SphereRegion(aligned.taken_away_m, radius_m + _MARGIN_M)
     return CommonPart(without_specks(outside(ct, taken), _LEAST_PART_M2), taken)

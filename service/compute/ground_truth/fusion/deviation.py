@@ -65,8 +65,9 @@ def deviation_field(surface: Surface, known_m: Array, known: Mask, lengths: Fiel
 def moved_unfolded(surface: Surface, move_m: Array) -> tuple[Surface, int]:
     """The surface after a displacement (V, 3) of its vertices, and the number of faces that are turned over.
 
-    Around faces that turn over, mostly slivers of marching cubes, the displacements of neighbours become more alike:
-    a common one turns nothing. Where that is not enough, the corners go to the mean of their neighbours.
+    Around faces that turn over (mostly slivers of marching cubes), displacements are averaged with those of their
+    neighbours: equal displacements turn no face. Where that is not enough, vertices move to the mean of their
+    neighbours.
     """
     points = surface.vertices_m + move_m
     folded = _folded(surface, points)

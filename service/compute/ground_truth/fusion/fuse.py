@@ -110,20 +110,20 @@ def fuse(
 
     Args:
         ct: in the scan's frame, vertices shared between faces, outward faces.
-        scan: its holes are where the CT is taken, besides the wound.
-        up: (3,) direction away from the table, by which hollows are told from undersides.
+        scan: where it has holes, and in the wound, the CT is taken.
+        up: (3,) direction away from the table; it distinguishes hollows from undersides.
         settings: the defaults if None.
         corrections: regions that people drew.
-        removed: where the CT shows something that was taken away before the scan; there the scan alone counts.
+        removed: where the CT shows something that was taken away before the scan; there only the scan counts.
 
     Raises:
-        ComputeError: a source has no faces, or the two nowhere agree.
+        ComputeError: a source has no faces, or the two agree nowhere.
     """
     chosen = settings or FusionSettings()
     carrier = without_specks(ct if removed is None else outside(ct, removed), chosen.least_part_m2)
     seen = overlap(carrier, scan, chosen.overlap)
     if not seen.covered.any():
-        raise ComputeError("CT and scan nowhere agree", remedy="Check that both are in the same frame and unit")
+        raise ComputeError("CT and scan agree nowhere", remedy="Check that both are in the same frame and unit")
     wound = corrected(propose_wound(carrier, seen.covered, up, chosen.wound), carrier.vertices_m, corrections)
     usable = seen.covered & ~wound
     height = seen.offset_m[usable] if usable.any() else np.zeros(1)

@@ -61,14 +61,14 @@ class Prism:
 
 
 @dataclass(frozen=True, slots=True)
-class Balls:
-    """Balls of one radius about centres (M, 3), such as spheres that were taken away."""
+class SphereRegion:
+    """The points within a radius of any of the centres (M, 3), such as those of spheres that were taken away."""
 
     centres_m: Array
     radius_m: float
 
     def contains(self, points_m: Array) -> Mask:
-        """(N,) which points (N, 3) lie in a ball."""
+        """(N,) which points (N, 3) lie in it."""
         out = np.zeros(len(points_m), dtype=np.bool_)
         for centre in self.centres_m:
             out |= np.linalg.norm(points_m - centre, axis=1) <= self.radius_m
@@ -77,7 +77,7 @@ class Balls:
 
 @dataclass(frozen=True, slots=True)
 class RegionCorrection:
-    """A region in which a person decides.
+    """A region in which a person has chosen CT or scan.
 
     Attributes:
         region: where.

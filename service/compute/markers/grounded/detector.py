@@ -66,7 +66,7 @@ class GroundedDetector:
 
 
 def voted(first: Sequence[SphereOutline], second: Sequence[SphereOutline]) -> tuple[SphereOutline, ...]:
-    """Of two detectors' outlines those that both find, and the whole and clear ones of either, the best first."""
+    """The outlines that both detectors find, and the complete and clear ones of either; the best first."""
     out = [o for o in first if _shown_by(o, second) or _sure(o)]
     out += [o for o in second if _sure(o) and not _shown_by(o, first)]
     return tuple(sorted(out, key=lambda outline: -outline.score))

@@ -105,7 +105,7 @@ def fit_limb(
 
 @dataclass(frozen=True, slots=True)
 class _Shading:
-    """What is known of the profiles' shading: the limb's rise is similar all around, and slopes are small.
+    """What is known about the profiles' shading: the limb's rise is similar all around, and slopes are small.
 
     Values are (G, K), and how far a profile may deviate is (G, 1).
     """

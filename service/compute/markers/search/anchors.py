@@ -38,7 +38,7 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 
-class MapOver(Protocol):
+class MapFunction(Protocol):
     """`map`, in this process or over several."""
 
     def __call__(self, work: Callable[[_Item], _Result], items: Iterable[_Item], /) -> Iterable[_Result]:
@@ -73,7 +73,7 @@ def register_anchors(
     spheres: ScanSpheres,
     sets: Sequence[NDArray[np.int64]],
     options: DetectionOptions,
-    map_over: MapOver,
+    map_over: MapFunction,
 ) -> AnchorRegistration | None:
     """The registration of a few images of each of the `sets`; None if no reliable one is found."""
     seen: dict[int, tuple[SphereOutline, ...]] = {}

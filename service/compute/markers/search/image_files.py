@@ -19,11 +19,11 @@ from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_image_of
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
-from service.compute.markers.search.anchors import AnchorRegistration, MapOver, register_anchors
+from service.compute.markers.search.anchors import AnchorRegistration, MapFunction, register_anchors
 from service.compute.markers.search.predicted import (
     ImageOutlines,
     PredictedSpheres,
-    find_spheres,
+    find_outlines,
 )
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.identification.pairing import paired
@@ -201,11 +201,11 @@ def searched_whole(outlines: Sequence[tuple[SphereOutline, ...]]) -> LocatedOutl
 
 
 def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> ImageOutlines:
-    return find_spheres(read_image_of(task.path, camera), camera, task.expected, options)
+    return find_outlines(read_image_of(task.path, camera), camera, task.expected, options)
 
 
 @contextmanager
-def _mapping(workers: int, items: int) -> Generator[MapOver]:
+def _mapping(workers: int, items: int) -> Generator[MapFunction]:
     """A map over processes, or the plain one for a single worker."""
     if workers <= 1 or items <= 1:
         yield map

@@ -100,7 +100,7 @@ class ImageOutlines:
     missing: dict[int, str]
 
 
-def find_spheres(
+def find_outlines(
     image_bgr: NDArray[np.uint8],
     camera: CameraModel,
     expected: PredictedSpheres | None,

@@ -83,7 +83,7 @@ def pose_error(R: Array, direction: Array, T_second_first: Transform) -> PoseErr
 def auc(errors_deg: Sequence[float], threshold_deg: float) -> float:
     """Area under the cumulative curve of pose errors up to a threshold, over the threshold: 0 to 1.
 
-    As Sarlin et al. (SuperGlue, CVPR 2020) and their successors have it. The curve is piecewise linear from (0, 0)
+    Defined as in Sarlin et al. (SuperGlue, CVPR 2020) and later work. The curve is piecewise linear from (0, 0)
     through (error k, k / n), with the errors in order, and level from the last error below the threshold. A pair
     without a pose has an infinite error.
 

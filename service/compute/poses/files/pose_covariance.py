@@ -12,7 +12,7 @@ import numpy as np
 from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.poses.hybrid.adjustment import first_guess, robust_rows
-from service.compute.poses.hybrid.bundle import BundleState, Data, Rows, Sigmas, normal_equations
+from service.compute.poses.hybrid.bundle import AdjustmentData, BundleState, Rows, Sigmas, normal_equations
 from service.compute.poses.hybrid.rows import linearise
 from service.compute.poses.hybrid.stated_covariance import clustered_information
 from service.compute.poses.sfm.tracks import Tracks
@@ -44,7 +44,7 @@ def similarity_covariance(
     """
     n = len(T_world_camera)
     state = BundleState(T_world_camera, tracks.points, np.empty((0, 4, 4)), camera)
-    data = Data(tracks)
+    data = AdjustmentData(tracks)
     rows = robust_rows(state, data, first_guess(state, data, Sigmas()))
     bread, meat = clustered_information(rows["tracks"], 6 * n)
     # The images do not determine seven directions: translation, rotation and scale.
@@ -75,7 +75,9 @@ def similarity_covariance(
     return covariance
 
 
-def _pulls(state: BundleState, data: Data, tracks: Rows, bread: Array, known: CameraCovariance) -> Iterator[Array]:
+def _pulls(
+    state: BundleState, data: AdjustmentData, tracks: Rows, bread: Array, known: CameraCovariance
+) -> Iterator[Array]:
     """(6 N,) change of the poses' gradient for each deviation of the camera, with the points adjusted."""
     plain = linearise(state, data, Sigmas())["tracks"]
     # The square roots of the robust weights, over the sigma that they were found with.

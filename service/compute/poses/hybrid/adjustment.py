@@ -9,7 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.compute.descent import Damping, levenberg_marquardt
-from service.compute.poses.hybrid.bundle import BundleState, Data, Normal, Rows, Sigmas, moved, normal_equations
+from service.compute.poses.hybrid.bundle import (
+    AdjustmentData,
+    BundleState,
+    Normal,
+    Rows,
+    Sigmas,
+    moved,
+    normal_equations,
+)
 from service.compute.poses.hybrid.rows import linearise
 from service.compute.poses.hybrid.stated_covariance import (
     CAUCHY,
@@ -50,7 +58,7 @@ class BundleSolution:
     steps: int
 
 
-def solve(state: BundleState, data: Data, sigmas: Sigmas, *, rounds: int = 3) -> BundleSolution:
+def solve(state: BundleState, data: AdjustmentData, sigmas: Sigmas, *, rounds: int = 3) -> BundleSolution:
     """Levenberg–Marquardt with Cauchy weights; the components' variances are estimated between rounds.
 
     The variances are Förstner's estimates: each component's weighted sum of squares over its redundancy (Koch,
@@ -86,7 +94,7 @@ def solve(state: BundleState, data: Data, sigmas: Sigmas, *, rounds: int = 3) ->
     return BundleSolution(state, sigmas, weights, covariance, chi2, steps)
 
 
-def first_guess(state: BundleState, data: Data, sigmas: Sigmas) -> Sigmas:
+def first_guess(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> Sigmas:
     """Sigmas with the tracks' from the median of their residuals, so that robust weights work from the start."""
     squares = linearise(state, dataclasses.replace(data, sightings=None, robot=None, lens_covariance=None), sigmas)[
         "tracks"
@@ -105,7 +113,7 @@ class _Linearised:
 
 
 def _descend(
-    state: BundleState, data: Data, sigmas: Sigmas, settled: float
+    state: BundleState, data: AdjustmentData, sigmas: Sigmas, settled: float
 ) -> tuple[BundleState, dict[str, Rows], int]:
     def at(there: BundleState) -> _Linearised:
         rows = linearise(there, data, sigmas)
@@ -182,7 +190,7 @@ def _estimated(sigmas: Sigmas, chi2: dict[str, float], redundancy: dict[str, flo
     )
 
 
-def robust_rows(state: BundleState, data: Data, sigmas: Sigmas) -> dict[str, Rows]:
+def robust_rows(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> dict[str, Rows]:
     """Rows of every component with their robust weights."""
     rows = linearise(state, data, sigmas)
     weights = _weights(rows)

@@ -48,7 +48,7 @@ class SphereSightings:
 
 
 @dataclass(frozen=True, slots=True)
-class Data:
+class AdjustmentData:
     """The measurements. Sigmas: px for tracks, (m, rad) for the robot, metres for the spheres' positions."""
 
     tracks: Tracks
@@ -95,7 +95,7 @@ class Rows:
         return np.sum(self.residual.reshape(-1, self.size) ** 2, axis=1)
 
 
-def width(state: BundleState, data: Data) -> int:
+def width(state: BundleState, data: AdjustmentData) -> int:
     """Number of frame parameters: six per camera, six per base, the errors shared by outlines, and the lens."""
     return lens_column(state, data) + (len(LENS) if data.lens_covariance is not None else 0)
 
@@ -105,7 +105,7 @@ def common_column(state: BundleState) -> int:
     return 6 * (len(state.cameras) + len(state.bases))
 
 
-def lens_column(state: BundleState, data: Data) -> int:
+def lens_column(state: BundleState, data: AdjustmentData) -> int:
     """First column of the lens."""
     return common_column(state) + (len(COMMON) if data.sightings is not None else 0)
 
@@ -161,7 +161,7 @@ def normal_equations(rows: list[Rows], damping: float = 0.0) -> Normal:
     return Normal(schur, gradient, W, inverse, point_gradient)
 
 
-def moved(state: BundleState, data: Data, frame: Array, points: Array) -> BundleState:
+def moved(state: BundleState, data: AdjustmentData, frame: Array, points: Array) -> BundleState:
     """The state after an increment of the frame parameters (n,) and the points (Q, 3)."""
     n, g = len(state.cameras), len(state.bases)
     camera = state.camera

@@ -10,14 +10,14 @@ from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone
 from service.compute.poses.hybrid.adjustment import BundleSolution
-from service.compute.poses.hybrid.bundle import Data, SphereSightings, normal_equations
+from service.compute.poses.hybrid.bundle import AdjustmentData, SphereSightings, normal_equations
 from service.compute.poses.hybrid.rows import linearise
 from service.core.geometry import Array
 
 _RIM = 12  # rays of an outline that are recomputed
 
 
-def camera_share(solution: BundleSolution, data: Data, known: CameraCovariance) -> Array:
+def camera_share(solution: BundleSolution, data: AdjustmentData, known: CameraCovariance) -> Array:
     """Covariance (n, n) of the frame parameters due to the camera's covariance, to be added to the solution's.
 
     For each deviation of the camera, this takes the step that the adjustment would make with that camera: robust

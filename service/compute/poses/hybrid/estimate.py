@@ -20,7 +20,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import SphereOutline
 from service.compute.poses.hybrid.adjustment import BundleSolution, solve
-from service.compute.poses.hybrid.bundle import BundleState, Data, Sigmas, SphereSightings, whitening_of
+from service.compute.poses.hybrid.bundle import AdjustmentData, BundleState, Sigmas, SphereSightings, whitening_of
 from service.compute.poses.hybrid.camera_error import camera_share
 from service.compute.poses.sfm.tracks import Tracks
 from service.compute.registration.identification.identity import identify
@@ -214,14 +214,14 @@ def hybrid_poses(
 
 def _data(
     tracks: Tracks, sightings: SphereSightings, spheres: ScanSpheres, camera: CameraModel, settings: HybridOptions
-) -> Data:
+) -> AdjustmentData:
     """The measurements of tracks and spheres, with their priors."""
     common = settings.common_errors or EXPECTED_COMMON_ERRORS
     covariance = spheres.covariance_m2
     if covariance is None:
         covariance = np.broadcast_to(settings.sphere_sigma_m**2 * np.eye(3), (len(spheres.centres_m), 3, 3))
     distance_m = float(np.mean(spheres.radius_m / np.sin(sightings.cones.half_angles)))
-    return Data(
+    return AdjustmentData(
         tracks=tracks,
         sightings=sightings,
         centres=spheres.centres_m,

@@ -15,8 +15,8 @@ from service.compute.camera_model import CameraModel
 from service.compute.poses.hybrid.bundle import (
     COMMON,
     LENS,
+    AdjustmentData,
     BundleState,
-    Data,
     Index,
     Rows,
     Sigmas,
@@ -28,7 +28,7 @@ from service.compute.poses.hybrid.bundle import (
 from service.core.geometry import Array, skew
 
 
-def linearise(state: BundleState, data: Data, sigmas: Sigmas) -> dict[str, Rows]:
+def linearise(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> dict[str, Rows]:
     """Rows of every component in the data: tracks, spheres, centres, common, robot_position …, lens."""
     out = {"tracks": _track_rows(state, data, sigmas)}
     if data.sightings is not None:
@@ -51,7 +51,7 @@ def _seen(cameras: Array, points: Array) -> tuple[Array, Array, Array]:
     return np.einsum("oij,oj->oi", Rt, v), d_pose, Rt
 
 
-def _track_rows(state: BundleState, data: Data, sigmas: Sigmas) -> Rows:
+def _track_rows(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> Rows:
     tracks = data.tracks
     c, d_pose, d_point = _seen(state.cameras[tracks.image], state.points[tracks.point])
     camera = state.camera
@@ -69,7 +69,7 @@ def _track_rows(state: BundleState, data: Data, sigmas: Sigmas) -> Rows:
     return _rows(state, data, observed)
 
 
-def _sphere_rows(state: BundleState, data: Data, sigmas: Sigmas) -> Rows:
+def _sphere_rows(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> Rows:
     s = data.sightings
     assert s is not None
     point = s.marker + len(data.tracks.points)
@@ -126,7 +126,7 @@ class _Observed:
     more: tuple[int, Array] | None  # first column and derivatives (O, k, m) of further frame parameters
 
 
-def _rows(state: BundleState, data: Data, seen: _Observed) -> Rows:
+def _rows(state: BundleState, data: AdjustmentData, seen: _Observed) -> Rows:
     """Sparse rows from dense derivatives."""
     n_obs, k = seen.residual.shape
     row = np.arange(n_obs * k).reshape(n_obs, k, 1)
@@ -150,7 +150,7 @@ def _sparse(row: NDArray[Any], column: NDArray[Any], values: NDArray[Any], shape
     return coo_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape).tocsr()
 
 
-def _centre_rows(state: BundleState, data: Data) -> Rows:
+def _centre_rows(state: BundleState, data: AdjustmentData) -> Rows:
     """Rows of the spheres' measured positions in the scan."""
     assert data.centres is not None
     assert data.centre_whitening is not None
@@ -162,7 +162,7 @@ def _centre_rows(state: BundleState, data: Data) -> Rows:
     return Rows(residual, csr_matrix((3 * m, width(state, data))), point, 3)
 
 
-def _common_rows(state: BundleState, data: Data) -> Rows:
+def _common_rows(state: BundleState, data: AdjustmentData) -> Rows:
     """Rows of the prior of the errors that all outlines share."""
     assert data.common_sigma_px is not None
     count = len(COMMON)
@@ -171,7 +171,7 @@ def _common_rows(state: BundleState, data: Data) -> Rows:
     return Rows(state.common / data.common_sigma_px, frame, csr_matrix((count, state.points.size)), 1)
 
 
-def _robot_rows(state: BundleState, data: Data, sigmas: Sigmas) -> tuple[Rows, Rows]:
+def _robot_rows(state: BundleState, data: AdjustmentData, sigmas: Sigmas) -> tuple[Rows, Rows]:
     assert data.robot is not None
     assert data.group is not None
     image = np.nonzero(np.isfinite(data.robot).all(axis=(1, 2)))[0]
@@ -203,7 +203,7 @@ def _robot_rows(state: BundleState, data: Data, sigmas: Sigmas) -> tuple[Rows, R
     return out[0], out[1]
 
 
-def _lens_rows(state: BundleState, data: Data) -> Rows:
+def _lens_rows(state: BundleState, data: AdjustmentData) -> Rows:
     """Rows of the lens calibration, as an observation of the lens."""
     assert data.calibrated is not None
     assert data.lens_covariance is not None

@@ -23,7 +23,7 @@ _RANK = 1e-10  # eigenvalues of the scaled information below this share of the l
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
+class CauchyMoments:
     """Means over normal residuals r of unit variance, per dimension, under Cauchy weights w.
 
     Attributes:
@@ -39,13 +39,13 @@ class Expected:
     slope: float
 
 
-def _expected(scale: float, dimensions: int) -> Expected:
+def _expected(scale: float, dimensions: int) -> CauchyMoments:
     s = np.linspace(0.0, 80.0, 20001)[1:]
     density = s ** (dimensions / 2 - 1) * np.exp(-s / 2)
     density /= density.sum()
     w = 1 / (1 + s / scale**2)
     slope = w - 2 * s / dimensions * w**2 / scale**2
-    return Expected(
+    return CauchyMoments(
         float(density @ (w * s)) / dimensions,
         float(density @ (w**2 * s)) / dimensions,
         float(density @ w),

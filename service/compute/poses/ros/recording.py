@@ -45,7 +45,7 @@ _DAMAGES = (
 
 @dataclass
 class Recording:
-    """What a recording holds, but for the images, which are handed on as they are read.
+    """What a recording holds, except the images, which are passed on as they are read.
 
     Attributes:
         frames: of /tf and /tf_static.

@@ -20,7 +20,7 @@ from service.compute.poses.colmap.process import ColmapProcess
 from service.compute.poses.files.pose_covariance import blocks, similarity_covariance
 from service.compute.poses.sfm.features import ImageFeatures, PairMatches
 from service.compute.poses.sfm.front_end import FrontEnd, pairs_of
-from service.compute.poses.sfm.kept import KeptFrontEnd
+from service.compute.poses.sfm.kept import CachedFrontEnd
 from service.compute.poses.sfm.options import Mapper, Progress, SfmOptions
 from service.compute.poses.sfm.tracks import Tracks
 from service.core.errors import ComputeError, DataError
@@ -130,7 +130,7 @@ def reconstruct(
     pairs = pairs_of(files, T_world_camera_prior, settings, stations=stations)
     seconds: dict[str, float] = {}
     with FrontEnd(camera, settings, processes=settings.threads, log=folder / "colmap_front.log") as front:
-        kept = KeptFrontEnd(folder, camera, settings, seconds)
+        kept = CachedFrontEnd(folder, camera, settings, seconds)
         features = kept.features(files, front, progress)
         matches = kept.matches(features, pairs, front, progress)
     start = T_world_camera_prior if mapper == "triangulated" else None

@@ -17,7 +17,7 @@ from service.compute.poses.sfm.options import Progress, SfmOptions
 
 
 @dataclass(frozen=True, slots=True)
-class KeptFrontEnd:
+class CachedFrontEnd:
     """Features and matches of one camera and one set of options.
 
     Attributes:

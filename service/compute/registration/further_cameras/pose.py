@@ -29,8 +29,8 @@ class SightedPose:
 
     Attributes:
         T_scan_camera: (4, 4).
-        noise: (6, 6) covariance by the noise of the outlines, which differs between images.
-        common: (6, 6) by errors of spheres, lens and edges, which many images share.
+        noise: (6, 6) covariance due to the noise of the outlines, which differs between images.
+        common: (6, 6) covariance due to errors of spheres, lens and edges, which many images share.
         spheres: number of them.
         rms_px: of their outlines.
     """

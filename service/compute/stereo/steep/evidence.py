@@ -20,7 +20,7 @@ from service.core.geometry import Array, apply, inverse
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-VIEWS = 4  # that are compared at a place
+VIEWS = 4  # compared at each place
 _HALF = 4  # of a patch's edge, in samples
 _LEAST_COSINE = 0.13  # between the normal and the ray
 _LEAST_PARALLAX = 0.2  # of two views, in the surface: metres for a metre along the normal
@@ -141,8 +141,8 @@ def evidence(
 ) -> tuple[Floats, Array]:
     """How alike the photographs are, 0 to 1 (N, L), with each place moved along its normal; and the views' cosines.
 
-    It is the mean over pairs of views of the correlation of patches, with noise, so that what is plain says little;
-    0 where fewer than two views see a place.
+    It is the correlation of patches, averaged over pairs of views. A noise is added to each variance, so that patches
+    without texture correlate little. It is 0 where fewer than two views see a place.
     """
     out = np.zeros((len(points_m), len(moves_m)), dtype=np.float32)
     views, cosines = best_views(photographs, points_m, normals)
@@ -183,7 +183,7 @@ def _likeness(patches: Floats, seen: NDArray[np.bool_]) -> Floats:
 def _patches(photographs: Sequence[Photograph], points_m: Array, axes: Array, chosen: Ints, moves_m: Array) -> Floats:
     """(N, VIEWS, L, samples) what each view shows of each moved patch, less its mean.
 
-    The patch is projected with its derivative in the middle: it is small beside its distance.
+    The patch is projected with the derivative at its middle, since it is small compared with its distance.
     """
     out = np.zeros((*chosen.shape, len(moves_m), len(_U)), dtype=np.float32)
     for k in np.unique(chosen[chosen >= 0]):

@@ -17,7 +17,7 @@ _LEAST_COVERAGE = 0.15  # of a sphere; smaller caps of any radius occur everywhe
 
 
 @dataclass(frozen=True, slots=True)
-class SeenRadius:
+class MeasuredRadius:
     """The radius of the spheres in a mesh, and those spheres."""
 
     radius_m: float
@@ -31,7 +31,7 @@ def seen_radius(
     limits: SphereLimits | None = None,
     *,
     normals: Array | None = None,
-) -> SeenRadius | None:
+) -> MeasuredRadius | None:
     """The radius with the most spheres in the mesh: from 0.7 to 1.3 times `radius_m`, half or twice it.
 
     Takes as long as a dozen searches. Arguments as for `locate_spheres`; None if there are no such spheres.
@@ -51,7 +51,7 @@ def seen_radius(
         nearest = nearest + float(np.median([sphere.radius_residual_m for sphere in best]))
         again = _located(vertices_m, faces, nearest, limits, normals)
         best = again if len(again) >= len(best) else best
-    return SeenRadius(nearest, best)
+    return MeasuredRadius(nearest, best)
 
 
 def _located(

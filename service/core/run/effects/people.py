@@ -1,4 +1,4 @@
-"""What people's entries do to the state, but for the actions of operator_transitions.py."""
+"""What people's entries do to the state, except the actions of operator_transitions.py."""
 
 from __future__ import annotations
 

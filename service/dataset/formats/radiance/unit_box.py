@@ -22,9 +22,9 @@ class UnitBox:
         return T
 
     def record(self, dataset: DataSet, mesh_axes: tuple[int, int, int]) -> dict[str, object]:
-        """As JSON, for whoever brings a mesh back: which axes of the saved mesh are x, y and z of the world.
+        """As JSON, to bring a saved mesh to the world: scale, centre, and which of its axes are the world's x, y, z.
 
-        The programs take scale and offset out again when they save a mesh; its centre is all that is missing.
+        The programs undo the scale when they save a mesh, so only the centre has to be added.
         """
         return {
             "simulated": dataset.simulated,
@@ -37,6 +37,6 @@ class UnitBox:
 
 
 def unit_box(mesh: Mesh, fill: float = 0.9) -> UnitBox:
-    """The box of a mesh, of whose half-edge the mesh fills this share."""
+    """The box about a mesh whose longest extent fills this share of the box's edge."""
     low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
     return UnitBox((low + high) / 2, fill / float((high - low).max()))

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.masks import Ball, Post, hull_mask, posts_below
+from service.compute.pixels.masks import Cylinder, WorldSphere, hull_mask, posts_below
 from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.splits import splits
 from service.core.errors import DataError
@@ -135,16 +135,16 @@ def _pixels(
     summary: RunSummary, files: dict[str, tuple[Path, str]], views: Sequence[PosedView], mesh: Mesh, *, personal: bool
 ) -> tuple[Photographs, str]:
     """Photographs, depth and masks of the views, and what the masks hold, in words."""
-    balls, posts = _markers(summary, views)
+    spheres, posts = _markers(summary, views)
     pixels = Photographs(
         {name: path for name, (path, _) in files.items()},
         RayMesh(mesh.vertices_m, mesh.faces),
-        balls,
+        spheres,
         posts,
         personal=personal,
         mark="SIMULATED" if summary.root.simulated else "",
     )
-    return pixels, _masked(balls, posts)
+    return pixels, _masked(spheres, posts)
 
 
 def _photographs(summary: RunSummary, registered: Registration) -> dict[str, tuple[Path, str]]:
@@ -184,23 +184,23 @@ def _view(name: str, path: Path, registered: Registration, covariance: Array, ta
     return PosedView(name, suffix, camera, T_scan_camera, covariance, taken)
 
 
-def _markers(summary: RunSummary, views: Sequence[PosedView]) -> tuple[tuple[Ball, ...], tuple[Post, ...]]:
+def _markers(summary: RunSummary, views: Sequence[PosedView]) -> tuple[tuple[WorldSphere, ...], tuple[Cylinder, ...]]:
     """All spheres that an image may show, and the posts of the registration spheres."""
     radius_m = metres(summary.protocol.spheres.radius_mm)
-    balls, extra = (
-        tuple(Ball(np.array(centre), radius_m) for centre in centres)
+    spheres, extra = (
+        tuple(WorldSphere(np.array(centre), radius_m) for centre in centres)
         for centres in (summary.scan_spheres_m(), control_spheres(summary))
     )
     vertices_m, faces = summary.scan_mesh()
     scan = Mesh(np.asarray(vertices_m, dtype=np.float64), np.asarray(faces, dtype=np.int64))
-    return (*balls, *extra), _posts(balls, scan, views)
+    return (*spheres, *extra), _posts(spheres, scan, views)
 
 
-def _masked(balls: Sequence[Ball], posts: Sequence[Post]) -> str:
+def _masked(spheres: Sequence[WorldSphere], posts: Sequence[Cylinder]) -> str:
     """What the masks hold, in words."""
     if posts:
-        return f"{len(balls)} spheres, and the posts below {len(posts)} of them"
-    return f"{len(balls)} spheres; posts are not masked, because the scan shows no board on which they stand"
+        return f"{len(spheres)} spheres, and the posts below {len(posts)} of them"
+    return f"{len(spheres)} spheres; posts are not masked, because the scan shows no board on which they stand"
 
 
 def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ...]:
@@ -211,16 +211,18 @@ def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ..
     return control_centres(summary.scan_spheres_m(), result_of_step(summary.state, before, SpheresFound).spheres_m)
 
 
-def _posts(balls: Sequence[Ball], mesh: Mesh, views: Sequence[PosedView]) -> tuple[Post, ...]:
+def _posts(spheres: Sequence[WorldSphere], mesh: Mesh, views: Sequence[PosedView]) -> tuple[Cylinder, ...]:
     """A post is not recorded: it stands below its sphere, is thinner, and ends on the board, if a scan shows one."""
     eyes = np.mean([view.T_world_camera[:3, 3] for view in views], axis=0)
     up = upwards(mesh, eyes - np.mean(mesh.vertices_m, axis=0))
     lowest = float((mesh.vertices_m @ up).min()) if up.any() else 0.0
     return tuple(
         post
-        for ball in balls
+        for sphere in spheres
         if up.any()
-        for post in posts_below([ball], up, max(ball.radius_m, float(ball.centre_m @ up) - lowest), ball.radius_m)
+        for post in posts_below(
+            [sphere], up, max(sphere.radius_m, float(sphere.centre_m @ up) - lowest), sphere.radius_m
+        )
     )
 
 

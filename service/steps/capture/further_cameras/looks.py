@@ -26,7 +26,7 @@ def look_at_further(
         context: of the capture step.
         spheres_m: centres in the CT.
         radius_m: of the spheres.
-        references: what is recorded in the place of `spheres_m`.
+        references: what is recorded instead of `spheres_m`.
     """
     jobs = context.evidence.jobs(context.step.id)
     begun = {image_of(job).sha256 for job in jobs if job.kind == further_view.KIND.name}

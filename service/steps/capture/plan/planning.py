@@ -13,8 +13,8 @@ from service.compute.planning.motion_plan import (
     MotionPlan,
     Order,
     PlannedView,
+    PlanningScene,
     Progress,
-    Situation,
     best_posture,
     plan_motion,
     travel_times_s,
@@ -31,7 +31,7 @@ from service.rig import CollisionSection, OpticsSection
 from service.steps.capture.plan.viewpoints import Viewpoint
 from service.steps.context import StationLayout, StepContext
 
-_LOOK_S = 0.4  # between two looks at the buttons during planning
+_LOOK_S = 0.4  # between two checks of the buttons during planning
 _NOT_PLANNED = "the kinematics of the arm are not known; its controller checks the reach at each viewpoint"
 _OTHER_AXES = "no arm stands there; the driver of its axes checks the reach at each viewpoint"
 _EXPOSURE_S = 3.0  # estimate of settling, exposure and download at each viewpoint
@@ -67,7 +67,7 @@ class ArmAtStation:
     optics: OpticsSection | None
     motion: Motion
 
-    def situation(self, start_rad: Array, *, sharp_at_m: Array | None = None) -> Situation:
+    def scene(self, start_rad: Array, *, sharp_at_m: Array | None = None) -> PlanningScene:
         """The planner's problem for a motion that starts with the joints (N,) at `start_rad`.
 
         `sharp_at_m`: (N, 3) points that must be sharp, base frame; None: the specimen.
@@ -82,7 +82,7 @@ class ArmAtStation:
             o = self.optics
             focal_m, blur_m = metres(o.focal_length_mm), metres_of_um(o.blur_um)
             sharp = depth_of_field(focal_m, o.aperture_f, o.focus_distance_m, blur_m)
-        return Situation(
+        return PlanningScene(
             body=ArmBody(self.model, self.T_flange_camera, camera),
             obstacles=Obstacles(
                 float(centre[2]) - c.table_below_scene_m, T_base_specimen, half, others=self._others()
@@ -164,8 +164,8 @@ def plan_step(
                 where=f"rig file, station {station}",
                 remedy="Take `arm` out of `collision`: each arm is then planned as its controller names it",
             )
-        situation = arm.situation(start_rad, sharp_at_m=sharp_at_m)
-        plans.append(plan_station(mine, arm, situation, order, _attending(context)))
+        scene = arm.scene(start_rad, sharp_at_m=sharp_at_m)
+        plans.append(plan_station(mine, arm, scene, order, _attending(context)))
     return _recorded(context, plans)
 
 
@@ -187,12 +187,12 @@ def _attending(context: StepContext) -> Progress:
 def plan_station(
     viewpoints: Sequence[Viewpoint],
     arm: ArmAtStation,
-    situation: Situation,
+    scene: PlanningScene,
     order: Order,
     progress: Progress = lambda _what, _done, _total: None,
 ) -> StepPlan:
     """Plan the viewpoints of one station for an arm of known kinematics, without a device."""
-    answer = plan_motion([(v.name, v.T_base_camera) for v in viewpoints], situation, order, progress)
+    answer = plan_motion([(v.name, v.T_base_camera) for v in viewpoints], scene, order, progress)
     stations = {v.name: v.station for v in viewpoints}
     planned = tuple(
         Viewpoint(v.name, stations[v.name], v.T_base_camera, None if v.outcome == "refused" else v.joints_rad)
@@ -232,12 +232,12 @@ def feasible_extra(
     if arm is None:
         return [(v, 0.0) for v in viewpoints]
     start = context.devices.robot(station).state().sample.joints_rad
-    situation = arm.situation(start)
+    scene = arm.scene(start)
     out: list[tuple[Viewpoint, float]] = []
     for viewpoint in viewpoints:
-        joints = best_posture(viewpoint.T_base_camera, situation)
+        joints = best_posture(viewpoint.T_base_camera, scene)
         if joints is not None:
-            out.append((viewpoint, float(travel_times_s(np.array([start, joints]), situation)[0, 1])))
+            out.append((viewpoint, float(travel_times_s(np.array([start, joints]), scene)[0, 1])))
     return out
 
 

@@ -85,8 +85,8 @@ def preview_plans(
         if arm is None:
             return ()
         views = [v for one in step.params.viewpoints if one.station == station for v in plan_viewpoints(one, there)]
-        situation = arm.situation(usual_posture(arm.model, there, arm.T_flange_camera))
-        plans.append(plan_station(views, arm, situation, step.params.order))
+        scene = arm.scene(usual_posture(arm.model, there, arm.T_flange_camera))
+        plans.append(plan_station(views, arm, scene, step.params.order))
     return tuple(plans)
 
 
@@ -111,5 +111,5 @@ def _feasible(arm: ArmAtStation | None, sharp_at_m: Array) -> Callable[[Transfor
     """Whether the arm can reach T_base_camera; always, for an unknown arm."""
     if arm is None:
         return lambda _T: True
-    situation = arm.situation(usual_posture(arm.model, arm.layout, arm.T_flange_camera), sharp_at_m=sharp_at_m)
-    return lambda T: best_posture(T, situation) is not None
+    scene = arm.scene(usual_posture(arm.model, arm.layout, arm.T_flange_camera), sharp_at_m=sharp_at_m)
+    return lambda T: best_posture(T, scene) is not None

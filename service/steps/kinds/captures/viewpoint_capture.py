@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 from service.compute.planning.motion_plan import Order
 from service.core.protocol.step_params import MovingParams, RepeatedStep
 from service.core.records.events import Record
-from service.steps.capture.live_numbers import Live, LiveAnalysis
+from service.steps.capture.live_numbers import LiveAnalysis, LiveParams
 from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.capture.plan.planning import feasible_extra, plan_step
 from service.steps.capture.plan.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
@@ -28,7 +28,7 @@ class Params(MovingParams):
     purpose: Literal["dataset", "control"]  # what the images are for
     viewpoints: tuple[ViewpointSet, ...]  # where the images are taken from
     order: Order = "as_listed"  # of the viewpoints: as listed, or along the shortest way
-    live: Live | None = None  # what is computed from each image during the capture; nothing if left out
+    live: LiveParams | None = None  # what is computed from each image during the capture; nothing if left out
 
     @property
     def photographs_specimen(self) -> bool:

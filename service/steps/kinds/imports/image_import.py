@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import BaseModel
 
+from drivers.stated_settings import agrees
 from service.core.errors import ConfigurationError, DataError
 from service.core.protocol.models import CameraSection
 from service.core.protocol.step_params import StepParams
@@ -77,7 +78,7 @@ def _bring_in(context: StepContext, params: Params, listed: ImportList, view: Im
     """Store one photograph: first its files, then its rows and its event in one transaction."""
     photograph = _put(context, listed, view.photograph, _KINDS[params.photographs])
     refs = (photograph, *(_put(context, listed, raw, "raw") for raw in view.raws))
-    settings = settings_agree(StatedSettings.model_validate(view.camera), context.protocol.camera)
+    settings = stated_settings_agree(StatedSettings.model_validate(view.camera), context.protocol.camera)
     rows = tuple(
         NewArtefact(
             ref=ref,
@@ -126,19 +127,16 @@ class StatedSettings(BaseModel):
     iso: float | None = None
 
 
-def settings_agree(stated: StatedSettings, wanted: CameraSection | None) -> bool | None:
+def stated_settings_agree(stated: StatedSettings, wanted: CameraSection | None) -> bool | None:
     """Whether aperture, exposure time and ISO of a photograph are those of the protocol, as in a capture.
 
     None if the protocol sets none, or the file states none of the three.
     """
     if wanted is None:
         return None
-    pairs = (
-        (stated.aperture_f, wanted.aperture_f, 0.02),
-        (stated.exposure_s, wanted.exposure_s, 0.02),
-        (stated.iso, wanted.iso, 0.0),
-    )
-    agree = [abs(value / meant - 1) <= tolerance for value, meant, tolerance in pairs if value]
+    rounded = ((stated.aperture_f, wanted.aperture_f), (stated.exposure_s, wanted.exposure_s))
+    agree = [agrees(value, meant) for value, meant in rounded if value]
+    agree += [stated.iso == wanted.iso] if stated.iso else []
     return all(agree) if agree else None
 
 

@@ -194,7 +194,7 @@ def _registrations(context: StepContext, step: str, ct: EarlierAnswer[Any]) -> t
             remedy="Leave out `registration` of the step: CT and scan are then registered by the spheres alone",
         )
     mine = arrived[name]
-    # The same job as the scan's, with the spheres of the CT in the place of the scan's.
+    # The same job as the scan's, with the spheres of the CT instead of the scan's.
     of_ct = {
         "spheres_m": ct.answer.spheres_m,
         "sphere_covariance_m2": tuple(sphere.covariance_m2 for sphere in ct.answer.details.spheres),

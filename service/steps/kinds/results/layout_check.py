@@ -146,7 +146,7 @@ def _advise(
         return
     if not details.moves:
         remedy = "; ".join(details.problems) or "the photographs do not decide it"
-        advice = f"{remedy[0].upper()}{remedy[1:]}. Set the spheres up less regularly and photograph them anew"
+        advice = f"{remedy[0].upper()}{remedy[1:]}. Set the spheres up less regularly and photograph them again"
         context.note(MOVE_WANTED, advice=advice)
     else:
         steps = "; then ".join(move.words for move in details.moves)

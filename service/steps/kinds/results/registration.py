@@ -35,7 +35,7 @@ from service.steps.inputs import (
     raw_files,
 )
 from service.steps.measures import Count, ErrorMm, Measure, MeasureRecord, Px, Ratio, RegistrationMeasures
-from service.steps.poses.developed import Exposed, developed
+from service.steps.poses.developed import ExposureFiles, developed
 from service.steps.poses.further_cameras import locate_further_cameras
 from service.steps.poses.registration_jobs import RegistrationJobs, registration_jobs
 from service.steps.poses.sources import DEFAULT_SOURCES, PLANNED, Source, WantedRegistrations, decisive, posed
@@ -85,7 +85,7 @@ class Params(StepParams):
 
 
 class OneRegistration(MeasureRecord):
-    """Of one registration."""
+    """The measures of one registration."""
 
     rms_px: Annotated[Px, "rms distance of the outlines' points from the predicted outlines"] = None
     chi2_reduced: Annotated[
@@ -192,7 +192,7 @@ def _search(context: StepContext, params: Params) -> JobRequest:
         detector=params.detector,
     ).model_copy(update={**mounted.mounting.set_fields(), **known})
     if params.measure_on == "raw":
-        taken = [Exposed(image.viewpoint, image.sha256, raw) for image, raw in raw_files(context, images)]
+        taken = [ExposureFiles(image.viewpoint, image.sha256, raw) for image, raw in raw_files(context, images)]
         arguments = arguments.model_copy(update={"developed": developed(context, taken)})
     references = {
         **mounted.references,

@@ -1,4 +1,4 @@
-// Places that are still being computed ([data-pending] with an id) are fetched again until they are there.
+// Elements that are still being computed ([data-pending] with an id) are fetched again until they are complete.
 "use strict";
 
 const WAIT_MS = 700;
@@ -29,7 +29,7 @@ async function refill() {
       }
     }
   } catch {
-    // The connection is away; the next try comes by itself.
+    // The connection is lost; the next attempt follows.
   }
   if (again) setTimeout(refill, WAIT_MS);
 }

@@ -1,5 +1,5 @@
-// The plan of the viewpoints: larger and smaller by buttons, wheel and two fingers; what lies closer together than a
-// fingertip is chosen from a list.
+// The plan of the viewpoints: zoomed by buttons, wheel and two fingers; viewpoints closer together than a fingertip are
+// chosen from a list.
 "use strict";
 
 (() => {
@@ -7,8 +7,8 @@
   const FAR_PX = 60; // further away from every viewpoint nothing is meant
   const LARGEST = 16;
   const STEP = 1.6; // of a button
-  // By step and station: how much larger, and the middle of what is seen, in units of the drawing. Kept while one viewpoint
-  // after the other is looked at, each of which is a page of its own.
+  // By step and station: zoom, and the middle of the visible part in units of the drawing. It is kept from page to page,
+  // since each viewpoint has its own.
   const KEY = `orthocapture-plan ${location.pathname}`;
   const looks = new Map(JSON.parse(sessionStorage.getItem(KEY) || "[]"));
   const planOf = (event) => (event.target instanceof Element ? event.target.closest("svg[data-plan]") : null);
@@ -25,7 +25,7 @@
     const [w, h] = [width / larger, height / larger];
     plan.setAttribute("viewBox", `${x - w / 2} ${y - h / 2} ${w} ${h}`);
     plan.classList.toggle("larger", larger > 1);
-    // The symbols keep their size on the screen: what lay on one another comes apart.
+    // The symbols keep their size on the screen, so that overlapping ones separate.
     for (const group of plan.querySelectorAll("g[data-viewpoint]")) {
       const [at, down] = [group.dataset.x, group.dataset.y];
       if (larger > 1) group.setAttribute("transform", `translate(${at} ${down}) scale(${1 / larger}) translate(${-at} ${-down})`);
@@ -43,7 +43,7 @@
   function set(plan, larger, x, y) {
     const [width, height] = sizeOf(plan);
     const now = Math.min(Math.max(larger, 1), LARGEST);
-    // The larger, the nearer the middle may come to the rim: what lies there can be looked at as well.
+    // With a larger zoom the middle may come nearer to the edge, so that the edge can be seen as well.
     const within = (at, size) => Math.min(Math.max(at, size / now / now / 2), size - size / now / now / 2);
     looks.set(nameOf(plan), { larger: now, x: within(x, width), y: within(y, height) });
     sessionStorage.setItem(KEY, JSON.stringify([...looks]));
@@ -52,7 +52,7 @@
   function pointOf(plan, clientX, clientY) {
     return new DOMPoint(clientX, clientY).matrixTransform(plan.getScreenCTM().inverse());
   }
-  /** Larger by a factor; what lies under a point of the screen stays there. */
+  /** Zooms by a factor about a point of the screen. */
   function zoom(plan, factor, clientX, clientY) {
     const now = look(plan);
     const larger = Math.min(Math.max(now.larger * factor, 1), LARGEST);
@@ -66,7 +66,7 @@
     set(plan, now.larger, now.x - dxPx / scale, now.y - dyPx / scale);
   }
 
-  /** Where somebody wants to look nearer: at the viewpoint that is shown, the next one, or that nearest to the middle. */
+  /** Where a zoom by button goes: to the viewpoint that is shown, the next one, or the one nearest to the middle. */
   function wanted(plan) {
     const [width, height] = sizeOf(plan);
     const from = ({ x, y }) => Math.hypot(x - width / 2, y - height / 2);
@@ -91,7 +91,7 @@
     zoom(plan, Math.exp(-Math.sign(event.deltaY) * Math.min(Math.abs(event.deltaY), 100) * 0.004), event.clientX, event.clientY);
   }, { passive: false });
 
-  // Two fingers, and one that moves the plan once it is larger.
+  // Two fingers zoom; one finger moves the enlarged plan.
   let fingers = null; // {plan, apart, x, y} of the last event
   const middle = (touches) => ({
     x: [...touches].reduce((sum, t) => sum + t.clientX, 0) / touches.length,

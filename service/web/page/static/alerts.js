@@ -1,6 +1,6 @@
 "use strict";
-/* Tells by sound and notification that a run stops, waits or ends: on the screens of people who have chosen so. The
- * title of the page says it on every screen. */
+/* Signals by sound and notification that a run stops, waits or ends, on screens where alerts are switched on. The title
+ * of the page says it on every screen. */
 
 (() => {
   const KEY = "orthocapture-alerts";

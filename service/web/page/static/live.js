@@ -1,5 +1,5 @@
-// The camera's live view, to focus by: a magnifier, the sharp edges marked, a histogram, and how sharp it is against the
-// sharpest that was seen. All of it is computed here, of the frames that come; nothing of it is recorded.
+// The camera's live view, for focusing: a magnifier, sharp edges marked, a histogram, and the sharpness compared with the
+// best so far. All of it is computed here from the frames; nothing is recorded.
 "use strict";
 
 (() => {
@@ -86,7 +86,7 @@
     context.clearRect(0, 0, loupe.width, loupe.height);
     context.drawImage(source, x, y, w, h, 0, 0, w * times, h * times);
   }
-  /** Energy of the fine edges in what is magnified, against its light: rises until the lens is focused. */
+  /** Energy of the fine edges in the magnified part, relative to its brightness: largest when the lens is focused. */
   function tellSharpness() {
     const { x, y, w, h } = region();
     const { luma, width, height } = frame;
@@ -137,7 +137,7 @@
     tellSharpness();
   }
 
-  // What was computed of the camera that was left is not of the other one.
+  // Clears what was computed for the camera shown before.
   function forget() {
     frame = null;
     [marks, loupe, histogram].forEach((canvas) => canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height));
@@ -154,7 +154,7 @@
       const response = await fetch(`${panel.dataset.live}?camera=${encodeURIComponent(asked)}`, { cache: "no-store" });
       const content = response.status === 200 ? await response.blob() : null;
       if (asked !== camera) {
-        // Another camera was chosen meanwhile: this frame is not of the one that is pressed.
+        // Another camera was chosen meanwhile: this frame is not from it.
       } else if (content) {
         const address = URL.createObjectURL(content);
         picture.src = address;
@@ -230,7 +230,7 @@
   }));
   document.addEventListener("visibilitychange", () => { if (document.hidden && open) set(false); });
 
-  // On the guided screen it belongs to the step at which the lens is focused.
+  // On the guided screen, the live view belongs to the step in which the lens is focused.
   if (panel.hasAttribute("data-at-its-step")) {
     const follow = () => {
       panel.hidden = !document.querySelector("[data-lens-step]");

@@ -26,7 +26,7 @@
     }
   }
 
-  // --- parts: fetched anew when something changed, merged so that focus, caret, typed text and opened details stay --
+  // --- parts: fetched again after a change, merged so that focus, caret, typed text and opened details stay --------
 
   const KEPT = { DETAILS: ["open"], DIALOG: ["open"] };
   const MARKS = new Set(["data-offline", "style"]);
@@ -56,7 +56,7 @@
     let here = old.firstChild;
     for (const node of wanted) {
       let match = here;
-      // Something may have been put in or taken away before: look a little further.
+      // Nodes before it may have been inserted or removed: look a little further.
       for (let i = 0; match && i < 8 && !sameKind(match, node); i += 1) match = match.nextSibling;
       if (match && sameKind(match, node)) {
         while (here !== match) { const next = here.nextSibling; here.remove(); here = next; }
@@ -80,14 +80,14 @@
     do {
       again = false;
       try {
-        // Fetched together and shown at once: no button of one step beside the words of another.
+        // Fetched together and shown at once, so that a button never stands beside the text of another step.
         const news = await Promise.all([...gathered()].map(([address, parts]) => fetchParts(address, parts)));
         for (const [part, fresh] of news.flat()) if (part.isConnected) showPart(part, fresh);
         outdatedSince = 0;
       } catch { outdatedSince ||= Date.now(); }
     } while (again);
     fetching = false;
-    // A run that waits for a person sends no further news: the page must not miss this one.
+    // A run that waits for a person sends no further news, so this one must not be missed.
     if (outdatedSince) retry = setTimeout(refresh, RETRY_MS);
     announce();
     document.dispatchEvent(new CustomEvent("page-changed"));
@@ -96,7 +96,7 @@
     if (offline) setControls(true);
   }
 
-  // A step that has just come up, or has just stopped, is read from its title on.
+  // When a step begins or stops, screen readers start at its title.
   const headOf = () => document.querySelector("[data-head]")?.dataset.head;
   let head = headOf();
   function startAtHead() {
@@ -152,7 +152,7 @@
     });
     stream.addEventListener("beat", heard);
     stream.addEventListener("signed_out", () => location.reload());
-    // Newer pages of this sign-in have taken the places of the oldest: one that nobody looks at waits until somebody does.
+    // This sign-in has opened newer pages, and streams are limited: a hidden page waits until somebody looks at it.
     stream.addEventListener("replaced", () => { stream.close(); replaced = true; });
   }
   function watch() {
@@ -163,7 +163,7 @@
     if (now - heardAt > 1500 && now - opening > 2500) connect();
   }
 
-  // Pages without a stream ask every two seconds how the robots stand, and whether the service answers.
+  // Pages without a stream ask every two seconds for the robots' states, and whether the service answers.
   const robots = by("robots");
   let answeredAt = Date.now();
   let asking = false;
@@ -188,7 +188,7 @@
   }
   function robotsUnknown() {
     if (!body.dataset.stream && !offline) goOffline();
-    // A page of a run that lost its connection says so of its own robot already.
+    // The page of a run that lost its connection already says so for its own robot.
     if (!body.dataset.stream || robots.childElementCount) mergeChildren(robots, by("robots-lost").content);
   }
   document.addEventListener("visibilitychange", () => {

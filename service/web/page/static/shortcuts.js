@@ -1,5 +1,5 @@
-// Keyboard shortcuts, with their list under "?". None of them lets the robot move: that button is held, or the pedal
-// pressed. They wait a moment, so that a badge reader or a scanner that types by itself releases none.
+// Keyboard shortcuts, with their list under "?". None of them lets the robot move: that takes a held button or the pedal.
+// They wait a moment, so that a badge reader or a scanner, which types by itself, triggers none.
 "use strict";
 
 (() => {

@@ -2,7 +2,7 @@
 "use strict";
 
 (() => {
-  // --- reasons: words of one's own are demanded only where no other reason is chosen ---
+  // --- reasons: free text is required only if no preset reason is chosen ---
 
   const reasonsOf = (form) => form?.querySelector(".presets");
   function demandWords(form) {
@@ -41,7 +41,7 @@
     localStorage.setItem(REMEMBERED, target.value);
     target.closest(".secret").querySelector("[name=password]").focus();
   });
-  // What this screen was last signed with comes first.
+  // The way of signing that was used last on this screen comes first.
   function prefer() {
     for (const secret of document.querySelectorAll("dialog:not([open]) .secret")) {
       const wanted = secret.querySelector(`[name=known_by][value="${localStorage.getItem(REMEMBERED) || "password"}"]`);

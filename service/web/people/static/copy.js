@@ -1,4 +1,4 @@
-// A button that copies what stands beside it; where the browser lends no clipboard, it selects it.
+// A button that copies the text beside it; if the browser gives no access to the clipboard, it selects the text.
 "use strict";
 
 document.addEventListener("click", async (event) => {

@@ -1,4 +1,4 @@
-// Draws the figure that this document holds with plotly, in the colours of the theme, and turns it to fixed views.
+// Draws this document's figure with plotly, in the colours of the theme, and turns it to fixed views.
 "use strict";
 
 (() => {
@@ -44,7 +44,7 @@
   );
   dark.addEventListener("change", () => Plotly.relayout(place, dress({ ...figure.layout })));
 
-  // The box that plotly's camera moves in has one unit for a metre; views are said in millimetres of the drawing.
+  // plotly's camera moves in units of a metre about the middle of the axes; views are given in millimetres of the drawing.
   const middle = (axis) => {
     const [low, high] = figure.layout.scene[axis].range;
     return (low + high) / 2;

@@ -1,4 +1,4 @@
-// Draws a region on the 3D view, corner by corner with pen, finger or mouse, and tells it to the page around this frame.
+// Draws a region on the 3D view, corner by corner with pen, finger or mouse, and sends it to the page around this frame.
 "use strict";
 
 (() => {
@@ -14,7 +14,7 @@
   const scene = () => place._fullLayout.scene._scene;
   const times = (m, [x, y, z, w]) => [0, 1, 2, 3].map((row) => m[row] * x + m[row + 4] * y + m[row + 8] * z + m[row + 12] * w);
 
-  // Pixels of the sheet, depth and distance of a place in the drawing, by the matrices with which plotly draws.
+  // Pixels of the sheet, depth and distance of a point of the drawing, from plotly's own matrices.
   const projection = () => {
     const { model, view, projection: lens } = scene().glplot.cameraParams;
     const box = scene().container.getBoundingClientRect();
@@ -31,7 +31,7 @@
     };
   };
 
-  // Where the line of sight through a pixel meets a triangle of projected corners: shares of them; null beside it.
+  // Barycentric coordinates of a pixel in a triangle of projected corners; null outside of it.
   const shares = ([ax, ay], [bx, by], [cx, cy], px, py) => {
     const whole = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay);
     const b = ((px - ax) * (cy - ay) - (cx - ax) * (py - ay)) / whole;
@@ -39,7 +39,7 @@
     return b >= 0 && c >= 0 && b + c <= 1 ? [1 - b - c, b, c] : null;
   };
 
-  // The place of the surface under a finger, in the drawing; beside its edge the nearest one; null where none is near.
+  // The point of the surface under a finger, in the drawing; outside its edge the nearest one; null if none is near.
   const onSurface = (px, py) => {
     const surface = place._fullData.find((trace) => trace.name === "surface");
     if (!surface) return null;
@@ -94,7 +94,7 @@
 
   const say = (text) => { said.textContent = text; };
 
-  // A place of the drawing (mm) or, with weight 0, a direction, in the frame of the scan (m).
+  // A point of the drawing (mm), or with weight 0 a direction, in the frame of the scan (m).
   const inScan = ([x, y, z], weight) => {
     const moved = [x, y, z].map((value, row) => (weight ? value / 1000 - toView[row][3] : value));
     return [0, 1, 2].map((column) => toView[0][column] * moved[0] + toView[1][column] * moved[1] + toView[2][column] * moved[2]);
@@ -134,7 +134,7 @@
     },
   };
 
-  // The picture has another size now: the corners are drawn where they are in it.
+  // The picture may have another size now: draw the corners again.
   place.on?.("plotly_afterplot", () => { if (corners.length) show(); });
 
   bar.addEventListener("click", (event) => {

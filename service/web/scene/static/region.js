@@ -1,4 +1,4 @@
-// Takes the region that was drawn in the 3D view's frame into the form that records it.
+// Puts the region that was drawn in the frame of the 3D view into the form that records it.
 "use strict";
 
 (() => {

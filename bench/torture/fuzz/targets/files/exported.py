@@ -30,7 +30,7 @@ from service.core.text.json_text import parse_json
 from service.dataset.posed.exporter import exporter, write_data_set
 from service.dataset.posed.folder import SUMS
 from service.dataset.posed.of_folder import data_set_of_folder
-from service.dataset.preview.records import Preview, ShownCoverage, ShownView, read_preview, write_preview
+from service.dataset.preview.records import CoveragePreview, Preview, ViewPreview, read_preview, write_preview
 from service.store.events import canonical
 from service.web.scene.region import read_region
 from tests.support.scenes.posed import posed_data_set
@@ -164,8 +164,8 @@ def _ply(data: bytes, folder: Path) -> None:
 
 
 def _previews(folder: Path) -> list[bytes]:
-    view = ShownView("v0", 48, 32, ("dense",), "v0.webp", "v0.jpg", "v0-depth.webp", 1.0, 2.0)
-    write_preview(folder, Preview((view,), (16, 16), ShownCoverage((1.0, 0.9, 0.5, 0.1), "coverage.json")))
+    view = ViewPreview("v0", 48, 32, ("dense",), "v0.webp", "v0.jpg", "v0-depth.webp", 1.0, 2.0)
+    write_preview(folder, Preview((view,), (16, 16), CoveragePreview((1.0, 0.9, 0.5, 0.1), "coverage.json")))
     return [path.read_bytes() for path in folder.iterdir()]
 
 

@@ -1,4 +1,4 @@
-// The scene of a report in 3D: WebGL over the drawing, which stays where a browser has none, and on paper.
+// The 3D scene of a report: WebGL over the drawing. The drawing is what paper, and a browser without WebGL, show.
 "use strict";
 (() => {
   const box = document.querySelector(".turned"), canvas = box.querySelector("canvas");
