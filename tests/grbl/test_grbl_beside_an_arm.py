@@ -34,7 +34,7 @@ def protocol(path: Path) -> Path:
     arm, control, registration = (
         by_id[name] for name in ("viewpoint_capture_1", "control_capture_1", "registration")
     )
-    turned = {**deepcopy(arm), "id": "around", "title": "Photographs from all sides"}
+    turned: dict[str, Any] = {**deepcopy(arm), "id": "around", "title": "Photographs from all sides"}
     captures: tuple[tuple[dict[str, Any], str, int], ...] = ((turned, "t", TURNED), (control, "c", 4))
     for step, prefix, count in captures:
         arc = {"tilt_deg": 35, "azimuth_from_deg": 20, "azimuth_to_deg": 310, "count": count, "distance_m": 0.62}
