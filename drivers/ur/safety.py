@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 
 from drivers.interfaces import SafetyState
 
 
-@cache
+@lru_cache(maxsize=256)  # a controller sends few of them, another sender any
 def safety_state(bits: int) -> SafetyState:
     """Decode the controller's safety_status_bits (RTDE guide); the gravest state wins."""
     for mask, state in (
