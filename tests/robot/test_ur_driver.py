@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sys
+import threading
 import time
 from collections.abc import Generator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,6 +50,27 @@ def test_identity_and_report(robot: RobotArm) -> None:
     assert report.problems == ()
     sample = robot.state().sample
     assert report.clock_offset_s == pytest.approx(sample.controller_time_s - sample.monotonic_s, abs=0.05)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux lets a thread say how late it may wake")
+def test_the_threads_of_the_library_may_wake_late_and_no_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    vendor = pytest.importorskip("drivers.ur.vendor")  # the library has no package for some versions of Python
+    slacks_ns: list[int] = []
+
+    def slack_ns() -> int:
+        return int(Path(f"/proc/{threading.get_native_id()}/timerslack_ns").read_text())
+
+    def interface(*_: object) -> object:
+        thread = threading.Thread(target=lambda: slacks_ns.append(slack_ns()))
+        thread.start()
+        thread.join()
+        return object()
+
+    mine_ns = slack_ns()
+    monkeypatch.setattr("rtde_receive.RTDEReceiveInterface", interface)
+    vendor.receive(address(51), 125.0, [])
+    assert slacks_ns == [round(1e9 * vendor.TIMER_SLACK_S)]
+    assert slack_ns() == mine_ns < slacks_ns[0]
 
 
 def test_flange_pose_has_no_tool_in_it(robot: RobotArm) -> None:
