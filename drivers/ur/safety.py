@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 from drivers.interfaces import SafetyState
 
 
+@cache
 def safety_state(bits: int) -> SafetyState:
     """Decode the controller's safety_status_bits (RTDE guide); the gravest state wins."""
     for mask, state in (

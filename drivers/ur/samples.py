@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import TypeVar
 
@@ -54,7 +55,16 @@ class SampleReader:
         self._latch = latch
         self._controller_time_s = -1.0  # of the last sample
         self.receive: library.Receive | None = None  # None while the arm is not connected
-        self.T_flange_tcp: Transform = np.eye(4)  # as the controller states it
+        self.T_flange_tcp = np.eye(4)
+
+    @property
+    def T_flange_tcp(self) -> Transform:
+        """The tool centre point (4, 4) as the controller states it."""
+        return self._T_flange_tcp
+
+    @T_flange_tcp.setter
+    def T_flange_tcp(self, T_flange_tcp: Transform) -> None:
+        self._T_flange_tcp, self._T_tcp_flange = T_flange_tcp, inverse(T_flange_tcp)
 
     def read_from(self, receive: library.Receive) -> None:
         """Read from a new connection."""
@@ -85,8 +95,8 @@ class SampleReader:
             joints_rad=np.array(receive.getActualQ()),
             joint_velocities_rad_s=np.array(receive.getActualQd()),
             target_velocities_rad_s=np.array(receive.getTargetQd()),
-            T_base_flange=from_rotation_vector(np.array(receive.getActualTCPPose())) @ inverse(self.T_flange_tcp),
-            tcp_speed_m_s=float(np.linalg.norm(receive.getActualTCPSpeed()[:3])),
+            T_base_flange=from_rotation_vector(np.array(receive.getActualTCPPose())) @ self._T_tcp_flange,
+            tcp_speed_m_s=math.hypot(*receive.getActualTCPSpeed()[:3]),
             safety=safety_state(receive.getSafetyStatusBits()),
         )
 
