@@ -105,6 +105,7 @@ class Controller:
         self.tcp_pose, self.target_tcp_pose = np.zeros(6), np.zeros(6)
         self.tcp_speed = np.zeros(6)
         self._history: deque[Array] = deque([joints.copy()], maxlen=HISTORY_CYCLES)
+        self._cycles = 0
         self.generation = 0  # increases whenever anything but the clock changes
         self.motion: Motion | None = None
         self._stopped_at_s = -math.inf
@@ -117,7 +118,7 @@ class Controller:
     # --- cycle -------------------------------------------------------------------------------------------
 
     def advance(self, dt_s: float) -> None:
-        """Advance by dt_s of real time."""
+        """Advance by dt_s of real time: a cycle, or several in which nothing changes."""
         self.time_s += dt_s
         if (lost_s := dt_s - LONGEST_CYCLE_S) > 0:
             # A real controller keeps its cycle time. If this process was not scheduled, clients' writes are still
@@ -130,7 +131,13 @@ class Controller:
             self._move(dt_s)
         elif self._ring is not None:
             self._swing()
-        self._history.append(self.actual_q)
+        cycles, self._cycles = self._cycles, int(self.time_s / self.step_s)
+        self._history.extend([self.actual_q] * min(self._cycles - cycles, HISTORY_CYCLES))
+
+    @property
+    def busy(self) -> bool:
+        """Whether anything but the clock changes from cycle to cycle, or will at a planned time."""
+        return self.motion is not None or self._ring is not None or self._pending_fault is not None
 
     def _move(self, dt_s: float) -> None:
         assert self.motion is not None

@@ -21,6 +21,7 @@ _LOG = logging.getLogger(__name__)
 MAX_BACKLOG_BYTES = 1 << 18  # a client that does not read loses data packages beyond this
 MOST_RECIPES = 255  # the recipe number is one byte
 LONGEST_LINE = 1 << 16
+EARLY_S = 0.0005  # a data package is sent in a cycle that begins this much before it is due
 
 
 class Link:
@@ -145,9 +146,14 @@ class RtdeLink(Link):
         """Whether the client wants data packages and reads them."""
         return self._streaming and not self.dead and len(self.out) < MAX_BACKLOG_BYTES
 
+    @property
+    def due_s(self) -> float:
+        """The time.monotonic() at which the next data package is due."""
+        return self._next_s
+
     def stream(self, now_s: float) -> None:
         """Send a data package if one is due."""
-        if self._output is None or now_s < self._next_s - 0.0005:
+        if self._output is None or now_s < self._next_s - EARLY_S:
             return
         self._next_s = max(self._next_s + self._every_s, now_s - self._every_s)
         controller = self._server.controller

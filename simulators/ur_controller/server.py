@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import selectors
 import socket
 import time
@@ -11,13 +12,14 @@ from collections.abc import Callable
 from simulators.serve import SimulatorError, Termination, listening
 from simulators.ur_controller import fields
 from simulators.ur_controller.controller import Controller
-from simulators.ur_controller.links import LineLink, Link, RtdeLink, ScriptLink
+from simulators.ur_controller.links import EARLY_S, LineLink, Link, RtdeLink, ScriptLink
 from simulators.ur_controller.program import Interpreter
 from simulators.world_link import WorldLink
 
 _LOG = logging.getLogger(__name__)
 
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
+LONGEST_REST_S = 0.008
 
 
 class Server:
@@ -34,6 +36,7 @@ class Server:
         # select() waits in microseconds; epoll's milliseconds are half a cycle long.
         self._selector = selectors.SelectSelector()
         self._stalled_until_s = 0.0
+        self._advanced_s = 0.0
         self._values: tuple[int, dict[str, tuple[float, ...]]] = (-1, {})
         self._listen(host, RTDE_PORT, lambda s: RtdeLink(s, self))
         self._listen(host, DASHBOARD_PORT, lambda s: LineLink(s, self))
@@ -87,24 +90,42 @@ class Server:
 
     def run(self, termination: Termination) -> None:
         """Serve until the termination is set."""
-        last_s = next_s = time.monotonic()
+        self._advanced_s = next_s = due_s = time.monotonic()
         while not termination.is_set():
-            self._exchange(max(0.0, next_s - time.monotonic()))
+            if self._exchange(max(0.0, due_s - time.monotonic())):
+                due_s = next_s + self._rest_s(next_s)
             now_s = time.monotonic()
-            if now_s < next_s:
+            if now_s < due_s:
                 continue
-            next_s = max(next_s + self.controller.step_s, now_s - 0.02)
+            next_s = max(due_s + self.controller.step_s, now_s - 0.02)
             self.interpreter.step()
-            self.controller.advance(now_s - last_s)
-            last_s = now_s
+            self._advance(now_s)
             # The program must see the end of a motion in the same cycle.
             self.interpreter.step()
             self._stream(now_s)
             if self._world is not None:
                 self._world.push([float(v) for v in self.controller.actual_q], self.controller.time_s, now_s)
+            due_s = next_s + self._rest_s(next_s)
 
-    def _exchange(self, timeout_s: float) -> None:
-        for key, _ in self._selector.select(timeout_s):
+    def _rest_s(self, next_s: float) -> float:
+        """The time of those whole cycles from `next_s` on in which nothing changes and no data package is due."""
+        if self.controller.busy or self.controller.faults.faults:  # faults count the cycles
+            return 0.0
+        streams = [link.due_s for link in self._links if isinstance(link, RtdeLink) and link.streaming]
+        rest_s = min([*streams, next_s + LONGEST_REST_S]) - next_s
+        step_s = self.controller.step_s
+        return step_s * max(0, math.ceil((rest_s - EARLY_S) / step_s))
+
+    def _advance(self, now_s: float) -> None:
+        self.controller.advance(now_s - self._advanced_s)
+        self._advanced_s = now_s
+
+    def _exchange(self, timeout_s: float) -> bool:
+        """Wait for clients and serve them; returns whether there was anything to do."""
+        ready = self._selector.select(timeout_s)
+        if ready and not self.controller.busy:
+            self._advance(time.monotonic())  # what begins now has not gone on while the controller rested
+        for key, _ in ready:
             if isinstance(key.data, Link):
                 self._read(key.data)
             else:
@@ -113,6 +134,7 @@ class Server:
                 self._accept(listener, key.data)
         for link in [link for link in self._links if link.dead]:
             self._drop(link)
+        return bool(ready)
 
     def _accept(self, listener: socket.socket, make: Callable[[socket.socket], Link]) -> None:
         connection, _ = listener.accept()
