@@ -11,7 +11,7 @@ from service.jobs.kind import JobRecord
 from service.jobs.registration import evaluate
 from service.steps.context import JobRequest
 from service.steps.poses.front_end import early_matches
-from service.steps.poses.registration_jobs import Task, name_of, recorded_registration_jobs
+from service.steps.poses.registration_jobs import RegistrationJobs, Task, name_of, recorded_registration_jobs
 from service.steps.poses.sources import evaluated_step
 from service.store.records import NewJob
 
@@ -22,13 +22,18 @@ class _Evaluated(JobRecord):
     registrations: dict[str, object]
 
 
-def evaluation_tasks(protocol: Protocol, state: RunState, step: Step) -> dict[str, Task]:
-    """The evaluation jobs of registrations that arrived after the step's own evaluation, by registration."""
+def evaluation_tasks(state: RunState, step: Step, found: RegistrationJobs | None) -> dict[str, Task]:
+    """The evaluation jobs of registrations that arrived after the step's own evaluation, by registration.
+
+    Args:
+        state: of the run.
+        step: the evaluation.
+        found: the jobs of the registration step that it evaluates, as recorded; None if that has not begun them.
+    """
     if step.gives != "accuracy" or state.steps[step.id].skipped:
         return {}
     own = [j for j in state.steps[step.id].jobs.values() if j.kind == evaluate.KIND.name and j.priority == WAITED]
     newest = max(own, key=lambda job: job.enqueued_seq, default=None)
-    found = recorded_registration_jobs(protocol, state, protocol.step(evaluated_step(step)))
     if newest is None or newest.status != "finished" or found is None:
         return {}
     tasks: dict[str, Task] = {}
@@ -47,10 +52,13 @@ def due(protocol: Protocol, state: RunState) -> list[NewJob]:
     if state.status == "aborted":
         return []
     jobs = early_matches(protocol, state)
+    recorded = {step.id: recorded_registration_jobs(protocol, state, step) for step in protocol.steps}
     for step in protocol.steps:
-        found = recorded_registration_jobs(protocol, state, step)
+        found = recorded[step.id]
         tasks = [] if found is None else found.due
-        tasks += [task for task in evaluation_tasks(protocol, state, step).values() if task.job is None]
+        if step.gives == "accuracy":
+            late = evaluation_tasks(state, step, recorded[evaluated_step(step)])
+            tasks += [task for task in late.values() if task.job is None]
         jobs += [new_job(state, step.id, task) for task in tasks]
     return jobs
 

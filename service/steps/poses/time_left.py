@@ -91,7 +91,7 @@ def missing_results(
         found = recorded_registration_jobs(protocol, state, step)
         if found is not None:
             evaluation = next(iter(evaluations_of(protocol, step)), None)
-            left += _left_of(protocol, state, step, evaluation, found, _JobTimes(state, started_utc, now_utc, cores))
+            left += _left_of(state, step, evaluation, found, _JobTimes(state, started_utc, now_utc, cores))
     return sorted(left, key=lambda one: one.seconds)
 
 
@@ -169,7 +169,6 @@ def _tells_of(done: _Work, work: _Work) -> bool:
 
 
 def _left_of(
-    protocol: Protocol,
     state: RunState,
     step: Step,
     evaluation: Step | None,
@@ -178,7 +177,7 @@ def _left_of(
 ) -> list[PendingResult]:
     """The missing results of a step, with its jobs scheduled on the cores in the order of their priority."""
     wanted = WantedRegistrations.of(step.params)
-    evaluations = {} if evaluation is None else evaluation_tasks(protocol, state, evaluation)
+    evaluations = {} if evaluation is None else evaluation_tasks(state, evaluation, found)
     free_s = [0.0] * clock.cores
     ready_s: dict[tuple[str, str], float] = {}
     left: list[PendingResult] = []
