@@ -55,7 +55,8 @@ def _rotation(x: float, y: float, z: float) -> tuple[tuple[float, float, float],
     """
     angle = math.sqrt(x * x + y * y + z * z)
     if not math.isfinite(angle):
-        return ((math.nan,) * 3,) * 3
+        none = (math.nan, math.nan, math.nan)
+        return (none, none, none)
     if angle <= 1e-3:  # by its series: the quotient is 0 / 0 where there is no rotation
         square = angle * angle
         share = 0.5 - square / 48 + square * square / 3840
