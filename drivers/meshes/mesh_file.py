@@ -111,7 +111,7 @@ def scanned_mesh(
     """
     path = export.files[0]
     check_mesh(path, vertices, faces)
-    found, evidence = credible_unit(path, vertices[np.unique(faces)], unit)
+    found, evidence = credible_unit(path, vertices[_used(faces, len(vertices))], unit)
     vertices = vertices * METRES_PER_UNIT[found]
     first, index = merge_equal(vertices)
     merged, faces = vertices[first], index[faces]
@@ -156,17 +156,15 @@ def vertex_normals(vertices: Array, faces: IntArray) -> Array:
 
 def mesh_findings(vertices: Array, faces: IntArray) -> dict[str, float]:
     """Count the defects of an indexed mesh without duplicate vertices; the keys are those of `read_mesh_file`."""
-    p = vertices[faces]
-    cross = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
-    longest = np.max(np.sum((p - np.roll(p, 1, axis=1)) ** 2, axis=2), axis=1)
+    p, q, r = (vertices.take(faces[:, k], axis=0) for k in range(3))
+    cross = np.cross(q - p, r - p)
+    longest = np.max([np.einsum("ij,ij->i", edge, edge) for edge in (p - r, q - p, r - q)], axis=0)
     degenerate = np.linalg.norm(cross, axis=1) <= 1e-9 * longest
     sound = faces[~degenerate]
     n = len(vertices)
-    ends = np.sort(np.concatenate([sound[:, [0, 1]], sound[:, [1, 2]], sound[:, [2, 0]]]), axis=1)
-    keys, counts = np.unique(ends[:, 0] * n + ends[:, 1], return_counts=True)
+    first, second = sound.T.ravel(), sound.T[[1, 2, 0]].ravel()
+    keys, counts = np.unique(np.minimum(first, second) * n + np.maximum(first, second), return_counts=True)
     a, b = keys // n, keys % n
-    used = np.zeros(n, dtype=np.bool_)
-    used[sound] = True
     return {
         "vertices": float(n),
         "faces": float(len(faces)),
@@ -175,8 +173,15 @@ def mesh_findings(vertices: Array, faces: IntArray) -> dict[str, float]:
         "non_manifold_edges": float(np.count_nonzero(counts > 2)),
         "components": float(_components(a, b, n)),
         "degenerate_faces": float(np.count_nonzero(degenerate)),
-        "unreferenced_vertices": float(n - np.count_nonzero(used)),
+        "unreferenced_vertices": float(n - np.count_nonzero(_used(sound, n))),
     }
+
+
+def _used(index: NDArray[np.integer], n: int) -> NDArray[np.bool_]:
+    """Which of 0…n-1 occur among these indices, (n,): in a tenth of the time of np.unique."""
+    used = np.zeros(n, dtype=np.bool_)
+    used[index] = True
+    return used
 
 
 def _components(a: IntArray, b: IntArray, n: int) -> int:
@@ -187,8 +192,8 @@ def _components(a: IntArray, b: IntArray, n: int) -> int:
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
     graph = coo_matrix((np.ones(len(a), dtype=np.int8), (a, b)), shape=(n, n))
-    _, labels = connected_components(graph, directed=False)
-    return len(np.unique(labels[a]))
+    count, labels = connected_components(graph, directed=False)
+    return int(np.count_nonzero(_used(labels[a], count)))
 
 
 def _summed(index: IntArray, rows: Array, n: int) -> Array:
