@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator
+from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from drivers.errors import (
     DeviceRefusedError,
     UnreachablePoseError,
 )
+from drivers.host.hosted_device import HostedDevice
 from drivers.interfaces import Payload, RobotArm, SafetyState, SettleCriteria
 from drivers.ur.safety import safety_state
 from service.core.geometry import inverse, rotation_angle_rad, transform
@@ -47,6 +50,22 @@ def test_identity_and_report(robot: RobotArm) -> None:
     assert report.problems == ()
     sample = robot.state().sample
     assert report.clock_offset_s == pytest.approx(sample.controller_time_s - sample.monotonic_s, abs=0.05)
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="only Linux lets a thread state how late a timer may be")
+def test_the_threads_of_the_library_do_not_spin(robot: RobotArm) -> None:
+    child = cast("HostedDevice", vars(robot)["hosted_device"])
+
+    def wakes() -> dict[str, int]:
+        threads = {task.name: task / "status" for task in Path(f"/proc/{child.pid}/task").iterdir()}
+        said = {name: status.read_text().split() for name, status in threads.items()}
+        return {name: int(words[words.index("voluntary_ctxt_switches:") + 1]) for name, words in said.items()}
+
+    before, start_s = wakes(), time.monotonic()
+    time.sleep(1.0)
+    after, lasted_s = wakes(), time.monotonic() - start_s
+    busiest = max(after[thread] - before[thread] for thread in before)
+    assert busiest < 1500 * lasted_s  # left to itself, the library wakes thousands of times a second
 
 
 def test_flange_pose_has_no_tool_in_it(robot: RobotArm) -> None:
