@@ -12,7 +12,7 @@ import dashboard_client
 import rtde_control
 import rtde_receive
 
-TIMER_SLACK_S = 0.002
+TIMER_SLACK_NS = 2_000_000
 
 
 class Connection(Protocol):
@@ -96,7 +96,7 @@ def control(host: str, frequency_hz: float) -> Control:
 
 @contextlib.contextmanager
 def _slack() -> Generator[None]:
-    """Give threads started meanwhile a timer slack of TIMER_SLACK_S, where the operating system is Linux.
+    """Give threads started meanwhile a timer slack of TIMER_SLACK_NS, where the operating system is Linux.
 
     Each interface of the library has a thread that looks for data and sleeps for 0.1 ms, again and again: thousands
     of times a second, for 125 packages. With this slack it sleeps for 2 ms, a quarter of the time between packages.
@@ -105,7 +105,7 @@ def _slack() -> Generator[None]:
     before = ""
     with contextlib.suppress(OSError):
         before = file.read_text()
-        file.write_text(f"{round(1e9 * TIMER_SLACK_S)}")
+        file.write_text(str(TIMER_SLACK_NS))
     try:
         yield
     finally:
