@@ -279,9 +279,9 @@ def test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere(
         write_data_set(data_set_of(summary), exporter("plain"), tmp_path / "dataset")
     assert error_mm(data, result["run"], photographer) < 0.3
     assert verify(data, result["run"]).ok
-    says_so(data, result["run"], tmp_path)
     again = orthocapture(*words, "--json")
     assert "imported before" in json.loads(again.stdout.splitlines()[-1])["error"]["what"]
+    says_so(data, result["run"], tmp_path)  # with an account, whose name needs its password from then on
     real = orthocapture(*[word for word in words if word != "--simulated"], "--json")
     assert "made by simulators" in json.loads(real.stdout.splitlines()[-1])["error"]["what"]
 
