@@ -281,9 +281,9 @@ def test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere(
     assert verify(data, result["run"]).ok
     again = orthocapture(*words, "--json")
     assert "imported before" in json.loads(again.stdout.splitlines()[-1])["error"]["what"]
-    says_so(data, result["run"], tmp_path)  # with an account, whose name needs its password from then on
     real = orthocapture(*[word for word in words if word != "--simulated"], "--json")
     assert "made by simulators" in json.loads(real.stdout.splitlines()[-1])["error"]["what"]
+    says_so(data, result["run"], tmp_path)  # with an account, whose name needs its password from then on
 
 
 def imported_so_far(data: Path) -> list[str]:
