@@ -76,7 +76,7 @@ def test_what_was_signed_at_once_and_is_signed_only_later_stays_told(data: Path,
     passed = forge(data, run)
     assert len(passed) == 3
     faults = [str(fault) for fault in verify(data).faults]
-    assert faults == [f"run {run}, event {seq}: step passed was never signed, or its signature was taken away"
+    assert faults == [f"run {run}, event {seq}: step passed was never signed, or its signature was removed"
                       for seq in passed]  # fmt: skip
     with Store.open(data) as store:
         with pytest.raises(IntegrityError, match="nothing is exported, because the evidence does not verify"):
