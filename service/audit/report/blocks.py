@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Literal
+from typing import ClassVar, Literal
 
 Tone = Literal["plain", "ok", "attention", "stop"]
 Style = Literal["text", "number", "code"]
@@ -31,6 +31,7 @@ class Column:
 class Paragraph:
     """Running text; with a tone other than plain, a highlighted statement."""
 
+    kind: ClassVar[str] = "paragraph"
     text: str
     tone: Tone = "plain"
 
@@ -39,6 +40,7 @@ class Paragraph:
 class Heading:
     """A heading within a section."""
 
+    kind: ClassVar[str] = "heading"
     text: str
 
 
@@ -46,6 +48,7 @@ class Heading:
 class DescriptionList:
     """A list of names and values."""
 
+    kind: ClassVar[str] = "description list"
     rows: tuple[tuple[str, TableCell | str], ...]
 
 
@@ -53,6 +56,7 @@ class DescriptionList:
 class Table:
     """Rows. `strong`: indices of highlighted rows; `spanning`: of rows whose first text spans every column."""
 
+    kind: ClassVar[str] = "table"
     columns: tuple[Column, ...]
     rows: tuple[tuple[TableCell | str, ...], ...]
     strong: frozenset[int] = frozenset()
@@ -78,6 +82,7 @@ class Picture:
 class Pictures:
     """Photographs in a number of columns."""
 
+    kind: ClassVar[str] = "pictures"
     items: tuple[Picture, ...]
     columns: int
 
@@ -151,6 +156,7 @@ class Drawing:
 class Drawings:
     """Charts, two in a row."""
 
+    kind: ClassVar[str] = "drawings"
     items: tuple[Drawing, ...]
 
 
@@ -158,10 +164,12 @@ class Drawings:
 class SceneBlock:
     """The 3D scene: a drawing of the initial view, and an HTML element that can be turned, or ""."""
 
+    kind: ClassVar[str] = "scene"
     drawing: Drawing
     html: str = field(repr=False)
 
 
+# The kind of a block names it in the template of the HTML report; without one, the report is not made.
 Block = Paragraph | Heading | DescriptionList | Table | Pictures | Drawings | SceneBlock
 
 

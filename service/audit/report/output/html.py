@@ -9,20 +9,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
-from service.audit.report.blocks import (
-    Block,
-    DescriptionList,
-    Drawing,
-    Drawings,
-    Heading,
-    Paragraph,
-    Picture,
-    Pictures,
-    Report,
-    SceneBlock,
-    Table,
-    TableCell,
-)
+from service.audit.report.blocks import Drawing, Picture, Report, TableCell
 from service.audit.report.output.svg import drawing_svg
 from service.audit.report.words import moment
 
@@ -42,28 +29,8 @@ def render_html(report: Report) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"cell": _cell, "data_url": _data_url, "svg": _svg, "kind": _kind, "moment": moment}
+    environment.filters |= {"cell": _cell, "data_url": _data_url, "svg": _svg, "moment": moment}
     return environment.get_template("report.html.j2").render(report=report)
-
-
-def _kind(block: Block) -> str:
-    """The name by which the template knows this kind of block; pyright finds a kind that has none."""
-    match block:
-        case Paragraph():
-            kind = "paragraph"
-        case Heading():
-            kind = "heading"
-        case DescriptionList():
-            kind = "description list"
-        case Table():
-            kind = "table"
-        case Pictures():
-            kind = "pictures"
-        case Drawings():
-            kind = "drawings"
-        case SceneBlock():
-            kind = "scene"
-    return kind
 
 
 def _cell(value: TableCell | str) -> Markup:
