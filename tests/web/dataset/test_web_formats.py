@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from service.audit.export.exports import Exports
 from service.audit.export.folder_zip import zip_chunks
 from service.audit.export.process import export
 from service.audit.export.wanted import ExportRequest, WantedExport, keep_request
@@ -250,22 +249,27 @@ def test_a_running_export_is_stopped(web: WebSite, run: str, supervisor: Browser
     assert not list(web.app.state.exports.folder.glob(".*"))
 
 
-def test_an_altered_folder_is_not_sent_as_whole(web: WebSite, run: str, tmp_path: Path) -> None:
-    exports: Exports = web.app.state.exports
-    name = next(f.record.file_name for f in exports.files(web.store.events(run)) if "colmap" in f.record.file_name)
-    folder, record = exports.path(web.store.events(run), name)
-    image = folder / "images" / "v001.jpg"
-    whole = image.read_bytes()
-    (tmp_path / "elsewhere.jpg").write_bytes(whole)
-    try:
-        image.write_bytes(whole + b"!")
-        with pytest.raises(IntegrityError):
-            list(zip_chunks(folder, record.sha256))
-        image.unlink()
-        image.symlink_to(tmp_path / "elsewhere.jpg")
-        with pytest.raises(IntegrityError):
-            list(zip_chunks(folder, record.sha256))
-    finally:
-        image.unlink()
-        image.write_bytes(whole)
-    assert b"".join(zip_chunks(folder, record.sha256))[:2] == b"PK"
+def test_an_altered_folder_is_not_sent_as_whole(tmp_path: Path) -> None:
+    image = tmp_path / "exported" / "images" / "v001.jpg"
+    image.parent.mkdir(parents=True)
+    whole = b"a picture" * 1000
+    image.write_bytes(whole)
+    elsewhere = tmp_path / "elsewhere.jpg"
+    elsewhere.write_bytes(whole)
+    folder = tmp_path / "exported"
+    sums = f"{hashlib.sha256(whole).hexdigest()}  images/v001.jpg\n"
+    (folder / SUMS).write_text(sums)
+    recorded = hashlib.sha256(sums.encode()).hexdigest()
+    assert b"".join(zip_chunks(folder, recorded))[:2] == b"PK"
+    image.write_bytes(whole + b"!")
+    with pytest.raises(IntegrityError):
+        list(zip_chunks(folder, recorded))
+    image.unlink()
+    image.symlink_to(elsewhere)
+    with pytest.raises(IntegrityError):
+        list(zip_chunks(folder, recorded))
+    image.unlink()
+    image.write_bytes(whole)
+    (folder / SUMS).write_text(sums + sums)
+    with pytest.raises(IntegrityError):
+        list(zip_chunks(folder, recorded))
