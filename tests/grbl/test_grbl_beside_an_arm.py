@@ -1,21 +1,28 @@
-"""A turntable beside an arm: the planner leaves its motions to its driver."""
+"""A turntable beside an arm: each takes photographs of one run, from doctor to registration and evaluation."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Generator
 from copy import deepcopy
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import yaml
 from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.geometry import inverse
-from tests.support.arms.grbl_simulator import CENTRE_M, TURN, mount
-from tests.support.protocols.one_side import one_side
+from service.core.records.events import ViewpointCaptured
+from tests.support.arms.grbl_simulator import CENTRE_M, TURN, mount, table
+from tests.support.protocols.one_side import VIEWS, one_side
+from tests.support.rig.rig import orthocapture, simulated_rig
+from tests.support.runs.ended_run import EndedRun, ended_run, patient
 
+HOST = "127.0.0.59"
 TURNED = 5  # views of the turntable
 STAND: dict[str, Any] = {
     "id": "to_the_stand",
@@ -83,3 +90,55 @@ def test_motions_are_planned_of_the_arm_and_not_of_the_table(tmp_path: Path) -> 
     plans = json.loads(done.stdout)
     assert [plan["station"] for plan in plans["viewpoint_capture_1"]] == ["station_1"]
     assert "around" not in plans
+
+
+@dataclass(frozen=True)
+class Run:
+    """The run that the tests below share."""
+
+    ended: EndedRun
+    doctor: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Generator[Run]:
+    folder = tmp_path_factory.mktemp("both")
+    data, steps = folder / "data", protocol(folder / "both.yaml")
+    options = ("--scene", "3", "--image-width", "960", "--speed-up", "10")
+    with (
+        simulated_rig(folder, *options, host=HOST) as rig,
+        table(folder, "--world", rig["world"]) as port,
+    ):
+        add_table(Path(rig["rig"]), str(port))
+        patient(Path(rig["rig"]), watchdog_s=1.0)
+        doctor = orthocapture("doctor", "--rig", rig["rig"], "--json")
+        answer = orthocapture(
+            "run", str(steps), "--rig", rig["rig"], "--data", str(data), "--operator", "Ada", "--auto-confirm",
+            "--json", timeout_s=1100,
+        )  # fmt: skip
+    assert answer.returncode == 0, answer.stdout[-2000:] + answer.stderr[-3000:]
+    with ended_run(data, Path(rig["truth"])) as ended:
+        yield Run(ended, json.loads(doctor.stdout))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_both_take_every_view_of_one_run(run: Run) -> None:
+    assert run.doctor["ok"]
+    assert run.doctor["devices"]["turntable"]["identity"]["driver"] == "grbl"
+    state = run.ended.summary.state
+    assert state.status == "completed"
+    captured = [e.payload for e in run.ended.summary.events if isinstance(e.payload, ViewpointCaptured)]
+    axes = {one.viewpoint: (one.station, len(one.joints_rad)) for one in captured}
+    assert [kind for name, kind in axes.items() if name.startswith("v1_")] == [("station_1", 6)] * VIEWS
+    assert [kind for name, kind in axes.items() if name.startswith("t")] == [("table", 1)] * TURNED
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_images_of_both_are_registered_together(run: Run) -> None:
+    measures = run.ended.summary.state.steps["registration"].measures
+    assert measures["spheres_images"] == VIEWS + TURNED
+    (row,) = run.ended.summary.table()
+    assert row.mean_radial_error_mm < 0.35
+    assert run.ended.true_mm["spheres"] < 0.35
