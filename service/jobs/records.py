@@ -133,7 +133,7 @@ class Mounting(JobRecord):
     """How the camera was mounted on the arm.
 
     Attributes:
-        T_flange_camera: for uncorrected poses of the arm; None if a person held the camera.
+        T_flange_camera: for uncorrected poses of the arm; None if a person held the camera, or the mount is unknown.
         arm_correction: of the reported poses; None if they are used uncorrected.
         arm_stations: stations of the corrected arm.
         further_arms: that carried the camera at other stations.

@@ -1,4 +1,4 @@
-"""Checks the gates of a protocol: their measures exist, and their units and limits are credible.
+"""Checks the gates of a protocol, that their measures exist and their limits are credible, and what its steps need.
 
 A gate on a measure that the step does not yield would fail only when the step is done, hours into a run; a limit in a
 wrong unit might pass everything. `orthocapture protocol check` compares gates with the Measures of each step kind.
@@ -14,7 +14,7 @@ from service.core.text.yaml_tree import FieldPath, Plain, YamlProblem, field_nam
 from service.rig import RigSection
 from service.steps import step_kinds
 from service.steps.measures import Measure, RegistrationMeasures
-from service.steps.poses.sources import WantedRegistrations
+from service.steps.poses.sources import WantedRegistrations, needing_mount
 
 # Section and field of the file → its credible range, and its unit.
 _SECTIONS: Mapping[tuple[str, str], tuple[float, float, str]] = {
@@ -59,6 +59,7 @@ def implausible(loaded: LoadedProtocol, rig: RigSection | None = None) -> tuple[
         for number, gate in enumerate(step.gates) if known is not None else ():
             assert known is not None
             found += [(("steps", index, "gates", number, *at), words) for at, words in _gate(gate, step, known)]
+        found += [(("steps", index, *at), words) for at, words in _mount(step, steps)]
     if rig is not None:
         found += list(_stations(data, rig))
     problems = [YamlProblem(tree.line(at), field_name(at), words) for at, words in found]
@@ -79,6 +80,21 @@ def _gate(gate: Gate, step: Step, known: Mapping[str, Measure]) -> Iterator[tupl
         if limit is not None and limit != 0 and not measure.least <= limit <= measure.most:
             between = f"{measure.least:g} to {measure.most:g} {measure.unit}".strip()
             yield (name,), f"a limit of {limit:g} on {gate.measure} is not credible: {between}"
+
+
+def _mount(step: Step, steps: Mapping[str, Step]) -> Iterator[tuple[FieldPath, str]]:
+    """Poses of an arm that a registration asks for although no step says how the arm held the camera."""
+    if step.gives != "registrations":
+        return
+    wanted = WantedRegistrations.of(step.params)
+    unknown = needing_mount(wanted.poses)
+    carried = [name for name in wanted.captures if name in steps and steps[name].moves_robot]
+    if wanted.hand_eye is None and unknown and carried:
+        yield (
+            ("params",),
+            f"the images of {carried[0]} are an arm's, and {' and '.join(unknown)} poses need its `hand_eye`; without "
+            "it, `poses` are spheres, colmap or glomap",
+        )
 
 
 def _stations(data: Mapping[str, Plain], rig: RigSection) -> Iterator[tuple[FieldPath, str]]:

@@ -45,6 +45,19 @@ def test_what_cannot_be_meant_is_said_by_line(tmp_path: Path, old: str, new: str
     assert f"{file}:{text[: text.index(old)].count(chr(10)) + 1}" in said
 
 
+def test_poses_of_an_arm_need_its_mount(tmp_path: Path) -> None:
+    text = (PROTOCOLS / "exvivo_spine.yaml").read_text()
+    mount = "      hand_eye: hand_eye\n      scan"
+    assert mount in text
+    file = tmp_path / "protocol.yaml"
+    file.write_text(text.replace(mount, "      scan"))
+    status, said = _check(file)
+    assert status == 1
+    assert "viewpoint_capture_1 are an arm's, and robot and robot_corrected and triangulated poses need" in said
+    at = text.index("params:\n      images_of: [viewpoint_capture_1, viewpoint_capture_2]")
+    assert f"{file}:{text[:at].count(chr(10)) + 1}" in said
+
+
 def test_a_station_that_the_rig_has_not_is_said(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     station = "{robot: robot, scene_centre_m: [0, 0, 0], approach_azimuth_deg: 0}"

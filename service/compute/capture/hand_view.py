@@ -78,7 +78,7 @@ def look_at_image(
     quality = sharpness(image_bgr, outlines, camera)
     clipped = clipped_fraction(image_bgr)
     found = _rough_pose(outlines, spheres_m, radius_m) if rough else _read(outlines, camera, spheres_m, radius_m)
-    T_camera_scene, markers = _refined(found, outlines, camera, spheres_m, radius_m)
+    T_camera_scene, markers = pose_by_spheres(found, outlines, camera, spheres_m, radius_m)
     exposure = _exposure(image_bgr, clipped)
     if T_camera_scene is None:
         why = exposure or _NO_POSE.format(count=len(outlines))
@@ -132,14 +132,14 @@ def _rough_pose(outlines: Sequence[SphereOutline], spheres_m: Array, radius_m: f
         return None
 
 
-def _refined(
+def pose_by_spheres(
     start: Transform | None,
     outlines: Sequence[SphereOutline],
     camera: CameraModel,
     spheres_m: Array,
     radius_m: float,
 ) -> tuple[Transform | None, dict[int, int]]:
-    """T_camera_scene and outline → sphere; None and {} if fewer than four spheres agree."""
+    """T_camera_scene of one image and outline → sphere; None and {} if fewer than four spheres (M, 3) agree."""
     if start is None:
         return None, {}
     markers = paired(outlines, start, spheres_m, radius_m, camera)

@@ -13,8 +13,9 @@ from service.jobs.records import PosedPhotograph
 
 # "robot" is the paper's baseline: the arm's poses as reported. "robot_corrected" removes the arm's errors as the
 # hand-eye calibration estimated them, and each pose's error as the spheres show it. "spheres" locates each image of a
-# hand-held camera by the spheres that it shows. "triangulated" is a bundle adjustment of the images' features that
-# starts from the corrected robot poses; COLMAP and GLOMAP start without any poses.
+# hand-held camera, or of one whose mount on its arm is unknown, by the spheres that it shows. "triangulated" is a
+# bundle adjustment of the images' features that starts from the corrected robot poses; COLMAP and GLOMAP start without
+# any poses.
 Source = Literal["robot", "robot_corrected", "spheres", "triangulated", "colmap", "glomap", "hybrid"]
 DEFAULT_SOURCES: tuple[Source, ...] = ("robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid")
 PLANNED = "sources_planned"  # the note with which a registration records what it waits for and what comes later
@@ -31,6 +32,7 @@ class WantedRegistrations(BaseModel):
         control_images_of: capture steps that see the control spheres.
         calibration: the step with the intrinsics.
         poses: sources.
+        hand_eye: steps with the mount of the camera on its arm.
         reduced: sizes of reduced images, such as 1920x1080.
         reduced_poses: sources for the reduced images.
         structure_from_motion: how many features and pairs.
@@ -42,6 +44,7 @@ class WantedRegistrations(BaseModel):
     control_images_of: tuple[str, ...]
     calibration: str
     poses: tuple[str, ...]
+    hand_eye: str | tuple[str, ...] | None = None
     reduced: tuple[str, ...]
     reduced_poses: tuple[str, ...]
     structure_from_motion: SfmEffort
@@ -105,3 +108,15 @@ def _named(measure: str, names: Iterable[str]) -> list[str]:
 def posed(images: Iterable[PosedPhotograph]) -> bool:
     """Whether the poses of any of the images are known, from a robot or from the spheres."""
     return any(image.T_base_flange is not None or image.T_scene_camera is not None for image in images)
+
+
+def of_arms(images: Iterable[PosedPhotograph]) -> bool:
+    """Whether an arm carried the camera in any of the images, and no sphere says where that was."""
+    return any(image.T_base_flange is not None and image.T_scene_camera is None for image in images)
+
+
+def needing_mount(poses: Iterable[str]) -> tuple[str, ...]:
+    """Those of the sources that need the mount of the camera on its arm; "triangulated" may start from the spheres."""
+    names = tuple(poses)
+    needing = ("robot", "robot_corrected") if "spheres" in names else ("robot", "robot_corrected", "triangulated")
+    return tuple(name for name in names if name in needing)

@@ -25,7 +25,7 @@ from service.worker.camera import camera_used
 from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.front_end import read_features, read_matches
 from service.worker.poses.photographs import photographs
-from service.worker.poses.robot_poses import robot_camera_poses
+from service.worker.poses.robot_poses import has_poses, robot_camera_poses
 from service.worker.registration.outlines import read_outlines
 
 
@@ -103,6 +103,7 @@ def hybrid(context: JobContext[hybrid_job.Arguments]) -> JobAnswer:
     names = [image.viewpoint for image in images]
     stations = sorted({image.station for image in images})
     context.progress("hybrid poses", 0, 1)
+    by_arm = has_poses(arguments, images) and not _held(images)
     # Intrinsics stay fixed: overlays and control spheres use the calibrated ones, which must fit the poses.
     answer = hybrid_poses(
         PosedImages(
@@ -117,7 +118,7 @@ def hybrid(context: JobContext[hybrid_job.Arguments]) -> JobAnswer:
         ScanSpheres(
             np.array(arguments.spheres_m), arguments.radius_m, covariance_m2=np.array(arguments.sphere_covariance_m2)
         ),
-        T_base_camera=None if _held(images) else robot_camera_poses(arguments, images),
+        T_base_camera=robot_camera_poses(arguments, images) if by_arm else None,
     )
     measures = {
         "track_sigma_px": answer.sigma_track_px,

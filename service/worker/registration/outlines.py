@@ -25,14 +25,15 @@ from service.jobs.registration import detect_spheres as job
 from service.worker.camera import camera_used
 from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.photographs import photographs
-from service.worker.poses.robot_poses import robot_camera_poses
+from service.worker.poses.robot_poses import has_poses, robot_camera_poses
 
 
 def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:
     """Outlines of every sphere in every image, as one artefact that all registrations share.
 
     Poses predict where to search: the robot's, or those of a `model` from structure from motion, which has no scale.
-    If they are too inaccurate, the images are searched whole. Images without a pose in the model get no outlines.
+    Without poses, or if they are too inaccurate, the images are searched whole. Images without a pose in the model get
+    no outlines.
     """
     arguments = context.arguments
     images, poses = _posed(context)
@@ -112,6 +113,8 @@ def _located(
         return searched_whole(detect_all(files, camera, options, 1, show, detect=networks))
     if arguments.detector == "paper":
         return searched_whole(detect_all(files, camera, options, workers, show, detect=detect_file_by_masks))
+    if poses is None and not has_poses(arguments, images):
+        return searched_whole(detect_all(files, camera, options, workers, show))
     return locate_outlines(
         files,
         PosedImages(

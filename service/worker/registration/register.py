@@ -9,6 +9,7 @@ import numpy as np
 
 from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
+from service.compute.capture.located import poses_by_spheres
 from service.compute.evaluation.accuracy import leave_one_out
 from service.compute.evaluation.closure import Alignment
 from service.compute.markers.records import SphereOutline
@@ -27,7 +28,7 @@ from service.jobs.registration import register as job
 from service.worker.camera import camera_record, camera_reduced, camera_used
 from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.models import joint_pose_covariance
-from service.worker.poses.robot_poses import robot_camera_poses
+from service.worker.poses.robot_poses import has_poses, robot_camera_poses
 from service.worker.registration.outlines import read_outlines
 
 
@@ -103,6 +104,9 @@ class _ImagesToRegister:
 def _posed_images(context: JobContext[job.Arguments]) -> _ImagesToRegister:
     arguments = context.arguments
     images = arguments.images
+    camera = camera_used(arguments)
+    if arguments.poses == "spheres" and not has_poses(arguments, images):
+        return _located_images(context, camera)
     if arguments.poses in ("robot", "robot_corrected", "spheres"):
         stations = sorted({image.station for image in images})
         poses = robot_camera_poses(arguments, images)
@@ -114,9 +118,24 @@ def _posed_images(context: JobContext[job.Arguments]) -> _ImagesToRegister:
         images = tuple(image for image in images if image.viewpoint in model)
         poses = np.array([model[image.viewpoint] for image in images])
         groups = [0] * len(images)
-    camera = camera_used(arguments)
     outlines = read_outlines(context.input_json, arguments.outlines, images, camera)
     return _ImagesToRegister(images, poses, groups, camera, outlines)
+
+
+def _located_images(context: JobContext[job.Arguments], camera: CameraModel) -> _ImagesToRegister:
+    """The images whose spheres determine their poses; of an arm whose mount is unknown, or of a turntable."""
+    arguments = context.arguments
+    searched = read_outlines(context.input_json, arguments.outlines, arguments.images, camera)
+    spheres = ScanSpheres(np.array(arguments.spheres_m), arguments.radius_m)
+    found = poses_by_spheres(searched, [image.viewpoint for image in arguments.images], camera, spheres)
+    located = [
+        (image, outlines)
+        for image, outlines in zip(arguments.images, searched, strict=True)
+        if image.viewpoint in found
+    ]
+    images = tuple(image for image, _ in located)
+    poses = np.array([found[image.viewpoint] for image in images])
+    return _ImagesToRegister(images, poses, [0] * len(images), camera, [outlines for _, outlines in located])
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,7 +38,16 @@ from service.steps.measures import Count, ErrorMm, Measure, MeasureRecord, Px, R
 from service.steps.poses.developed import ExposureFiles, developed
 from service.steps.poses.further_cameras import locate_further_cameras
 from service.steps.poses.registration_jobs import RegistrationJobs, registration_jobs
-from service.steps.poses.sources import DEFAULT_SOURCES, PLANNED, Source, WantedRegistrations, decisive, posed
+from service.steps.poses.sources import (
+    DEFAULT_SOURCES,
+    PLANNED,
+    Source,
+    WantedRegistrations,
+    decisive,
+    needing_mount,
+    of_arms,
+    posed,
+)
 
 
 class StructureFromMotion(Record):
@@ -60,7 +69,8 @@ class Params(StepParams):
     images_of: tuple[str, ...]  # capture steps with the images
     control_images_of: tuple[str, ...] = ()  # capture steps that see the control spheres, for the evaluation too
     calibration: str  # step with the intrinsics
-    # Step with T_flange_camera, or a list of steps with one for each arm; None: no robot carried the camera.
+    # Step with T_flange_camera, or a list of steps with one for each arm; None: no robot carried the camera, or `poses`
+    # need no mount (spheres, colmap, glomap).
     hand_eye: str | tuple[str, ...] | None = None
     scan: str  # step that imported the scan
     poses: tuple[Source, ...] = DEFAULT_SOURCES  # where the camera poses come from; each gives a registration
@@ -175,6 +185,12 @@ def _search(context: StepContext, params: Params) -> JobRequest:
             "no image has a pose, but the registration asks for poses that do not come from the images alone",
             where=f"step {context.step.id}",
             remedy="Set `poses` of the step to colmap and glomap",
+        )
+    if params.hand_eye is None and of_arms(images) and (unknown := needing_mount(params.poses)):
+        raise ConfigurationError(
+            f"an arm carried the camera, but no `hand_eye` says how, which {' and '.join(unknown)} poses need",
+            where=f"step {context.step.id}",
+            remedy="Set `hand_eye` of the step to the calibration, or `poses` to spheres, colmap or glomap",
         )
     scan = earlier_answer(context, params.scan, locate_spheres.KIND)
     calibration = earlier_answer(context, params.calibration, calibrate.KIND)
