@@ -92,8 +92,8 @@ def _mount(step: Step, steps: Mapping[str, Step]) -> Iterator[tuple[FieldPath, s
     if wanted.hand_eye is None and unknown and carried:
         yield (
             ("params",),
-            f"the images of {carried[0]} are an arm's, and {' and '.join(unknown)} poses need its `hand_eye`; without "
-            "it, `poses` are spheres, colmap or glomap",
+            f"the images of {carried[0]} are an arm's, and {' and '.join(unknown)} poses need its `hand_eye`; "
+            "without it, `poses` are spheres, colmap or glomap",
         )
 
 

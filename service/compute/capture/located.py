@@ -21,8 +21,8 @@ def poses_by_spheres(
     """T_scene_camera of every image whose spheres determine it, by its name.
 
     The list of spheres says which is which. The poses themselves come from the photographs alone, by an adjustment of
-    all cameras and spheres together, so that a registration with them tests the list. Where too few images share their
-    spheres for that, each pose comes from its own image and the list.
+    all cameras and spheres together, so that a registration with them tests the list. Where too few images share
+    their spheres for that, each pose comes from its own image and the list.
 
     Args:
         outlines: of N images, each searched whole.

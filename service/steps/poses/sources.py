@@ -14,8 +14,8 @@ from service.jobs.records import PosedPhotograph
 # "robot" is the paper's baseline: the arm's poses as reported. "robot_corrected" removes the arm's errors as the
 # hand-eye calibration estimated them, and each pose's error as the spheres show it. "spheres" locates each image of a
 # hand-held camera, or of one whose mount on its arm is unknown, by the spheres that it shows. "triangulated" is a
-# bundle adjustment of the images' features that starts from the corrected robot poses; COLMAP and GLOMAP start without
-# any poses.
+# bundle adjustment of the images' features that starts from the corrected robot poses; COLMAP and GLOMAP start
+# without any poses.
 Source = Literal["robot", "robot_corrected", "spheres", "triangulated", "colmap", "glomap", "hybrid"]
 DEFAULT_SOURCES: tuple[Source, ...] = ("robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid")
 PLANNED = "sources_planned"  # the note with which a registration records what it waits for and what comes later
@@ -116,7 +116,7 @@ def of_arms(images: Iterable[PosedPhotograph]) -> bool:
 
 
 def needing_mount(poses: Iterable[str]) -> tuple[str, ...]:
-    """Those of the sources that need the mount of the camera on its arm; "triangulated" may start from the spheres."""
+    """Those of the sources that need the camera's mount on its arm; "triangulated" may start from the spheres."""
     names = tuple(poses)
     needing = ("robot", "robot_corrected") if "spheres" in names else ("robot", "robot_corrected", "triangulated")
     return tuple(name for name in names if name in needing)

@@ -69,8 +69,8 @@ class Params(StepParams):
     images_of: tuple[str, ...]  # capture steps with the images
     control_images_of: tuple[str, ...] = ()  # capture steps that see the control spheres, for the evaluation too
     calibration: str  # step with the intrinsics
-    # Step with T_flange_camera, or a list of steps with one for each arm; None: no robot carried the camera, or `poses`
-    # need no mount (spheres, colmap, glomap).
+    # Step with T_flange_camera, or a list of steps with one for each arm; None: no robot carried the camera, or the
+    # poses need no mount (spheres, colmap, glomap).
     hand_eye: str | tuple[str, ...] | None = None
     scan: str  # step that imported the scan
     poses: tuple[Source, ...] = DEFAULT_SOURCES  # where the camera poses come from; each gives a registration
