@@ -50,7 +50,8 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
         uncertain = register_images(images.outlines, posed, spheres, settings, assignments=solved.assignments)
         components = components | {"intrinsics": _added(answer, uncertain.registration, refined=refined)}
     covariance = np.sum(list(components.values()), axis=0)
-    left_out = _leave_one_out(answer, refined=refined)
+    # The poses of located images know every sphere: none is left out of them.
+    left_out = None if images.located else _leave_one_out(answer, refined=refined)
     record = _record(arguments, images, answer, _Judged(placed, components, covariance, left_out))
     alignment = Alignment(placed.T_world_scan, covariance)
     centre_m = np.array(arguments.spheres_m).mean(axis=0)
@@ -79,6 +80,7 @@ class _ImagesToRegister:
         groups: of each image; images of one group share a frame.
         camera: at the size of the images.
         outlines: of each image.
+        located: whether the poses come from the spheres that are registered.
     """
 
     images: Sequence[PosedPhotograph]
@@ -86,6 +88,7 @@ class _ImagesToRegister:
     groups: Sequence[int]
     camera: CameraModel
     outlines: Sequence[Sequence[SphereOutline]]
+    located: bool = False
 
     @property
     def names(self) -> list[str]:
@@ -135,7 +138,8 @@ def _located_images(context: JobContext[job.Arguments], camera: CameraModel) -> 
     ]
     images = tuple(image for image, _ in located)
     poses = np.array([found[image.viewpoint] for image in images])
-    return _ImagesToRegister(images, poses, [0] * len(images), camera, [outlines for _, outlines in located])
+    seen = [outlines for _, outlines in located]
+    return _ImagesToRegister(images, poses, [0] * len(images), camera, seen, located=True)
 
 
 @dataclass(frozen=True, slots=True)
