@@ -17,10 +17,9 @@ from typing import Any
 def short_collections() -> Generator[None]:
     """Within this block, a full collection visits only what was made since the one before.
 
-    What survives a full collection is not visited again. It is still freed when its last reference goes; only a
-    cycle that becomes garbage later stays in memory, until the end of the block.
+    What was there before, or survives a full collection, is not visited again. It is still freed when its last
+    reference goes; only a cycle that becomes garbage later stays in memory, until the end of the block.
     """
-    gc.collect()
     gc.freeze()
     gc.callbacks.append(_keep_survivors)
     try:
