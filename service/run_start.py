@@ -14,6 +14,7 @@ from service.core.run.state import RunState
 from service.rig import Rig, parse_recorded_rig, read_rig
 from service.run_record import recorded_protocol, recorded_root
 from service.runner.software import software_versions
+from service.steps.protocol_check import require_plausible
 from service.store.files.space_used import forecast_of, require_space
 from service.store.records import NewArtefact
 from service.store.store import Store
@@ -44,11 +45,13 @@ def start_run(
         about: what was entered about the run.
 
     Raises:
+        ProtocolError: a gate names no measure of its step, or the rig has no station that the protocol names.
         ConfigurationError: automatic confirmation is requested on a rig that is not simulated.
         SpaceShortError: the disk is too full to capture anything.
     """
     if auto_confirm:
         require_simulated(rig)
+    require_plausible(loaded, f"{loaded.protocol.id}.yaml", rig.section)
     require_space(store, forecast_of(store, loaded.protocol, simulated=rig.section.simulated))
     source = loaded.source.encode()
     protocol = store.put_bytes(

@@ -1,7 +1,8 @@
 """Checks the gates of a protocol, that their measures exist and their limits are credible, and what its steps need.
 
 A gate on a measure that the step does not yield would fail only when the step is done, hours into a run; a limit in a
-wrong unit might pass everything. `orthocapture protocol check` compares gates with the Measures of each step kind.
+wrong unit might pass everything. Gates are compared with the Measures of each step kind, by `orthocapture protocol
+check` and whenever a run starts.
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Mapping
 
+from service.core.errors import ProtocolError
 from service.core.protocol.models import Gate, LoadedProtocol, Step
+from service.core.text.counts import counted
 from service.core.text.yaml_tree import FieldPath, Plain, YamlProblem, field_name, parse_yaml
 from service.rig import RigSection
 from service.steps import step_kinds
@@ -64,6 +67,22 @@ def implausible(loaded: LoadedProtocol, rig: RigSection | None = None) -> tuple[
         found += list(_stations(data, rig))
     problems = [YamlProblem(tree.line(at), field_name(at), words) for at, words in found]
     return tuple(sorted(problems, key=lambda p: (p.line, p.field)))
+
+
+def require_plausible(loaded: LoadedProtocol, name: str, rig: RigSection | None = None) -> None:
+    """Refuse a protocol that `implausible` finds fault with; `name` is its file.
+
+    Raises:
+        ProtocolError: the message lists every problem with its line.
+    """
+    problems = implausible(loaded, rig)
+    if problems:
+        listed = "\n".join(f"  {name}:{p.line} {p.field}: {p.message}" for p in problems)
+        raise ProtocolError(
+            f"{counted(len(problems), 'problem')} in what the protocol asks for:\n{listed}\n",
+            where=f"{name}:{problems[0].line}",
+            remedy="Correct what each line names; docs/reference/steps.md lists parameters, measures and units",
+        )
 
 
 def _gate(gate: Gate, step: Step, known: Mapping[str, Measure]) -> Iterator[tuple[FieldPath, str]]:

@@ -11,12 +11,11 @@ from rich.markup import escape
 from service.cli.common import JsonOption, console, print_json, reporting_errors
 from service.core.documents.protocol_docs import lifecycle_text, schema_text
 from service.core.documents.ways_docs import ways_text
-from service.core.errors import ProtocolError
 from service.core.protocol.models import load_protocol
 from service.core.text.counts import counted
 from service.rig import load_rig
 from service.steps import params_models
-from service.steps.protocol_check import implausible
+from service.steps.protocol_check import require_plausible
 
 protocol_app = typer.Typer(name="protocol", help="Check a protocol file before it is used.", no_args_is_help=True)
 
@@ -31,14 +30,7 @@ def check_command(
     with reporting_errors(json):
         loaded = load_protocol(file, params_models())
         protocol = loaded.protocol
-        problems = implausible(loaded, None if rig is None else load_rig(rig).section)
-        if problems:
-            listed = "\n".join(f"  {file}:{p.line} {p.field}: {p.message}" for p in problems)
-            raise ProtocolError(
-                f"{len(problems)} of its numbers or names are implausible:\n{listed}\n",
-                where=f"{file}:{problems[0].line}",
-                remedy="Correct the measure, its unit or its limit; docs/reference/steps.md lists the measures",
-            )
+        require_plausible(loaded, str(file), None if rig is None else load_rig(rig).section)
         if json:
             steps = [{"id": s.id, "kind": s.kind, "irreversible": s.irreversible} for s in protocol.steps]
             print_json({"id": protocol.id, "version": protocol.version, "sha256": loaded.sha256, "steps": steps})
