@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
+from service.store.store import Store
 
 PROTOCOLS = Path(__file__).parents[2] / "protocols"
 
@@ -67,3 +68,16 @@ def test_a_station_that_the_rig_has_not_is_said(tmp_path: Path) -> None:
     status, said = _check(file, "--rig", str(rig))
     assert status == 1
     assert "the rig has no station 'station_2'; did you mean 'station_1'?" in said
+
+
+def test_a_run_does_not_start_with_what_the_check_refuses(tmp_path: Path) -> None:
+    file = tmp_path / "protocol.yaml"
+    text = (PROTOCOLS / "exvivo_spine.yaml").read_text()
+    file.write_text(text.replace("measure: rms_px,", "measure: rms_pix,", 1))
+    (tmp_path / "rig.yaml").write_text("name: r\nsimulated: true\ndevices: {}\n")
+    arguments = ["run", str(file), "--rig", str(tmp_path / "rig.yaml"), "--data", str(tmp_path / "data")]
+    done = CliRunner().invoke(app, [*arguments, "--operator", "Ada"])
+    assert done.exit_code == 1
+    assert "calibration measures no 'rms_pix'; did you mean 'rms_px'?" in done.output
+    with Store.open(tmp_path / "data") as store:
+        assert not store.runs()
