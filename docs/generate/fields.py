@@ -16,6 +16,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from service.core.protocol.step_params import NamesStep
+
 # The end of a name → the unit of its number; the longest that fits counts.
 UNITS: Mapping[str, str] = {
     "acceleration_rad_s2": "rad/s²", "rad_s2": "rad/s²", "rad_s": "rad/s", "m_s": "m/s", "monotonic_s": "s",
@@ -124,7 +126,9 @@ def _records_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _type_of(field: FieldInfo) -> str:
-    return _words(field.annotation, tuple(field.metadata))
+    said = _words(field.annotation, tuple(field.metadata))
+    named = [one for one in field.metadata if isinstance(one, NamesStep)]
+    return f"{said}: an earlier step that {named[0].does}" if named else said
 
 
 def _words(annotation: Any, metadata: tuple[Any, ...] = ()) -> str:

@@ -8,10 +8,11 @@ check` and whenever a run starts.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from service.core.errors import ProtocolError
 from service.core.protocol.models import Gate, LoadedProtocol, Step
+from service.core.protocol.step_params import named_steps
 from service.core.text.counts import counted
 from service.core.text.yaml_tree import FieldPath, Plain, YamlProblem, field_name, parse_yaml
 from service.rig import RigSection
@@ -39,7 +40,7 @@ def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, 
     registering = kind.registered_by(step.params, protocol_steps) if kind.registered_by is not None else step
     return (
         None
-        if registering is None
+        if registering is None or registering.gives != "registrations"
         else kind.measures.declared_for(WantedRegistrations.of(registering.params).registrations)
     )
 
@@ -62,7 +63,10 @@ def implausible(loaded: LoadedProtocol, rig: RigSection | None = None) -> tuple[
         for number, gate in enumerate(step.gates) if known is not None else ():
             assert known is not None
             found += [(("steps", index, "gates", number, *at), words) for at, words in _gate(gate, step, known)]
-        found += [(("steps", index, *at), words) for at, words in _mount(step, steps)]
+        earlier = loaded.protocol.steps[:index]
+        found += [
+            (("steps", index, *at), words) for at, words in (*_named(step, earlier, steps), *_mount(step, steps))
+        ]
     if rig is not None:
         found += list(_stations(data, rig))
     problems = [YamlProblem(tree.line(at), field_name(at), words) for at, words in found]
@@ -99,6 +103,21 @@ def _gate(gate: Gate, step: Step, known: Mapping[str, Measure]) -> Iterator[tupl
         if limit is not None and limit != 0 and not measure.least <= limit <= measure.most:
             between = f"{measure.least:g} to {measure.most:g} {measure.unit}".strip()
             yield (name,), f"a limit of {limit:g} on {gate.measure} is not credible: {between}"
+
+
+def _named(step: Step, earlier: Sequence[Step], steps: Mapping[str, Step]) -> Iterator[tuple[FieldPath, str]]:
+    """Names in the params of a step that are not those of earlier steps, or of steps that do something else."""
+    before = [one.id for one in earlier]
+    for at, name, mark in named_steps(step.params):
+        where = ("params", *at)
+        if name not in steps:
+            near = difflib.get_close_matches(name, before, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else f"; before it there are {', '.join(before) or 'none'}"
+            yield where, f"there is no step {name!r}{hint}"
+        elif name not in before:
+            yield where, f"step {name!r} comes later; only earlier steps have results"
+        elif not mark.fits(steps[name].params):
+            yield where, f"{name!r} is a step of kind {steps[name].kind}, but only one that {mark.does} can be named"
 
 
 def _mount(step: Step, steps: Mapping[str, Step]) -> Iterator[tuple[FieldPath, str]]:

@@ -46,6 +46,54 @@ def test_what_cannot_be_meant_is_said_by_line(tmp_path: Path, old: str, new: str
     assert f"{file}:{text[: text.index(old)].count(chr(10)) + 1}" in said
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (
+            "      calibration: intrinsics\n",
+            "      calibration: intrinsic\n",
+            "no step 'intrinsic'; did you mean 'intrinsics'?",
+        ),
+        (
+            "spheres_of: ct_import",
+            "spheres_of: ct_imprt",
+            "live.spheres_of: there is no step 'ct_imprt'; did you mean 'ct_import'?",
+        ),
+        (
+            "compare_with: ct_import, wait_s: 1800",
+            "compare_with: scanning, wait_s: 1800",
+            "step 'scanning' comes later",
+        ),
+        (
+            "      registration: registration\n",
+            "      registration: scanning\n",
+            "'scanning' is a step of kind scan_import, but only one that registers can be named",
+        ),
+        (
+            "application: spraying",
+            "application: ct_import",
+            "ct_import, but only one that applies a coat can be named",
+        ),
+        (
+            "control_images_of: [control_capture_1, control_capture_2]",
+            "control_images_of: [control_capture_1, spraying]",
+            "[1]: 'spraying' is a step of kind timed_application, but only one that takes photographs can be named",
+        ),
+    ],
+)
+def test_a_step_that_is_named_exists_comes_earlier_and_has_what_is_asked_of_it(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
+    text = (PROTOCOLS / "exvivo_spine.yaml").read_text()
+    assert old in text
+    file = tmp_path / "protocol.yaml"
+    file.write_text(text.replace(old, new, 1))
+    status, said = _check(file)
+    assert status == 1
+    assert words in said
+    assert f"{file}:" in said
+
+
 def test_poses_of_an_arm_need_its_mount(tmp_path: Path) -> None:
     text = (PROTOCOLS / "exvivo_spine.yaml").read_text()
     mount = "      hand_eye: hand_eye\n      scan"

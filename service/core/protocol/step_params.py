@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import ClassVar, Literal
+
+from pydantic import BaseModel
 
 from service.core.records.base import Record
 
@@ -66,3 +69,44 @@ class MovingParams(StepParams):
     def moves_robot(self) -> bool:
         """True, unless a step kind's own params say otherwise."""
         return True
+
+
+@dataclass(frozen=True, slots=True)
+class NamesStep:
+    """Marks a field of params whose value names an earlier step, or several.
+
+    Attributes:
+        does: what such a step must do, in words: `imports a scan`.
+        fits: whether a step with these params does.
+    """
+
+    does: str
+    fits: Callable[[StepParams], bool]
+
+
+def names_step(does: str, *gives: Gives) -> NamesStep:
+    """The mark of a field that names a step whose result is one of these."""
+    return NamesStep(does, lambda params: params.gives in gives)
+
+
+NAMES_CALIBRATION = names_step("calibrates", "calibration")
+NAMES_CT = names_step("imports a CT", "ct_surface")
+NAMES_SCAN = names_step("imports a scan", "scan_surface")
+NAMES_SPHERES = names_step("locates spheres", "ct_surface", "scan_surface", "rough_spheres")
+NAMES_REGISTRATION = names_step("registers", "registrations")
+NAMES_CAPTURE = NamesStep(
+    "takes photographs", lambda params: params.gives in (None, "calibration") and params.needs_disk
+)
+
+
+def named_steps(params: BaseModel) -> Iterator[tuple[tuple[str | int, ...], str, NamesStep]]:
+    """Every step that params name: the place of the name in them, the name, and the mark of its field."""
+    for field, info in type(params).model_fields.items():
+        value: object = getattr(params, field)
+        mark = next((one for one in info.metadata if isinstance(one, NamesStep)), None)
+        if isinstance(value, BaseModel):
+            yield from (((field, *at), name, inner) for at, name, inner in named_steps(value))
+        elif mark is not None and isinstance(value, str):
+            yield (field,), value, mark
+        elif mark is not None and isinstance(value, tuple):
+            yield from (((field, number), str(name), mark) for number, name in enumerate(value))

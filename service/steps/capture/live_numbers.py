@@ -15,6 +15,7 @@ from service.core.jobs.keys import key_stem
 from service.core.jobs.priorities import LIVE
 from service.core.jobs.references import Each, Reference, jobs_of, resolve
 from service.core.protocol.models import Gate
+from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, NAMES_CT
 from service.core.records.events import Record, RecordedView
 from service.core.run.state import JobState
 from service.core.units import metres, rad_of_mrad
@@ -45,10 +46,10 @@ class CoverageRule(Record):
 class LiveParams(Record):
     """What the numbers after each image are computed from, and how."""
 
-    calibration: str  # step with the intrinsics
-    hand_eye: str  # step with T_flange_camera
-    spheres_of: str  # CT import: the spheres and, for the coverage, the surface
-    images_of: tuple[str, ...] = ()  # earlier capture steps whose images count too
+    calibration: Annotated[str, NAMES_CALIBRATION]  # step with the intrinsics
+    hand_eye: Annotated[str, NAMES_CALIBRATION]  # step with T_flange_camera
+    spheres_of: Annotated[str, NAMES_CT]  # CT import: the spheres and, for the coverage, the surface
+    images_of: Annotated[tuple[str, ...], NAMES_CAPTURE] = ()  # earlier capture steps whose images count too
     aim_mm: Annotated[float, Field(gt=0)] = 0.35  # error that suggested views should reach, if no gate sets a limit
     # Scatter of the camera's positions before any image is taken; without it, as the held-out views of the
     # hand-eye calibration show it.

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from service.core.protocol.step_params import RepeatedStep, StepParams
+from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_SPHERES, RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.steps.capture.live_numbers import CoverageRule
 from service.steps.measures import Count, PredictedMeasures, Share
@@ -50,8 +50,10 @@ class Params(StepParams):
     prefix: str = "h_"  # of the views' names
     min_images: Annotated[int, Field(ge=3)] = 12  # usable images that are needed at least
     max_images: Annotated[int, Field(ge=3)] = 200  # including unusable ones
-    calibration: str | None = None  # step with the intrinsics; not for images of the board
-    spheres_of: tuple[str, ...] = ()  # steps that locate the spheres, the best first: ct_import, layout_check
+    # Step with the intrinsics; not for images of the board.
+    calibration: Annotated[str | None, NAMES_CALIBRATION] = None
+    # Steps that locate the spheres, the best first: ct_import, layout_check.
+    spheres_of: Annotated[tuple[str, ...], NAMES_SPHERES] = ()
     sensor_width_mm: float = 35.7  # for images of the board, together with the focal length in the file
     coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
     pose_sigma_mm: Annotated[float, Field(gt=0)] = 0.05  # expected position error of structure from motion

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import model_validator
 
 from service.core.errors import ConfigurationError
-from service.core.protocol.step_params import MovingParams, RepeatedStep
+from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, MovingParams, RepeatedStep
 from service.core.records.events import Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
@@ -38,8 +38,10 @@ class Params(MovingParams):
     solve: tuple[Literal["intrinsics", "hand_eye"], ...]  # what is computed
     board_poses: BoardPoses | None = None  # images whose poses the software plans
     viewpoints: tuple[ViewpointSet, ...] = ()  # or images from these viewpoints
-    images_of: str | None = None  # use the images of this earlier calibration step instead of new ones
-    intrinsics_of: str | None = None  # for hand-eye alone: the step that solved the intrinsics
+    # Use the images of this earlier calibration step instead of new ones.
+    images_of: Annotated[str | None, NAMES_CAPTURE] = None
+    # For hand-eye alone: the step that solved the intrinsics.
+    intrinsics_of: Annotated[str | None, NAMES_CALIBRATION] = None
 
     @property
     def moves_robot(self) -> bool:

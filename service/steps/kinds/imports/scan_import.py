@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import Field
 
 from service.core.jobs.references import Reference
-from service.core.protocol.step_params import RepeatedStep, StepParams
+from service.core.protocol.step_params import NAMES_SPHERES, NamesStep, RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, Record
 from service.core.units import metres
 from service.jobs.records import Point, SphereDetails
@@ -19,6 +19,8 @@ from service.steps.inputs import earlier_answer, earlier_result
 from service.steps.kinds.by_hand import timed_application
 from service.steps.layouts import layout_uncertainties
 from service.steps.measures import Count, ErrorMm, Measure, SphereMeasures
+
+_NAMES_APPLICATION = NamesStep("applies a coat", lambda params: isinstance(params, timed_application.Params))
 
 
 class Params(StepParams):
@@ -31,8 +33,9 @@ class Params(StepParams):
     parts: int = Field(default=1, ge=1)  # exports that together are the scan; each shares four spheres with another
     wait_s: float = 1800.0  # longest wait until the export is complete
     device: str | None = None  # name of the scanner in rig.yaml; None: the only one
-    application: str | None = None  # the step whose coat is still on the specimen
-    compare_with: str | None = None  # an earlier ct_import or scan_import, to see whether spheres moved since
+    application: Annotated[str | None, _NAMES_APPLICATION] = None  # the step whose coat is still on the specimen
+    # An earlier ct_import or scan_import, to see whether spheres moved since.
+    compare_with: Annotated[str | None, NAMES_SPHERES] = None
 
 
 class Measures(SphereMeasures):

@@ -10,7 +10,15 @@ from typing import Annotated, ClassVar
 
 from service.core.errors import ConfigurationError
 from service.core.jobs.references import Reference
-from service.core.protocol.step_params import RepeatedStep, StepParams
+from service.core.protocol.step_params import (
+    NAMES_CAPTURE,
+    NAMES_CT,
+    NAMES_REGISTRATION,
+    NAMES_SCAN,
+    NAMES_SPHERES,
+    RepeatedStep,
+    StepParams,
+)
 from service.core.records.events import Record
 from service.core.units import metres
 from service.jobs.registration import evaluate, register
@@ -31,11 +39,12 @@ class Params(StepParams):
         "Compute it again; the same registration gives the same figures", same=True, device=False
     )
 
-    registration: str  # step whose registrations are evaluated
-    images_of: tuple[str, ...]  # capture steps that show the control spheres
-    scan: str  # the registered scan
-    control_scan: str | None = None  # scan or CT with the control spheres; None: each sphere is left out in turn
-    ct: str | None = None  # CT import, for the loop closures of the error budget
+    registration: Annotated[str, NAMES_REGISTRATION]  # step whose registrations are evaluated
+    images_of: Annotated[tuple[str, ...], NAMES_CAPTURE]  # capture steps that show the control spheres
+    scan: Annotated[str, NAMES_SCAN]  # the registered scan
+    # Scan or CT with the control spheres; None: each sphere is left out in turn.
+    control_scan: Annotated[str | None, NAMES_SPHERES] = None
+    ct: Annotated[str | None, NAMES_CT] = None  # CT import, for the loop closures of the error budget
 
 
 class EvaluatedRegistration(MeasureRecord):

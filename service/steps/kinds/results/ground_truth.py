@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from service.core.errors import ConfigurationError
 from service.core.jobs.references import Each, Reference
-from service.core.protocol.step_params import RepeatedStep, StepParams
+from service.core.protocol.step_params import NAMES_CT, NAMES_REGISTRATION, NAMES_SCAN, RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.core.run.state import JobState
 from service.core.units import metres
@@ -57,9 +57,10 @@ class Params(StepParams):
     gives: ClassVar = "ground_truth"
     repeated: ClassVar = RepeatedStep("Correct the wound's region, then fuse again", same=True, device=False)
 
-    ct: str  # step that imported the CT
-    scan: str  # step that imported the scan
-    registration: str | None = None  # step whose camera poses place both meshes; None: by the spheres alone
+    ct: Annotated[str, NAMES_CT]  # step that imported the CT
+    scan: Annotated[str, NAMES_SCAN]  # step that imported the scan
+    # Step whose camera poses place both meshes; None: by the spheres alone.
+    registration: Annotated[str | None, NAMES_REGISTRATION] = None
     blend_mm: _Mm = 3.0  # width of the overlap over which the mesh changes from the CT to the scan
     chamfer_spacing_mm: _Mm = 0.1  # of the samples for the Chamfer distance
     cut_posts_mm: _Mm | None = None  # cuts out spheres, and posts of this radius below them; None: they stay

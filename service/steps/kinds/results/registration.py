@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.jobs.keys import arguments_name
-from service.core.protocol.step_params import RepeatedStep, StepParams
+from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, NAMES_SCAN, RepeatedStep, StepParams
 from service.core.records.events import ComputedBy, Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
@@ -66,13 +66,14 @@ class Params(StepParams):
         "Compute it again; the same images give the same figures", same=True, device=False
     )
 
-    images_of: tuple[str, ...]  # capture steps with the images
-    control_images_of: tuple[str, ...] = ()  # capture steps that see the control spheres, for the evaluation too
-    calibration: str  # step with the intrinsics
+    images_of: Annotated[tuple[str, ...], NAMES_CAPTURE]  # capture steps with the images
+    # Capture steps that see the control spheres, for the evaluation too.
+    control_images_of: Annotated[tuple[str, ...], NAMES_CAPTURE] = ()
+    calibration: Annotated[str, NAMES_CALIBRATION]  # step with the intrinsics
     # Step with T_flange_camera, or a list of steps with one for each arm; None: no robot carried the camera, or the
     # poses need no mount (spheres, colmap, glomap).
-    hand_eye: str | tuple[str, ...] | None = None
-    scan: str  # step that imported the scan
+    hand_eye: Annotated[str | tuple[str, ...] | None, NAMES_CALIBRATION] = None
+    scan: Annotated[str, NAMES_SCAN]  # step that imported the scan
     poses: tuple[Source, ...] = DEFAULT_SOURCES  # where the camera poses come from; each gives a registration
     structure_from_motion: StructureFromMotion = StructureFromMotion()  # sizes and numbers of features
     # The others search every image whole: "paper" is the published method without its networks, "grounded" has
