@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +15,7 @@ from service.core.run.state import RunState
 from service.rig import Rig, parse_recorded_rig, read_rig
 from service.run_record import recorded_protocol, recorded_root
 from service.runner.software import software_versions
-from service.steps.protocol_check import require_plausible
+from service.steps.protocol_check import require_devices, require_plausible
 from service.store.files.space_used import forecast_of, require_space
 from service.store.records import NewArtefact
 from service.store.store import Store
@@ -33,6 +34,7 @@ def start_run(
     operator: str,
     auto_confirm: bool,
     about: RunAbout | None = None,
+    device_kinds: Mapping[str, str] | None = None,
 ) -> str:
     """Record the first event of a new run and return the run's name.
 
@@ -43,16 +45,20 @@ def start_run(
         operator: the person who begins the run.
         auto_confirm: whether confirmations are automatic, on a simulated rig.
         about: what was entered about the run.
+        device_kinds: of the rig's devices by name, as the station knows them; None: they are not checked.
 
     Raises:
         ProtocolError: a gate names no measure of its step, or the rig has no station that the protocol names.
-        ConfigurationError: automatic confirmation is requested on a rig that is not simulated.
+        ConfigurationError: the rig lacks a device that a step needs, or automatic confirmation is requested on a rig
+            that is not simulated.
         SpaceShortError: the disk is too full to capture anything.
     """
     if auto_confirm:
         require_simulated(rig)
-    # Without devices nothing is captured at any station.
-    require_plausible(loaded, f"{loaded.protocol.id}.yaml", rig.section if rig.section.devices else None)
+    captures = bool(rig.section.devices)
+    require_plausible(loaded, f"{loaded.protocol.id}.yaml", rig.section if captures else None)
+    if captures and device_kinds is not None:
+        require_devices(loaded.protocol, rig, device_kinds)
     require_space(store, forecast_of(store, loaded.protocol, simulated=rig.section.simulated))
     source = loaded.source.encode()
     protocol = store.put_bytes(

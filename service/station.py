@@ -317,6 +317,12 @@ def _one_name(field: str, address: str) -> str:
         return address
 
 
+def device_kinds(rig: Rig) -> dict[str, str]:
+    """The kind of each device in a rig file, by name. Raises ConfigurationError if a driver is not installed."""
+    station = Station(rig)
+    return {name: station.kind_of(name) for name in station.names()}
+
+
 def layout_of(rig: Rig, station: str) -> StationLayout:
     """The layout of a station in a rig file. Raises ConfigurationError if there is no such station."""
     section = rig.section.stations.get(station)

@@ -10,12 +10,12 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 
-from service.core.errors import ProtocolError
-from service.core.protocol.models import Gate, LoadedProtocol, Step
+from service.core.errors import ConfigurationError, ProtocolError
+from service.core.protocol.models import Gate, LoadedProtocol, Protocol, Step
 from service.core.protocol.step_params import named_steps
 from service.core.text.counts import counted
 from service.core.text.yaml_tree import FieldPath, Plain, YamlProblem, field_name, parse_yaml
-from service.rig import RigSection
+from service.rig import Rig, RigSection
 from service.steps import step_kinds
 from service.steps.measures import Measure, RegistrationMeasures
 from service.steps.poses.sources import WantedRegistrations, needing_mount
@@ -27,6 +27,7 @@ _SECTIONS: Mapping[tuple[str, str], tuple[float, float, str]] = {
     ("camera", "aperture_f"): (0.7, 64.0, ""),
     ("camera", "iso"): (25.0, 409600.0, ""),
 }
+_TERMS = {"camera": "camera", "scanner": "scanner", "ct": "CT source"}
 _ALIAS = {"deg": "°", "1": "", "degrees": "°"}
 
 
@@ -87,6 +88,29 @@ def require_plausible(loaded: LoadedProtocol, name: str, rig: RigSection | None 
             where=f"{name}:{problems[0].line}",
             remedy="Correct what each line names; docs/reference/steps.md lists parameters, measures and units",
         )
+
+
+def require_devices(protocol: Protocol, rig: Rig, kinds: Mapping[str, str]) -> None:
+    """Refuse a rig that lacks a device of a step which nobody may skip; `kinds` are those of its devices, by name.
+
+    Raises:
+        ConfigurationError: the message names the first such step.
+    """
+    for step in protocol.steps:
+        for needed in () if step.skippable else step.params.needed_devices:
+            own = [name for name, kind in kinds.items() if kind == needed.kind and name not in rig.section.cameras]
+            if needed.name is None and len(own) != 1:
+                raise ConfigurationError(
+                    f"step {step.id} needs exactly one {_TERMS[needed.kind]}, the rig has {len(own)}",
+                    where=str(rig.path),
+                    remedy="Correct the devices of the rig file, or choose a protocol for this rig",
+                )
+            if needed.name is not None and needed.name not in own:
+                raise ConfigurationError(
+                    f"step {step.id} needs the {_TERMS[needed.kind]} {needed.name!r}, which the rig does not have",
+                    where=str(rig.path),
+                    remedy=f"Name it so among the devices; the rig has {', '.join(kinds) or 'none'}",
+                )
 
 
 def _gate(gate: Gate, step: Step, known: Mapping[str, Measure]) -> Iterator[tuple[FieldPath, str]]:

@@ -51,7 +51,7 @@ from service.run_start import (
     time_stamp_authority,
 )
 from service.runner.loop import Runner
-from service.station import Station, layout_of
+from service.station import Station, device_kinds, layout_of
 from service.steps import params_models
 from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.timestamps import stamp_end
@@ -93,7 +93,15 @@ def run_command(
             who = acting_person(store, operator, password_stdin=password_stdin)
             if not auto_confirm:  # simulated rigs need no approval
                 approve(store, loaded, who.name, reason=approve_change, identified=who.identified)
-            run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm, about=about)
+            run_id = start_run(
+                store,
+                loaded,
+                rig_file,
+                operator=who.name,
+                auto_confirm=auto_confirm,
+                about=about,
+                device_kinds=device_kinds(rig_file),
+            )
             state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker, who=who)
         _report_end(run_id, state, json=json)
 

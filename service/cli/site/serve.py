@@ -27,6 +27,7 @@ from service.logs.file_log import file_log
 from service.people.sessions import People
 from service.rig import Rig, load_rig
 from service.run_start import signature_copy
+from service.station import device_kinds
 from service.steps import params_models
 from service.store.database.engine import BUSY_TIMEOUT_S
 from service.store.records import SITE
@@ -114,6 +115,7 @@ def serve_command(
                 store=store,
                 people=people,
                 launcher=Launcher(data.resolve(), store),
+                device_kinds=device_kinds,
                 secure=tls is not None or not lan,
                 idle_lock_s=60 * idle_lock_min,
                 hosts=_names(host, name or []),

@@ -34,6 +34,14 @@ Gives = Literal[
 ]
 
 
+@dataclass(frozen=True, slots=True)
+class NeededDevice:
+    """A device that a step cannot do without: the rig's only one of its kind, or the one of this name."""
+
+    kind: Literal["camera", "scanner", "ct"]
+    name: str | None = None
+
+
 class StepParams(Record):
     """Base of the params of every step kind.
 
@@ -60,6 +68,11 @@ class StepParams(Record):
     def photographs_specimen(self) -> bool:
         """Whether this step takes images of the specimen, which nobody can take again once it was changed."""
         return False
+
+    @property
+    def needed_devices(self) -> tuple[NeededDevice, ...]:
+        """The devices that this step cannot do without, besides the robots of its stations."""
+        return ()
 
 
 class MovingParams(StepParams):

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_SPHERES, RepeatedStep, StepParams
+from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_SPHERES, NeededDevice, RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.steps.capture.live_numbers import CoverageRule
 from service.steps.measures import Count, PredictedMeasures, Share
@@ -59,6 +59,11 @@ class Params(StepParams):
     pose_sigma_mm: Annotated[float, Field(gt=0)] = 0.05  # expected position error of structure from motion
     pose_sigma_mrad: Annotated[float, Field(gt=0)] = 0.1  # expected rotation error of structure from motion
     wait_s: Annotated[float, Field(gt=0)] = 600.0  # longest wait for the next image before the step stops
+
+    @property
+    def needed_devices(self) -> tuple[NeededDevice, ...]:
+        """A camera."""
+        return (NeededDevice("camera"),)
 
     @property
     def photographs_specimen(self) -> bool:

@@ -91,7 +91,15 @@ def start(
             site.people.check_password(person.account, form.password)
     approve(site.store, loaded, person.account, reason=form.reason, identified="password" if changed else "")
     rig = load_rig(site.rig.path)
-    run_id = start_run(site.store, loaded, rig, operator=person.account, auto_confirm=False, about=about)
+    run_id = start_run(
+        site.store,
+        loaded,
+        rig,
+        operator=person.account,
+        auto_confirm=False,
+        about=about,
+        device_kinds=site.device_kinds(rig),
+    )
     Control(site.store).take(run_id, person)
     site.launcher.start(run_id)
     return back_to(run_id)

@@ -19,6 +19,7 @@ from service.people.person import Person
 from service.people.roles import ROLES, Role
 from service.people.sessions import People
 from service.rig import load_rig
+from service.station import device_kinds
 from service.steps import params_models
 from service.store.durable_effects import Clock
 from service.store.store import Store
@@ -160,6 +161,7 @@ def web_site(folder: Path, *, clock: Clock | None = None, idle_lock_s: float = 6
             store=store,
             people=people,
             launcher=NoLauncher(data, store),
+            device_kinds=device_kinds,
             idle_lock_s=idle_lock_s,
             hosts=("testserver",),
         )

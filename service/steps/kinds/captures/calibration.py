@@ -8,7 +8,13 @@ import numpy as np
 from pydantic import model_validator
 
 from service.core.errors import ConfigurationError
-from service.core.protocol.step_params import NAMES_CALIBRATION, NAMES_CAPTURE, MovingParams, RepeatedStep
+from service.core.protocol.step_params import (
+    NAMES_CALIBRATION,
+    NAMES_CAPTURE,
+    MovingParams,
+    NeededDevice,
+    RepeatedStep,
+)
 from service.core.records.events import Record
 from service.core.units import metres
 from service.jobs.calibration import calibrate
@@ -47,6 +53,11 @@ class Params(MovingParams):
     def moves_robot(self) -> bool:
         """Whether new images are taken."""
         return self.images_of is None
+
+    @property
+    def needed_devices(self) -> tuple[NeededDevice, ...]:
+        """A camera, if new images are taken."""
+        return (NeededDevice("camera"),) if self.images_of is None else ()
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Annotated, ClassVar, Literal
 
 from service.compute.planning.motion_plan import Order
-from service.core.protocol.step_params import MovingParams, RepeatedStep
+from service.core.protocol.step_params import MovingParams, NeededDevice, RepeatedStep
 from service.core.records.events import Record
 from service.steps.capture.live_numbers import LiveAnalysis, LiveParams
 from service.steps.capture.optics import departing_images, optics_departures
@@ -29,6 +29,11 @@ class Params(MovingParams):
     viewpoints: tuple[ViewpointSet, ...]  # where the images are taken from
     order: Order = "as_listed"  # of the viewpoints: as listed, or along the shortest way
     live: LiveParams | None = None  # what is computed from each image during the capture; nothing if left out
+
+    @property
+    def needed_devices(self) -> tuple[NeededDevice, ...]:
+        """A camera."""
+        return (NeededDevice("camera"),)
 
     @property
     def photographs_specimen(self) -> bool:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 
 from drivers.interfaces import CtSource, CtVolume
-from service.core.protocol.step_params import RepeatedStep, StepParams
+from service.core.protocol.step_params import NeededDevice, RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, Record
 from service.core.units import metres, mm
 from service.jobs.records import Point, SphereDetails
@@ -31,6 +31,11 @@ class Params(StepParams):
     threshold_hu: float = -450.0  # half way between air and tissue or plastic: unbiased surfaces
     spheres: int  # number of registration and control spheres in the volume
     wait_s: float = 600.0  # longest wait until the series is complete
+
+    @property
+    def needed_devices(self) -> tuple[NeededDevice, ...]:
+        """A CT source."""
+        return (NeededDevice("ct"),)
 
 
 class Measures(SphereMeasures):

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import Field
 
 from service.core.jobs.references import Reference
-from service.core.protocol.step_params import NAMES_SPHERES, NamesStep, RepeatedStep, StepParams
+from service.core.protocol.step_params import NAMES_SPHERES, NamesStep, NeededDevice, RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, Record
 from service.core.units import metres
 from service.jobs.records import Point, SphereDetails
@@ -36,6 +36,11 @@ class Params(StepParams):
     application: Annotated[str | None, _NAMES_APPLICATION] = None  # the step whose coat is still on the specimen
     # An earlier ct_import or scan_import, to see whether spheres moved since.
     compare_with: Annotated[str | None, NAMES_SPHERES] = None
+
+    @property
+    def needed_devices(self) -> tuple[NeededDevice, ...]:
+        """A scanner."""
+        return (NeededDevice("scanner", self.device),)
 
 
 class Measures(SphereMeasures):

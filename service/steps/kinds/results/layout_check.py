@@ -11,7 +11,7 @@ from pydantic import Field
 
 from drivers.errors import ReleasedElsewhereError
 from service.core.gates.verdict import evaluate_gates
-from service.core.protocol.step_params import RepeatedStep, StepParams
+from service.core.protocol.step_params import NeededDevice, RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, GateVerdict, Record
 from service.core.units import metres
 from service.jobs.records import Point
@@ -48,6 +48,11 @@ class Params(StepParams):
     between_s: float = 5.0  # time for moving the camera
     wait_s: Annotated[float, Field(gt=0)] = 600.0  # longest wait for a photograph that arrives as a file
     sensor_width_mm: float = 35.7  # gives nominal intrinsics, with the focal length in the file
+
+    @property
+    def needed_devices(self) -> tuple[NeededDevice, ...]:
+        """A camera."""
+        return (NeededDevice("camera"),)
 
 
 class Measures(LayoutMeasures):
