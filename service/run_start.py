@@ -26,6 +26,25 @@ if TYPE_CHECKING:
 _SCHEMES = ("ptpip:", "socket://")
 
 
+def require_runnable(loaded: LoadedProtocol, rig: Rig, device_kinds: Mapping[str, str]) -> None:
+    """Refuse what could not be run to its end: it would fail hours later, when little can be done again.
+
+    Args:
+        loaded: the protocol.
+        rig: the rig. One without any device captures nothing, so that its stations and devices are not asked for.
+        device_kinds: of the rig's devices by name, as the station knows them.
+
+    Raises:
+        ProtocolError: params name the wrong steps, a gate a measure that its step does not have, or a step a station
+            that the rig does not have.
+        ConfigurationError: the rig lacks a device of a step.
+    """
+    captures = bool(rig.section.devices)
+    require_plausible(loaded, f"{loaded.protocol.id}.yaml", rig.section if captures else None)
+    if captures:
+        require_devices(loaded.protocol, rig, device_kinds)
+
+
 def start_run(
     store: Store,
     loaded: LoadedProtocol,
@@ -34,7 +53,6 @@ def start_run(
     operator: str,
     auto_confirm: bool,
     about: RunAbout | None = None,
-    device_kinds: Mapping[str, str] | None = None,
 ) -> str:
     """Record the first event of a new run and return the run's name.
 
@@ -45,20 +63,13 @@ def start_run(
         operator: the person who begins the run.
         auto_confirm: whether confirmations are automatic, on a simulated rig.
         about: what was entered about the run.
-        device_kinds: of the rig's devices by name, as the station knows them; None: they are not checked.
 
     Raises:
-        ProtocolError: a gate names no measure of its step, or the rig has no station that the protocol names.
-        ConfigurationError: the rig lacks a device that a step needs, or automatic confirmation is requested on a rig
-            that is not simulated.
+        ConfigurationError: automatic confirmation is requested on a rig that is not simulated.
         SpaceShortError: the disk is too full to capture anything.
     """
     if auto_confirm:
         require_simulated(rig)
-    captures = bool(rig.section.devices)
-    require_plausible(loaded, f"{loaded.protocol.id}.yaml", rig.section if captures else None)
-    if captures and device_kinds is not None:
-        require_devices(loaded.protocol, rig, device_kinds)
     require_space(store, forecast_of(store, loaded.protocol, simulated=rig.section.simulated))
     source = loaded.source.encode()
     protocol = store.put_bytes(

@@ -129,3 +129,17 @@ def test_a_run_does_not_start_with_what_the_check_refuses(tmp_path: Path) -> Non
     assert "calibration measures no 'rms_pix'; did you mean 'rms_px'?" in done.output
     with Store.open(tmp_path / "data") as store:
         assert not store.runs()
+
+
+def test_a_run_does_not_start_on_a_rig_without_a_device_that_a_step_needs(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    station = "{robot: robot, scene_centre_m: [0, 0, 0], approach_azimuth_deg: 0}"
+    rig.write_text(
+        "name: r\nsimulated: true\n"
+        'devices: {robot: {driver: ur, host: 127.0.0.1}, camera: {driver: gphoto, port: "ptpip:127.0.0.1"}}\n'
+        f"stations: {{station_1: {station}, station_2: {station}}}\n"
+    )
+    arguments = ["run", str(PROTOCOLS / "exvivo_spine.yaml"), "--rig", str(rig), "--data", str(tmp_path / "data")]
+    done = CliRunner().invoke(app, [*arguments, "--operator", "Ada"])
+    assert done.exit_code == 1
+    assert "step control_scan needs exactly one scanner, the rig has 0" in done.output

@@ -45,6 +45,7 @@ from service.run_start import (
     recorded_rig,
     recorded_run,
     require_rig_free,
+    require_runnable,
     require_simulated,
     signature_copy,
     start_run,
@@ -89,19 +90,12 @@ def run_command(
         about = about_run(specimen=specimen, purpose=purpose, site=site, text=remarks)
         loaded = load_protocol(protocol, params_models())
         rig_file = load_rig(rig)
+        require_runnable(loaded, rig_file, device_kinds(rig_file))
         with Store.open(data) as store:
             who = acting_person(store, operator, password_stdin=password_stdin)
             if not auto_confirm:  # simulated rigs need no approval
                 approve(store, loaded, who.name, reason=approve_change, identified=who.identified)
-            run_id = start_run(
-                store,
-                loaded,
-                rig_file,
-                operator=who.name,
-                auto_confirm=auto_confirm,
-                about=about,
-                device_kinds=device_kinds(rig_file),
-            )
+            run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm, about=about)
             state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker, who=who)
         _report_end(run_id, state, json=json)
 

@@ -41,6 +41,7 @@ from service.rig import Rig
 from service.run_record import recorded_root
 from service.run_start import start_run
 from service.steps import params_models
+from service.steps.protocol_check import require_plausible
 from service.store.store import Store
 
 _PROTOCOL = shipped_protocols() / "import_spine.yaml"
@@ -106,6 +107,7 @@ def import_command(
     with reporting_errors(json):
         about = about_run(specimen=specimen, purpose=purpose, site=site, text=remarks)
         loaded = load_protocol(protocol, params_models())
+        require_plausible(loaded, str(protocol))
         with progress_bar(quiet=json) as progress:
             places = find_places(folder, given, _parts_of(loaded.protocol))
             listing = list_import(places, progress, ct_first_number=ct_first_number)

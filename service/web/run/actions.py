@@ -34,7 +34,7 @@ from service.people.errors import NotAllowedError
 from service.people.sessions import NAMES, KnownBy
 from service.rig import load_rig
 from service.run_record import RunRecord
-from service.run_start import record_refusal, require_rig_free, start_run
+from service.run_start import record_refusal, require_rig_free, require_runnable, start_run
 from service.steps import params_models
 from service.web.run.forms import ActionForm, RunId, StartForm, back_to
 from service.web.security.guards import SignedInPerson, requires
@@ -82,6 +82,8 @@ def start(
             f"there is no protocol file {form.protocol!r}", where=str(site.protocols), remedy="Reload the page"
         )
     loaded = load_protocol(known[form.protocol], params_models())
+    rig = load_rig(site.rig.path)
+    require_runnable(loaded, rig, site.device_kinds(rig))
     require_rig_free(site.store, site.rig.path)
     changed = standing_of(site.store, loaded).changed
     if changed:
@@ -90,16 +92,7 @@ def start(
         if form.reason.strip():
             site.people.check_password(person.account, form.password)
     approve(site.store, loaded, person.account, reason=form.reason, identified="password" if changed else "")
-    rig = load_rig(site.rig.path)
-    run_id = start_run(
-        site.store,
-        loaded,
-        rig,
-        operator=person.account,
-        auto_confirm=False,
-        about=about,
-        device_kinds=site.device_kinds(rig),
-    )
+    run_id = start_run(site.store, loaded, rig, operator=person.account, auto_confirm=False, about=about)
     Control(site.store).take(run_id, person)
     site.launcher.start(run_id)
     return back_to(run_id)
