@@ -14,8 +14,9 @@ from service.core.documents.ways_docs import ways_text
 from service.core.protocol.models import load_protocol
 from service.core.text.counts import counted
 from service.rig import load_rig
+from service.station import device_kinds
 from service.steps import params_models
-from service.steps.protocol_check import require_plausible
+from service.steps.protocol_check import require_devices, require_plausible
 
 protocol_app = typer.Typer(name="protocol", help="Check a protocol file before it is used.", no_args_is_help=True)
 
@@ -23,14 +24,19 @@ protocol_app = typer.Typer(name="protocol", help="Check a protocol file before i
 @protocol_app.command("check")
 def check_command(
     file: Annotated[Path, typer.Argument(help="The protocol file.")],
-    rig: Annotated[Path | None, typer.Option("--rig", help="Also check that this rig file has its stations.")] = None,
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="Also check that this rig has its stations and devices.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Check a protocol and report every problem with file, line and field."""
     with reporting_errors(json):
         loaded = load_protocol(file, params_models())
         protocol = loaded.protocol
-        require_plausible(loaded, str(file), None if rig is None else load_rig(rig).section)
+        site = None if rig is None else load_rig(rig)
+        require_plausible(loaded, str(file), None if site is None else site.section)
+        if site is not None:
+            require_devices(loaded.protocol, site, device_kinds(site))
         if json:
             steps = [{"id": s.id, "kind": s.kind, "irreversible": s.irreversible} for s in protocol.steps]
             print_json({"id": protocol.id, "version": protocol.version, "sha256": loaded.sha256, "steps": steps})
