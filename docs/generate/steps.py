@@ -28,8 +28,9 @@ gates:
 A gate compares the measured number with `min` and `max`, in the unit of the measure. Where a measure states its
 uncertainty, both bounds of the number must be within the limits, each held with 99 %; where one is and the other is
 not, the gate is not decided and the step does not pass. `orthocapture protocol check protocols/exvivo_spine.yaml`
-refuses a measure that a kind does not have, another unit, and limits that cannot be meant (column *limits*). Params that
-name an earlier step say in their type what that step must do.
+refuses a measure that a kind does not have, another unit, and limits that cannot be meant (column *limits*).
+
+Params that name an earlier step say in their type what that step must do.
 
 `NAME` stands for the source of the camera poses: `robot`, `robot_corrected`, `triangulated`, `colmap`, `glomap`,
 `hybrid`, `spheres`; with `reduced`, the resolution too.

@@ -90,6 +90,8 @@ def run_command(
         about = about_run(specimen=specimen, purpose=purpose, site=site, text=remarks)
         loaded = load_protocol(protocol, params_models())
         rig_file = load_rig(rig)
+        if auto_confirm:
+            require_simulated(rig_file)
         require_runnable(loaded, rig_file, device_kinds(rig_file))
         with Store.open(data) as store:
             who = acting_person(store, operator, password_stdin=password_stdin)
