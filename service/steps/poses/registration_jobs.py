@@ -27,7 +27,7 @@ from service.jobs.records import ImageFile, ImagesCamera, PosedPhotograph
 from service.jobs.registration import detect_spheres
 from service.steps.context import JobRequest
 from service.steps.poses.front_end import IMAGES_A_JOB, PAIRS_A_JOB, EarlyJobs, chunks, found_early
-from service.steps.poses.sources import PLANNED, QUICK, WantedRegistrations, decisive, posed
+from service.steps.poses.sources import ARM, PLANNED, QUICK, WantedRegistrations, decisive, posed
 
 _REDUCED = ("reduced_to", "full_camera")  # arguments of jobs on reduced images; the second one in old runs only
 _SEARCH_ONLY = ("detector", "colour", "developed")  # arguments of the search for outlines alone
@@ -151,7 +151,8 @@ class _Plan:
         markers = {**shared, "outlines": detected.artefacts[0].sha256, "poses": source}
         if source in QUICK:
             reported = _uncorrected(markers) if source == "robot" else {}
-            return self._need("register", source, size, {**markers, **reported})
+            stated = {"state_pose_errors": True} if source in ARM else {}
+            return self._need("register", source, size, {**markers, **reported, **stated})
         model = self._model(self._mapper(source), size, shared)
         if model is not None and source == "hybrid":
             # It starts from one reconstruction and adds the robot and the spheres.

@@ -18,7 +18,8 @@ from service.jobs.records import PosedPhotograph
 Source = Literal["robot", "robot_corrected", "spheres", "triangulated", "colmap", "glomap", "hybrid"]
 DEFAULT_SOURCES: tuple[Source, ...] = ("robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid")
 PLANNED = "sources_planned"  # the note with which a registration records what it waits for and what comes later
-QUICK = ("robot", "robot_corrected", "spheres")  # computed in seconds, from the outlines alone
+ARM = ("robot", "robot_corrected")  # whose poses are those of an arm
+QUICK = (*ARM, "spheres")  # computed in seconds, from the outlines alone
 
 _BY_PREFERENCE = ("robot_corrected", "robot", "spheres", "triangulated", "colmap", "glomap", "hybrid")
 

@@ -23,7 +23,6 @@ from service.core.units import metres
 from service.dataset.control_spheres import control_centres
 from service.dataset.posed.of_run.about_run import about_run
 from service.dataset.posed.of_run.further_views import FurtherView, further_views
-from service.dataset.posed.of_run.pose_errors import own_pose_errors
 from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.posed.of_run.statement import described_run
 from service.dataset.posed.of_run.view_covariances import view_covariances
@@ -69,16 +68,14 @@ def data_set_of(
     own, registered, files = _registered(summary)
     truth = summary.ground_truth()
     mesh = Mesh(truth.vertices_m, truth.faces, truth.source, truth.sigma_m)
-    joint = own_pose_errors(summary, registered, sorted(files))
-    stated_errors = view_covariances(summary, own, registered, sorted(files), joint)
+    stated_errors = view_covariances(summary, own, registered, sorted(files))
     taken = {capture.viewpoint: str(capture.camera.get("exif_time") or "") for capture in summary.captures()}
     first = [
         _view(name, path, registered, stated_errors.covariance[name], taken[name])
         for name, (path, _) in sorted(files.items())
     ]
     further = further_views(summary, {view.name: view.T_world_camera for view in first})
-    if joint is not None:
-        joint = further.joint(joint, sorted(files))
+    joint = None if stated_errors.joint is None else further.joint(stated_errors.joint, sorted(files))
     covariances = further.covariances(stated_errors.covariance)
     files |= {one.name: (one.path, one.sha256) for one in further.views}
     views = _in_order([*first, *(_further_view(one, covariances[one.name]) for one in further.views)])
@@ -93,6 +90,7 @@ def data_set_of(
             "mesh": truth.words,
             "mesh_sha256": truth.sha256,
             "masks": masks,
+            "pose_covariance": stated_errors.words,
             "image_sha256": hashes,
             "further_cameras": further.statement,
         },

@@ -201,6 +201,7 @@ def _registrations(context: StepContext, step: str, ct: EarlierAnswer[Any]) -> t
     }
     references = {"spheres_m": "spheres_m", "sphere_covariance_m2": "details/spheres/*/covariance_m2"}
     recorded = dict(mine.arguments)
+    recorded.pop("state_pose_errors", None)  # no image is placed by the CT
     for field, path in references.items():
         reference = ct.reference(path)
         recorded[field] = of_ct[field] if reference is None else reference.record()
