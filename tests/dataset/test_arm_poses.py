@@ -46,7 +46,9 @@ def arm_jobs(run: RecordedRun) -> dict[str, JobState]:
 def computed(run: RecordedRun, job: JobState, folder: Path, more: Mapping[str, Any]) -> JobAnswer:
     """The job computed again with more arguments; its files are kept in the folder."""
     arguments: Mapping[str, Any] = {**resolve(job.arguments, jobs_of(run.state)), **more}
-    context: RecordedContext = JobContext(arguments, ScratchStore(run.files, folder), folder / "scratch", lambda *_: None)
+    context: RecordedContext = JobContext(
+        arguments, ScratchStore(run.files, folder), folder / "scratch", lambda *_: None
+    )
     return HANDLERS[job.kind](context)
 
 

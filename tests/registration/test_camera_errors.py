@@ -112,17 +112,16 @@ def test_poses_are_as_wrong_as_stated(known: list[Known], refined: bool) -> None
 
 
 def test_a_given_pose_errs_about_as_the_arm_and_a_refined_one_less(known: list[Known]) -> None:
+    of_arm = np.array([SIGMA_M**2] * 3 + [SIGMA_RAD**2] * 3)
     for one in known:
-        sigma_m, sigma_rad = one.result.pose_sigma
-        assert (sigma_m, sigma_rad) == pytest.approx((SIGMA_M, SIGMA_RAD), rel=0.6)
-        of_arm = np.array([sigma_m**2] * 3 + [sigma_rad**2] * 3)
-        given, refined = (
-            np.diag(camera_errors(one.result, refined=each)).reshape(-1, 6).mean(axis=0) for each in (False, True)
-        )
-        assert (given > 0.7 * of_arm).all()  # the bases follow part of the errors of the six images of each
-        assert (given < 1.3 * of_arm).all()
-        assert (refined < 0.9 * of_arm).all()
-        assert refined[:3].sum() < 0.3 * of_arm[:3].sum()
+        assert one.result.pose_sigma == pytest.approx((SIGMA_M, SIGMA_RAD), rel=0.6)
+    given, refined = (
+        np.mean([np.diag(camera_errors(one.result, refined=each)).reshape(-1, 6) for one in known], axis=(0, 1))
+        for each in (False, True)
+    )
+    assert given == pytest.approx(of_arm, rel=0.5)
+    assert refined[:3].sum() < 0.3 * given[:3].sum()
+    assert refined[3:].sum() < 0.8 * given[3:].sum()
 
 
 def test_poses_of_another_unit_are_refused(known: list[Known]) -> None:

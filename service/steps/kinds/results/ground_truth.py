@@ -125,6 +125,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         blend_m=metres(params.blend_mm),
         spacing_m=metres(params.chamfer_spacing_mm),
         regions=_regions(context, params),
+        simulated=context.run.simulated,
     )
     if params.cut_posts_mm is not None:
         arguments = arguments.model_copy(update={"post_radius_m": metres(params.cut_posts_mm)})
