@@ -9,6 +9,7 @@ from service.jobs.records import Camera, Hash, Matrix
 from service.jobs.registration import further_camera
 from service.jobs.registration.detect_spheres import SceneArguments
 
+ARM = ("robot", "robot_corrected")  # sources of poses that are an arm's
 POSE_ERRORS = "pose_errors"  # kind of the artefact with the errors of an arm's poses
 
 

@@ -25,9 +25,10 @@ from service.jobs.poses.features import ImagesToMatch
 from service.jobs.poses.match import PairsToMatch
 from service.jobs.records import ImageFile, ImagesCamera, PosedPhotograph
 from service.jobs.registration import detect_spheres
+from service.jobs.registration.register import ARM
 from service.steps.context import JobRequest
 from service.steps.poses.front_end import IMAGES_A_JOB, PAIRS_A_JOB, EarlyJobs, chunks, found_early
-from service.steps.poses.sources import ARM, PLANNED, QUICK, WantedRegistrations, decisive, posed
+from service.steps.poses.sources import PLANNED, QUICK, WantedRegistrations, decisive, posed
 
 _REDUCED = ("reduced_to", "full_camera")  # arguments of jobs on reduced images; the second one in old runs only
 _SEARCH_ONLY = ("detector", "colour", "developed")  # arguments of the search for outlines alone

@@ -13,12 +13,12 @@ from service.core.errors import ConfigurationError
 from service.core.geometry import Array, apply, inverse
 from service.dataset.posed.records import Mesh, PosedView
 from service.dataset.summary import RunSummary
+from service.jobs.registration.register import ARM
 from service.rig import RigSection, parse_recorded_rig
 
 _CANDIDATES = 300  # faces whose normals are tried as the board's
 _WITHIN, _LEVEL = 0.7, 0.996  # cosines: of the board from the cameras' direction, of level faces from the board
 _LEAST_LEVEL = 0.05  # share of the surface that must be level
-_ARM = ("robot_corrected", "robot")  # poses with which the frame of the registration is the base of an arm
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ def _down_to(ground: _Ground, scan: Mesh, spheres: Sequence[WorldSphere]) -> tup
 def _table(summary: RunSummary) -> _Ground | None:
     """The table at a station, from the rig file and a registration of an arm's poses; None without either."""
     registrations = summary.registrations()
-    registered = next((registrations[name] for name in _ARM if name in registrations), None)
+    registered = next((registrations[name] for name in reversed(ARM) if name in registrations), None)
     rig = None if registered is None else _rig(summary)
     if registered is None or rig is None:
         return None
