@@ -20,7 +20,8 @@ from service.compute.pixels.masks import WorldSphere, marker_mask
 from service.core.geometry import apply, increment, inverse
 from service.core.records.events import EvidenceExported, RunCompleted, RunReleased
 from service.core.units import metres
-from service.dataset.posed.of_run.data_set import control_spheres, data_set_of, specimen_pixels, upwards
+from service.dataset.posed.of_run.data_set import control_spheres, data_set_of, specimen_pixels
+from service.dataset.posed.of_run.posts import upwards
 from service.dataset.posed.of_run.view_covariances import pose_covariance
 from service.dataset.posed.records import Mesh
 from service.store.store import Store
@@ -58,7 +59,8 @@ def test_a_run_is_exported_recorded_and_still_verifies(recorded: Path, tmp_path:
     described = json.loads((out / "dataset.json").read_text())
     assert described["simulated"] is True
     assert described["pose_source"] == run.summary().best()
-    assert described["masks"].startswith("13 spheres; posts are not masked")  # its scan was cut to the spheres
+    # Its scan was cut to the spheres.
+    assert described["masks"].startswith("13 spheres, and the posts below 10 of them, down to the table")
     # The spheres are in the images where pycolmap projects them: they differ from what surrounds them.
     model = pycolmap.Reconstruction(str(out / "sparse" / "0"))
     spheres = np.array(run.summary().scan_spheres_m())

@@ -22,6 +22,7 @@ from service.core.protocol.models import parse_protocol
 from service.core.records.events import RegionDrawn
 from service.core.run.state import RunState
 from service.dataset.posed.of_run.about_run import about_run
+from service.dataset.posed.records import SIMULATED
 from service.dataset.preview.surfaces import SimplifiedMesh, fused_mesh, shown_distances
 from service.dataset.recorded_fusion import recorded_fusion
 from service.dataset.summary import summarise
@@ -274,6 +275,27 @@ def test_the_way_through_the_cameras_is_compared_with_the_spheres(bench: Bench, 
     middle = (np.hypot(x + 16, y - 14.5) < 1.5) & (z > 25)
     assert middle.any()
     assert np.all(columns["source"][middle] == 0)
+
+
+@pytest.mark.slow
+def test_the_meshes_of_a_simulated_run_say_so_and_those_of_earlier_versions_are_as_they_were(
+    bench: Bench, tmp_path: Path
+) -> None:
+    fused(bench)
+    steps = bench.state().steps
+    (job,) = (j for j in steps["ground_truth"].jobs.values() if j.kind == "fuse")
+    earlier = {**job.arguments, "ct": dict(steps["ct"].result), "scan": dict(steps["scan"].result)}
+    assert earlier.pop("simulated") is True
+    before = HANDLERS["fuse"](JobContext(earlier, bench.store, tmp_path, lambda *_: None))
+    line = b"comment " + SIMULATED.encode("ascii") + b"\n"
+    files = [
+        [bench.store.artefact_path(ref.sha256).read_bytes() for ref in refs if ref.media_type == "model/ply"]
+        for refs in (job.artefacts, before.artefacts)
+    ]
+    assert [len(each) for each in files] == [2, 2]
+    for now, as_it_was in zip(*files, strict=True):
+        assert now.count(line) == 1
+        assert now.replace(line, b"") == as_it_was
 
 
 def test_a_region_is_a_polygon_or_a_box() -> None:

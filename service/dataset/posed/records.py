@@ -114,8 +114,8 @@ class DataSet:
         pixels: of the views.
         mesh: ground truth in the world frame.
         splits: of the names of the views.
-        pose_errors: (6 V, 6 V) joint covariance of the poses in the views' order, as a view's covariance, but without
-            the errors that are common to all views; None where it is not stated.
+        pose_errors: (6 V, 6 V) joint covariance of the poses in the views' order, as a view's covariance. Errors that
+            are common to all views may be missing: they cancel in relative poses. None where it is not stated.
         about: the data set as a whole, for its data card and metadata.
         scan_files: the scanner's own export, with its textures.
     """

@@ -9,14 +9,21 @@ from service.jobs.records import Camera, Hash, Matrix
 from service.jobs.registration import further_camera
 from service.jobs.registration.detect_spheres import SceneArguments
 
+ARM = ("robot", "robot_corrected")  # sources of poses that are an arm's
+POSE_ERRORS = "pose_errors"  # kind of the artefact with the errors of an arm's poses
+
 
 class Arguments(SceneArguments):
-    """Outlines and the source of the poses, with its model if they come from the images."""
+    """Outlines and the source of the poses, with its model if they come from the images.
+
+    With `state_pose_errors`, which is for poses of an arm, the errors of the poses are estimated and kept.
+    """
 
     outlines: Hash
     poses: str
     model: Hash | None = None
     tracks: Hash | None = None
+    state_pose_errors: bool = False  # jobs of earlier versions did not
 
 
 class LeaveOneOut(JobRecord):
@@ -46,6 +53,8 @@ class Registration(JobRecord):
         covariance: (6, 6) of T_world_scan, m and rad.
         components: terms whose sum is the covariance.
         leave_one_out: None if a station sees too few spheres for it.
+        pose_sigma_m: of a single pose of the arm, along each axis, before the outlines refined it; None: not stated.
+        pose_sigma_rad: of its rotation vector.
     """
 
     poses: str
@@ -63,6 +72,8 @@ class Registration(JobRecord):
     covariance: Matrix
     components: dict[str, Matrix]
     leave_one_out: LeaveOneOut | None = None
+    pose_sigma_m: float | None = None
+    pose_sigma_rad: float | None = None
 
 
 class Registrations(JobRecord):

@@ -46,6 +46,7 @@ class Arguments(JobRecord):
         spacing_m: of the samples for the Chamfer distance.
         post_radius_m: of the spheres' posts, which are then cut out with the spheres; None: nothing is cut out.
         regions: where people decided, the later overruling the earlier.
+        simulated: the run is, and the meshes say so; jobs of earlier versions did not say it.
     """
 
     ct_mesh: Hash
@@ -59,6 +60,7 @@ class Arguments(JobRecord):
     spacing_m: float
     post_radius_m: float | None = None
     regions: tuple[Region, ...] = ()
+    simulated: bool = False
 
 
 class Answer(JobRecord):

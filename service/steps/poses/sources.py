@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from service.core.protocol.models import Protocol, Step
 from service.jobs.poses.features import SfmEffort
 from service.jobs.records import PosedPhotograph
+from service.jobs.registration.register import ARM
 
 # "robot" is the paper's baseline: the arm's poses as reported. "robot_corrected" removes the arm's errors as the
 # hand-eye calibration estimated them, and each pose's error as the spheres show it. "spheres" locates each image of a
@@ -19,7 +20,7 @@ from service.jobs.records import PosedPhotograph
 Source = Literal["robot", "robot_corrected", "spheres", "triangulated", "colmap", "glomap", "hybrid"]
 DEFAULT_SOURCES: tuple[Source, ...] = ("robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid")
 PLANNED = "sources_planned"  # the note with which a registration records what it waits for and what comes later
-QUICK = ("robot", "robot_corrected", "spheres")  # computed in seconds, from the outlines alone
+QUICK = (*ARM, "spheres")  # computed in seconds, from the outlines alone
 
 _BY_PREFERENCE = ("robot_corrected", "robot", "spheres", "triangulated", "colmap", "glomap", "hybrid")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,12 +16,14 @@ from service.compute.evaluation.accuracy import leave_one_out
 from service.compute.evaluation.closure import Alignment
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import register_images
+from service.compute.registration.camera_errors import camera_errors
 from service.compute.registration.joint_poses import with_joint_pose_covariance
 from service.compute.registration.result import RegistrationResult
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, inverse
+from service.core.records.events import ArtefactRef
 from service.core.units import mm
 from service.jobs.poses.hybrid import HybridModel
 from service.jobs.poses.structure_from_motion import ModelFile
@@ -44,11 +48,12 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
     solved = register_images(images.outlines, posed, spheres)
     answer = solved.registration
     placed = _placed(context, images, answer)
-    components = placed.components
+    components, judged = placed.components, answer
     if (lens := _intrinsics_covariance(arguments)) is not None:
         settings = RegistrationSettings(intrinsics_covariance=lens)
         uncertain = register_images(images.outlines, posed, spheres, settings, assignments=solved.assignments)
-        components = components | {"intrinsics": _added(answer, uncertain.registration, refined=refined)}
+        judged = uncertain.registration
+        components = components | {"intrinsics": _added(answer, judged, refined=refined)}
     covariance = np.sum(list(components.values()), axis=0)
     # The poses of located images know every sphere: none is left out of them.
     left_out = None if images.located else _leave_one_out(answer, refined=refined)
@@ -66,8 +71,24 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
     if left_out is not None:
         measures["leave_one_out_mm"] = left_out.mean_radial_error_mm
     kept = {**record.plain(), **_residuals(answer, images.names)}
-    ref = context.keep_json(kept, kind="registration", name=f"{source}.json")
-    return JobAnswer(measures, (ref,), record)
+    files = [context.keep_json(kept, kind="registration", name=f"{source}.json")]
+    if arguments.state_pose_errors:
+        files.append(_kept_pose_errors(context, images.names, camera_errors(judged, refined=refined)))
+    return JobAnswer(measures, tuple(files), record)
+
+
+def _kept_pose_errors(context: JobContext[job.Arguments], names: Sequence[str], joint: Array) -> ArtefactRef:
+    """Store the joint covariance (6 N, 6 N) of T_scan_camera of the images that are placed, with their names."""
+    placed = np.isfinite(np.diag(joint))
+    buffer = io.BytesIO()
+    listed = json.dumps([name for name, stated in zip(names, placed[::6], strict=True) if stated])
+    np.savez(buffer, names=np.array(listed), covariance=joint[np.ix_(placed, placed)])
+    return context.keep_bytes(
+        buffer.getvalue(),
+        kind=job.POSE_ERRORS,
+        media_type="application/x-npz",
+        name=f"{context.arguments.poses}_pose_errors.npz",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,6 +248,9 @@ def _record(
         components=matrices(judged.components),
         leave_one_out=judged.left_out,
     )
+    if arguments.state_pose_errors:
+        sigma_m, sigma_rad = answer.pose_sigma
+        record = record.model_copy(update={"pose_sigma_m": sigma_m, "pose_sigma_rad": sigma_rad})
     if placed.given is None:
         return record
     cameras, covariance = placed.given

@@ -24,6 +24,7 @@ from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.records.events import ArtefactRef
 from service.core.units import deg, metres, mm
+from service.dataset.posed.records import SIMULATED
 from service.jobs.records import Point, SpheresFound, matrix
 from service.jobs.surfaces import fuse as job
 from service.worker.job import JobAnswer, JobContext
@@ -144,9 +145,10 @@ def _files(context: JobContext[job.Arguments], compared: _ComparedSurfaces, fuse
     scale = HeatScale.of(compared.score, ChamferSettings().outlier_m)
     mesh, heat = context.scratch / "ground_truth.ply", context.scratch / "ct_to_scan.ply"
     properties = {"source": fused.source, "sigma_mm": mm(fused.sigma_m)}
-    write_ply(mesh, fused.surface, _MM, properties, _COMMENTS)
+    mark = [SIMULATED] if context.arguments.simulated else []
+    write_ply(mesh, fused.surface, _MM, properties, [*_COMMENTS, *mark])
     distance_m = PointIndex(compared.score.gt.samples.points_m).nearest(compared.ct.vertices_m, scale.outlier_m)[0]
-    write_heat_mesh(heat, compared.ct, distance_m, scale, _MM)
+    write_heat_mesh(heat, compared.ct, distance_m, scale, _MM, mark)
     picture = fusion_picture(compared.ct, compared.scan, compared.score, scale, fused)
     kept = (
         (mesh.read_bytes(), "ground_truth_mesh", "model/ply", mesh.name),

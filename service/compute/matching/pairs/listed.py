@@ -60,7 +60,7 @@ def listed_pairs(
         views: by name, in the order of `covisible`; their depth is not needed.
         points_m: (P, 3) points of the surface, in the world frame.
         covisible: what the views see of them.
-        errors: (6 V, 6 V) joint covariance of the poses, without the error that is common to all; None if unknown.
+        errors: (6 V, 6 V) joint covariance of the poses; errors common to all cancel; None if unknown.
     """
     names = list(views)
     found: list[ListedPair] = []

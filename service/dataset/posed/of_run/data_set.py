@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.pixels.masks import Cylinder, WorldSphere, hull_mask, posts_below
+from service.compute.pixels.masks import WorldSphere, hull_mask
 from service.compute.pixels.ray_mesh import RayMesh
 from service.compute.pixels.splits import splits
 from service.core.errors import DataError
@@ -23,7 +23,7 @@ from service.core.units import metres
 from service.dataset.control_spheres import control_centres
 from service.dataset.posed.of_run.about_run import about_run
 from service.dataset.posed.of_run.further_views import FurtherView, further_views
-from service.dataset.posed.of_run.pose_errors import own_pose_errors
+from service.dataset.posed.of_run.posts import posts_of
 from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.posed.of_run.statement import described_run
 from service.dataset.posed.of_run.view_covariances import view_covariances
@@ -36,9 +36,6 @@ from service.jobs.records import SpheresFound
 from service.jobs.registration.register import Registration
 
 _POINTS = 2000  # of the mesh, by which the sparse views are chosen
-_CANDIDATES = 300  # faces whose normals are tried as the board's
-_WITHIN, _LEVEL = 0.7, 0.996  # cosines: of the board from the cameras' direction, of level faces from the board
-_LEAST_LEVEL = 0.05  # share of the surface that must be level
 
 
 def data_set_of(
@@ -69,16 +66,14 @@ def data_set_of(
     own, registered, files = _registered(summary)
     truth = summary.ground_truth()
     mesh = Mesh(truth.vertices_m, truth.faces, truth.source, truth.sigma_m)
-    joint = own_pose_errors(summary, registered, sorted(files))
-    stated_errors = view_covariances(summary, own, registered, sorted(files), joint)
+    stated_errors = view_covariances(summary, own, registered, sorted(files))
     taken = {capture.viewpoint: str(capture.camera.get("exif_time") or "") for capture in summary.captures()}
     first = [
         _view(name, path, registered, stated_errors.covariance[name], taken[name])
         for name, (path, _) in sorted(files.items())
     ]
     further = further_views(summary, {view.name: view.T_world_camera for view in first})
-    if joint is not None:
-        joint = further.joint(joint, sorted(files))
+    joint = None if stated_errors.joint is None else further.joint(stated_errors.joint, sorted(files))
     covariances = further.covariances(stated_errors.covariance)
     files |= {one.name: (one.path, one.sha256) for one in further.views}
     views = _in_order([*first, *(_further_view(one, covariances[one.name]) for one in further.views)])
@@ -93,6 +88,7 @@ def data_set_of(
             "mesh": truth.words,
             "mesh_sha256": truth.sha256,
             "masks": masks,
+            "pose_covariance": stated_errors.words,
             "image_sha256": hashes,
             "further_cameras": further.statement,
         },
@@ -135,16 +131,17 @@ def _pixels(
     summary: RunSummary, files: dict[str, tuple[Path, str]], views: Sequence[PosedView], mesh: Mesh, *, personal: bool
 ) -> tuple[Photographs, str]:
     """Photographs, depth and masks of the views, and what the masks hold, in words."""
-    spheres, posts = _markers(summary, views)
+    standing, others = _spheres(summary)
+    posts = posts_of(summary, standing, views)
     pixels = Photographs(
         {name: path for name, (path, _) in files.items()},
         RayMesh(mesh.vertices_m, mesh.faces),
-        spheres,
-        posts,
+        (*standing, *others),
+        posts.cylinders,
         personal=personal,
         mark="SIMULATED" if summary.root.simulated else "",
     )
-    return pixels, _masked(spheres, posts)
+    return pixels, f"{len(standing) + len(others)} spheres{posts.words}"
 
 
 def _photographs(summary: RunSummary, registered: Registration) -> dict[str, tuple[Path, str]]:
@@ -184,23 +181,14 @@ def _view(name: str, path: Path, registered: Registration, covariance: Array, ta
     return PosedView(name, suffix, camera, T_scan_camera, covariance, taken)
 
 
-def _markers(summary: RunSummary, views: Sequence[PosedView]) -> tuple[tuple[WorldSphere, ...], tuple[Cylinder, ...]]:
-    """All spheres that an image may show, and the posts of the registration spheres."""
+def _spheres(summary: RunSummary) -> tuple[tuple[WorldSphere, ...], tuple[WorldSphere, ...]]:
+    """The registration spheres, and the others that an image may show."""
     radius_m = metres(summary.protocol.spheres.radius_mm)
-    spheres, extra = (
+    standing, others = (
         tuple(WorldSphere(np.array(centre), radius_m) for centre in centres)
         for centres in (summary.scan_spheres_m(), control_spheres(summary))
     )
-    vertices_m, faces = summary.scan_mesh()
-    scan = Mesh(np.asarray(vertices_m, dtype=np.float64), np.asarray(faces, dtype=np.int64))
-    return (*spheres, *extra), _posts(spheres, scan, views)
-
-
-def _masked(spheres: Sequence[WorldSphere], posts: Sequence[Cylinder]) -> str:
-    """What the masks hold, in words."""
-    if posts:
-        return f"{len(spheres)} spheres, and the posts below {len(posts)} of them"
-    return f"{len(spheres)} spheres; posts are not masked, because the scan shows no board on which they stand"
+    return standing, others
 
 
 def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ...]:
@@ -209,44 +197,6 @@ def control_spheres(summary: RunSummary) -> tuple[tuple[float, float, float], ..
     if not before or not summary.state.steps[before].result:
         return ()
     return control_centres(summary.scan_spheres_m(), result_of_step(summary.state, before, SpheresFound).spheres_m)
-
-
-def _posts(spheres: Sequence[WorldSphere], mesh: Mesh, views: Sequence[PosedView]) -> tuple[Cylinder, ...]:
-    """A post is not recorded: it stands below its sphere, is thinner, and ends on the board, if a scan shows one."""
-    eyes = np.mean([view.T_world_camera[:3, 3] for view in views], axis=0)
-    up = upwards(mesh, eyes - np.mean(mesh.vertices_m, axis=0))
-    lowest = float((mesh.vertices_m @ up).min()) if up.any() else 0.0
-    return tuple(
-        post
-        for sphere in spheres
-        if up.any()
-        for post in posts_below(
-            [sphere], up, max(sphere.radius_m, float(sphere.centre_m @ up) - lowest), sphere.radius_m
-        )
-    )
-
-
-def upwards(mesh: Mesh, about: Array) -> Array:
-    """Unit normal (3,) of the board: the direction, within 45° of `about`, to which most of the surface is level.
-
-    Zero where no direction has a twentieth of the surface: the mesh shows no board.
-    """
-    a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
-    vector = np.cross(b - a, c - a)
-    area = np.linalg.norm(vector, axis=1)
-    normal = vector / np.maximum(area, 1e-300)[:, None]
-    up = about / np.linalg.norm(about)
-    normal *= np.where(normal @ up < 0, -1.0, 1.0)[:, None]  # of a scan, faces may turn either way
-    candidates = normal[:: max(1, len(normal) // _CANDIDATES)]
-    candidates = candidates[candidates @ up > _WITHIN]
-    if not len(candidates):
-        return np.zeros(3)
-    level = np.array([area[normal @ candidate > _LEVEL].sum() for candidate in candidates])
-    best = int(level.argmax())
-    if level[best] < _LEAST_LEVEL * area.sum():
-        return np.zeros(3)
-    mean = (area[:, None] * normal)[normal @ candidates[best] > _LEVEL].sum(axis=0)
-    return mean / np.linalg.norm(mean)
 
 
 def _sees(view: PosedView, mesh: Mesh) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:

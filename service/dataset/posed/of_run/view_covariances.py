@@ -10,6 +10,8 @@ from pydantic import ValidationError
 
 from service.core.errors import IntegrityError
 from service.core.geometry import Array, Transform, skew
+from service.core.units import mm, mrad
+from service.dataset.posed.of_run.pose_errors import arm_pose_errors, own_pose_errors
 from service.dataset.summary import RunSummary
 from service.jobs.poses import hybrid
 from service.jobs.registration.register import Registration
@@ -19,6 +21,11 @@ _WHOLE = (
     "all of it, from the adjustment of images, robot and spheres together; the registration's share, which is common "
     "to all images, is in it"
 )
+_ARM = (
+    "all of it: the share of the registration and that of the arm, whose poses err by {mm:.3f} mm and {mrad:.3f} "
+    "mrad along each axis, as the spheres show"
+)
+_REFINED = _ARM + "; the outlines of the spheres refined each pose, and the covariance is what they leave open"
 _SHARED = "the share of the registration, which is common to all images; the record states none of single poses"
 _BOTH = (
     "the share of the registration, which is common to all images, and that of the pose in the bundle adjustment, "
@@ -28,41 +35,63 @@ _BOTH = (
 
 @dataclass(frozen=True, slots=True)
 class ViewCovariances:
-    """Covariances (6, 6) of T_scan_camera by viewpoint, as `View.covariance`, and what they hold, in words."""
+    """What is stated of the errors of T_scan_camera.
+
+    Attributes:
+        covariance: (6, 6) by viewpoint, as `View.covariance`.
+        words: what they hold.
+        joint: (6 N, 6 N) of all viewpoints, as `DataSet.pose_errors`; None where it is not stated.
+    """
 
     covariance: dict[str, Array]
     words: str
+    joint: Array | None
 
 
 def view_covariances(
-    summary: RunSummary, own: str, registered: Registration, names: Sequence[str], joint: Array | None
+    summary: RunSummary, own: str, registered: Registration, names: Sequence[str]
 ) -> ViewCovariances:
     """What the record states of the poses of the run's own registration.
 
-    Hybrid poses have a covariance each. The others have that of the registration, seen from each camera, and with it
-    that of the bundle adjustment, where there was one.
+    Hybrid poses have a covariance each, poses of an arm a joint one. The others have that of the registration, seen
+    from each camera, and with it that of the bundle adjustment, where there was one. So have poses of an arm in runs
+    of earlier versions, which did not state theirs.
 
     Args:
         summary: the run.
         own: name of its registration.
         registered: that registration.
-        names: viewpoints.
-        joint: (6 N, 6 N) of their own errors, as `own_pose_errors` has it.
+        names: viewpoints, in the order of the rows of the joint covariance.
 
     Raises:
         IntegrityError: the recorded file of the hybrid poses is not one.
     """
     stated = _of_hybrid(summary) if own == hybrid.KIND.name else {}
     if set(names) <= set(stated):
-        return ViewCovariances(stated, _WHOLE)
+        return ViewCovariances(stated, _WHOLE, None)
+    whole = arm_pose_errors(summary, registered, names)
+    if whole is not None:
+        return ViewCovariances(dict(zip(names, _blocks(whole), strict=True)), _of_arm(registered), whole)
     T_world_scan, covariance = np.array(registered.T_world_scan), np.array(registered.covariance)
-    found: dict[str, Array] = {}
-    for k, name in enumerate(names):
-        found[name] = pose_covariance(T_world_scan, covariance, np.array(registered.T_scan_camera[name]))
-        if joint is not None:
-            block = slice(6 * k, 6 * k + 6)
-            found[name] = found[name] + joint[block, block]
-    return ViewCovariances(found, _SHARED if joint is None else _BOTH)
+    found = {
+        name: pose_covariance(T_world_scan, covariance, np.array(registered.T_scan_camera[name])) for name in names
+    }
+    joint = own_pose_errors(summary, registered, names)
+    if joint is None:
+        return ViewCovariances(found, _SHARED, None)
+    both = {name: found[name] + block for name, block in zip(names, _blocks(joint), strict=True)}
+    return ViewCovariances(both, _BOTH, joint)
+
+
+def _blocks(joint: Array) -> list[Array]:
+    """(6, 6) of each pose from the joint covariance (6 N, 6 N)."""
+    return [joint[k : k + 6, k : k + 6] for k in range(0, len(joint), 6)]
+
+
+def _of_arm(registered: Registration) -> str:
+    """What the covariances of an arm's poses hold, in words."""
+    words = _ARM if registered.T_scan_camera_given is None else _REFINED
+    return words.format(mm=mm(registered.pose_sigma_m or 0.0), mrad=mrad(registered.pose_sigma_rad or 0.0))
 
 
 def pose_covariance(T_world_scan: Transform, covariance: Array, T_scan_camera: Transform) -> Array:

@@ -126,6 +126,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         blend_m=metres(params.blend_mm),
         spacing_m=metres(params.chamfer_spacing_mm),
         regions=_regions(context, params),
+        simulated=context.run.simulated,
     )
     if params.cut_posts_mm is not None:
         arguments = arguments.model_copy(update={"post_radius_m": metres(params.cut_posts_mm)})
@@ -202,6 +203,7 @@ def _registrations(context: StepContext, step: str, ct: EarlierAnswer[Any]) -> t
     }
     references = {"spheres_m": "spheres_m", "sphere_covariance_m2": "details/spheres/*/covariance_m2"}
     recorded = dict(mine.arguments)
+    recorded.pop("state_pose_errors", None)  # no image is placed by the CT
     for field, path in references.items():
         reference = ct.reference(path)
         recorded[field] = of_ct[field] if reference is None else reference.record()

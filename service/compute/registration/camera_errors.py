@@ -1,0 +1,52 @@
+"""Errors of the cameras' poses in the scan, as a registration of metric poses states them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from service.compute.registration.result import RegistrationResult
+from service.core.errors import DataError
+from service.core.geometry import Array, skew
+
+
+def camera_errors(registration: RegistrationResult, *, refined: bool) -> Array:
+    """(6 N, 6 N) joint covariance of `T_scan_camera`, or of `T_scan_camera_refined`.
+
+    Of (d, w) of each pose: exp([w]x) R, t + d, in the axes of the scan, m and rad. It is whole: the registration's
+    share is in it. Rows of images at stations without outlines are NaN.
+
+    With B = T_base_scan of an image's station, R its rotation and a the vector from its origin to the camera,
+    d_scan = R^T (d - d_B + a x w_B) and w_scan = R^T (w - w_B), where xi = (d, w) is the error of the pose in its
+    base. The outlines tell of it that xi = xi_0 + K x + own error, with x the error of the common unknowns, whose
+    covariance is C, and own errors of covariance Q. Refined poses have xi_0 taken off. Given ones do not: the
+    covariance of their xi is P, and that of xi with x is K C.
+
+    Raises:
+        DataError: the scale was estimated, so that the poses are not metric.
+    """
+    s = registration.solution
+    problem = s.problem
+    if problem.with_scale:
+        raise DataError("the errors of poses are stated for metric poses only")
+    T_base_camera = s.state.cameras(problem, refined=refined)
+    by_base = np.full((problem.n_images, 6, problem.size), np.nan)
+    to_scan = np.full((problem.n_images, 6, 6), np.nan)
+    for i, k in enumerate(problem.station):
+        if k < 0:
+            continue
+        T_base_scan = s.state.bases[k]
+        to_scan[i] = np.kron(np.eye(2), T_base_scan[:3, :3].T)
+        moved = -np.eye(6)
+        moved[:3, 3:] = skew(T_base_camera[i, :3, 3] - T_base_scan[:3, 3])
+        by_base[i] = 0.0
+        by_base[i, :, 6 * k : 6 * k + 6] = to_scan[i] @ moved
+    by_pose = (to_scan @ s.pose_gain()).reshape(-1, problem.size)
+    through = by_base.reshape(-1, problem.size) + by_pose
+    joint = through @ s.covariance @ through.T
+    covariance = s.marginal.Q
+    if not refined:
+        joint -= by_pose @ s.covariance @ by_pose.T
+        covariance = s.pose_root @ s.pose_root.transpose(0, 2, 1)
+    joint += block_diag(*(to_scan @ covariance @ to_scan.transpose(0, 2, 1)))
+    return (joint + joint.T) / 2

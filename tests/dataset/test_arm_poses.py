@@ -1,0 +1,119 @@
+"""The covariance of an arm's poses in a data set is whole; for a run of an earlier version it is as before."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.audit.record.run import RecordedRun, read_run
+from service.audit.replay.scratch import ScratchStore
+from service.compute.matching.pairs.relative_pose import relative_covariance
+from service.core.jobs.references import jobs_of, resolve
+from service.core.run.state import JobState
+from service.dataset.posed.of_run.data_set import data_set_of
+from service.dataset.posed.of_run.view_covariances import pose_covariance
+from service.dataset.summary import RunSummary
+from service.jobs.registration import register
+from service.worker.job import JobAnswer, JobContext, RecordedContext
+from service.worker.loop import HANDLERS
+from tests.support.recorded.unpacked_run import unpack_recorded_run
+
+pytestmark = pytest.mark.timeout(300)
+ARM = ("robot", "robot_corrected")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
+    """A run of an earlier version."""
+    return read_run(unpack_recorded_run(tmp_path_factory.mktemp("recorded")), "latest")
+
+
+def arm_jobs(run: RecordedRun) -> dict[str, JobState]:
+    """The job of each registration of an arm's poses at full size."""
+    jobs = [job for job in jobs_of(run.state).values() if job.kind == register.KIND.name]
+    return {
+        job.arguments["poses"]: job
+        for job in jobs
+        if job.arguments["poses"] in ARM and job.arguments.get("reduced_to") is None
+    }
+
+
+def computed(run: RecordedRun, job: JobState, folder: Path, more: Mapping[str, Any]) -> JobAnswer:
+    """The job computed again with more arguments; its files are kept in the folder."""
+    arguments: Mapping[str, Any] = {**resolve(job.arguments, jobs_of(run.state)), **more}
+    context: RecordedContext = JobContext(
+        arguments, ScratchStore(run.files, folder), folder / "scratch", lambda *_: None
+    )
+    return HANDLERS[job.kind](context)
+
+
+def stated(run: RecordedRun, job: JobState, folder: Path) -> tuple[JobAnswer, RunSummary]:
+    """The job as this version has it computed, and the run as if it had been, with the best of the registrations."""
+    answer = computed(run, job, folder, {"state_pose_errors": True})
+    name, steps = str(job.arguments["poses"]), dict(run.state.steps)
+    step = next(step for step in steps.values() if job.job in step.jobs)
+    again = dataclasses.replace(job, result=answer.result, artefacts=answer.artefacts)
+    result = {**step.result, "registrations": {**step.result["registrations"], name: answer.result}}
+    steps[step.step] = dataclasses.replace(step, jobs={**step.jobs, job.job: again}, result=result)
+    judged = next(step.id for step in run.protocol.steps if step.gives == "accuracy")
+    rows = [row for row in steps[judged].result["table"] if row["poses"] == name]
+    steps[judged] = dataclasses.replace(steps[judged], result={**steps[judged].result, "table": rows})
+    state = dataclasses.replace(run.state, steps=steps)
+    return answer, dataclasses.replace(run.summary(), state=state, store=ScratchStore(run.files, folder))
+
+
+@pytest.mark.parametrize("name", ARM)
+def test_the_arm_is_in_the_covariance_of_each_of_its_poses(run: RecordedRun, name: str, tmp_path: Path) -> None:
+    answer, summary = stated(run, arm_jobs(run)[name], tmp_path)
+    record = answer.answer
+    assert isinstance(record, register.Registration)
+    assert record.pose_sigma_m is not None
+    assert record.pose_sigma_rad is not None
+    dataset = data_set_of(summary)
+    joint = dataset.pose_errors
+    assert joint is not None
+    assert np.linalg.eigvalsh(joint).min() > -1e-9 * np.abs(joint).max()
+    T_world_scan, of_registration = np.array(record.T_world_scan), np.array(record.covariance)
+    for k, view in enumerate(dataset.views):
+        block = slice(6 * k, 6 * k + 6)
+        assert np.array_equal(view.covariance, joint[block, block])
+        whole = np.diag(view.covariance)
+        shared = np.diag(pose_covariance(T_world_scan, of_registration, view.T_world_camera))
+        if name == "robot":
+            assert (whole > 1.5 * shared).all()
+            own = np.array([record.pose_sigma_m**2] * 3 + [record.pose_sigma_rad**2] * 3)
+            assert (whole > 0.6 * own).all()
+        else:  # the outlines leave little open of each pose, and the images share nearly all of the rest
+            assert whole == pytest.approx(shared, rel=0.2)
+    first, second = dataset.views[:2]
+    of_pair = relative_covariance(first.T_world_camera, second.T_world_camera, joint[:12, :12])
+    assert np.trace(of_pair[:3, :3]) > (3 * record.pose_sigma_m**2 if name == "robot" else 0.0)
+    assert f"err by {1e3 * record.pose_sigma_m:.3f} mm" in dataset.about.covariance
+    assert ("refined each pose" in dataset.about.covariance) == (name == "robot_corrected")
+    assert dataset.statement["pose_covariance"] == dataset.about.covariance
+
+
+@pytest.mark.parametrize("name", ARM)
+def test_a_job_of_an_earlier_version_answers_as_it_did(run: RecordedRun, name: str, tmp_path: Path) -> None:
+    job = arm_jobs(run)[name]
+    assert "state_pose_errors" not in job.arguments
+    again = computed(run, job, tmp_path, {})
+    assert set(again.result) == set(job.result)
+    assert [ref.original_name for ref in again.artefacts] == [ref.original_name for ref in job.artefacts]
+
+
+def test_the_data_set_of_an_earlier_run_says_that_the_arm_is_not_in_it(run: RecordedRun) -> None:
+    summary = run.summary()
+    own = summary.best()
+    assert own in ARM
+    dataset, record = data_set_of(summary), summary.registrations()[own]
+    assert dataset.pose_errors is None
+    assert "the record states none of single poses" in dataset.statement["pose_covariance"]
+    for view in dataset.views:
+        shared = pose_covariance(np.array(record.T_world_scan), np.array(record.covariance), view.T_world_camera)
+        assert np.array_equal(view.covariance, shared)
