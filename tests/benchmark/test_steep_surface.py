@@ -16,6 +16,7 @@ from service.compute.stereo.pairs import StereoView
 from service.compute.stereo.steep.choice import averaged, beliefs, edges_of
 from service.compute.stereo.steep.complete import completed
 from service.compute.stereo.steep.evidence import best_views, evidence, photograph, seen_through
+from service.compute.stereo.steep.relaxed import relaxed
 from service.core.geometry import Array, Transform, look_at
 
 CAMERA = CameraModel(400, 300, 600.0, 600.0, 199.5, 149.5)
@@ -183,6 +184,38 @@ def test_means_with_neighbours_keep_a_constant_and_make_noise_smaller() -> None:
     noise = np.random.default_rng(0).normal(0, 1, len(surface.vertices_m))
     assert np.abs(averaged(np.full(len(noise), 3.0), edges, 4) - 3).max() < 1e-6
     assert averaged(noise, edges, 4).std() < 0.35
+
+
+def bumpy_wall() -> tuple[Surface, NDArray[np.bool_], NDArray[np.bool_]]:
+    """A plane with a bump of 3 mm, its vertices on that, and those of its border, 3 edges wide."""
+    plane = grid(np.array([-EDGE, EDGE]), np.zeros(2), 2e-3)
+    x, y = plane.vertices_m[:, 0], plane.vertices_m[:, 1]
+    bump = np.hypot(x, y) < 0.02
+    border = np.maximum(np.abs(x), np.abs(y)) > EDGE - 5e-3
+    return Surface(plane.vertices_m + 3e-3 * bump[:, None] * [0, 0, 1], plane.faces), bump, border
+
+
+def test_what_has_no_hold_is_bent_to_what_has_and_what_is_fixed_does_not_move() -> None:
+    surface, bump, border = bumpy_wall()
+    edges = edges_of(surface.faces)
+    found = relaxed(surface.vertices_m, np.where(bump, 0.0, 1.0), border, edges, 3e-3, 2e-3)
+    assert np.array_equal(found[border], surface.vertices_m[border])
+    assert np.abs(found[:, 2]).max() < 0.1e-3
+    held = relaxed(surface.vertices_m, np.ones(len(bump)), border, edges, 3e-3, 2e-3)
+    middle = np.hypot(*surface.vertices_m[:, :2].T) < 0.01
+    assert np.abs(held[middle, 2] - 3e-3).max() < 0.3e-3, "a bump with evidence stays"
+
+
+def test_noise_of_what_is_held_becomes_smaller_and_a_curved_surface_keeps_its_shape() -> None:
+    plane, _, border = bumpy_wall()
+    dome = plane.vertices_m.copy()
+    dome[:, 2] = np.sqrt(0.1**2 - (dome[:, :2] ** 2).sum(axis=1))
+    noise = np.random.default_rng(0).normal(0, 1e-3, len(dome)) * ~border
+    rough = dome + noise[:, None] * [0, 0, 1]
+    found = relaxed(rough, np.ones(len(dome)), border, edges_of(plane.faces), 3e-3, 2e-3)
+    off = found[~border, 2] - np.sqrt(0.1**2 - (found[~border, :2] ** 2).sum(axis=1))
+    assert off.std() < 0.5 * noise[~border].std()
+    assert abs(off.mean()) < 0.1e-3
 
 
 @pytest.mark.slow

@@ -1,8 +1,8 @@
 """Completes a fused surface where it is open and steep: a closed guess is moved until the photographs are alike.
 
 Rectified matching loses what is steep: it is foreshortened, each pair of images differently. Here patches lie in the
-surface. Where to move each vertex of the guess is chosen for all vertices together; what the photographs do not
-support after that is left out again.
+surface. Where to move each vertex of the guess is chosen for all vertices together. Those with little evidence keep
+the shape of the guess in that, and are bent to those with much. What the photographs do not support is left out.
 """
 
 from __future__ import annotations
@@ -20,16 +20,19 @@ from service.compute.stereo.closed import closed
 from service.compute.stereo.pairs import StereoView
 from service.compute.stereo.steep.choice import averaged, beliefs, edges_of
 from service.compute.stereo.steep.evidence import Photograph, best_views, evidence, photograph, seen_through
+from service.compute.stereo.steep.relaxed import relaxed
 from service.core.geometry import Array
 
 # What follows is in pixels of the images, at the object.
 _OPEN_PX = 2.5  # from the surface that is known: farther vertices of the guess are moved
 _SEARCHES = ((16.0, 1.0, 2.5), (12.0, 1.0, 2.0))  # reach to both sides, step, spacing of a patch's samples
+_SMOOTH_PX, _SLIP_PX = 6.0, 1.0  # length over which the moved surface is made even, and change that evidence permits
 _RING = 3  # edges: vertices of the known surface around an opening, which stay
 _EVEN = 8  # means of normals with their neighbours'
 _PER_STEP, _MOST = 0.06, 0.48  # cost of neighbours that move differently, by a step and by many
 _THROUGH, _MOST_THROUGH = 0.15, 6  # cost of each view that sees through a place, up to so many
 _STAYS, _MOST_STAYS = 0.5, 3.0  # cost of a known vertex that moves, by a step and by many
+_NO_HOLD, _FULL_HOLD = 0.4, 0.8  # evidence up to which a vertex is not held in place then, and from which it is fully
 _LEAST_EVIDENCE = 0.2  # of a place that is kept
 _STEEP = 0.6  # cosine at the second view: what two views see less steeply, rectified matching would have found
 _FEW_THROUGH = 2  # views that see through a place that is not kept
@@ -62,14 +65,17 @@ def completed(known: Surface, views: Sequence[StereoView], footprint_m: float) -
     part = _opening(known, guess, edges, photographs, _OPEN_PX * footprint_m)
     if part.stays.all():
         return known
-    vertices, normals, found = guess.vertices_m.copy(), np.zeros((0, 3)), np.zeros(0)
+    vertices, places, normals, found = guess.vertices_m.copy(), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     for reach, step, spacing in _SEARCHES:
         even = averaged(Surface(vertices, guess.faces).vertex_normals, edges, _EVEN)
         normals = even[part.vertices] / np.maximum(np.linalg.norm(even[part.vertices], axis=1, keepdims=True), 1e-9)
         moves = np.arange(-reach, reach + step / 2, step) * footprint_m
         moved, found = _moved(photographs, vertices[part.vertices], normals, part, moves, spacing * footprint_m)
-        vertices[part.vertices] += moved[:, None] * normals
-    kept = _supported(photographs, vertices[part.vertices], normals, found) & ~part.stays
+        places = vertices[part.vertices] + moved[:, None] * normals
+        held = ((found - _NO_HOLD) / (_FULL_HOLD - _NO_HOLD)).clip(0, 1) ** 2
+        even_m, slip_m = _SMOOTH_PX * footprint_m, _SLIP_PX * footprint_m
+        vertices[part.vertices] = relaxed(places, held, part.stays, part.edges, even_m, slip_m)
+    kept = _supported(photographs, places, normals, found) & ~part.stays
     return _with(known, vertices, guess.faces, part, kept)
 
 
