@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from service.core.errors import ConfigurationError, ProtocolError
 from service.core.protocol.models import Gate, LoadedProtocol, Protocol, Step
 from service.core.protocol.step_params import named_steps
-from service.core.text.counts import counted
+from service.core.text.checked_yaml import refuse
 from service.core.text.yaml_tree import FieldPath, Plain, YamlProblem, field_name, parse_yaml
 from service.rig import Rig, RigSection
 from service.steps import step_kinds
@@ -82,12 +82,8 @@ def require_plausible(loaded: LoadedProtocol, name: str, rig: RigSection | None 
     """
     problems = implausible(loaded, rig)
     if problems:
-        listed = "\n".join(f"  {name}:{p.line} {p.field}: {p.message}" for p in problems)
-        raise ProtocolError(
-            f"{counted(len(problems), 'problem')} in what the protocol asks for:\n{listed}\n",
-            where=f"{name}:{problems[0].line}",
-            remedy="Correct what each line names; docs/reference/steps.md lists parameters, measures and units",
-        )
+        remedy = "Correct it; docs/reference/steps.md lists the parameters, measures and units of each kind of step"
+        refuse(problems, what="protocol", name=name, remedy=remedy, error=ProtocolError)
 
 
 def require_devices(protocol: Protocol, rig: Rig, kinds: Mapping[str, str]) -> None:

@@ -57,7 +57,7 @@ def test_what_cannot_be_meant_is_said_by_line(tmp_path: Path, old: str, new: str
         (
             "spheres_of: ct_import",
             "spheres_of: ct_imprt",
-            "live.spheres_of: there is no step 'ct_imprt'; did you mean 'ct_import'?",
+            "there is no step 'ct_imprt'; did you mean 'ct_import'?",
         ),
         (
             "compare_with: ct_import, wait_s: 1800",
@@ -77,7 +77,7 @@ def test_what_cannot_be_meant_is_said_by_line(tmp_path: Path, old: str, new: str
         (
             "control_images_of: [control_capture_1, control_capture_2]",
             "control_images_of: [control_capture_1, spraying]",
-            "[1]: 'spraying' is a step of kind timed_application, but only one that takes photographs can be named",
+            "'spraying' is a step of kind timed_application, but only one that takes photographs can be named",
         ),
     ],
 )

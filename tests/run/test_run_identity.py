@@ -27,6 +27,7 @@ from service.store.signatures.signing import checkpoint
 from service.store.verification.verify import verify
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import Browser, WebSite, web_site
+from tests.support.rig.rig import REPOSITORY
 
 ENTERED = {
     "specimen": "Spine 7, L1–L5",
@@ -129,6 +130,16 @@ def test_nothing_has_to_be_entered_and_too_much_is_refused(web: WebSite) -> None
     assert isinstance(root, RunStarted)
     assert root.about is None
     assert "<h2>This run</h2>" not in browser.get(f"/runs/{empty}").text
+
+
+def test_a_protocol_that_could_not_be_run_to_its_end_does_not_start_and_each_fault_is_a_line(web: WebSite) -> None:
+    shipped = (REPOSITORY / "protocols" / "exvivo_spine.yaml").read_text()
+    (web.site.protocols / "wrong.yaml").write_text(shipped.replace("      scan: scanning\n", "      scan: scaning\n"))
+    answer = web.browser("technician").send_form("/runs", protocol="wrong.yaml")
+    assert answer.status_code == 422
+    assert "<title>3 things are wrong in this protocol" in answer.text
+    assert answer.text.count("there is no step &#39;scaning&#39;; did you mean &#39;scanning&#39;?</li>") == 3
+    assert web.store.runs() == []
 
 
 def test_records_from_before_are_read(web: WebSite) -> None:
