@@ -70,3 +70,17 @@ def test_with_the_password_it_is_recorded_and_a_strangers_name_needs_none(data: 
     assert recorded_by(data, "grace")[-1] == "evidence_exported"
     assert called(data, "A Stranger", "audit", "rotate-key", "--reason", "yearly", typed="")[0] == 0
     assert recorded_by(data, "A Stranger") == ["key_changed"]
+
+
+def test_a_backup_is_restored_in_the_name_of_an_account_with_its_password_only(data: Path, tmp_path: Path) -> None:
+    backup, destination = tmp_path / "backup", tmp_path / "restored"
+    made = CliRunner().invoke(app, ["store", "backup", str(backup), "--data", str(data)], catch_exceptions=False)
+    assert made.exit_code == 0, made.output
+    words = ["store", "restore", str(backup), str(destination), "--operator", "grace", "--password-stdin", "--json"]
+    refused = CliRunner().invoke(app, words, input="guessed\n", catch_exceptions=False)
+    assert refused.exit_code == 1
+    assert "name and password do not belong together" in refused.output.lower()
+    assert list(destination.iterdir()) == []
+    restored = CliRunner().invoke(app, words, input=f"{password_of('grace')}\n", catch_exceptions=False)
+    assert restored.exit_code == 0, restored.output
+    assert "data_restored" in recorded_by(destination, "grace")

@@ -18,10 +18,12 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
 )
+from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.text.counts import counted
 from service.core.units import gigabytes
 from service.store.backup.backup import BackupOptions, BackupReport, back_up
 from service.store.backup.restore import RestoreReport, restore
+from service.store.store import Store
 
 
 def backup_command(
@@ -57,15 +59,23 @@ def restore_command(
     backup: Annotated[Path, typer.Argument(metavar="BACKUP", help="The folder of backups.")],
     destination: Annotated[Path, typer.Argument(metavar="DIR", help="The new data folder: empty or not existing.")],
     state: Annotated[str, typer.Option("--state", help="The backup to restore; default: the newest.")] = "",
-    operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
     json: JsonOption = False,
 ) -> None:
     """Restore a data folder as it was when the backup was made, and verify it.
 
-    The exit status is 1 if anything is missing or does not verify.
+    The name of an account in the backup needs the password that it had then. The exit status is 1 if anything is
+    missing or does not verify.
     """
+
+    def identify(folder: Path) -> None:
+        with Store.open(folder, create=False) as store:
+            acting_person(store, operator, password_stdin=password_stdin)
+
     with reporting_errors(json), progress_bar(quiet=json) as progress:
-        made = restore(backup, destination, name=state, actor=operator or getpass.getuser(), progress=progress)
+        actor = operator or getpass.getuser()
+        made = restore(backup, destination, name=state, actor=actor, identify=identify, progress=progress)
     if json:
         print_json(_restore_json(made))
     else:

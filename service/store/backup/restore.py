@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sqlalchemy import delete, select
 
-from service.core.errors import IntegrityError, StoreError
+from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.records.events import DataRestored
 from service.store.backup.folder import BackupFolder, BackupState, folder_errors
 from service.store.database.engine import DATABASE_NAME, open_read_only
@@ -48,6 +48,7 @@ def restore(
     *,
     name: str = "",
     actor: str,
+    identify: Callable[[Path], object] | None = None,
     progress: Progress | None = None,
     files: Files | None = None,
 ) -> RestoreReport:
@@ -61,12 +62,14 @@ def restore(
         destination: an empty or new folder.
         name: the state to restore; "" for the newest.
         actor: the person who restores, for the record.
+        identify: called with the folder that has the restored accounts; raises if the actor is not who they say.
         progress: called with the number of bytes copied, then verified.
         files: durable file operations.
 
     Raises:
         StoreError: the destination is not empty or cannot be written.
         IntegrityError: the database or the log of signatures was altered in the backup or in copying.
+        OrthocaptureError: what `identify` raises; nothing is left of the restoration.
     """
     files = files or DurableFiles()
     source = BackupFolder(backup, files, RandomIds())
@@ -80,6 +83,12 @@ def restore(
         work = destination / _UNDER_WAY
         files.make_directory(work)
         _copy_state(source.path(name), work, state, files)
+        if identify is not None:
+            try:
+                identify(work)
+            except OrthocaptureError:
+                shutil.rmtree(work)
+                raise
         lost = _copy_files(source, work, files, progress)
         report = audit.verify(work, progress=progress)
         _let_go(work, DataRestored(state=name, at_utc=state.at_utc, folder=state.data_folder, host=state.host), actor)
