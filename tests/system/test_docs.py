@@ -21,6 +21,7 @@ from tests.support.processes.documented_site import (
     says_how_to_get_the_data,
     serves_pages,
     serves_until_terminated,
+    starts_and_is_aborted,
     succeeds,
 )
 from tests.support.runs.bench_run import record_runs
@@ -67,8 +68,8 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture protocol check protocols/dry_run.yaml": succeeds,
     "orthocapture doctor --rig rig.yaml": succeeds,
     "orthocapture run protocols/exvivo_spine.yaml --rig rig.yaml --data runs "
-    '--operator "A. Name"': asks_and_is_aborted,
-    'orthocapture run protocols/dry_run.yaml --rig rig.yaml --data runs --operator "A. Name"': asks_and_is_aborted,
+    '--operator "A. Name"': starts_and_is_aborted,
+    'orthocapture run protocols/dry_run.yaml --rig rig.yaml --data runs --operator "A. Name"': starts_and_is_aborted,
     "orthocapture resume latest --data runs": asks_and_is_aborted,
     "orthocapture status latest --data runs": succeeds,
     "orthocapture plan next latest --data runs": succeeds,

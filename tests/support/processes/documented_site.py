@@ -26,6 +26,18 @@ from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, render,
 
 ROOT = Path(__file__).parents[3]
 SCRIPTS = Path(sys.executable).parent
+COMPLETE_RIG = """\
+name: a complete site
+devices:
+  robot: {driver: ur, host: 127.0.0.1}
+  camera: {driver: gphoto, port: "ptpip:127.0.0.1"}
+  scanner: {driver: scan_folder, folder: scans}
+  ct: {driver: dicom_folder, folder: ct}
+stations:
+  station_1: {robot: robot, scene_centre_m: [0.0, 0.8, 0.0], approach_azimuth_deg: -90}
+  station_2: {robot: robot, scene_centre_m: [0.0, 0.8, 0.0], approach_azimuth_deg: 90}
+T_flange_camera_nominal: [[1, 0, 0, 0], [0, 1, 0, -0.06], [0, 0, 1, 0.09], [0, 0, 0, 1]]
+"""
 
 
 @dataclass(frozen=True)
@@ -55,6 +67,13 @@ def asks_and_is_aborted(site: Site, command: str) -> None:
     assert done.returncode == 1, done.stderr
     assert "Type one of: confirm" in done.stderr.replace("\n", " ")
     assert "is aborted" in done.stdout
+
+
+def starts_and_is_aborted(site: Site, command: str) -> None:
+    """`asks_and_is_aborted` on a rig with all devices that a whole protocol needs; none of them is opened."""
+    (site.folder / "ct").mkdir()
+    (site.folder / "rig.yaml").write_text(COMPLETE_RIG)
+    asks_and_is_aborted(site, command)
 
 
 def says_how_to_get_the_data(site: Site, command: str) -> None:
