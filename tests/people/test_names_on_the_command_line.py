@@ -76,7 +76,7 @@ def test_a_backup_is_restored_in_the_name_of_an_account_with_its_password_only(d
     backup, destination = tmp_path / "backup", tmp_path / "restored"
     made = CliRunner().invoke(app, ["store", "backup", str(backup), "--data", str(data)], catch_exceptions=False)
     assert made.exit_code == 0, made.output
-    words = ["store", "restore", str(backup), str(destination), "--operator", "grace", "--password-stdin", "--json"]
+    words = ["store", "restore", str(backup), str(destination), "--operator", "Grace", "--password-stdin", "--json"]
     refused = CliRunner().invoke(app, words, input="guessed\n", catch_exceptions=False)
     assert refused.exit_code == 1
     assert "name and password do not belong together" in refused.output.lower()

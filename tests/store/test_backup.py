@@ -29,6 +29,11 @@ from tests.support.record.tampering import cut
 from tests.support.runs.bench_run import record_runs
 
 
+def ada(_folder: Path) -> str:
+    """The person who restores."""
+    return "Ada"
+
+
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
     """A signed run of three viewpoints."""
@@ -113,7 +118,7 @@ def test_backups_during_a_run_hold_one_moment_of_it_each(tmp_path: Path, data: P
     assert sizes == sorted(sizes)
     assert sizes[-1] > sizes[0]
     for number, report in enumerate(reports):
-        back = restore(tmp_path / "backup", tmp_path / f"restored{number}", name=report.name, actor="Ada")
+        back = restore(tmp_path / "backup", tmp_path / f"restored{number}", name=report.name, actor=ada)
         assert back.ok, back.audit.first_fault
         assert verify(tmp_path / f"restored{number}").ok
         with Store.open(tmp_path / f"restored{number}") as store:
@@ -130,8 +135,8 @@ def test_the_second_backup_copies_only_what_is_new(tmp_path: Path, data: Path) -
     second = back_up(data, tmp_path / "backup")
     assert (second.copied, second.present) == (1, first.state.artefacts)
     assert all(p.stat().st_mtime_ns == at for p, at in before.items())
-    restore(tmp_path / "backup", tmp_path / "old", name=first.name, actor="Ada")
-    restore(tmp_path / "backup", tmp_path / "new", actor="Ada")
+    restore(tmp_path / "backup", tmp_path / "old", name=first.name, actor=ada)
+    restore(tmp_path / "backup", tmp_path / "new", actor=ada)
     viewpoints = "SELECT viewpoint FROM artefacts WHERE viewpoint IS NOT NULL ORDER BY viewpoint"
     assert [v for (v,) in rows(tmp_path / "old", viewpoints)] == ["v1", "v2", "v3"]
     assert [v for (v,) in rows(tmp_path / "new", viewpoints)] == ["v1", "v2", "v3", "v4"]
@@ -152,7 +157,7 @@ def test_killed_or_without_power_at_any_point_no_half_backup_looks_whole(tmp_pat
         if power:
             files.lose_power()
         for name in states(backup) if backup.exists() else []:
-            restore(backup, tmp_path / f"half{point}", name=name, actor="Ada")
+            restore(backup, tmp_path / f"half{point}", name=name, actor=ada)
             assert verify(tmp_path / f"half{point}").ok
             whole += 1
         again = back_up(small, backup)
@@ -165,11 +170,11 @@ def test_killed_or_without_power_at_any_point_no_half_backup_looks_whole(tmp_pat
 def test_an_interrupted_restoration_is_no_data_folder(tmp_path: Path, small: Path) -> None:
     back_up(small, tmp_path / "backup")
     counted = CrashingFiles()
-    restore(tmp_path / "backup", tmp_path / "counted", actor="Ada", files=counted)
+    restore(tmp_path / "backup", tmp_path / "counted", actor=ada, files=counted)
     for point in range(0, len(counted.points), 6):
         folder = tmp_path / f"restored{point}"
         with pytest.raises(Crash):
-            restore(tmp_path / "backup", folder, actor="Ada", files=CrashingFiles(crash_at=point))
+            restore(tmp_path / "backup", folder, actor=ada, files=CrashingFiles(crash_at=point))
         try:
             assert verify(folder).ok  # it died after the last rename
         except StoreError as error:
@@ -244,10 +249,10 @@ def test_the_signing_key_leaves_only_when_asked_and_a_restored_run_can_be_signed
     back_up(data, tmp_path / "without")
     assert not any(b"PRIVATE KEY" in p.read_bytes() for p in (tmp_path / "without").rglob("*") if p.is_file())
     back_up(data, tmp_path / "with", BackupOptions(with_keys=True))
-    restore(tmp_path / "with", tmp_path / "restored", actor="Ada")
+    restore(tmp_path / "with", tmp_path / "restored", actor=ada)
     capture_more(tmp_path / "restored", "v9")
     assert verify(tmp_path / "restored").ok
-    restore(tmp_path / "without", tmp_path / "lost", actor="Ada")
+    restore(tmp_path / "without", tmp_path / "lost", actor=ada)
     with pytest.raises(StoreError, match="signing key is missing"):
         capture_more(tmp_path / "lost", "v9")
     assert command("audit", "rotate-key", "--lost", "--reason", "disk died", "--data", tmp_path / "lost")[0] == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -69,13 +68,12 @@ def restore_command(
     missing or does not verify.
     """
 
-    def identify(folder: Path) -> None:
+    def actor(folder: Path) -> str:
         with Store.open(folder, create=False) as store:
-            acting_person(store, operator, password_stdin=password_stdin)
+            return acting_person(store, operator, password_stdin=password_stdin).name
 
     with reporting_errors(json), progress_bar(quiet=json) as progress:
-        actor = operator or getpass.getuser()
-        made = restore(backup, destination, name=state, actor=actor, identify=identify, progress=progress)
+        made = restore(backup, destination, name=state, actor=actor, progress=progress)
     if json:
         print_json(_restore_json(made))
     else:

@@ -47,8 +47,7 @@ def restore(
     destination: Path,
     *,
     name: str = "",
-    actor: str,
-    identify: Callable[[Path], object] | None = None,
+    actor: Callable[[Path], str],
     progress: Progress | None = None,
     files: Files | None = None,
 ) -> RestoreReport:
@@ -61,15 +60,15 @@ def restore(
         backup: the folder of backups.
         destination: an empty or new folder.
         name: the state to restore; "" for the newest.
-        actor: the person who restores, for the record.
-        identify: called with the folder that has the restored accounts; raises if the actor is not who they say.
+        actor: gives the name of the person who restores, for the record, or raises if that is somebody else's; called
+            with the folder once it has the accounts.
         progress: called with the number of bytes copied, then verified.
         files: durable file operations.
 
     Raises:
         StoreError: the destination is not empty or cannot be written.
         IntegrityError: the database or the log of signatures was altered in the backup or in copying.
-        OrthocaptureError: what `identify` raises; nothing is left of the restoration.
+        OrthocaptureError: what `actor` raises; nothing is left of the restoration.
     """
     files = files or DurableFiles()
     source = BackupFolder(backup, files, RandomIds())
@@ -83,15 +82,15 @@ def restore(
         work = destination / _UNDER_WAY
         files.make_directory(work)
         _copy_state(source.path(name), work, state, files)
-        if identify is not None:
-            try:
-                identify(work)
-            except OrthocaptureError:
-                shutil.rmtree(work)
-                raise
+        try:
+            name_of_actor = actor(work)
+        except OrthocaptureError:
+            shutil.rmtree(work)
+            raise
         lost = _copy_files(source, work, files, progress)
         report = audit.verify(work, progress=progress)
-        _let_go(work, DataRestored(state=name, at_utc=state.at_utc, folder=state.data_folder, host=state.host), actor)
+        restored = DataRestored(state=name, at_utc=state.at_utc, folder=state.data_folder, host=state.host)
+        _let_go(work, restored, name_of_actor)
         for part in (LOG_NAME, KEYS, "artefacts", DATABASE_NAME):  # the database last: it makes this a data folder
             if (work / part).exists():
                 files.rename(work / part, destination / part)
