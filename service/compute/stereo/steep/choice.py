@@ -25,10 +25,15 @@ def edges_of(faces: Ints) -> Ints:
     return ends[ends[:, 0] != ends[:, 1]]
 
 
+def neighbours(edges: Ints, count: int) -> csr_matrix:
+    """(V, V) 1 for each two of V vertices that share one of the edges (E, 2), else 0."""
+    return _incidence(np.concatenate([edges, edges[:, ::-1]]), (count, count))
+
+
 def averaged(values: NDArray[np.floating], edges: Ints, rounds: int) -> Array:
     """Values (V, ...) after so many means of each vertex with its neighbours."""
     out, count = np.asarray(values, dtype=np.float64), len(values)
-    mean = _incidence(np.concatenate([edges, edges[:, ::-1]]), (count, count)) + identity(count, format="csr")
+    mean = neighbours(edges, count) + identity(count, format="csr")
     mean = diags(1 / np.asarray(mean.sum(axis=1)).ravel()) @ mean
     for _ in range(rounds):
         out = np.asarray(mean @ out, dtype=np.float64)

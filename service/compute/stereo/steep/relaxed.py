@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix, diags, identity
+from scipy.sparse import csr_matrix, diags, identity
 from scipy.sparse.linalg import splu
 
+from service.compute.stereo.steep.choice import neighbours
 from service.core.geometry import Array
 
 _LEAST_SPRING = 1e-6  # keeps in place what has no path to a vertex that is held
@@ -47,7 +48,6 @@ def relaxed(
 
 def _bending(edges: NDArray[np.int64], count: int) -> csr_matrix:
     """(V, V) takes vertices to what separates each from the mean of its neighbours."""
-    both = np.concatenate([edges, edges[:, ::-1]])
-    beside = coo_matrix((np.ones(len(both)), both.T), (count, count)).tocsr()
-    mean = diags(1 / np.maximum(np.asarray(beside.sum(axis=1)).ravel(), 1)) @ beside
+    beside = neighbours(edges, count)
+    mean = diags(1 / np.maximum(np.asarray(beside.sum(axis=1), dtype=np.float64).ravel(), 1)) @ beside
     return (identity(count, format="csr") - mean).tocsr()
