@@ -96,7 +96,7 @@ def drifts(summary: RunSummary, recomputed: RecomputedJobs) -> Iterator[Drift]:
         shared = sorted(before.T_scan_camera.keys() & after.T_scan_camera.keys())
         moved, given = (np.array([each.T_scan_camera[name] for name in shared]) for each in (after, before))
         in_world: float | None = None
-        if before.poses in ("robot", "robot_corrected"):  # the world is the base of the first station
+        if before.poses in register.ARM:  # the world is the base of the first station
             places = [apply(np.array(each.T_world_scan), centre_m) for each in (before, after)]
             in_world = mm(float(np.linalg.norm(places[1] - places[0])))
         yield Drift(before.poses, in_world, mm(true_error_m(moved, given, centre_m)))

@@ -119,5 +119,5 @@ def of_arms(images: Iterable[PosedPhotograph]) -> bool:
 def needing_mount(poses: Iterable[str]) -> tuple[str, ...]:
     """Those of the sources that need the camera's mount on its arm; "triangulated" may start from the spheres."""
     names = tuple(poses)
-    needing = ("robot", "robot_corrected") if "spheres" in names else ("robot", "robot_corrected", "triangulated")
+    needing = ARM if "spheres" in names else (*ARM, "triangulated")
     return tuple(name for name in names if name in needing)

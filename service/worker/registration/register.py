@@ -41,7 +41,7 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
     arguments, source = context.arguments, context.arguments.poses
     refined = source == "robot_corrected"
     images = _posed_images(context)
-    metric = source in ("robot", "robot_corrected", "spheres", "hybrid")
+    metric = source in (*job.ARM, "spheres", "hybrid")
     posed = PosedImages(images.poses, images.camera, groups=images.groups, metric=metric, names=images.names)
     covariance_m2 = np.array(arguments.sphere_covariance_m2)
     spheres = ScanSpheres(np.array(arguments.spheres_m), arguments.radius_m, covariance_m2=covariance_m2)
@@ -131,7 +131,7 @@ def _posed_images(context: JobContext[job.Arguments]) -> _ImagesToRegister:
     camera = camera_used(arguments)
     if arguments.poses == "spheres" and not has_poses(arguments, images):
         return _located_images(context, camera)
-    if arguments.poses in ("robot", "robot_corrected", "spheres"):
+    if arguments.poses in (*job.ARM, "spheres"):
         stations = sorted({image.station for image in images})
         poses = robot_camera_poses(arguments, images)
         groups = [stations.index(image.station) for image in images]
