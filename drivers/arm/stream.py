@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from itertools import takewhile
 
 import numpy as np
+import scipy.spatial.transform  # noqa: F401 - for drivers.stillness: read while the arm moves it would hold all threads
 
 from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import RobotSample, SettleCriteria, SettleReport
