@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 
 import numpy as np
@@ -10,6 +12,7 @@ from embreex.rtcore_scene import EmbreeScene
 
 from simulators.geometry import Array, Array32, Bools, Ints
 
+THREADS = min(4, os.cpu_count() or 1)
 LAMP_RADIUS_M = 0.13
 LAMP_SAMPLES = 24
 ROOM_SAMPLES = 28
@@ -21,6 +24,8 @@ class Caster:
     def __init__(self, vertices: Array, faces: Ints) -> None:
         self._scene = EmbreeScene()
         self._mesh = TriangleMesh(self._scene, vertices.astype(np.float32), faces.astype(np.int32))
+        ray = np.array([[0, 0, 1]], dtype=np.float32)
+        self._scene.run(ray, ray)  # builds the tree, which several threads must not do at once
 
     def blocked(self, origins: Array32, directions: Array32) -> Bools:
         """Whether each ray (N, 3) hits something within the length of its direction."""
@@ -53,7 +58,8 @@ def blocked_rays(caster: Caster, vertices: Array, normals: Array, lamp_m: Array)
         np.ascontiguousarray(np.broadcast_to((0.25 * direction).astype(np.float32), start.shape))
         for direction in _room()
     )
-    return np.stack([caster.blocked(start, rays) for rays in chain(towards_lamp, towards_room)])
+    with ThreadPoolExecutor(THREADS) as pool:  # embree casts rays without Python's lock
+        return np.stack(list(pool.map(lambda rays: caster.blocked(start, rays), chain(towards_lamp, towards_room))))
 
 
 def vertex_light(blocked: Bools, vertices: Array, normals: Array, lamp_m: Array) -> Array32:

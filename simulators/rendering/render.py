@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +12,7 @@ import cv2
 import numpy as np
 
 from simulators.geometry import Array, Array32, Bools, Bytes, Ints, inverse
+from simulators.rendering.lighting import THREADS
 from simulators.rendering.overlays import Frame, draw_calibration_board, draw_sphere
 from simulators.rendering.sensor import EXPOSED, FULL_WELL_E, READ_NOISE_E, Light, light_of
 from simulators.rendering.srgb import coded_table
@@ -109,16 +112,28 @@ class Renderer:
 
     def _blurred_tiles(self, view: View) -> Iterator[tuple[int, Array32]]:
         """First row and linear colour (rows, W, 3) of the parts of the image, blurred by the lens."""
-        surfaces, lens = self.surfaces(view.seed, view.moved), view.intrinsics
-        for first, last in _tiles(lens):
-            top, bottom = max(0, first - HALO), min(lens.height, last + HALO)
-            linear = self._linear(surfaces, view, top, bottom)
-            linear = np.asarray(cv2.GaussianBlur(linear, (0, 0), BLUR_PX, borderType=cv2.BORDER_REPLICATE))
-            yield first, np.maximum(linear[first - top : last - top], 0.0)
+        lens = view.intrinsics
+        surfaces, rays = self.surfaces(view.seed, view.moved), self._kept_rays(lens)
+        surfaces.light(view.control_spheres)  # computed once, before several tiles ask for it
 
-    def _linear(self, surfaces: Surfaces, view: View, top: int, bottom: int) -> Array32:
-        """Linear colour (rows, W, 3) of the image rows top…bottom."""
-        rays = self._ray_rows(view.intrinsics, top, bottom)
+        def blurred(first: int, last: int) -> Array32:
+            top, bottom = max(0, first - HALO), min(lens.height, last + HALO)
+            directions = _pixel_rays(lens, top, bottom) if rays is None else rays[top:bottom]
+            linear = self._linear(surfaces, view, top, directions)
+            linear = np.asarray(cv2.GaussianBlur(linear, (0, 0), BLUR_PX, borderType=cv2.BORDER_REPLICATE))
+            return np.maximum(linear[first - top : last - top], 0.0)
+
+        with ThreadPoolExecutor(THREADS) as pool:
+            begun: deque[tuple[int, Future[Array32]]] = deque()
+            for first, last in _tiles(lens):
+                begun.append((first, pool.submit(blurred, first, last)))
+                if len(begun) > THREADS:  # no more of a large picture than is being used
+                    yield _finished(begun)
+            while begun:
+                yield _finished(begun)
+
+    def _linear(self, surfaces: Surfaces, view: View, top: int, rays: Array) -> Array32:
+        """Linear colour (rows, W, 3) of the image rows from `top` on, of rays (rows, W, 3) in the camera frame."""
         R, eye = view.T_world_camera[:3, :3], view.T_world_camera[:3, 3]
         world = (rays @ R.T).astype(np.float32)
         height, width = world.shape[:2]
@@ -160,13 +175,18 @@ class Renderer:
             total += shade.colour
         frame.colour.reshape(-1, 3)[at] = total / np.float32(len(_SUB))
 
-    def _ray_rows(self, lens: Intrinsics, top: int, bottom: int) -> Array:
-        """Rays (rows, W, 3) of the pixel centres, in the camera frame."""
+    def _kept_rays(self, lens: Intrinsics) -> Array | None:
+        """Rays (H, W, 3) of all pixel centres, in the camera frame; None if they are too many to be kept."""
         if lens.width * lens.height > MOST_KEPT_RAYS:
-            return _pixel_rays(lens, top, bottom)
+            return None
         if self._rays is None or self._rays[0] != lens:
             self._rays = (lens, _pixel_rays(lens, 0, lens.height))
-        return self._rays[1][top:bottom]
+        return self._rays[1]
+
+
+def _finished(begun: deque[tuple[int, Future[Array32]]]) -> tuple[int, Array32]:
+    first, tile = begun.popleft()
+    return first, tile.result()
 
 
 def _electrons(view: View, settings: Mapping[str, float]) -> float:
