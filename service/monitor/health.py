@@ -60,7 +60,8 @@ def _data_folder(data: Path) -> str:
 def _worker(data: Path, queued: int) -> str:
     if not queued or living_workers(data):
         return ""
-    return f"{queued} jobs wait, and no worker is running"
+    waiting = "a job waits" if queued == 1 else f"{queued} jobs wait"
+    return f"{waiting}, and no worker is running"
 
 
 def _runners(data: Path, driven: Sequence[str]) -> str:

@@ -63,7 +63,7 @@ def test_a_healthy_site_says_so_to_anybody_and_nothing_more(site: WebSite) -> No
 def test_a_job_without_a_worker_is_not_healthy_until_one_lives(site: WebSite) -> None:
     let_wait(site, site.begin_run())
     answer = site.browser().get("/health")
-    assert (answer.status_code, answer.json()["worker"]["what"]) == (503, "1 jobs wait, and no worker is running")
+    assert (answer.status_code, answer.json()["worker"]["what"]) == (503, "a job waits, and no worker is running")
     # In an empty folder beside it: the worker has nothing to do and stays alive.
     words = [sys.executable, "-m", "service.cli.main", "worker", "--data", str(site.site.data), "--json"]
     with subprocess.Popen(words, stdout=subprocess.DEVNULL) as worker:

@@ -93,7 +93,7 @@ def test_damaged_images_are_errors_and_all_are_named(odd: BoardFolder, tmp_path:
 def test_strict_refuses_odd_files_by_name(odd: BoardFolder, tmp_path: Path, command: str) -> None:
     done = _invoke(*_commands(odd, tmp_path)[command], "--strict")
     assert done.exit_code == 1
-    assert "3 files are odd" in done.output
+    assert "3 odd files" in done.output
     for words in ("._b1.jpg: a hidden file", "the same file as", "small.jpg: 450 × 300 px"):
         assert words in done.output
 
@@ -117,7 +117,7 @@ def test_images_without_a_pose_are_left_out_by_name(photographs: BoardFolder, tm
     done = _invoke(*_commands(fewer, tmp_path)["register"])
     assert "left out b0.jpg: no pose in poses.csv" in done.output
     done = _invoke(*_commands(fewer, tmp_path)["register"], "--strict")
-    assert "1 files are odd: b0.jpg: no pose" in done.output
+    assert "1 odd file: b0.jpg: no pose" in done.output
 
 
 def test_images_all_of_another_size_blame_the_camera_model(photographs: BoardFolder, tmp_path: Path) -> None:

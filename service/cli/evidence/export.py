@@ -22,6 +22,7 @@ from service.cli.common import (
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.errors import ConfigurationError
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement
+from service.core.text.counts import counted
 from service.store.store import Store
 
 
@@ -97,7 +98,7 @@ def export_command(
             }
         )
     else:
-        console.print(f"{len(dataset.views)} images of run {run_id} as {form}: {escape(str(target))}")
+        console.print(f"{counted(len(dataset.views), 'image')} of run {run_id} as {form}: {escape(str(target))}")
         if dataset.simulated:
             console.print("  The run is simulated, and its files say so.")
 

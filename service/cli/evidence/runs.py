@@ -24,6 +24,7 @@ from service.cli.common import (
     reporting_errors,
     require_writable,
 )
+from service.core.text.counts import counted
 from service.run_record import read_log
 from service.run_start import recorded_run
 from service.store.store import Store
@@ -171,4 +172,4 @@ def history_command(
         typer.echo(content, nl=False)
         return
     out.write_text(content, encoding="utf-8", newline="")
-    console.print(f"{len(rows)} runs with figures: {escape(str(out))}")
+    console.print(f"{counted(len(rows), 'run')} with figures: {escape(str(out))}")

@@ -17,6 +17,7 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
 )
+from service.core.text.counts import counted
 from service.logs.file_log import file_log
 from service.worker.pool import work_side_by_side
 
@@ -51,4 +52,4 @@ def worker_command(
         if json:
             print_json({"jobs": done})
         elif not parent:
-            console.print(f"{done} jobs done")
+            console.print(f"{counted(done, 'job')} done")

@@ -9,6 +9,7 @@ import numpy as np
 
 from service.core.errors import DataError
 from service.core.geometry import Array
+from service.core.text.counts import counted
 from service.core.text.file_text import csv_rows
 
 _AXES = range(1, 17)  # no arm has more
@@ -51,7 +52,7 @@ def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
     missing = [image for image in images if image not in joints]
     if missing:
         raise DataError(
-            f"{len(missing)} images have no joints: {', '.join(missing[:5])}",
+            f"no joints for {counted(len(missing), 'image')}: {', '.join(missing[:5])}",
             where=str(path),
             remedy="Add their rows, or leave the images out",
         )

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from service.compute.images.files import image_size
 from service.core.errors import DataError
+from service.core.text.counts import counted
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm"})
 READ = "JPEG, PNG, TIFF, BMP, PGM and PNM files are read"
@@ -75,7 +76,7 @@ def image_folder(folder: Path, *, size: tuple[int, int] | None = None, strict: b
 def strict_refusal(reasons: dict[str, str], folder: Path) -> DataError:
     """The error for odd files with `--strict`."""
     return DataError(
-        f"{len(reasons)} files are odd: " + "; ".join(f"{name}: {reason}" for name, reason in reasons.items()),
+        f"{counted(len(reasons), 'odd file')}: " + "; ".join(f"{name}: {reason}" for name, reason in reasons.items()),
         where=str(folder),
         remedy="Remove them from the folder, or omit --strict to skip them",
     )

@@ -150,7 +150,7 @@ def _redo(protocol: Protocol, state: RunState, target: str) -> WayOn:
     images = sum(len(state.steps[s.id].captured) for s in begun)
     reset = [s.title for s in begun if s.id != target]
     title = protocol.step(target).title
-    lost = [f"{images} images no longer count"] if images else []
+    lost = ["1 image no longer counts" if images == 1 else f"{images} images no longer count"] if images else []
     lost += [f"These are done again as well: {', '.join(reset)}"] if reset else []
     loses = ". ".join([*lost, "All of it stays in the record"]) + "." if lost else "Nothing."
     afresh = (

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from service.compute.evaluation.closure import Alignment
 from service.core.geometry import Array, Transform, inverse
 from service.core.records.events import ArtefactRef, RecordedView, ViewpointCaptured
+from service.core.text.counts import counted
 from service.core.units import metres, mm
 from service.dataset.further_cameras import further_poses
 from service.dataset.registered_scan import registered_scan
@@ -175,7 +176,7 @@ def _live(log: RunRecord) -> KnownScene | None:
         spheres,
         "of the CT",
         "provisional: placed by the spheres seen so far",
-        (f"{away} images of a station whose position is not known yet.",) if away else (),
+        (f"{counted(away, 'image')} of a station whose position is not known yet.",) if away else (),
         meshes[-1] if meshes else None,
     )
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from service.core.errors import DataError
 from service.core.geometry import Transform
+from service.core.text.counts import counted
 from service.core.text.file_text import csv_rows, file_text
 from service.core.text.json_text import parse_json
 
@@ -52,7 +53,7 @@ def read_stations(path: Path, images: Iterable[str]) -> dict[str, str]:
     missing = sorted(set(images) - set(found))
     if missing:
         raise DataError(
-            f"{len(missing)} images have no station: {', '.join(missing[:5])}",
+            f"no station for {counted(len(missing), 'image')}: {', '.join(missing[:5])}",
             where=str(path),
             remedy="Add their lines",
         )
