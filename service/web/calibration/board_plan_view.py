@@ -17,7 +17,8 @@ from service.steps.kinds.captures.calibration import Params
 from service.steps.notes import BOARD_POSES, board_plans
 from service.web.calibration.board_plan_drawing import board_plan_svg
 from service.web.record.pictures import cached
-from service.web.record.planned_poses import recorded_rig_section, station_of
+from service.web.record.planned_poses import station_of
+from service.web.record.recorded_rig import recorded_rig_section
 
 
 def board_plan_of(log: RunRecord, step_id: str, data: Path) -> bytes:

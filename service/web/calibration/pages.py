@@ -30,6 +30,7 @@ from service.web.page.rendering import render
 from service.web.page.run_frame import RunFrame, run_frame
 from service.web.page.run_words import gate_word, limit, measure_name
 from service.web.record.images import further_cameras_of
+from service.web.record.recorded_rig import recorded_rig_section
 from service.web.security.guards import requires
 from service.web.site import CurrentSite, Site
 
@@ -170,7 +171,6 @@ def _advice(
     """Parts of the image without corners, and board poses worth taking."""
     # The planning of poses brings scipy, which the start of the service does not wait for.
     from service.web.calibration.board_advice import advised_poses, empty_regions  # noqa: PLC0415
-    from service.web.record.planned_poses import recorded_rig_section  # noqa: PLC0415
 
     coverage = None if found.intrinsics is None else found.intrinsics.coverage
     regions = [] if coverage is None else empty_regions(coverage.corners)

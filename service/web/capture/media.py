@@ -27,7 +27,7 @@ from service.store.database.tables import artefacts
 from service.store.files.artefacts import to_artefact
 from service.web.record.images import Capture, find_capture, further_of
 from service.web.record.pictures import IMAGE_WIDTHS, PICTURES, cached, nearest_width, reduced_jpeg, safe_name
-from service.web.record.rig_cameras import rig_cameras
+from service.web.record.recorded_rig import rig_cameras
 from service.web.security.guards import requires
 from service.web.site import CurrentSite, Site
 

@@ -21,7 +21,7 @@ from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.record.board_images import BoardUse, board_uses
 from service.web.record.images import Capture, captures_of, step_to_show
-from service.web.record.rig_cameras import rig_cameras
+from service.web.record.recorded_rig import rig_cameras
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 

@@ -5,21 +5,18 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 from threading import Lock
 
 import numpy as np
 
 from service.core.geometry import Transform
 from service.core.protocol.models import Step
-from service.core.records.events import RunStarted
-from service.rig import RigSection, parse_recorded_rig
 from service.run_record import RunRecord
 from service.steps.capture.plan.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.context import StationLayout
 from service.steps.kinds.captures import calibration
 from service.steps.notes import BOARD_POSES, SUGGESTION, board_plans, suggested_views
+from service.web.record.recorded_rig import recorded_rig_section
 
 Vector = tuple[float, float, float]
 _lock = Lock()
@@ -122,15 +119,3 @@ def nominal_T_flange_camera(log: RunRecord) -> tuple[tuple[float, float, float, 
 def _vector(values: Transform) -> Vector:
     x, y, z = (float(v) for v in values)
     return x, y, z
-
-
-def recorded_rig_section(log: RunRecord) -> RigSection:
-    """The rig file as it was when the run began."""
-    root = log.events[0].payload
-    assert isinstance(root, RunStarted)  # checked when the record was read
-    return _rig_section(log.store.artefact_path(root.rig.sha256))
-
-
-@lru_cache(maxsize=8)
-def _rig_section(path: Path) -> RigSection:
-    return parse_recorded_rig(path.read_bytes(), path).section

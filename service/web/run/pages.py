@@ -28,7 +28,7 @@ from service.steps import step_kinds
 from service.store.files.space_used import forecast_of
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
-from service.web.record.rig_cameras import rig_cameras
+from service.web.record.recorded_rig import rig_cameras
 from service.web.run.notes import PageNote, notes_of
 from service.web.run.view import run_view
 from service.web.run.view_records import RunView, Viewer
