@@ -1,4 +1,4 @@
-"""The covariance of an arm's poses in a data set is whole; for a run of an earlier version it is as before."""
+"""The covariance of poses by an arm or by the spheres is whole in a data set; in runs of before it is as it was."""
 
 from __future__ import annotations
 
@@ -52,6 +52,12 @@ def computed(run: RecordedRun, job: JobState, folder: Path, more: Mapping[str, A
     return HANDLERS[job.kind](context)
 
 
+def without_mount(job: JobState) -> JobState:
+    """The job as if the camera's mount were unknown, so that each image is located by its spheres."""
+    unknown = {"poses": "spheres", "T_flange_camera": None, "arm_correction": None}
+    return dataclasses.replace(job, arguments={**job.arguments, **unknown})
+
+
 def stated(run: RecordedRun, job: JobState, folder: Path) -> tuple[JobAnswer, RunSummary]:
     """The job as this version has it computed, and the run as if it had been, with the best of the registrations."""
     answer = computed(run, job, folder, {"state_pose_errors": True})
@@ -61,7 +67,7 @@ def stated(run: RecordedRun, job: JobState, folder: Path) -> tuple[JobAnswer, Ru
     result = {**step.result, "registrations": {**step.result["registrations"], name: answer.result}}
     steps[step.step] = dataclasses.replace(step, jobs={**step.jobs, job.job: again}, result=result)
     judged = next(step.id for step in run.protocol.steps if step.gives == "accuracy")
-    rows = [row for row in steps[judged].result["table"] if row["poses"] == name]
+    rows = [{**steps[judged].result["table"][0], "poses": name, "source": name}]
     steps[judged] = dataclasses.replace(steps[judged], result={**steps[judged].result, "table": rows})
     state = dataclasses.replace(run.state, steps=steps)
     return answer, dataclasses.replace(run.summary(), state=state, store=ScratchStore(run.files, folder))
@@ -88,14 +94,36 @@ def test_the_arm_is_in_the_covariance_of_each_of_its_poses(run: RecordedRun, nam
             assert (whole > 1.5 * shared).all()
             own = np.array([record.pose_sigma_m**2] * 3 + [record.pose_sigma_rad**2] * 3)
             assert (whole > 0.6 * own).all()
-        else:  # the outlines leave little open of each pose, and the images share nearly all of the rest
-            assert whole == pytest.approx(shared, rel=0.2)
+        else:  # the outlines leave little open of each pose; the lens counts as its calibration left it
+            assert (whole > shared).all()
+            assert (whole < 1.7 * shared).all()
     first, second = dataset.views[:2]
     of_pair = relative_covariance(first.T_world_camera, second.T_world_camera, joint[:12, :12])
     assert np.trace(of_pair[:3, :3]) > (3 * record.pose_sigma_m**2 if name == "robot" else 0.0)
     assert f"err by {1e3 * record.pose_sigma_m:.3f} mm" in dataset.about.covariance
     assert ("refined each pose" in dataset.about.covariance) == (name == "robot_corrected")
     assert dataset.statement["pose_covariance"] == dataset.about.covariance
+
+
+def test_the_outlines_of_each_image_are_in_the_covariance_of_poses_by_the_spheres(
+    run: RecordedRun, tmp_path: Path
+) -> None:
+    answer, summary = stated(run, without_mount(arm_jobs(run)["robot"]), tmp_path)
+    record = answer.answer
+    assert isinstance(record, register.Registration)
+    assert record.pose_sigma_m is None
+    assert record.leave_one_out is not None
+    dataset = data_set_of(summary)
+    joint = dataset.pose_errors
+    assert joint is not None
+    assert np.linalg.eigvalsh(joint).min() > 0.0
+    T_world_scan, of_registration = np.array(record.T_world_scan), np.array(record.covariance)
+    for k, view in enumerate(dataset.views):
+        block = slice(6 * k, 6 * k + 6)
+        assert np.array_equal(view.covariance, joint[block, block])
+        shared = pose_covariance(T_world_scan, of_registration, view.T_world_camera)
+        assert np.trace(view.covariance[:3, :3]) > 1.5 * np.trace(shared[:3, :3])
+    assert dataset.statement["pose_covariance"].startswith("all of it: what the outlines of the spheres")
 
 
 @pytest.mark.parametrize("name", ARM)
@@ -105,6 +133,16 @@ def test_a_job_of_an_earlier_version_answers_as_it_did(run: RecordedRun, name: s
     again = computed(run, job, tmp_path, {})
     assert set(again.result) == set(job.result)
     assert [ref.original_name for ref in again.artefacts] == [ref.original_name for ref in job.artefacts]
+
+
+def test_a_job_of_before_locates_each_image_on_its_own(run: RecordedRun, tmp_path: Path) -> None:
+    job = without_mount(arm_jobs(run)["robot"])
+    answer = computed(run, job, tmp_path, {})
+    record = answer.answer
+    assert isinstance(record, register.Registration)
+    assert [ref.kind for ref in answer.artefacts] == ["registration"]
+    assert record.leave_one_out is None
+    assert set(record.components) == {"outlines", "common", "poses", "spheres", "intrinsics"}
 
 
 def test_the_data_set_of_an_earlier_run_says_that_the_arm_is_not_in_it(run: RecordedRun) -> None:

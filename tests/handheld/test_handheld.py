@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from service.audit.record.run import read_run
+from service.dataset.posed.of_run.view_covariances import view_covariances
 from tests.support.rig.rig import orthocapture
 from tests.support.runs.run_by_hand import run_by_hand, small_protocol
 
@@ -40,6 +44,19 @@ def test_every_image_that_was_not_used_says_why(run: dict[str, Any]) -> None:
 def test_the_registration_is_as_good_as_with_a_robot(run: dict[str, Any]) -> None:
     measures = run["steps"]["evaluation"]["measures"]
     assert measures["best_mean_radial_error_mm"] < 0.2
+
+
+def test_the_covariance_of_each_pose_by_the_spheres_is_whole(run: dict[str, Any]) -> None:
+    summary = read_run(Path(run["data"]), run["run"]).summary()
+    registered = summary.registrations()["spheres"]
+    names = sorted(registered.T_scan_camera)
+    stated = view_covariances(summary, "spheres", registered, names)
+    assert stated.words.startswith("all of it: what the outlines of the spheres in each image leave open")
+    assert stated.joint is not None
+    assert stated.joint.shape == (6 * len(names), 6 * len(names))
+    sigmas_m = [np.sqrt(np.trace(stated.covariance[name][:3, :3])) for name in names]
+    assert min(sigmas_m) > 5e-5
+    assert max(sigmas_m) < 3e-3
 
 
 def test_the_evidence_verifies(run: dict[str, Any]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import block_diag
 
-from service.compute.registration.result import RegistrationResult
+from service.compute.registration.result import RegistrationResult, Solution
 from service.core.errors import DataError
 from service.core.geometry import Array, skew
 
@@ -21,6 +21,9 @@ def camera_errors(registration: RegistrationResult, *, refined: bool) -> Array:
     base. The outlines tell of it that xi = xi_0 + K x + own error, with x the error of the common unknowns, whose
     covariance is C, and own errors of covariance Q. Refined poses have xi_0 taken off. Given ones do not: the
     covariance of their xi is P, and that of xi with x is K C.
+
+    Intrinsics, if uncertain, count with their whole covariance, not with what the outlines leave of it: the poses are
+    those of the calibrated lens.
 
     Raises:
         DataError: the scale was estimated, so that the poses are not metric.
@@ -41,12 +44,28 @@ def camera_errors(registration: RegistrationResult, *, refined: bool) -> Array:
         moved[:3, 3:] = skew(T_base_camera[i, :3, 3] - T_base_scan[:3, 3])
         by_base[i] = 0.0
         by_base[i, :, 6 * k : 6 * k + 6] = to_scan[i] @ moved
+    by_base = by_base.reshape(-1, problem.size)
     by_pose = (to_scan @ s.pose_gain()).reshape(-1, problem.size)
-    through = by_base.reshape(-1, problem.size) + by_pose
-    joint = through @ s.covariance @ through.T
-    covariance = s.marginal.Q
-    if not refined:
-        joint -= by_pose @ s.covariance @ by_pose.T
+    through = by_base + by_pose
+    known, of_lens = _with_calibrated_lens(s)
+    joint = through @ known @ through.T
+    if refined:
+        joint += through @ of_lens @ through.T
+        covariance = s.marginal.Q
+    else:
+        joint += by_base @ of_lens @ by_base.T - by_pose @ known @ by_pose.T
         covariance = s.pose_root @ s.pose_root.transpose(0, 2, 1)
     joint += block_diag(*(to_scan @ covariance @ to_scan.transpose(0, 2, 1)))
     return (joint + joint.T) / 2
+
+
+def _with_calibrated_lens(s: Solution) -> tuple[Array, Array]:
+    """(n, n) covariances of the common unknowns: with the lens as calibrated, and what its errors then cause.
+
+    An error e of the lens is one of V e of the unknowns, V the regression of their errors on those of the lens.
+    """
+    lens = slice(s.problem.lens_column, s.problem.size)
+    left_open = s.covariance[lens, lens]
+    V = np.linalg.solve(left_open, s.covariance[lens]).T
+    prior = np.linalg.inv(s.problem.prior()[lens, lens])
+    return s.covariance - V @ left_open @ V.T, V @ prior @ V.T

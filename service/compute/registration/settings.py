@@ -45,7 +45,7 @@ class RegistrationSettings:
         robust: whether to weight outlines robustly and exclude outliers.
         pose_covariance: (N, 6, 6) of each pose's (position in the unit of the poses, rotation vector in radians) in
             the axes of its base, independent between images; "estimate": isotropic, estimated from the residuals;
-            "exact": no pose errors.
+            "exact": no pose errors; "free": the outlines alone tell where each camera was.
         intrinsics_covariance: (4, 4) of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only for poses whose
             errors do not depend on the intrinsics'. None leaves them to the error budget.
         common_errors: prior sizes of errors shared by all outlines of a capture.
@@ -53,6 +53,6 @@ class RegistrationSettings:
 
     cost: Cost = "cone"
     robust: bool = True
-    pose_covariance: Array | Literal["estimate", "exact"] = field(default="estimate", repr=False)
+    pose_covariance: Array | Literal["estimate", "exact", "free"] = field(default="estimate", repr=False)
     intrinsics_covariance: Array | None = field(default=None, repr=False)
     common_errors: CommonErrors = EXPECTED_COMMON_ERRORS

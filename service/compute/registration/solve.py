@@ -28,6 +28,7 @@ from service.compute.registration.least_squares.start import starting_state
 from service.compute.registration.least_squares.variance_components import (
     PoseNoise,
     estimate,
+    free_poses,
     given_pose_noise,
     no_pose_noise,
     unknown_pose_noise,
@@ -81,10 +82,10 @@ def register(
     return _result(solution, images.stations, settings.cost)
 
 
-def _noise(problem: Problem, given: Array | Literal["estimate", "exact"], scale: float) -> PoseNoise:
+def _noise(problem: Problem, given: Array | Literal["estimate", "exact", "free"], scale: float) -> PoseNoise:
     n = problem.n_images
     if isinstance(given, str):
-        return unknown_pose_noise(n) if given == "estimate" else no_pose_noise(n)
+        return {"estimate": unknown_pose_noise, "exact": no_pose_noise, "free": free_poses}[given](n)
     if given.shape != (n, 6, 6):
         raise DataError(f"covariances of poses have the shape {given.shape}, not {(n, 6, 6)}")
     unit = np.array([scale] * 3 + [1.0] * 3)

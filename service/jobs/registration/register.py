@@ -10,13 +10,15 @@ from service.jobs.registration import further_camera
 from service.jobs.registration.detect_spheres import SceneArguments
 
 ARM = ("robot", "robot_corrected")  # sources of poses that are an arm's
-POSE_ERRORS = "pose_errors"  # kind of the artefact with the errors of an arm's poses
+POSE_ERRORS = "pose_errors"  # kind of the artefact with the errors of the poses
 
 
 class Arguments(SceneArguments):
     """Outlines and the source of the poses, with its model if they come from the images.
 
-    With `state_pose_errors`, which is for poses of an arm, the errors of the poses are estimated and kept.
+    With `state_pose_errors`, which is for poses of an arm and of the spheres, the errors of the poses are estimated
+    and kept. Poses of the spheres then follow from the outlines alone, and images that show fewer than four spheres
+    have none.
     """
 
     outlines: Hash

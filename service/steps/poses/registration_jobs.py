@@ -25,7 +25,6 @@ from service.jobs.poses.features import ImagesToMatch
 from service.jobs.poses.match import PairsToMatch
 from service.jobs.records import ImageFile, ImagesCamera, PosedPhotograph
 from service.jobs.registration import detect_spheres
-from service.jobs.registration.register import ARM
 from service.steps.context import JobRequest
 from service.steps.poses.front_end import IMAGES_A_JOB, PAIRS_A_JOB, EarlyJobs, chunks, found_early
 from service.steps.poses.sources import PLANNED, QUICK, WantedRegistrations, decisive, posed
@@ -152,8 +151,7 @@ class _Plan:
         markers = {**shared, "outlines": detected.artefacts[0].sha256, "poses": source}
         if source in QUICK:
             reported = _uncorrected(markers) if source == "robot" else {}
-            stated = {"state_pose_errors": True} if source in ARM else {}
-            return self._need("register", source, size, {**markers, **reported, **stated})
+            return self._need("register", source, size, {**markers, **reported, "state_pose_errors": True})
         model = self._model(self._mapper(source), size, shared)
         if model is not None and source == "hybrid":
             # It starts from one reconstruction and adds the robot and the spheres.

@@ -6,6 +6,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from service.compute.evaluation.closure import Alignment
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import register_images
 from service.compute.registration.camera_errors import camera_errors
+from service.compute.registration.identification.identity import identify
 from service.compute.registration.joint_poses import with_joint_pose_covariance
 from service.compute.registration.result import RegistrationResult
 from service.compute.registration.settings import RegistrationSettings
@@ -35,28 +37,34 @@ from service.worker.poses.models import joint_pose_covariance
 from service.worker.poses.robot_poses import has_poses, robot_camera_poses
 from service.worker.registration.outlines import read_outlines
 
+_LEAST_SPHERES = 4
+
 
 def register(context: JobContext[job.Arguments]) -> JobAnswer:
     """T_world_scan for one source of poses. With robot poses, every station has its own base frame."""
     arguments, source = context.arguments, context.arguments.poses
-    refined = source == "robot_corrected"
-    images = _posed_images(context)
-    metric = source in (*job.ARM, "spheres", "hybrid")
-    posed = PosedImages(images.poses, images.camera, groups=images.groups, metric=metric, names=images.names)
+    free = source == "spheres" and arguments.state_pose_errors
+    refined = free or source == "robot_corrected"
     covariance_m2 = np.array(arguments.sphere_covariance_m2)
     spheres = ScanSpheres(np.array(arguments.spheres_m), arguments.radius_m, covariance_m2=covariance_m2)
+    images = _posed_images(context)
+    if free and not images.located:
+        images = images.locatable(spheres)
+    posed = images.posed(metric=source in (*job.ARM, "spheres", "hybrid"))
     solved = register_images(images.outlines, posed, spheres)
-    answer = solved.registration
-    placed = _placed(context, images, answer)
-    components, judged = placed.components, answer
+    answer = placing = solved.registration
+    again = partial(register_images, images.outlines, posed, spheres, assignments=solved.assignments)
+    settings = RegistrationSettings(pose_covariance="free" if free else "estimate")
+    if free:
+        placing = again(settings).registration
+    placed = _placed(context, images, answer, placing)
+    components, judged = placed.components, placing
     if (lens := _intrinsics_covariance(arguments)) is not None:
-        settings = RegistrationSettings(intrinsics_covariance=lens)
-        uncertain = register_images(images.outlines, posed, spheres, settings, assignments=solved.assignments)
-        judged = uncertain.registration
-        components = components | {"intrinsics": _added(answer, judged, refined=refined)}
+        judged = again(replace(settings, intrinsics_covariance=lens)).registration
+        components = components | {"intrinsics": _added(placing, judged, refined=refined)}
     covariance = np.sum(list(components.values()), axis=0)
-    # The poses of located images know every sphere: none is left out of them.
-    left_out = None if images.located else _leave_one_out(answer, refined=refined)
+    # Unless they are free, the poses of located images know every sphere: none is left out of them.
+    left_out = None if images.located and not free else _leave_one_out(placing, refined=refined)
     record = _record(arguments, images, answer, _Judged(placed, components, covariance, left_out))
     alignment = Alignment(placed.T_world_scan, covariance)
     centre_m = np.array(arguments.spheres_m).mean(axis=0)
@@ -114,6 +122,22 @@ class _ImagesToRegister:
     @property
     def names(self) -> list[str]:
         return [image.viewpoint for image in self.images]
+
+    def posed(self, *, metric: bool) -> PosedImages:
+        """The images as a registration takes them."""
+        return PosedImages(self.poses, self.camera, groups=self.groups, metric=metric, names=self.names)
+
+    def locatable(self, spheres: ScanSpheres) -> _ImagesToRegister:
+        """Those that show four of the spheres, by which a camera can be located."""
+        shown = identify(self.outlines, self.posed(metric=True), spheres)
+        kept = [i for i, assigned in enumerate(shown) if len(assigned.markers) >= _LEAST_SPHERES]
+        return replace(
+            self,
+            images=[self.images[i] for i in kept],
+            poses=self.poses[kept],
+            groups=[self.groups[i] for i in kept],
+            outlines=[self.outlines[i] for i in kept],
+        )
 
     def known(self, T_scan_camera: Array) -> dict[str, Transform]:
         """The poses that are known, by image."""
@@ -183,7 +207,13 @@ class _Placed:
     given: tuple[Mapping[str, Transform], Array] | None = None
 
 
-def _placed(context: JobContext[job.Arguments], images: _ImagesToRegister, answer: RegistrationResult) -> _Placed:
+def _placed(
+    context: JobContext[job.Arguments],
+    images: _ImagesToRegister,
+    answer: RegistrationResult,
+    placing: RegistrationResult,
+) -> _Placed:
+    """The scan as `answer` has it, and the cameras as `placing` has them."""
     arguments = context.arguments
     stated = answer
     if arguments.tracks is not None:
@@ -195,6 +225,12 @@ def _placed(context: JobContext[job.Arguments], images: _ImagesToRegister, answe
         images.known(answer.T_scan_camera),
         {name: np.asarray(C, dtype=np.float64)[:6, :6] for name, C in stated.components.items()},
     )
+    if placing is not answer:  # the outlines of each image alone tell where its camera was
+        return replace(
+            placed,
+            T_scan_camera=images.known(placing.T_scan_camera_refined),
+            components=placing.refined_components(),
+        )
     if arguments.poses == "robot_corrected":
         # The outlines measure the error of a single pose of the arm (some 0.3 mm) better than the arm itself.
         return replace(
@@ -248,7 +284,7 @@ def _record(
         components=matrices(judged.components),
         leave_one_out=judged.left_out,
     )
-    if arguments.state_pose_errors:
+    if arguments.state_pose_errors and arguments.poses in job.ARM:
         sigma_m, sigma_rad = answer.pose_sigma
         record = record.model_copy(update={"pose_sigma_m": sigma_m, "pose_sigma_rad": sigma_rad})
     if placed.given is None:

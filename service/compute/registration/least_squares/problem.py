@@ -69,6 +69,11 @@ class Problem:
         return self.sphere_column + (0 if self.sphere_prior is None else 3 * len(self.centres))
 
     @property
+    def lens_column(self) -> int:
+        """First column of the errors of the intrinsics, if they are estimated."""
+        return self.common_column + 6
+
+    @property
     def size(self) -> int:
         """Number of common unknowns."""
         return self.common_column + 3 + self.common.shape[2]

@@ -37,6 +37,11 @@ def no_pose_noise(n_images: int) -> PoseNoise:
     return PoseNoise(np.zeros((1, n_images, 6, 6)), 1.0, free=False)
 
 
+def free_poses(n_images: int) -> PoseNoise:
+    """Poses that tell nothing: 0.1 m and 0.1 rad, hundreds of times what the outlines of four spheres leave open."""
+    return PoseNoise(np.tile(0.1 * np.eye(6), (1, n_images, 1, 1)), 1.0, free=False)
+
+
 def unknown_pose_noise(n_images: int) -> PoseNoise:
     """Isotropic noise of position and of orientation, equal for all images, in units of 0.1 mm and 0.1 mrad."""
     parts = np.zeros((2, n_images, 6, 6))

@@ -21,7 +21,7 @@ def own_pose_errors(summary: RunSummary, registered: Registration, names: Sequen
 
     Stated for poses of structure from motion: the covariance of their bundle adjustment, after a similarity has
     aligned the positions with the true ones, in the scan's axes and in metres. The error of the scale is not in it,
-    nor is that of the registration. None for poses of an arm, whose own errors the record does not state.
+    nor is that of the registration. None for other poses.
 
     Args:
         summary: the run.
@@ -39,10 +39,10 @@ def own_pose_errors(summary: RunSummary, registered: Registration, names: Sequen
     return J @ joint @ J.T
 
 
-def arm_pose_errors(summary: RunSummary, registered: Registration, names: Sequence[str]) -> Array | None:
+def stated_pose_errors(summary: RunSummary, registered: Registration, names: Sequence[str]) -> Array | None:
     """(6 N, 6 N) joint covariance of T_scan_camera of these viewpoints, with that of the registration.
 
-    Stated for poses of an arm. None for other poses, and in runs of earlier versions.
+    Stated for poses of an arm and of the spheres. None for other poses, and in runs of earlier versions.
 
     Args:
         summary: the run.

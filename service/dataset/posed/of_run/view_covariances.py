@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from service.core.errors import IntegrityError
 from service.core.geometry import Array, Transform, skew
 from service.core.units import mm, mrad
-from service.dataset.posed.of_run.pose_errors import arm_pose_errors, own_pose_errors
+from service.dataset.posed.of_run.pose_errors import own_pose_errors, stated_pose_errors
 from service.dataset.summary import RunSummary
 from service.jobs.poses import hybrid
 from service.jobs.registration.register import Registration
@@ -26,6 +26,10 @@ _ARM = (
     "mrad along each axis, as the spheres show"
 )
 _REFINED = _ARM + "; the outlines of the spheres refined each pose, and the covariance is what they leave open"
+_LOCATED = (
+    "all of it: what the outlines of the spheres in each image leave open of its pose, and what all images share: "
+    "errors of the spheres' centres in the scan, of the edges and of the lens"
+)
 _SHARED = "the share of the registration, which is common to all images; the record states none of single poses"
 _BOTH = (
     "the share of the registration, which is common to all images, and that of the pose in the bundle adjustment, "
@@ -53,9 +57,9 @@ def view_covariances(
 ) -> ViewCovariances:
     """What the record states of the poses of the run's own registration.
 
-    Hybrid poses have a covariance each, poses of an arm a joint one. The others have that of the registration, seen
-    from each camera, and with it that of the bundle adjustment, where there was one. So have poses of an arm in runs
-    of earlier versions, which did not state theirs.
+    Hybrid poses have a covariance each, poses of an arm and of the spheres a joint one. The others have that of the
+    registration, seen from each camera, and with it that of the bundle adjustment, where there was one. So have poses
+    of an arm and of the spheres in runs of earlier versions, which did not state theirs.
 
     Args:
         summary: the run.
@@ -69,9 +73,10 @@ def view_covariances(
     stated = _of_hybrid(summary) if own == hybrid.KIND.name else {}
     if set(names) <= set(stated):
         return ViewCovariances(stated, _WHOLE, None)
-    whole = arm_pose_errors(summary, registered, names)
+    whole = stated_pose_errors(summary, registered, names)
     if whole is not None:
-        return ViewCovariances(dict(zip(names, _blocks(whole), strict=True)), _of_arm(registered), whole)
+        words = _LOCATED if registered.pose_sigma_m is None else _of_arm(registered)
+        return ViewCovariances(dict(zip(names, _blocks(whole), strict=True)), words, whole)
     T_world_scan, covariance = np.array(registered.T_world_scan), np.array(registered.covariance)
     found = {
         name: pose_covariance(T_world_scan, covariance, np.array(registered.T_scan_camera[name])) for name in names
