@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import threading
 import time
@@ -10,7 +11,6 @@ from collections.abc import Callable, Sequence
 from itertools import takewhile
 
 import numpy as np
-import scipy.spatial.transform  # noqa: F401 - for drivers.stillness: read while the arm moves it would hold all threads
 
 from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import RobotSample, SettleCriteria, SettleReport
@@ -24,6 +24,8 @@ MINIMUM_COVERAGE = 0.8  # fraction of the settle window that samples must cover
 TARGET_AT_REST_RAD_S = 1e-9  # above this target velocity the controller drives the arm
 
 _LOG = logging.getLogger(__name__)
+# drivers.stillness needs it; read for the first time in a motion, it would hold all threads of this process.
+importlib.import_module("scipy.spatial.transform")
 
 
 class PoseStream:
