@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from pydantic import Field
 
@@ -143,6 +143,16 @@ class Mounting(JobRecord):
     arm_correction: ArmCorrection | None = None
     arm_stations: tuple[str, ...] | None = None
     further_arms: tuple[FurtherArm, ...] = ()
+
+
+def has_poses(mounting: Mounting, images: Sequence[PosedPhotograph]) -> bool:
+    """Whether the poses of images are known before their registration.
+
+    Those of images from an arm with an unknown mount, or from a turntable, are not.
+    """
+    if all(image.T_scene_camera is not None for image in images):
+        return True
+    return mounting.T_flange_camera is not None and all(image.T_base_flange is not None for image in images)
 
 
 class BoardSize(JobRecord):

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,49 +11,22 @@ import pytest
 from service.audit.record.run import RecordedRun, read_run
 from service.audit.replay.scratch import ScratchStore
 from service.compute.matching.pairs.relative_pose import relative_covariance
-from service.core.jobs.references import jobs_of, resolve
 from service.core.run.state import JobState
 from service.dataset.posed.of_run.data_set import data_set_of
 from service.dataset.posed.of_run.view_covariances import pose_covariance
 from service.dataset.summary import RunSummary
 from service.jobs.registration import register
-from service.worker.job import JobAnswer, JobContext, RecordedContext
-from service.worker.loop import HANDLERS
+from service.worker.job import JobAnswer
+from tests.support.recorded.recomputed import ARM, arm_jobs, computed, without_mount
 from tests.support.recorded.unpacked_run import unpack_recorded_run
 
 pytestmark = pytest.mark.timeout(300)
-ARM = ("robot", "robot_corrected")
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     """A run of an earlier version."""
     return read_run(unpack_recorded_run(tmp_path_factory.mktemp("recorded")), "latest")
-
-
-def arm_jobs(run: RecordedRun) -> dict[str, JobState]:
-    """The job of each registration of an arm's poses at full size."""
-    jobs = [job for job in jobs_of(run.state).values() if job.kind == register.KIND.name]
-    return {
-        job.arguments["poses"]: job
-        for job in jobs
-        if job.arguments["poses"] in ARM and job.arguments.get("reduced_to") is None
-    }
-
-
-def computed(run: RecordedRun, job: JobState, folder: Path, more: Mapping[str, Any]) -> JobAnswer:
-    """The job computed again with more arguments; its files are kept in the folder."""
-    arguments: Mapping[str, Any] = {**resolve(job.arguments, jobs_of(run.state)), **more}
-    context: RecordedContext = JobContext(
-        arguments, ScratchStore(run.files, folder), folder / "scratch", lambda *_: None
-    )
-    return HANDLERS[job.kind](context)
-
-
-def without_mount(job: JobState) -> JobState:
-    """The job as if the camera's mount were unknown, so that each image is located by its spheres."""
-    unknown = {"poses": "spheres", "T_flange_camera": None, "arm_correction": None}
-    return dataclasses.replace(job, arguments={**job.arguments, **unknown})
 
 
 def stated(run: RecordedRun, job: JobState, folder: Path) -> tuple[JobAnswer, RunSummary]:

@@ -20,12 +20,12 @@ from service.core.units import mm
 from service.jobs.poses import hybrid as hybrid_job
 from service.jobs.poses import structure_from_motion as sfm_job
 from service.jobs.poses.structure_from_motion import ModelFile
-from service.jobs.records import Hash, PosedPhotograph, matrices, matrix
+from service.jobs.records import Hash, PosedPhotograph, has_poses, matrices, matrix
 from service.worker.camera import camera_used
 from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.front_end import read_features, read_matches
 from service.worker.poses.photographs import photographs
-from service.worker.poses.robot_poses import has_poses, robot_camera_poses
+from service.worker.poses.robot_poses import robot_camera_poses
 from service.worker.registration.outlines import read_outlines
 
 

@@ -12,13 +12,6 @@ from service.jobs.records import ArmCorrection, Mounting, PosedPhotograph
 from service.worker.calibration.records import corrected_mounting
 
 
-def has_poses(mounting: Mounting, images: Sequence[PosedPhotograph]) -> bool:
-    """Whether `robot_camera_poses` knows the poses: not those of images from an arm with an unknown mount."""
-    if all(image.T_scene_camera is not None for image in images):
-        return True
-    return mounting.T_flange_camera is not None and all(image.T_base_flange is not None for image in images)
-
-
 def robot_camera_poses(mounting: Mounting, images: Sequence[PosedPhotograph]) -> Array:
     """(N, 4, 4) T_base_camera of a job's images, each in the base frame of its station.
 

@@ -20,12 +20,12 @@ from service.compute.markers.search.paper_files import detect_file_by_masks
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
 from service.jobs.poses.structure_from_motion import ModelFile
-from service.jobs.records import Hash, PosedPhotograph
+from service.jobs.records import Hash, PosedPhotograph, has_poses
 from service.jobs.registration import detect_spheres as job
 from service.worker.camera import camera_used
 from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.photographs import photographs
-from service.worker.poses.robot_poses import has_poses, robot_camera_poses
+from service.worker.poses.robot_poses import robot_camera_poses
 
 
 def detect_spheres(context: JobContext[job.Arguments]) -> JobAnswer:

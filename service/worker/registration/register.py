@@ -29,12 +29,12 @@ from service.core.records.events import ArtefactRef
 from service.core.units import mm
 from service.jobs.poses.hybrid import HybridModel
 from service.jobs.poses.structure_from_motion import ModelFile
-from service.jobs.records import ParameterCovariance, PosedPhotograph, matrices, matrix
+from service.jobs.records import ParameterCovariance, PosedPhotograph, has_poses, matrices, matrix
 from service.jobs.registration import register as job
 from service.worker.camera import camera_record, camera_reduced, camera_used
 from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.models import joint_pose_covariance
-from service.worker.poses.robot_poses import has_poses, robot_camera_poses
+from service.worker.poses.robot_poses import robot_camera_poses
 from service.worker.registration.outlines import read_outlines
 
 _LEAST_SPHERES = 4

@@ -30,6 +30,7 @@ _PAPER = {
 _SOURCES = {
     "robot": "the robot's poses as reported",
     "robot_corrected": "the robot's poses, its errors corrected",
+    "spheres": "each image located by its own spheres",
     "triangulated": "adjusted from the corrected robot poses",
     "colmap": "incremental structure from motion, COLMAP",
     "glomap": "global structure from motion, GLOMAP",

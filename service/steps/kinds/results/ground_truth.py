@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from service.core.errors import ConfigurationError
-from service.core.jobs.references import Each, Reference
+from service.core.jobs.references import Each, Reference, jobs_of
 from service.core.protocol.step_params import NAMES_CT, NAMES_REGISTRATION, NAMES_SCAN, RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.core.run.state import JobState
@@ -22,6 +22,7 @@ from service.jobs.surfaces import fuse, locate_spheres
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import EarlierAnswer, artefact_of, earlier_answer
 from service.steps.measures import Count, Deg, ErrorMm, Measure, MeasureRecord, Share
+from service.steps.poses.located_images import located_images
 from service.steps.poses.registration_jobs import recorded_registration_jobs
 from service.steps.poses.sources import decisive
 
@@ -204,6 +205,9 @@ def _registrations(context: StepContext, step: str, ct: EarlierAnswer[Any]) -> t
     references = {"spheres_m": "spheres_m", "sphere_covariance_m2": "details/spheres/*/covariance_m2"}
     recorded = dict(mine.arguments)
     recorded.pop("state_pose_errors", None)  # no image is placed by the CT
+    images = located_images(mine, jobs_of(context.run))
+    if images is not None:
+        recorded["images"] = images
     for field, path in references.items():
         reference = ct.reference(path)
         recorded[field] = of_ct[field] if reference is None else reference.record()
