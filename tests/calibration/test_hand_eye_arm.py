@@ -290,7 +290,7 @@ def test_an_empty_correction_changes_nothing(q: Array) -> None:
         ("image,q1,q2,q3,q4,q5,q6\na.jpg,90,0,0,0,0,0\n", "not a joint angle"),
         ("image,q1,q2,q3,q4,q5,q6\na.jpg,0,0,0,0,0\n", "not 6 finite"),
         ("image,q1,q2,q3,q4,q5,q6\na.jpg,0,0,0,0,0,x\n", "not a number"),
-        ("image,q1,q2,q3,q4,q5,q6\nb.jpg,0,0,0,0,0,0\n", "no joints: a.jpg"),
+        ("image,q1,q2,q3,q4,q5,q6\nb.jpg,0,0,0,0,0,0\n", "no joints for 1 image: a.jpg"),
         ("image,q1,q3\na.jpg,0,0\n", "first line"),
         ("image\na.jpg\n", "first line"),
     ],

@@ -35,7 +35,7 @@ def test_the_ct_comes_to_the_scan_through_located_cameras(tmp_path: Path) -> Non
         for key in ("ct_import/0/locate_spheres/", "scanning/0/locate_spheres/")
     )
     spheres = {
-        "images": images,
+        "images": [image.plain() for image in images],
         "spheres_m": in_ct.spheres_m,
         "sphere_covariance_m2": [sphere.covariance_m2 for sphere in in_ct.details.spheres],
     }

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from service.core.jobs.references import Jobs
 from service.core.run.state import JobState
 from service.jobs.kind import read_part
@@ -18,8 +16,8 @@ class _Posed(Mounting):
     poses: str
 
 
-def located_images(registered: JobState, jobs: Jobs) -> list[dict[str, Any]] | None:
-    """The images with the poses that the spheres of the first mesh gave them, in its frame, as arguments of a job.
+def located_images(registered: JobState, jobs: Jobs) -> tuple[PosedPhotograph, ...] | None:
+    """The images with the poses that the spheres of the first mesh gave them, in its frame.
 
     None if the poses were known before: by an arm, from the capture by hand, or by structure from motion. Otherwise
     each mesh would locate the images by its own spheres, in its own frame, and the two could not be compared.
@@ -32,9 +30,8 @@ def located_images(registered: JobState, jobs: Jobs) -> list[dict[str, Any]] | N
     if arguments.poses != "spheres" or has_poses(arguments, arguments.images):
         return None
     found = register.KIND.read_answer(registered.result).T_scan_camera
-    located = [
+    return tuple(
         image.model_copy(update={"T_scene_camera": found[image.viewpoint]})
         for image in arguments.images
         if image.viewpoint in found
-    ]
-    return [image.plain() for image in located]
+    )

@@ -207,7 +207,7 @@ def _registrations(context: StepContext, step: str, ct: EarlierAnswer[Any]) -> t
     recorded.pop("state_pose_errors", None)  # no image is placed by the CT
     images = located_images(mine, jobs_of(context.run))
     if images is not None:
-        recorded["images"] = images
+        recorded["images"] = [image.plain() for image in images]
     for field, path in references.items():
         reference = ct.reference(path)
         recorded[field] = of_ct[field] if reference is None else reference.record()
