@@ -11,10 +11,10 @@ from scipy.spatial import KDTree
 
 from service.audit.record.run import read_run
 from service.core.geometry import apply, inverse
-from service.core.jobs.references import jobs_of
+from service.core.jobs.references import Reference, jobs_of, references_in, resolve
 from service.jobs.registration import register
 from service.jobs.surfaces import locate_spheres
-from service.steps.poses.located_images import located_images
+from service.steps.poses.located_images import with_located_images
 from tests.support.recorded.recomputed import arm_jobs, computed, without_mount
 from tests.support.recorded.unpacked_run import unpack_recorded_run
 
@@ -26,8 +26,9 @@ def test_the_ct_comes_to_the_scan_through_located_cameras(tmp_path: Path) -> Non
     of_scan = without_mount(arm_jobs(run)["robot"])
     answer = computed(run, of_scan, tmp_path, {"state_pose_errors": True})
     of_scan = dataclasses.replace(of_scan, result=answer.result)
-    images = located_images(of_scan, jobs)
-    assert images is not None
+    jobs[of_scan.job] = of_scan
+    images = with_located_images(of_scan, jobs).arguments["images"]
+    assert {found.job for found in references_in(images) if isinstance(found, Reference)} == {of_scan.job}
     in_ct, in_scan = (
         locate_spheres.KIND.read_answer(
             next(job for job in jobs.values() if job.idempotency_key.startswith(key)).result
@@ -35,7 +36,7 @@ def test_the_ct_comes_to_the_scan_through_located_cameras(tmp_path: Path) -> Non
         for key in ("ct_import/0/locate_spheres/", "scanning/0/locate_spheres/")
     )
     spheres = {
-        "images": [image.plain() for image in images],
+        "images": resolve(images, jobs),
         "spheres_m": in_ct.spheres_m,
         "sphere_covariance_m2": [sphere.covariance_m2 for sphere in in_ct.details.spheres],
     }
@@ -52,4 +53,4 @@ def test_the_ct_comes_to_the_scan_through_located_cameras(tmp_path: Path) -> Non
 def test_images_with_known_poses_keep_them(tmp_path: Path) -> None:
     run = read_run(unpack_recorded_run(tmp_path / "recorded"), "latest")
     for job in arm_jobs(run).values():
-        assert located_images(job, jobs_of(run.state)) is None
+        assert with_located_images(job, jobs_of(run.state)).arguments == job.arguments

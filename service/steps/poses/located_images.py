@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from service.core.jobs.references import Jobs
+from service.core.jobs.references import Jobs, Reference
 from service.core.run.state import JobState
 from service.jobs.kind import read_part
 from service.jobs.records import Mounting, PosedPhotograph, has_poses
 from service.jobs.registration import register
+from service.steps.context import JobRequest
 
 
 class _Posed(Mounting):
@@ -16,22 +17,24 @@ class _Posed(Mounting):
     poses: str
 
 
-def located_images(registered: JobState, jobs: Jobs) -> tuple[PosedPhotograph, ...] | None:
-    """The images with the poses that the spheres of the first mesh gave them, in its frame.
+def with_located_images(registered: JobState, jobs: Jobs) -> JobRequest:
+    """The request of a registration, for another mesh, whose images stand where the spheres of the first placed them.
 
-    None if the poses were known before: by an arm, from the capture by hand, or by structure from motion. Otherwise
-    each mesh would locate the images by its own spheres, in its own frame, and the two could not be compared.
+    As it was where their poses were known before: by an arm, from a capture by hand, or by structure from motion.
+    Otherwise each mesh would locate the images by its own spheres, in its own frame, and the two could not be
+    compared.
 
     Args:
         registered: the finished job `register` of the first mesh.
         jobs: of the run, for references.
     """
-    arguments = read_part(_Posed, registered.arguments, jobs)
-    if arguments.poses != "spheres" or has_poses(arguments, arguments.images):
-        return None
-    found = register.KIND.read_answer(registered.result).T_scan_camera
-    return tuple(
-        image.model_copy(update={"T_scene_camera": found[image.viewpoint]})
-        for image in arguments.images
-        if image.viewpoint in found
-    )
+    recorded = dict(registered.arguments)
+    known = read_part(_Posed, recorded, jobs)
+    if known.poses == "spheres" and not has_poses(known, known.images):
+        found = register.KIND.read_answer(registered.result).T_scan_camera
+        recorded["images"] = [
+            image.plain() | {"T_scene_camera": Reference(registered.job, f"result/T_scan_camera/{name}").record()}
+            for image in known.images
+            if (name := image.viewpoint) in found
+        ]
+    return JobRequest(register.KIND.name, recorded, version=register.KIND.version)

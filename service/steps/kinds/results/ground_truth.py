@@ -22,7 +22,7 @@ from service.jobs.surfaces import fuse, locate_spheres
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import EarlierAnswer, artefact_of, earlier_answer
 from service.steps.measures import Count, Deg, ErrorMm, Measure, MeasureRecord, Share
-from service.steps.poses.located_images import located_images
+from service.steps.poses.located_images import with_located_images
 from service.steps.poses.registration_jobs import recorded_registration_jobs
 from service.steps.poses.sources import decisive
 
@@ -203,11 +203,8 @@ def _registrations(context: StepContext, step: str, ct: EarlierAnswer[Any]) -> t
         "sphere_covariance_m2": tuple(sphere.covariance_m2 for sphere in ct.answer.details.spheres),
     }
     references = {"spheres_m": "spheres_m", "sphere_covariance_m2": "details/spheres/*/covariance_m2"}
-    recorded = dict(mine.arguments)
+    recorded = dict(with_located_images(mine, jobs_of(context.run)).arguments)
     recorded.pop("state_pose_errors", None)  # no image is placed by the CT
-    images = located_images(mine, jobs_of(context.run))
-    if images is not None:
-        recorded["images"] = [image.plain() for image in images]
     for field, path in references.items():
         reference = ct.reference(path)
         recorded[field] = of_ct[field] if reference is None else reference.record()
