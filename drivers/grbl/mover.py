@@ -13,10 +13,10 @@ import numpy as np
 from drivers.arm.latch import Latch
 from drivers.errors import DeviceBusyError, DeviceError, DeviceUnavailableError, LeaveNeededError, SafetyStopError
 from drivers.grbl import LETTERS, GrblConfig
-from drivers.grbl.link import POLL_S, Link, Sent
+from drivers.grbl.link import POLL_S, STOOD_STILL_S, Link, Sent
 from drivers.grbl.motion import AHEAD_S, PIECE_S, Motion
 from drivers.grbl.setup import Setup
-from drivers.grbl.wire import JOG_CANCEL, Alarm, Message, Refused, Status, Welcome
+from drivers.grbl.wire import JOG_CANCEL, RESET, Alarm, Message, Refused, Status, Welcome
 from drivers.interfaces import Array, SafetyState
 
 HEARTBEAT_S = 0.2  # the axes are stopped if the program gives no sign of life for longer
@@ -24,6 +24,7 @@ HEARTBEAT_S = 0.2  # the axes are stopped if the program gives no sign of life f
 REACTION_S = max(AHEAD_S + 1.5 * PIECE_S, HEARTBEAT_S + POLL_S) + 0.05
 _UNANSWERED = 3  # lines that fit into the controller's 128 bytes
 _DRIVEN = ("Run", "Jog", "Home")
+_STOOD_STILL = "the driver's process stood still, and the axes were stopped"
 _DOOR = "A person must close the safety door, and then confirm"
 
 
@@ -234,10 +235,16 @@ class Mover:
                 self._sent.append(link.send(piece))
         except DeviceError:
             self.interrupted, self._motion = True, None  # the next call reports the dead line
+            # A line may have been written after all, but late, to axes that have come to rest.
+            with suppress(DeviceUnavailableError):
+                link.act(RESET)
+            return
+        if time.monotonic() - now_s > STOOD_STILL_S:  # suspended between the checks above and the last line
+            self._end(link, _STOOD_STILL)
 
     def _unsupervised(self, link: Link, now_s: float) -> str:
         if link.went_on_s > self._began_s:  # the axes came to rest meanwhile, and must not move on by themselves
-            return "the driver's process stood still, and the axes were stopped"
+            return _STOOD_STILL
         if now_s - self._beat_s > HEARTBEAT_S:
             return "the program gave no sign of life, and the axes were stopped"
         if now_s - self._attended_s > self._config.unattended_s:

@@ -122,6 +122,7 @@ def test_sound_and_notification_are_by_choice(server: Served, browser: Browser) 
         go = OperatorAction(action="confirm", step="capture")
         record(server, run_id, go, StepStarted(step="capture", attempt=1), failed)
         expect(page.get_by_role("heading", name="Capture did not work")).to_be_visible(timeout=20_000)
+        page.wait_for_function("heard.length > 0")  # the page is followed after it has changed
         assert page.evaluate("heard") == [880, 440, 880, 440]
         assert page.evaluate("noted") == [["Stopped: Capture: No link → check the device.", f"Run {run_id}"]]
         expect(page).to_have_title(re.compile("^Stopped: Capture: No link"))

@@ -1,0 +1,72 @@
+"""A driver that is suspended while it writes a piece of a motion takes it back: the axes may stand, and people be near."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import serial
+
+from drivers.errors import DeviceError
+from drivers.grbl import DRIVER, GrblConfig
+from drivers.grbl.link import STOOD_STILL_S
+from drivers.grbl.wire import JOG_CANCEL, RESET
+from drivers.interfaces import RobotArm
+from tests.support.arms.grbl_simulator import TURN, Tap, mount, table
+from tests.support.processes.waiting import until
+
+pytestmark = pytest.mark.slow  # it homes a machine
+SUSPENDED_S = STOOD_STILL_S + 0.1
+
+
+class Suspended(serial.Serial):
+    """A port whose process is suspended before its sixth piece of a motion reaches the line.
+
+    Class attribute `times_out`: pyserial then gives the write up, although the controller has the line.
+    """
+
+    times_out = False
+    pieces = 0
+
+    def write(self, b: Any, /) -> int | None:
+        if not b.startswith(b"$J"):
+            return super().write(b)
+        self.pieces += 1
+        if self.pieces == 6:
+            time.sleep(SUSPENDED_S)
+        written = super().write(b)
+        if self.pieces == 6 and self.times_out:
+            raise serial.SerialTimeoutException("Write timeout")
+        return written
+
+
+@pytest.mark.parametrize(("times_out", "taken_back"), [(False, JOG_CANCEL), (True, RESET)])
+def test_a_piece_that_was_written_late_is_taken_back(
+    times_out: bool, taken_back: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Suspended, "times_out", times_out)
+    monkeypatch.setattr(serial, "serial_for_url", Suspended)
+    rows = tuple(tuple(map(float, row)) for row in mount())
+    with table(tmp_path) as port, Tap(port, tmp_path) as tap:
+        config = GrblConfig.model_validate(
+            {"port": str(tap.port), "axes": (TURN,), "T_base_flange_zero": rows, "connect_timeout_s": 30.0}
+        )
+        arm = cast(RobotArm, DRIVER.build(config))
+        arm.open()
+        try:
+            arm.let_move("Ada", time.monotonic())
+            arm.move_joints(np.radians([-90.0]), speed_rad_s=0.9, acceleration_rad_s2=1.5)
+            with pytest.raises(DeviceError):  # nothing moves until a person has confirmed, or the line is dead
+                until(lambda: not arm.is_moving(), "it moves on", 20.0, every_s=0.02)
+        finally:
+            until(lambda: taken_back in after_the_last_piece(tap.sent), "not taken back", 20.0, every_s=0.02)
+            arm.close()
+    assert tap.sent.count(b"$J") == 6
+    assert after_the_last_piece(tap.sent).startswith(taken_back)
+
+
+def after_the_last_piece(sent: bytes) -> bytes:
+    return sent.rpartition(b"$J")[2].partition(b"\n")[2]
