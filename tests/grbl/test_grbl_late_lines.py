@@ -1,4 +1,4 @@
-"""A driver that is suspended while it writes a piece of a motion takes it back: the axes may stand, and people be near."""
+"""A driver that is suspended while it writes a piece of a motion takes it back: the axes may stand by then."""
 
 from __future__ import annotations
 
