@@ -100,10 +100,12 @@ class RunFollower:
 
     def _read(self) -> RunState:
         leave, looked_s = self._state.leave, time.monotonic()
-        for event in self.store.events(self.run_id, after_seq=len(self._events)):
-            # Fold first: an event that is refused must not be kept.
-            self._state = advance(self.protocol, self._state, event)
-            self._events.append(event)
+        known = len(self._events)
+        if self.store.head(self.run_id) != known:  # steps that wait look often, and seldom is anything new
+            for event in self.store.events(self.run_id, after_seq=known):
+                # Fold first: an event that is refused must not be kept.
+                self._state = advance(self.protocol, self._state, event)
+                self._events.append(event)
         if self._state.leave != leave:
             self.leave_not_before_s = self._looked_s
         self._looked_s = looked_s
