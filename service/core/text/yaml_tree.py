@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import yaml
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
@@ -66,8 +68,7 @@ def parse_yaml(text: str, *, name: str) -> YamlTree:
     200,000 values with all aliases expanded.
     """
     try:
-        _check_depth(text, name)
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        root = _composed(text, name)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 1
@@ -92,17 +93,42 @@ def parse_yaml(text: str, *, name: str) -> YamlTree:
     return YamlTree(data=data, lines=builder.lines, problems=tuple(builder.problems))
 
 
-def _check_depth(text: str, name: str) -> None:
-    """Refuse deep nesting before composing the tree, which is recursive and would end in a RecursionError."""
-    depth = 0
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > MOST_DEEP:
+def _composed(text: str, name: str) -> Node | None:
+    loader = _Loader(text, name)
+    try:
+        return loader.get_single_node()
+    finally:
+        loader.dispose()
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses deep nesting while it composes the tree, which is recursive and would end in a RecursionError."""
+
+    def __init__(self, text: str, name: str) -> None:
+        super().__init__(text)
+        self._file = name
+        self._depth = 0
+
+    def compose_sequence_node(self, anchor: Any) -> SequenceNode:
+        with self._one_deeper():
+            return super().compose_sequence_node(anchor)
+
+    def compose_mapping_node(self, anchor: Any) -> MappingNode:
+        with self._one_deeper():
+            return super().compose_mapping_node(anchor)
+
+    @contextmanager
+    def _one_deeper(self) -> Generator[None]:
+        self._depth += 1
+        if self._depth > MOST_DEEP:
+            start = self.peek_event().start_mark
             raise ProtocolError(
                 f"nested more than {MOST_DEEP} deep",
-                where=f"{name}:{event.start_mark.line + 1 if event.start_mark else 1}",
+                where=f"{self._file}:{start.line + 1 if start else 1}",
                 remedy="Look for brackets that are not closed",
             )
+        yield
+        self._depth -= 1
 
 
 class _Builder:
