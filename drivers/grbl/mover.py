@@ -233,14 +233,14 @@ class Mover:
         try:
             while link.unanswered < _UNANSWERED and (piece := motion.next_piece(position)) is not None:
                 self._sent.append(link.send(piece))
+                if time.monotonic() - now_s > STOOD_STILL_S:  # suspended between the checks above and this line
+                    self._end(link, _STOOD_STILL)
+                    return
         except DeviceError:
             self.interrupted, self._motion = True, None  # the next call reports the dead line
             # A line may have been written after all, but late, to axes that have come to rest.
             with suppress(DeviceUnavailableError):
                 link.act(RESET)
-            return
-        if time.monotonic() - now_s > STOOD_STILL_S:  # suspended between the checks above and the last line
-            self._end(link, _STOOD_STILL)
 
     def _unsupervised(self, link: Link, now_s: float) -> str:
         if link.went_on_s > self._began_s:  # the axes came to rest meanwhile, and must not move on by themselves

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from pathlib import Path
 from typing import Any, cast
@@ -13,8 +14,8 @@ import serial
 from drivers.errors import DeviceError
 from drivers.grbl import DRIVER, GrblConfig
 from drivers.grbl.link import STOOD_STILL_S
+from drivers.grbl.table import GrblTable
 from drivers.grbl.wire import JOG_CANCEL, RESET
-from drivers.interfaces import RobotArm
 from tests.support.arms.grbl_simulator import TURN, Tap, mount, table
 from tests.support.processes.waiting import until
 
@@ -54,8 +55,10 @@ def test_a_piece_that_was_written_late_is_taken_back(
         config = GrblConfig.model_validate(
             {"port": str(tap.port), "axes": (TURN,), "T_base_flange_zero": rows, "connect_timeout_s": 30.0}
         )
-        arm = cast(RobotArm, DRIVER.build(config))
+        arm = cast(GrblTable, DRIVER.build(config))
         arm.open()
+        over = threading.Event()
+        threading.Thread(target=lives, args=(arm, over), daemon=True).start()
         try:
             arm.let_move("Ada", time.monotonic())
             arm.move_joints(np.radians([-90.0]), speed_rad_s=0.9, acceleration_rad_s2=1.5)
@@ -63,9 +66,16 @@ def test_a_piece_that_was_written_late_is_taken_back(
                 until(lambda: not arm.is_moving(), "it moves on", 20.0, every_s=0.02)
         finally:
             until(lambda: taken_back in after_the_last_piece(tap.sent), "not taken back", 20.0, every_s=0.02)
+            over.set()
             arm.close()
     assert tap.sent.count(b"$J") == 6
     assert after_the_last_piece(tap.sent).startswith(taken_back)
+
+
+def lives(arm: GrblTable, over: threading.Event) -> None:
+    """Give the driver its program's signs of life."""
+    while not over.wait(0.02):
+        arm.heartbeat(time.monotonic())
 
 
 def after_the_last_piece(sent: bytes) -> bytes:
