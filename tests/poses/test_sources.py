@@ -57,7 +57,9 @@ NOW = "2026-11-22T10:00:00Z"
 
 
 def protocol(change: tuple[str, str] = ("", "")) -> Protocol:
-    source = DEMO.read_text().replace(*change) if change[0] else DEMO.read_text()
+    source = DEMO.read_text()
+    assert change[0] in source
+    source = source.replace(*change) if change[0] else source
     loaded: LoadedProtocol = parse_protocol(source.encode(), params_models(), name="demo.yaml")
     return loaded.protocol
 
@@ -184,7 +186,7 @@ def test_a_way_that_failed_is_said_to_have_failed_and_not_tried_again_by_itself(
 
 
 def test_a_size_that_is_no_reduction_of_the_photographs_is_left_out_and_holds_nothing_up() -> None:
-    effort = "structure_from_motion: {max_image_size: 1600, max_features: 1500, neighbours: 8}"
+    effort = "structure_from_motion: {max_image_size: 960, max_features: 1500, neighbours: 8}"
     run = _Run(protocol((effort, effort + "\n      reduced: [640x360, 4752x3168]")))
     run.finish("detect_spheres")
     found = recorded_registration_jobs(run.protocol, run.state, run.protocol.step("registration"))
