@@ -174,6 +174,11 @@ class Link:
             _LOG.warning("%s: answers to %d lines were lost", self._where, len(self._waiting))
             self._drop_waiting()
 
+    def require_alive(self) -> None:
+        """Raise DeviceUnavailableError if the connection has ended."""
+        if self.death:
+            raise self._lost()
+
     def close(self) -> None:
         """Close the port."""
         self._die("it was closed")

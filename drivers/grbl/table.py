@@ -253,12 +253,14 @@ class GrblTable:
     def is_moving(self) -> bool:
         """Return whether the last motion is still under way.
 
-        Raises the SafetyStopError or LeaveNeededError that interrupted it, or DeviceUnavailableError if the reports
-        are stale.
+        Raises the SafetyStopError or LeaveNeededError that interrupted it, or DeviceUnavailableError if the line
+        is dead or the reports are stale.
         """
         self._mover.attend()
-        if (stop := self._mover.latch.stop) is not None and self._mover.interrupted:
-            raise stop
+        if self._mover.interrupted:
+            if (stop := self._mover.latch.stop) is not None:
+                raise stop
+            self._linked().require_alive()
         moving = self._mover.moving
         # While the newest sample is older than the arrival, a caller would read where the axes were before it.
         return self._latest().monotonic_s < self._mover.arrived_s or moving
