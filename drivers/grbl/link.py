@@ -108,8 +108,7 @@ class Link:
         if resets > 1:  # a late welcome would drop the lines that are sent next
             with self._news:
                 self._news.wait_for(lambda: self._welcomes >= before + resets or bool(self.death), 1.0)
-        if self.death:
-            raise self._lost()
+        self.require_alive()
 
     def act(self, command: bytes) -> None:
         """Send a real-time command. Raises DeviceUnavailableError if the line is dead."""

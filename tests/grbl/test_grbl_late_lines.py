@@ -5,18 +5,17 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 import serial
 
 from drivers.errors import DeviceError
-from drivers.grbl import DRIVER, GrblConfig
 from drivers.grbl.link import STOOD_STILL_S
 from drivers.grbl.table import GrblTable
 from drivers.grbl.wire import JOG_CANCEL, RESET
-from tests.support.arms.grbl_simulator import TURN, Tap, mount, table
+from tests.support.arms.grbl_simulator import TURN, Tap, grbl_config, table
 from tests.support.processes.waiting import until
 
 pytestmark = pytest.mark.slow  # it homes a machine
@@ -50,12 +49,8 @@ def test_a_piece_that_was_written_late_is_taken_back(
 ) -> None:
     monkeypatch.setattr(Suspended, "times_out", times_out)
     monkeypatch.setattr(serial, "serial_for_url", Suspended)
-    rows = tuple(tuple(map(float, row)) for row in mount())
     with table(tmp_path) as port, Tap(port, tmp_path) as tap:
-        config = GrblConfig.model_validate(
-            {"port": str(tap.port), "axes": (TURN,), "T_base_flange_zero": rows, "connect_timeout_s": 30.0}
-        )
-        arm = cast(GrblTable, DRIVER.build(config))
+        arm = GrblTable(grbl_config(tap.port, TURN, connect_timeout_s=30.0))
         arm.open()
         over = threading.Event()
         threading.Thread(target=lives, args=(arm, over), daemon=True).start()

@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from drivers.grbl import GrblConfig
 from drivers.kuka import KukaConfig
-from tests.support.arms.grbl_simulator import TURN, mount, table
+from tests.support.arms.grbl_simulator import TURN, grbl_config, table
 from tests.support.arms.kuka_simulator import simulated_kuka
 from tests.support.arms.stubborn import WATCHED_S, Program
 from tests.support.arms.ur_simulator import address
@@ -21,7 +20,6 @@ from tests.support.rig.world_watch import WorldWatch, watched_world
 
 pytestmark = pytest.mark.slow
 AT_REST_WITHIN_S = 0.5
-LATE_S = 0.1  # a line of the driver that was suspended while it wrote it comes late, and is cancelled at once
 
 
 @contextlib.contextmanager
@@ -34,9 +32,8 @@ def kuka(folder: Path, world: str) -> Generator[BaseModel]:
 
 @contextlib.contextmanager
 def grbl(folder: Path, world: str) -> Generator[BaseModel]:
-    rows = tuple(tuple(map(float, row)) for row in mount())
     with table(folder, "--world", world) as port:
-        yield GrblConfig.model_validate({"port": str(port), "axes": (TURN,), "T_base_flange_zero": rows})
+        yield grbl_config(port, TURN)
 
 
 Rig = Callable[[Path, str], contextlib.AbstractContextManager[BaseModel]]
@@ -98,7 +95,7 @@ def test_stopped_and_continued(name: str, victim: str, tmp_path: Path) -> None:
         while program.next("error")["error"] != "LeaveNeededError":
             pass  # at first its stream is old
         comes_to_rest(watch, again_s)
-        assert watch.moved_for_s(again_s) <= LATE_S, "it moves on by itself"
+        assert watch.moved_for_s(again_s) == 0.0, "it moves on by itself"
         goes_on_for_a_person(program, watch)
 
 

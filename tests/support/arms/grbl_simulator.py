@@ -39,13 +39,16 @@ def fault(**fields: object) -> tuple[str, str]:
     return "--faults", json.dumps([{"device": "grbl", **fields}])
 
 
+def grbl_config(port: Path, *axes: GrblAxis, **fields: float) -> GrblConfig:
+    """The driver's section of a rig file for the simulated machine."""
+    rows = tuple(tuple(map(float, row)) for row in mount())
+    return GrblConfig.model_validate({"port": str(port), "axes": axes, "T_base_flange_zero": rows, **fields})
+
+
 @contextmanager
 def opened(port: Path, *axes: GrblAxis, **config: float) -> Generator[RobotArm]:
     """The driver in its own process, not yet allowed to move."""
-    rows = tuple(tuple(map(float, row)) for row in mount())
-    section = GrblConfig.model_validate(
-        {"port": str(port), "axes": axes or (TURN,), "T_base_flange_zero": rows, "connect_timeout_s": 30.0, **config}
-    )
+    section = grbl_config(port, *(axes or (TURN,)), **{"connect_timeout_s": 30.0, **config})
     arm = hosted(RobotArm, "drivers.grbl:DRIVER", section, call_timeout_s=60, name="table")
     try:
         arm.open()
