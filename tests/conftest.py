@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests.plugins.cpu_record import CpuRecord
+from tests.plugins.draw import Draw
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is imported, here and in child processes
 
 # Each commit of the store waits for the disk, which is half the time of its tests. What a disk loses is simulated
@@ -20,6 +23,22 @@ if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM_BYTES:
 # The same examples every time, so that a failure is due to the change. `--hypothesis-profile=default` tries new ones.
 settings.register_profile("repeatable", derandomize=True, database=None)
 settings.load_profile("repeatable")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options of this suite."""
+    parser.addoption("--cpu-record", type=Path, metavar="DIR", help="write the CPU seconds of tests and fixtures to DIR")
+    parser.addoption("--draw", metavar="SEED", help="run a tenth of the whole runs and sweeps, chosen by SEED")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the plug-ins of this suite."""
+    directory: Path | None = config.getoption("--cpu-record")
+    if directory is not None:
+        config.pluginmanager.register(CpuRecord(directory / f"{os.environ.get('PYTEST_XDIST_WORKER', 'main')}.jsonl"))
+    seed: str | None = config.getoption("--draw")
+    if seed is not None:
+        config.pluginmanager.register(Draw(seed))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,0 +1,57 @@
+"""Draws a tenth of the tests that take too long to run them all each time: whole runs, and rows of systematic sweeps.
+
+`pytest --draw SEED` keeps every test but those marked `whole` or `sweep`, of which it keeps a tenth, chosen by the seed
+(continuous integration gives the commit's hash), and prints which. Tests marked `whole(always=True)` are kept whatever
+the seed. Without `--draw` all of them run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+
+import pytest
+
+ONE_IN = 10
+
+
+def drawn(seed: str, units: Iterable[str]) -> set[str]:
+    """Return a tenth of `units`, at least one, in an order that the hash of seed and unit decides.
+
+    >>> len(drawn("a", [f"test_{i}" for i in range(40)]))
+    4
+    """
+    ranked = sorted(set(units), key=lambda unit: hashlib.sha256(f"{seed}\n{unit}".encode()).digest())
+    return set(ranked[: -(-len(ranked) // ONE_IN)])
+
+
+class Draw:
+    """The plug-in: deselects what was not drawn, and says what was."""
+
+    def __init__(self, seed: str) -> None:
+        self._seed = seed
+        self._kept: dict[str, tuple[int, list[str]]] = {}
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
+        """Deselect what was not drawn: whole runs by file, since its tests share the run; rows of sweeps one by one."""
+        left_out: set[pytest.Item] = set()
+        for mark in ("whole", "sweep"):
+            units: dict[str, list[pytest.Item]] = {}
+            for item in items:
+                found = item.get_closest_marker(mark)
+                if found is not None and not found.kwargs.get("always", False):
+                    unit = item.nodeid.partition("::")[0] if mark == "whole" else item.nodeid
+                    units.setdefault(unit, []).append(item)
+            kept = drawn(self._seed, units)
+            self._kept[mark] = (len(units), sorted(kept))
+            left_out.update(item for unit, members in units.items() if unit not in kept for item in members)
+        config.hook.pytest_deselected(items=[item for item in items if item in left_out])
+        items[:] = [item for item in items if item not in left_out]
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        """Say which were drawn."""
+        for mark, (count, kept) in self._kept.items():
+            terminalreporter.section(f"drawn by {self._seed}: {len(kept)} of {count} marked {mark}")
+            for unit in kept:
+                terminalreporter.line(unit)
