@@ -1,12 +1,12 @@
 """Marks as `slow` the tests that cost two CPU seconds or more, and keeps the list of what each test costs.
 
 `make marks` runs the tests with `--cpu-record` (tests/plugins/cpu_record.py) and then this script on what they
-recorded; `make marks FILES=tests/core` measures one folder and leaves the rest of the list alone. `make lint` calls it
-with `--check`: the list and the marks must agree, and every test must be on the list.
+recorded; `make marks FILES=tests/core` measures one folder and leaves the rest of the list alone. `make lint` calls
+it with `--check`: the list and the marks must agree, and every test must be on the list.
 
-The cost of a test is its own, plus its share of each wider fixture that it uses: the fixture's cost over the number of
-tests that use it. Of a parametrised test the dearest row counts. A measurement within a fifth of the limit changes no
-mark, so that marks do not come and go with the machine's mood.
+The cost of a test is its own, plus its share of each wider fixture that it uses: the fixture's cost over the number
+of tests that use it. Of a parametrised test the dearest row counts. A measurement within a fifth of the limit changes
+no mark, so that marks do not come and go with the machine's mood.
 """
 
 from __future__ import annotations
