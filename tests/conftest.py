@@ -32,6 +32,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--cpu-record", type=Path, metavar="DIR", help="write the CPU seconds of tests and fixtures to DIR"
     )
     parser.addoption("--draw", metavar="SEED", help="run a tenth of the whole runs and sweeps, chosen by SEED")
+    parser.addoption(
+        "--repeat", type=int, default=1, metavar="N", help="run every test N times (bench.suite.realtime)"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -44,7 +47,7 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(Draw(seed))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Put the files with slow tests first, so that none keeps one process busy while all others have ended.
 
     A test that meets the clock may run once more if it failed.
@@ -54,6 +57,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.flaky(reruns=1))
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
+    repeats: int = config.getoption("--repeat")
+    items[:] = items * repeats
 
 
 @pytest.hookimpl(wrapper=True)
