@@ -57,8 +57,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.flaky(reruns=1))
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
-    repeats: int = config.getoption("--repeat")
-    items[:] = items * repeats
+    items *= int(config.getoption("--repeat") or 1)
 
 
 @pytest.hookimpl(wrapper=True)
