@@ -42,7 +42,8 @@ class Ended:
 def ended(kind: type[subprocess.Popen[str]], *words: str, typed: str = "", **more: Any) -> Ended:
     """Run a process to its end, as a fork or by a real start."""
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with kind(words, text=True, **{"cwd": ROOT, **pipes, **more}) as process:
+    how: dict[str, Any] = {"cwd": ROOT, **pipes, **more}
+    with kind(words, text=True, **how) as process:
         out, errors = process.communicate(typed, timeout=60)
     assert isinstance(process, Forked) == (kind is Forked)
     assert not isinstance(process, Forked) or process.is_fork
