@@ -26,6 +26,7 @@ from drivers.dicom_folder.folder import DicomFolder
 from drivers.dicom_receiver import Receiver, ReceiverConfig
 from drivers.errors import DeviceRefusedError, DeviceUnavailableError
 from tests.support.ct.ct_series import SHAPE, hospital, pixels, write_series
+from tests.support.processes.forked import Forked, run
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY
 
@@ -36,9 +37,7 @@ UID = "1.2.826.0.1.3680043.8.498.1"
 @contextmanager
 def listening(folder: Path, *options: str) -> Generator[tuple[int, Iterator[str]]]:
     """The command in a process of its own: its port, and the sentences that it tells."""
-    process = subprocess.Popen(
-        [*LISTEN, "--folder", str(folder), *options], stdout=subprocess.PIPE, text=True, cwd=REPOSITORY
-    )
+    process = Forked([*LISTEN, "--folder", str(folder), *options], stdout=subprocess.PIPE, text=True, cwd=REPOSITORY)
     assert process.stdout is not None
     lines = (json.loads(line) for line in process.stdout)
     try:
@@ -301,13 +300,7 @@ def test_connections_that_say_nothing_or_nonsense_block_nobody(tmp_path: Path) -
 
 
 def test_it_listens_elsewhere_only_when_told_who_may_send(tmp_path: Path) -> None:
-    refused = subprocess.run(
-        [*LISTEN, "--folder", str(tmp_path), "--host", "0.0.0.0"],
-        capture_output=True,
-        text=True,
-        cwd=REPOSITORY,
-        check=False,
-    )
+    refused = run([*LISTEN, "--folder", str(tmp_path), "--host", "0.0.0.0"], cwd=REPOSITORY, timeout_s=100)
     assert refused.returncode == 1
     assert "any caller may send" in json.loads(refused.stdout)["error"]["what"]
 

@@ -15,6 +15,7 @@ from service.core.records.events import DeviceOpened, DeviceTrouble
 from service.monitor.snapshot import Snapshot, write_snapshot
 from service.store.records import NewJob
 from tests.support.pages.web import HOST, Browser, WebSite, web_site
+from tests.support.processes.forked import Forked
 from tests.support.record.store import enqueue
 from tests.support.runs.bench_run import Bench
 
@@ -66,7 +67,7 @@ def test_a_job_without_a_worker_is_not_healthy_until_one_lives(site: WebSite) ->
     assert (answer.status_code, answer.json()["worker"]["what"]) == (503, "a job waits, and no worker is running")
     # In an empty folder beside it: the worker has nothing to do and stays alive.
     words = [sys.executable, "-m", "service.cli.main", "worker", "--data", str(site.site.data), "--json"]
-    with subprocess.Popen(words, stdout=subprocess.DEVNULL) as worker:
+    with Forked(words, stdout=subprocess.DEVNULL) as worker:
         try:
             deadline = time.monotonic() + 60
             while scrape(site)["orthocapture_workers"][()] < 1:

@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from tests.support.processes.forked import Forked, run
+
 REPOSITORY = Path(__file__).parents[3]
 
 
@@ -44,9 +46,7 @@ def press_pedal(world: str) -> None:
 
 def orthocapture(*words: str, timeout_s: float = 120) -> subprocess.CompletedProcess[str]:
     """Run the command to its end."""
-    return subprocess.run(
-        command(*words), cwd=REPOSITORY, capture_output=True, text=True, timeout=timeout_s, check=False
-    )
+    return run(command(*words), cwd=REPOSITORY, timeout_s=timeout_s)
 
 
 def command(*words: str) -> list[str]:
@@ -58,8 +58,8 @@ def command(*words: str) -> list[str]:
 def simulated_rig(folder: Path, *options: str, host: str = _USUAL) -> Generator[dict[str, Any]]:
     """Start a rig around one scene; yields its ready line. On another loopback address it waits for no other rig."""
     with RigLock(host), (folder / "rig.log").open("w") as log:
-        process = subprocess.Popen(
-            command("simulate", "rig", "--dir", str(folder), "--host", host, *options),
+        process = Forked(
+            [sys.executable, "-m", "simulators", "rig", "--dir", str(folder), "--host", host, *options],
             cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
         )  # fmt: skip
         try:
