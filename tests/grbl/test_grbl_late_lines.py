@@ -58,9 +58,9 @@ def test_a_piece_that_was_written_late_is_taken_back(
             arm.let_move("Ada", time.monotonic())
             arm.move_joints(np.radians([-90.0]), speed_rad_s=0.9, acceleration_rad_s2=1.5)
             with pytest.raises(DeviceError):  # nothing moves until a person has confirmed, or the line is dead
-                until(lambda: not arm.is_moving(), "it moves on", 20.0, every_s=0.02)
+                until(lambda: not arm.is_moving(), "it moves on", every_s=0.02)
         finally:
-            until(lambda: taken_back in after_the_last_piece(tap.sent), "not taken back", 20.0, every_s=0.02)
+            until(lambda: taken_back in after_the_last_piece(tap.sent), "not taken back", every_s=0.02)
             over.set()
             arm.close()
     assert tap.sent.count(b"$J") == 6

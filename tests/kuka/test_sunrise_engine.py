@@ -133,7 +133,7 @@ def test_a_stop_of_the_safety_controller_latches_and_cancels_the_motion() -> Non
         assert (ended["code"], ended["what"]) == ("safety", "the arm is in enabling switch")
         assert client.ask(do="permit", by="Ada")["code"] == "safety"
         pendant(host, "release")
-        until(lambda: client.state()["safety"] == "normal", "the stop is not over", 10, every_s=0)
+        until(lambda: client.state()["safety"] == "normal", "the stop is not over", every_s=0)
         stood = client.state()
         assert stood["locked"]
         assert stood["motion"] == 0, "the motion does not go on by itself"
@@ -164,7 +164,7 @@ def test_the_end_of_the_connection_stops_and_locks_and_the_next_client_may_come_
                 assert second.line()["code"] == "taken"
         with connected(host) as client:
             assert client.state()["locked"]
-            until(lambda: client.state()["motion"] == 0, "the arm goes on", 10, every_s=0)
+            until(lambda: client.state()["motion"] == 0, "the arm goes on", every_s=0)
             assert client.state()["q"][0] < 1.0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import socket
@@ -30,6 +31,7 @@ from tests.support.arms.arm_watch import ArmWatch, watched_arm
 from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.processes.waiting import until
 from tests.support.rig.bench_rig import BenchCamera, ScriptedOperator, answer, numbered
+from tests.support.rig.patience import PATIENT_UR
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -38,7 +40,7 @@ RIG = """\
 name: one arm
 simulated: true
 devices:
-  robot: {{driver: ur, host: {host}, watchdog_s: 1.0, stale_after_s: 10}}  # on a machine that is shared
+  robot: {robot}
 stations:
   station_1: {{robot: robot, scene_centre_m: [0.75, 0.0, -0.1], approach_azimuth_deg: 180}}
 T_flange_camera_nominal: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]]
@@ -79,7 +81,8 @@ class OneArm(Station):
 
     def __init__(self, folder: Path, host: str) -> None:
         path = folder / "rig.yaml"
-        path.write_text(RIG.format(host=host))
+        robot = {"driver": "ur", "host": host, **PATIENT_UR}
+        path.write_text(RIG.format(robot=json.dumps(robot)))
         super().__init__(load_rig(path))
         self.shutter = BenchCamera(picture=slowly)
         self.shutter.open()
@@ -165,7 +168,7 @@ def stop_and_release(host: str) -> None:
     client = RtdeClient(host)
     client.pause()
     client.close()
-    until(lambda: unlock(host), "the stop is released", 20.0)
+    until(lambda: unlock(host), "the stop is released")
     time.sleep(0.3)
 
 

@@ -105,10 +105,8 @@ def test_heartbeat_finds_a_child_that_died_between_calls(caplog: pytest.LogCaptu
     device = HostedDevice(SPEC, FakeConfig(), call_timeout_s=30, name="mortal", heartbeat_s=0.1)
     device.open()
     device.call("crash_later", 0.1)
-    until(lambda: device.pid is None, "the death is noticed", 10)
-    until(
-        lambda: any("SIGSEGV" in r.message for r in caplog.records if r.levelno == logging.ERROR), "it is logged", 10
-    )
+    until(lambda: device.pid is None, "the death is noticed")
+    until(lambda: any("SIGSEGV" in r.message for r in caplog.records if r.levelno == logging.ERROR), "it is logged")
     device.close()
 
 
@@ -173,8 +171,8 @@ def test_output_of_the_child_goes_to_logging(
 ) -> None:
     caplog.set_level(logging.INFO)
     fake.talk()
-    until(lambda: "vendor chatter on stdout" in caplog.messages, "the vendor's line", 10)
-    until(lambda: "fake: the driver warns" in caplog.messages, "the driver's line", 10)
+    until(lambda: "vendor chatter on stdout" in caplog.messages, "the vendor's line")
+    until(lambda: "fake: the driver warns" in caplog.messages, "the driver's line")
     assert {r.levelname for r in caplog.records if r.message == "fake: the driver warns"} == {"WARNING"}
     out, err = capfd.readouterr()
     assert "chatter" not in out + err
@@ -230,5 +228,5 @@ def test_child_exits_when_its_parent_is_killed(tmp_path: Path, busy: bool) -> No
         pid = int(parent.stdout.readline())
         time.sleep(0.2)
         parent.kill()
-    until(lambda: not psutil.pid_exists(pid), "the child exits", 10)
+    until(lambda: not psutil.pid_exists(pid), "the child exits")
     assert trace.read_text() == "closed", "an orphaned driver must still let go of its device"

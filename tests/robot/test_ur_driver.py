@@ -112,8 +112,8 @@ def test_stop_in_mid_motion(robot: RobotArm) -> None:
     move(robot, turned(robot, 1.5))
     time.sleep(0.3)
     robot.stop()
-    wait_for(lambda: not robot.is_moving(), 2)
-    wait_for(lambda: robot.settle(SettleCriteria(window_s=0.2)).settled, 3)
+    wait_for(lambda: not robot.is_moving())
+    wait_for(lambda: robot.settle(SettleCriteria(window_s=0.2)).settled)
     done = robot.state().sample.joints_rad[0] - start
     assert 0.05 < done < 1.4
     time.sleep(0.2)

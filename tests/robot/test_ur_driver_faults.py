@@ -169,7 +169,7 @@ def test_reconnect_after_the_controller_restarted() -> None:
             arm = stack.enter_context(opened(host, connect_timeout_s=1.0))
             arm.state()
         with pytest.raises(DeviceUnavailableError):
-            wait_for(lambda: not arm.state(), 5)
+            wait_for(lambda: not arm.state())
         with pytest.raises(DeviceUnavailableError):
             arm.open()
         with simulated_ur(host, "--speed-up", SPEED_UP):

@@ -48,10 +48,10 @@ class ArmWatch:
         return self._seen[-1]
 
     def wait_moving(self, at_least_rad_s: float) -> None:
-        until(lambda: bool(self._seen) and self.now.speed_rad_s >= at_least_rad_s, "it moves", 20.0, every_s=0.002)
+        until(lambda: bool(self._seen) and self.now.speed_rad_s >= at_least_rad_s, "it moves", every_s=0.002)
 
     def wait_resting(self) -> None:
-        until(lambda: self.now.speed_rad_s == 0.0, "it rests", 20.0, every_s=0.01)
+        until(lambda: self.now.speed_rad_s == 0.0, "it rests", every_s=0.01)
 
     def moved_for_s(self, since: int) -> float:
         """Time from a mark until the arm was last driven, on the controller's clock; 0 if it never was."""
