@@ -20,7 +20,8 @@ from tests.support.runs.ended_run import ended_run
 SCENE, ARM = 7, "LBR Med 14"
 POSES = ("robot", "robot_corrected", "triangulated", "hybrid")
 OPTIONS = (
-    "--image-width", "960", "--ct-voxel-mm", "1.0", "--speed-up", "10", "--arm", ARM, "--arms", "2", "--patience", "20",
+    "--image-width", "960", "--ct-voxel-mm", "1.0", "--speed-up", "10", "--arm", ARM, "--arms", "2",
+    "--patience", "20",
 )  # fmt: skip
 
 

@@ -230,7 +230,8 @@ class Mover:
         try:
             while link.unanswered < _UNANSWERED and (piece := motion.next_piece(position)) is not None:
                 self._sent.append(link.send(piece))
-                if time.monotonic() - now_s > self._config.stood_still_s:  # suspended between the checks above and this line
+                # Suspended between the checks above and this line?
+                if time.monotonic() - now_s > self._config.stood_still_s:
                     self._end(link, _STOOD_STILL)
                     return
         except DeviceError:

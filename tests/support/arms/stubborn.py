@@ -15,7 +15,6 @@ from typing import Any
 
 from pydantic import BaseModel
 
-WATCHED_S = 4.0  # an arm that moved by itself did so after 2.3 s
 
 
 class Program:

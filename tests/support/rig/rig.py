@@ -62,7 +62,7 @@ def simulated_rig(
 ) -> Generator[dict[str, Any]]:
     """Start a rig around one scene; yields its ready line. On another loopback address it waits for no other rig.
 
-    Its limits are patient, since a busy machine is no dead link. `patience_s=0` is for tests of the limits themselves.
+    Its limits are patient, since a busy machine is no dead link; `patience_s=0` is for tests of the limits.
     """
     words = ("--dir", str(folder), "--host", host, "--patience", str(patience_s))
     with RigLock(host), (folder / "rig.log").open("w") as log:
