@@ -61,6 +61,12 @@ def wait_for(condition: Callable[[], bool]) -> None:
     until(condition, "waited in vain", every_s=0.02)
 
 
+def pass_s(arm: RobotArm, seconds: float) -> None:
+    """Let so much time of the controller pass."""
+    end_s = arm.state().sample.controller_time_s + seconds
+    wait_for(lambda: arm.state().sample.controller_time_s >= end_s)
+
+
 def move(arm: RobotArm, joints: Array) -> None:
     arm.move_joints(joints, speed_rad_s=SPEED, acceleration_rad_s2=ACCELERATION)
 
