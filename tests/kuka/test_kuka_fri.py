@@ -150,7 +150,7 @@ def test_a_session_that_could_command_gets_no_reply() -> None:
 
 @contextlib.contextmanager
 def opened(host: str, port: int = 30200) -> Generator[RobotArm]:
-    config = KukaConfig(host=host, fri_port=port, fri_host=host, **PATIENT_KUKA)
+    config = KukaConfig.model_validate({"host": host, "fri_port": port, "fri_host": host, **PATIENT_KUKA})
     arm = hosted(RobotArm, "drivers.kuka:DRIVER", config, call_timeout_s=60, name="robot")
     try:
         arm.open()
@@ -182,13 +182,19 @@ def test_its_samples_are_the_pose_stream(version: str) -> None:
         arm.move_joints(goal, speed_rad_s=1.0, acceleration_rad_s2=1.4)
         until(lambda: not arm.is_moving(), "it does not arrive", every_s=0.02)
         until(lambda: arm.settle(SettleCriteria()).settled, "it does not settle", every_s=0.02)
-        until(lambda: listened(last_second(arm)), "FRI has gaps")
-        sample = last_second(arm)[-1]
+        samples: list[RobotSample] = []
+
+        def listens() -> bool:
+            samples[:] = last_second(arm)
+            return listened(tuple(samples))
+
+        until(listens, "FRI has gaps")
+        sample = samples[-1]
         np.testing.assert_allclose(sample.joints_rad, goal, atol=1e-4)
         np.testing.assert_allclose(
             sample.T_base_flange, forward(arm_model("LBR Med 14"), sample.joints_rad), atol=1e-12
         )
-        assert sample.controller_time_s == pytest.approx(time.time(), abs=5.0)
+        assert sample.controller_time_s == pytest.approx(time.time(), abs=60.0)
         report = arm.report()
         assert report.problems == ()
         assert "MONITORING_READY" in report.details["FRI"], "it has commanded nothing"
@@ -206,11 +212,11 @@ def test_lost_messages_are_told_and_an_interruption_falls_back_to_the_applicatio
         until(lambda: "2 refused" in arm.report().details["FRI messages"], "nothing was corrupted")
         assert "5 lost" in arm.report().details["FRI messages"]
         until(lambda: any("brings no messages" in p for p in arm.report().problems), "FRI is not missed")
-        samples = last_second(arm)
-        assert samples
-        assert not listened(samples)
+        until(
+            lambda: bool(last_second(arm)) and not listened(last_second(arm)), "the application's samples do not come"
+        )
         arm.let_move("Ada", time.monotonic())
-        assert arm.settle(SettleCriteria()).samples > 10
+        until(lambda: arm.settle(SettleCriteria()).samples > 10, "no samples of the application")
 
 
 @pytest.mark.slow
@@ -263,4 +269,4 @@ def test_its_process_ends_with_the_driver() -> None:
         (driver,) = [child for child in children if "drivers.host" in " ".join(child.cmdline())]
         (listener,) = [child for child in children if "drivers.kuka.fri" in " ".join(child.cmdline())]
         driver.kill()
-        assert not psutil.wait_procs([listener], timeout=20)[1]
+        assert not psutil.wait_procs([listener], timeout=90)[1]

@@ -107,7 +107,9 @@ class _Golden(threading.Thread):
 def test_the_driver_speaks_as_the_transcript() -> None:
     golden = _Golden("127.0.0.1", transcript("session.jsonl"))
     golden.start()
-    robot = cast(RobotArm, DRIVER.build(KukaConfig(host="127.0.0.1", port=golden.port, **PATIENT_KUKA)))
+    robot = cast(
+        RobotArm, DRIVER.build(KukaConfig.model_validate({"host": "127.0.0.1", "port": golden.port, **PATIENT_KUKA}))
+    )
     robot.open()
     robot.let_move("Ada", time.monotonic())
     robot.configure(Payload(1.6, (0.0, 0.0, 0.08)), transform(np.eye(3), np.array([0.0, 0.0, 0.1])))
@@ -115,7 +117,7 @@ def test_the_driver_speaks_as_the_transcript() -> None:
     robot.move_joints(goal, speed_rad_s=0.5, acceleration_rad_s2=1.0)
     until(lambda: not robot.is_moving(), "the motion did not end", every_s=0.02)
     robot.stop()
-    assert golden.complete.wait(10)
+    assert golden.complete.wait(90)
     assert golden.wrong == []
     robot.close()
 

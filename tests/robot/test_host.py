@@ -165,7 +165,7 @@ def test_a_child_that_does_not_read_holds_its_parent_up_for_no_beat(monkeypatch:
     device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=20.0, name="stopped")
     pid = int(device.open().serial)
     os.kill(pid, signal.SIGSTOP)
-    line = vars(device)["hosted_device"]._line
+    line = vars(device)["hosted_device"]._child.line
     until(lambda: is_full(line._connection), "the beats do not fill the socket")
     assert line._lock.acquire(timeout=60), "a beat waits, and a call could not be sent"
     line._lock.release()

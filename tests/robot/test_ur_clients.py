@@ -144,7 +144,8 @@ def test_handshake_and_stream(controller: tuple[str, str], client: RtdeClient) -
     packages = [client.data() for _ in range(50)]
     times = np.array([p["timestamp"][0] for p in packages])
     assert np.all(np.diff(times) > 0)
-    assert np.min(np.diff(times)) == pytest.approx(0.008, abs=0.003)
+    assert np.mean(np.diff(times)) > 0.007, "never more than 125 Hz"
+    assert np.quantile(np.diff(times), 0.25) < 0.011, "nor less, but where the simulator was not scheduled"
     assert packages[-1]["robot_mode"] == (7,)
     assert packages[-1]["safety_status_bits"][0] == 1
     assert len(packages[-1]["actual_q"]) == 6

@@ -106,7 +106,8 @@ def test_move_to_a_pose_settle_and_read_the_exposure(robot: RobotArm) -> None:
     samples = robot.samples(begin, time.monotonic())
     steps_s = np.diff([s.controller_time_s for s in samples])
     assert np.all(steps_s > 0)
-    assert np.min(steps_s) == pytest.approx(1 / 125, abs=0.003)
+    assert np.mean(steps_s) > 0.007, "never more than 125 Hz"
+    assert np.quantile(steps_s, 0.25) < 0.011, "nor less, but where the simulator was not scheduled"
     assert all(begin <= s.monotonic_s for s in samples)
     assert {s.safety for s in samples} == {SafetyState.NORMAL}
 

@@ -169,7 +169,7 @@ def test_reconnect_after_the_controller_restarted() -> None:
     host = address(54)
     with contextlib.ExitStack() as stack:
         with simulated_ur(host, "--speed-up", SPEED_UP):
-            arm = stack.enter_context(opened(host))
+            arm = stack.enter_context(opened(host, stale_after_s=STALE_S))
             arm.state()
         with pytest.raises(DeviceUnavailableError):
             wait_for(lambda: not arm.state())

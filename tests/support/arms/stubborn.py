@@ -16,7 +16,6 @@ from typing import Any
 from pydantic import BaseModel
 
 
-
 class Program:
     """tests.support.processes.stubborn_program as a process.
 

@@ -13,26 +13,28 @@ from rtde_receive import RTDEReceiveInterface
 
 from tests.support.processes.waiting import until
 
+Receive = Any  # the client library has no types
+
 
 def apart(joints_rad: list[float], others_rad: list[float]) -> float:
     return max(abs(a - b) for a, b in zip(joints_rad, others_rad, strict=True))
 
 
-def current(receive: RTDEReceiveInterface) -> float:
+def current(receive: Receive) -> float:
     """Wait for packages that were sent after this call; the controller's time, s."""
     start_s = receive.getTimestamp()
     until(lambda: receive.getTimestamp() > start_s + 0.05, "no new package", every_s=0.01)
     return receive.getTimestamp()
 
 
-def at_rest(receive: RTDEReceiveInterface) -> list[float]:
+def at_rest(receive: Receive) -> list[float]:
     """Joints once the arm no longer swings."""
     current(receive)
     until(lambda: not any(receive.getActualQd()), "it does not come to rest")
     return receive.getActualQ()
 
 
-def unlocked(dashboard: DashboardClient) -> bool:
+def unlocked(dashboard: Any) -> bool:
     """Whether the protective stop could be released, for which some time must have passed."""
     try:
         dashboard.unlockProtectiveStop()
