@@ -111,7 +111,7 @@ class GrblConfig(DriverConfig):
     def _time_to_brake(self) -> Self:
         if self.rest_within_s < self.reaction_s + SHORTEST_BRAKING_S - 1e-9:
             least_s = self.reaction_s + SHORTEST_BRAKING_S
-            raise ValueError(f"with this watchdog_s the axes rest after {least_s:g} s at the earliest (rest_within_s)")
+            raise ValueError(f"with this watchdog_s the axes rest after {least_s:g} s at the earliest: rest_within_s")
         return self
 
     @property
