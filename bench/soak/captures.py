@@ -20,7 +20,7 @@ import httpx
 import psutil
 import yaml
 
-from bench.soak.creep import CHILD, Sample, judge
+from bench.soak.creep import CHILD, FEWEST, Sample, after_warm_up, judge
 from bench.soak.person import Typist
 from service.core.records.events import Payload, ViewpointCaptured
 from service.core.run.state import RunState
@@ -123,7 +123,7 @@ class _Soak:
     stops: int = 0  # of the arm by its watchdog, after each of which the person let it go on
 
     def go(self, seconds: float, every_s: float) -> None:
-        """Run, read pages and sample until the time is up; then end the run and its processes."""
+        """Run, read pages and sample until the time is up and there are enough samples; then end all processes."""
         words = ("run", str(self.protocol), "--rig", str(self.rig), "--data", str(self.data))
         with self.log.open("wb") as log:
             runner = subprocess.Popen(
@@ -155,7 +155,7 @@ class _Soak:
         with Store.open(self.data) as store:
             run: RunFollower | None = None
             count = seen = 0
-            while not ends_s or time.monotonic() < ends_s:
+            while not ends_s or time.monotonic() < ends_s or len(after_warm_up(self.samples)) < FEWEST:
                 if runner.poll() is not None:
                     self.faults.append(f"the run ended by itself: {self.log.read_text()[-500:]}")
                     return

@@ -35,12 +35,11 @@ def test_each_part_runs_small_and_its_figures_stand_beside_the_others(tmp_path: 
     (written,) = tmp_path.glob("soak-*.json")
     found: dict[str, Any] = json.loads(written.read_text())
     assert set(found) == {"captures", "large", "together", "speed"}
-    assert [fault for fault in found["captures"]["faults"] if "say nothing" not in fault] == []
+    assert found["captures"]["faults"] == []
     assert found["captures"]["captured"] >= 2
     figures = {"runner: threads", "driver of the robot: resident memory, MB", "database, MB"}
     figures |= {"web: descriptors, but for the database", "web: descriptors of the database"}
-    busy_machine = found["captures"]["samples"] < 16
-    assert busy_machine or figures <= {row["what"] for row in found["captures"]["rows"]}
+    assert figures <= {row["what"] for row in found["captures"]["rows"]}
     of_speed = (" waited ", "this says nothing")  # durations are not judged here
     assert [fault for fault in found["together"]["faults"] if not any(words in fault for words in of_speed)] == []
     assert {row["who"]: row["processes"] for row in found["together"]["rows"]} == {
@@ -98,9 +97,9 @@ def test_memory_of_its_own_does_not_depend_on_other_programs(tmp_path: Path) -> 
     """Both map the same file, as programs map the same libraries."""
     (tmp_path / "library").write_bytes(bytes(20_000_000))
     words = (
-        "import mmap, sys, time; file = open(sys.argv[1], 'rb'); "
+        "import mmap, signal, sys; file = open(sys.argv[1], 'rb'); "
         "pages = mmap.mmap(file.fileno(), 0, flags=mmap.MAP_PRIVATE, prot=mmap.PROT_READ); "
-        "sum(pages[::4096]); print('mapped', flush=True); time.sleep(600)"
+        "sum(pages[::4096]); print('mapped', flush=True); signal.pause()"
     )
     with ExitStack() as ending:
 

@@ -17,8 +17,6 @@ from pydantic import BaseModel
 
 from tests.support.processes.forked import Forked
 
-WATCHED_S = 4.0  # an arm that moved by itself did so after 2.3 s
-
 
 class Program:
     """tests.support.processes.stubborn_program as a process.

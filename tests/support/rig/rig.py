@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.processes.forked import Forked, run
+from tests.support.rig.patience import PATIENCE_S
 
 REPOSITORY = Path(__file__).parents[3]
 
@@ -55,11 +56,17 @@ def command(*words: str) -> list[str]:
 
 
 @contextmanager
-def simulated_rig(folder: Path, *options: str, host: str = _USUAL) -> Generator[dict[str, Any]]:
-    """Start a rig around one scene; yields its ready line. On another loopback address it waits for no other rig."""
+def simulated_rig(
+    folder: Path, *options: str, host: str = _USUAL, patience_s: float = PATIENCE_S
+) -> Generator[dict[str, Any]]:
+    """Start a rig around one scene; yields its ready line. On another loopback address it waits for no other rig.
+
+    Its limits are patient, since a busy machine is no dead link; `patience_s=0` is for tests of the limits.
+    """
+    words = ("--dir", str(folder), "--host", host, "--patience", str(patience_s))
     with RigLock(host), (folder / "rig.log").open("w") as log:
         process = Forked(
-            [sys.executable, "-m", "simulators", "rig", "--dir", str(folder), "--host", host, *options],
+            [sys.executable, "-m", "simulators", "rig", *words, *options],
             cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
         )  # fmt: skip
         try:
