@@ -1,4 +1,4 @@
-"""`orthocapture dicom-listen`, to which other programs send: dcmtk's storescu and pynetdicom's, and broken ones."""
+"""`orthocapture dicom-listen`, to which other programs send: pynetdicom's storescu and dcmtk's, and broken ones."""
 
 from __future__ import annotations
 
@@ -103,13 +103,16 @@ def slices(folder: Path) -> list[Dataset]:
 # --- whole series -----------------------------------------------------------------------------------------------
 
 
-def test_dcmtk_sends_a_series_and_the_importer_reads_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sender", ["pynetdicom", pytest.param("dcmtk", marks=pytest.mark.packages("dcmtk"))])
+def test_another_program_sends_a_series_and_the_importer_reads_it(tmp_path: Path, sender: str) -> None:
     T = write_series(tmp_path / "suite", uid=UID, change=hospital)
+    program = [sys.executable, "-m", "pynetdicom"] if sender == "pynetdicom" else []
+    subfolders = "-r" if sender == "pynetdicom" else "+sd"
     with listening(tmp_path / "ct") as (port, told):
         address = ["127.0.0.1", str(port), "-aet", "CTSUITE", "-aec", "ORTHOCAPTURE"]
-        subprocess.run(["echoscu", *address], check=True, timeout=60)
+        subprocess.run([*program, "echoscu", *address], check=True, timeout=60)
         assert "CTSUITE at 127.0.0.1" in next(told)
-        subprocess.run(["storescu", *address, "+sd", str(tmp_path / "suite")], check=True, timeout=60)
+        subprocess.run([*program, "storescu", *address, subfolders, str(tmp_path / "suite")], check=True, timeout=60)
         assert f"series {UID}: 5 files are in {tmp_path / 'ct' / UID}" in next(told)
     ct = DicomFolder(DicomFolderConfig(folder=tmp_path / "ct", stable_s=0))
     (series,) = ct.series()

@@ -30,6 +30,8 @@ from simulators.still_camera.exif import ExposureSettings
 from simulators.still_camera.scene import Moment, StillLife
 from tests.support.rig.gentl_producer import ADDRESS_VARIABLE, compiled_producer, industrial_camera
 
+pytestmark = pytest.mark.packages("aravis-tools", "gcc", "libc6-dev")
+
 HOST, FAULTY = "127.0.0.62", "127.0.0.63"
 SET = CameraSettings(22.0, 1 / 15, 100)
 

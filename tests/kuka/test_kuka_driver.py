@@ -29,11 +29,11 @@ from service.core.geometry import inverse, rotation_angle_rad, transform
 from service.core.seven_axes import forward, nearest_posture, postures
 from simulators.kuka_controller.kinematics import MODELS, frames
 from tests.support.arms.kuka_simulator import Controller, pendant, simulated_kuka
-from tests.support.arms.sunrise import sunrise_engine
+from tests.support.arms.sunrise import needs_jdk, sunrise_engine
 from tests.support.arms.ur_simulator import address
 from tests.support.processes.waiting import until
 
-both = pytest.mark.parametrize("controller", [simulated_kuka, sunrise_engine])
+both = pytest.mark.parametrize("controller", [simulated_kuka, pytest.param(sunrise_engine, marks=needs_jdk)])
 PAYLOAD = Payload(1.6, (0.0, 0.0, 0.08))
 TCP = transform(Rotation.from_euler("z", 0.3), np.array([0.01, 0.0, 0.1]))
 

@@ -16,13 +16,13 @@ from drivers.kuka import DRIVER, KukaConfig
 from drivers.kuka.wire import WireError, from_abc, hello_of, parse, state_of, to_abc
 from service.core.geometry import transform
 from tests.support.arms.kuka_simulator import Controller, agrees, simulated_kuka, transcript
-from tests.support.arms.sunrise import sunrise_engine
+from tests.support.arms.sunrise import needs_jdk, sunrise_engine
 from tests.support.arms.ur_simulator import address
 from tests.support.processes.waiting import until
 
 
 @pytest.mark.parametrize("name", ["session.jsonl", "refusals.jsonl"])
-@pytest.mark.parametrize("controller", [simulated_kuka, sunrise_engine])
+@pytest.mark.parametrize("controller", [simulated_kuka, pytest.param(sunrise_engine, marks=needs_jdk)])
 def test_simulator_and_application_answer_as_the_transcript(controller: Controller, name: str) -> None:
     host = address(70)
     with (
@@ -42,7 +42,7 @@ def test_simulator_and_application_answer_as_the_transcript(controller: Controll
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("controller", [simulated_kuka, sunrise_engine])
+@pytest.mark.parametrize("controller", [simulated_kuka, pytest.param(sunrise_engine, marks=needs_jdk)])
 def test_a_client_that_stays_silent_gives_way_to_a_new_one(controller: Controller) -> None:
     host = address(70)
     said: list[str] = []

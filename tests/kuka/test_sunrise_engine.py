@@ -17,9 +17,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.arms.kuka_simulator import pendant
-from tests.support.arms.sunrise import APPLICATION, TEST_SIDE, compile_java, java_program, sunrise_engine
+from tests.support.arms.sunrise import (
+    APPLICATION,
+    TEST_SIDE,
+    compile_java,
+    java_program,
+    needs_jdk,
+    sunrise_engine,
+)
 from tests.support.arms.ur_simulator import address
 from tests.support.processes.waiting import until
+
+pytestmark = needs_jdk
 
 HOME = [0.0, 0.5236, 0.0, -1.2217, 0.0, 1.3963, 0.0]
 FAR = [2.5, *HOME[1:]]

@@ -12,6 +12,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+needs_jdk = pytest.mark.packages("default-jdk-headless")
+
 ROOT = Path(__file__).parents[3]
 APPLICATION = ROOT / "drivers" / "kuka" / "sunrise"
 TEST_SIDE = ROOT / "tests" / "sunrise"
