@@ -27,7 +27,9 @@ settings.load_profile("repeatable")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options of this suite."""
-    parser.addoption("--cpu-record", type=Path, metavar="DIR", help="write the CPU seconds of tests and fixtures to DIR")
+    parser.addoption(
+        "--cpu-record", type=Path, metavar="DIR", help="write the CPU seconds of tests and fixtures to DIR"
+    )
     parser.addoption("--draw", metavar="SEED", help="run a tenth of the whole runs and sweeps, chosen by SEED")
 
 
