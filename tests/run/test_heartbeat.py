@@ -198,7 +198,7 @@ def test_a_runner_that_is_started_is_told_of_at_once(tmp_path: Path) -> None:
         launcher.start(run_id)
         try:
             assert launcher.driven(run_id)
-            assert read_snapshot(web.site.data, run_id, web.store.clock.utc_now().timestamp()).doing != "unknown"
+            assert read_snapshot(web.site.data, run_id, web.now_utc_s).doing != "unknown"
         finally:
             children = vars(launcher)["_children"]
             children[run_id].terminate()

@@ -108,6 +108,11 @@ class WebSite:
         return self.site.store
 
     @property
+    def now_utc_s(self) -> float:
+        """The site's time, in seconds since the epoch."""
+        return self.store.clock.utc_now().timestamp()
+
+    @property
     def people(self) -> People:
         return self.site.people
 
