@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 import threading
 import time
+from types import TracebackType
 
 _NAP_S = 0.005
 
