@@ -14,7 +14,7 @@ import time
 from typing import Any
 
 from drivers.errors import DeviceError, DeviceUnavailableError
-from drivers.host.__main__ import load_spec
+from drivers.host.serving import load_spec
 from drivers.host.hosted_device import HostedDevice, hosted
 from drivers.interfaces import RobotArm
 
