@@ -25,6 +25,7 @@ from service.rig import load_rig
 from service.station import Station
 from service.store.store import Store
 from tests.support.processes.waiting import until
+from tests.support.rig.patience import PATIENT_UR
 from tests.support.rig.rig import REPOSITORY, RigLock, orthocapture, simulated_rig, without_calibration_and_ct
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
@@ -102,6 +103,7 @@ def test_files_world_and_hands(tmp_path: Path) -> None:
         assert rig.section.simulated
         assert rig.section.hands == ready["world"]
         assert set(rig.section.stations) == {"station_1", "station_2"}
+        assert PATIENT_UR.items() <= rig.section.devices["robot"].items()
 
         # The ground truth is only in its own file.
         truth = json.loads(Path(ready["truth"]).read_text())
