@@ -216,7 +216,7 @@ def test_a_confirmation_from_before_the_stop_lets_nothing_move(tmp_path: Path, s
         run.station.device("robot")  # it streams while the question is open
         run.operator.on_prepare = lambda: stop_and_release(
             host, arm
-        )  # the confirmation is recorded, no step has begun
+        )  # it is recorded, no step begun
         run.answers(looks_for(0.5, arm, "was in protective stop"))
         assert run.drive().status == "completed"
     assert run.failures() == ["SafetyStopError"]

@@ -22,9 +22,7 @@ class Lateness:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_exc: object) -> None:
         self._over.set()
         self._thread.join()
 
