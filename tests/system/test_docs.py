@@ -169,6 +169,10 @@ RUN_ELSEWHERE = {
     "python -m bench.torture.crash --sample 100 --random-runs 1": (
         "tests/torture/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
     ),
+    **dict.fromkeys(
+        ("python -m bench.suite.mutants --reach", "python -m bench.suite.mutants --seed 20261127 --count 60"),
+        "tests/torture/test_mutants.py::test_a_mutation_is_killed_by_a_test_that_fails_and_the_tree_is_as_before",
+    ),
     "python -m bench.soak --only large --viewpoints 2000 --gigabytes 5": (
         "tests/torture/test_soak.py::test_each_part_runs_small_and_its_figures_stand_beside_the_others"
     ),
@@ -184,6 +188,7 @@ RUN_ELSEWHERE = {
             "make torture-audit",
             "make torture-faults",
             "make torture-fuzz",
+            "make mutants",
             "make soak",
             "make clean",
         ),
