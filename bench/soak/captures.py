@@ -20,7 +20,7 @@ import httpx
 import psutil
 import yaml
 
-from bench.soak.creep import CHILD, Sample, judge
+from bench.soak.creep import CHILD, FEWEST, Sample, judge, warmed_up
 from bench.soak.person import Typist
 from service.core.records.events import Payload, ViewpointCaptured
 from service.core.run.state import RunState
@@ -35,13 +35,13 @@ _HOST = "127.0.0.81"
 _SPEED_UP = 20
 _WIDTH_PX = 640
 _ROBOT_PORTS = {29999, 30001, 30002, 30003, 30004}  # fixed by the manufacturer
-_LONGEST_S = 600.0  # until the first capture on a busy machine
+_LONGEST_S = 600.0  # until the first capture on a busy machine, and beyond the time until there are enough samples
 _LOOK_S = 0.5  # between two page requests
 _ENDS_S = 120.0  # for the runner to end after it was told to
 
 
 def captures(folder: Path, minutes: float, every_s: float, planned: int, *, calibrated: bool) -> dict[str, Any]:
-    """Capture for `minutes`; returns samples, fitted lines and faults.
+    """Capture for `minutes`, or for longer until there are enough samples; returns samples, fitted lines and faults.
 
     `planned` and `calibrated` are those of `protocol_of`.
     """
@@ -123,7 +123,7 @@ class _Soak:
     stops: int = 0  # of the arm by its watchdog, after each of which the person let it go on
 
     def go(self, seconds: float, every_s: float) -> None:
-        """Run, read pages and sample until the time is up; then end the run and its processes."""
+        """Run, read pages and sample until the time is up and there are enough samples; then end all processes."""
         words = ("run", str(self.protocol), "--rig", str(self.rig), "--data", str(self.data))
         with self.log.open("wb") as log:
             runner = subprocess.Popen(
@@ -155,7 +155,7 @@ class _Soak:
         with Store.open(self.data) as store:
             run: RunFollower | None = None
             count = seen = 0
-            while not ends_s or time.monotonic() < ends_s:
+            while not ends_s or time.monotonic() < ends_s or self._has_too_few_samples(ends_s):
                 if runner.poll() is not None:
                     self.faults.append(f"the run ended by itself: {self.log.read_text()[-500:]}")
                     return
@@ -184,6 +184,10 @@ class _Soak:
                     told_s = time.monotonic()
                     print(f"captures: {count} so far, {person.stops} stops", flush=True)
                 time.sleep(_LOOK_S)
+
+    def _has_too_few_samples(self, ends_s: float) -> bool:
+        """Whether a busy machine has left too few samples to fit lines to, which more time may mend."""
+        return len(warmed_up(self.samples)) < FEWEST and time.monotonic() < ends_s + _LONGEST_S
 
     def _look(self, client: httpx.Client, run: str, state: RunState) -> None:
         """Request what an open page requests after each event, and whole pages in turn."""

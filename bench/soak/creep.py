@@ -55,9 +55,14 @@ SIZES_MB: Mapping[str, Bound] = {
 }
 
 
+def warmed_up(samples: Sequence[Sample]) -> list[Sample]:
+    """The samples after the warm-up."""
+    return [s for s in samples if s.at_s >= samples[0].at_s + WARM_UP * (samples[-1].at_s - samples[0].at_s)]
+
+
 def judge(samples: Sequence[Sample]) -> dict[str, Any]:
     """Return rows with the growth per 1000 captures, and the faults."""
-    warm = [s for s in samples if s.at_s >= samples[0].at_s + WARM_UP * (samples[-1].at_s - samples[0].at_s)]
+    warm = warmed_up(samples)
     if len(warm) < FEWEST:
         return {
             "rows": [],

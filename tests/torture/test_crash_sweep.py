@@ -1,4 +1,4 @@
-"""The short crash sweep: a death at every kind of point leaves no fault; a store that forgets is detected."""
+"""The crash sweep: a death at every kind of point leaves no fault; a store that forgets is detected."""
 
 from __future__ import annotations
 
@@ -12,8 +12,20 @@ from typing import Any
 import pytest
 
 from tests.support.rig.rig import REPOSITORY
+from tests.support.runs.drawn_rows import rows_to_run
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.slow, pytest.mark.sweep, pytest.mark.timeout(400)]
+KINDS = [
+    f"{process}/{effect}/{how}"
+    for process, effects in (
+        ("begin", ("make_directory", "write", "sync_file", "rename", "commit")),
+        ("runner", ("write", "append", "sync_file", "rename", "sync_directory", "commit")),
+        ("worker", ("write", "sync_file", "rename", "sync_directory", "commit")),
+        ("web", ("append", "sync_file", "commit")),
+    )
+    for effect in effects
+    for how in ("kill", "power")
+]
 FORGETFUL = """
 from bench.torture.crash.__main__ import main
 from bench.torture.crash.mortal import MortalFiles
@@ -35,18 +47,18 @@ def sweep(folder: Path, *words: str, code: str = "") -> tuple[int, dict[str, Any
     return done.returncode, json.loads(results[0].read_text())["points"]
 
 
-def test_a_death_at_every_kind_of_point_leaves_nothing_behind(tmp_path: Path) -> None:
-    status, shown = sweep(tmp_path, "--kinds")
-    assert shown["faults"] == []
-    assert status == 0
-    assert {(row["process"], row["effect"]) for row in shown["rows"]} >= {
-        *(("begin", effect) for effect in ("make_directory", "write", "sync_file", "rename", "commit")),
-        *(("runner", effect) for effect in ("write", "append", "sync_file", "rename", "sync_directory", "commit")),
-        *(("worker", effect) for effect in ("write", "sync_file", "rename", "sync_directory", "commit")),
-        *(("web", effect) for effect in ("append", "sync_file", "commit")),
-    }
-    assert shown["deaths"] >= shown["planned"] - 2, "points that were hardly ever reached were not tried"
-    assert {row["how"] for row in shown["rows"]} == {"kill", "power"}
+@pytest.fixture(scope="module")
+def swept(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """One sweep over the kinds of death that are tested this time: it begins with two whole undisturbed runs."""
+    return sweep(tmp_path_factory.mktemp("crash"), "--kinds", *rows_to_run(request, "kind"))[1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_death_there_leaves_nothing_behind(swept: dict[str, Any], kind: str) -> None:
+    process, effect, how = kind.split("/")
+    (row,) = (r for r in swept["rows"] if (r["process"], r["effect"], r["how"]) == (process, effect, how))
+    assert row["deaths"] == 1, "it did not die there"
+    assert [fault for fault in swept["faults"] if fault["kind"] == kind] == []
 
 
 def test_a_store_that_does_not_sync_its_files_shows(tmp_path: Path) -> None:

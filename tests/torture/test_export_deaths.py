@@ -6,6 +6,7 @@ import random
 import signal
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,8 @@ from service.dataset.posed.folder import check_folder
 from service.dataset.posed.records import DataSet
 from tests.support.scenes.posed import posed_data_set
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.slow, pytest.mark.sweep, pytest.mark.timeout(300)]
+ROUNDS = 7  # the last two die at the last operations
 
 #: Exports into a folder and kills itself at the n-th operation on its files; says how many there were if it lives.
 CHILD = """
@@ -53,6 +55,15 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@dataclass(frozen=True)
+class Undisturbed:
+    """An export that nobody killed: the photographs, what it wrote, and how many operations on files that took."""
+
+    photographs: Path
+    whole: dict[str, bytes]
+    operations: int
+
+
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("photographs")
@@ -63,27 +74,42 @@ def dataset(photographs: Path) -> DataSet:
     return posed_data_set(photographs)
 
 
-@pytest.mark.parametrize("name", ["plain", "nerfstudio"])
-def test_deaths_at_random_points_leave_nothing_that_looks_whole(
-    dataset: DataSet, photographs: Path, tmp_path: Path, name: str
-) -> None:
-    write_data_set(dataset, exporter(name), tmp_path / "at_once")
-    counted = attempt(photographs, tmp_path / "counted", name, 0)
+@pytest.fixture(scope="module", params=["plain", "nerfstudio"])
+def name(request: pytest.FixtureRequest) -> str:
+    """A form of data set."""
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def undisturbed(
+    dataset: DataSet, photographs: Path, tmp_path_factory: pytest.TempPathFactory, name: str
+) -> Undisturbed:
+    folder = tmp_path_factory.mktemp(name)
+    write_data_set(dataset, exporter(name), folder / "at_once")
+    counted = attempt(photographs, folder / "counted", name, 0)
     assert counted.returncode == 0, counted.stderr
-    operations = int(counted.stdout)
-    assert operations > 2 * len(contents(tmp_path / "at_once")), "each file is written and gets its name"
-    whole = contents(tmp_path / "at_once")
-    dice = random.Random(14)
-    deaths = [*dice.sample(range(1, operations), 5), operations - 1, operations]
-    for round_, death in enumerate(deaths):
-        out = tmp_path / f"killed_{round_}"
-        for point in (death, dice.randrange(1, operations // 2)):  # killed again while it goes on
-            died = attempt(photographs, out, name, point)
-            assert died.returncode in (-signal.SIGKILL, 0, 1), died.stderr
-            if out.exists():
-                assert check_folder(out) == len(whole) - 1
-                break
-        if not out.exists():
-            write_data_set(dataset, exporter(name), out)
-        assert contents(out) == whole
-        check_folder(out)
+    whole, operations = contents(folder / "at_once"), int(counted.stdout)
+    assert operations > 2 * len(whole), "each file is written and gets its name"
+    return Undisturbed(photographs, whole, operations)
+
+
+@pytest.mark.parametrize("round_", range(ROUNDS))
+def test_a_death_at_a_random_point_leaves_nothing_that_looks_whole(
+    dataset: DataSet, undisturbed: Undisturbed, tmp_path: Path, name: str, round_: int
+) -> None:
+    whole, operations, out = undisturbed.whole, undisturbed.operations, tmp_path / "killed"
+    dice = random.Random(14 + round_)
+    last = {ROUNDS - 2: operations - 1, ROUNDS - 1: operations}
+    for point in (
+        last.get(round_, dice.randrange(1, operations)),
+        dice.randrange(1, operations // 2),
+    ):  # while it goes on
+        died = attempt(undisturbed.photographs, out, name, point)
+        assert died.returncode in (-signal.SIGKILL, 0, 1), died.stderr
+        if out.exists():
+            assert check_folder(out) == len(whole) - 1
+            break
+    if not out.exists():
+        write_data_set(dataset, exporter(name), out)
+    assert contents(out) == whole
+    check_folder(out)

@@ -24,6 +24,7 @@ INPUTS = 24  # per target, times its pace
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_parser_refuses_bad_input_as_people_can_understand(group: str, tmp_path: Path) -> None:
     inputs = {target.name: max(2, round(INPUTS * target.pace)) for target in targets_of(group)}

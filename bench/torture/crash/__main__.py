@@ -30,6 +30,7 @@ from bench.torture.crash.sweep import Case, How, Sweep, Verdict
 
 _WAYS: tuple[How, ...] = ("kill", "power")
 _TWICE = 10  # one case in this many dies again after resuming
+_TRIES = 3  # points of a kind, of which a run of several processes may not reach each
 
 
 def chosen(sweep: Sweep, rng: Random, options: argparse.Namespace) -> list[Case]:
@@ -37,11 +38,16 @@ def chosen(sweep: Sweep, rng: Random, options: argparse.Namespace) -> list[Case]
     cases = list(sweep.cases(options.ways))
     rng.shuffle(cases)
     if options.kinds:
-        return list({(case.role, case.point.effect): case for case in cases}.values())
+        return [case for kind in options.kinds for case in [c for c in cases if kind_of(c) == kind][:_TRIES]]
     later = sweep.points["runner", "kill"]
     twice = [Case(c.role, c.point, c.how, rng.choice(later)) for c in cases[::_TWICE] if c.role == "runner"]
     both = [*cases, *twice]
     return both if options.sample is None else both[: options.sample]
+
+
+def kind_of(case: Case) -> str:
+    """The process, the effect and the way to die, as `--kinds` names them."""
+    return f"{case.role}/{case.point.effect}/{case.how}"
 
 
 def sweep_points(folder: Path, options: argparse.Namespace, rng: Random) -> dict[str, Any]:
@@ -53,11 +59,16 @@ def sweep_points(folder: Path, options: argparse.Namespace, rng: Random) -> dict
     gc.freeze()
     cases = chosen(sweep, rng, options)
     verdicts: list[Verdict] = []
+    died: set[str] = set()
     for number, case in enumerate(cases, start=1):
+        if options.kinds and kind_of(case) in died:
+            continue
         if options.minutes and time.monotonic() - began_s > 60 * options.minutes:
             break
         verdict = sweep.try_case(case, rng)
         verdicts.append(verdict)
+        if verdict.reached:
+            died.add(kind_of(case))
         for fault in verdict.faults:
             print(f"{_named(case)}: {fault}", flush=True)
         if verdict.faults and options.first_fault:
@@ -72,7 +83,9 @@ def sweep_points(folder: Path, options: argparse.Namespace, rng: Random) -> dict
         "twice": sum(v.reached for v in verdicts if v.case.again is not None),
         "taken_by_power": sum(bool(v.taken) for v in verdicts),
         "leftovers": sum(v.leftovers for v in verdicts),
-        "faults": [{"case": _named(v.case), "faults": list(v.faults)} for v in verdicts if v.faults],
+        "faults": [
+            {"case": _named(v.case), "kind": kind_of(v.case), "faults": list(v.faults)} for v in verdicts if v.faults
+        ],
         "seconds": round(time.monotonic() - began_s),
     }
 
@@ -154,7 +167,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--sample", type=int, help="number of cases of the systematic sweep; default: all")
-    parser.add_argument("--kinds", action="store_true", help="one case per process, effect and way to die")
+    parser.add_argument(
+        "--kinds", nargs="+", metavar="KIND", help="one death of each, such as runner/commit/power, instead of all"
+    )
     parser.add_argument("--ways", nargs="+", choices=_WAYS, default=_WAYS, help="how the processes die")
     parser.add_argument("--first-fault", action="store_true", help="end the systematic sweep at the first fault")
     parser.add_argument("--minutes", type=float, default=0, help="end the systematic sweep after this time; 0: never")
