@@ -16,6 +16,7 @@ from service.store.records import NewArtefact
 from service.web.page.rendering import local_time
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
+from tests.support.processes.waiting import until
 from tests.support.recorded.reported_run import record_reported_run
 
 
@@ -29,13 +30,17 @@ def web(tmp_path: Path) -> Generator[tuple[WebSite, str]]:
 def read(web: tuple[WebSite, str], page: str = "") -> str:
     """A page of the run's audit, once its background computation is ready."""
     site, run_id = web
-    browser = site.browser("auditor")
-    while True:
+    browser, text = site.browser("auditor"), ""
+
+    def computed() -> bool:
+        nonlocal text
         answer = browser.get(f"/audit/runs/{run_id}{page}")
         assert answer.status_code == 200, answer.text
-        if "Being computed" not in answer.text:
-            return words(answer.text)
-        time.sleep(0.05)
+        text = answer.text
+        return "Being computed" not in text
+
+    until(computed, "the page is still being computed", every_s=0.05)
+    return words(text)
 
 
 def test_the_accuracy_stands_beside_its_limit_and_what_is_exported(web: tuple[WebSite, str]) -> None:

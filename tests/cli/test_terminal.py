@@ -6,13 +6,13 @@ import json
 import os
 import pty
 import select
-import time
 from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 
 from tests.support.processes.forked import Forked
+from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, command, orthocapture
 
 PROTOCOL = """
@@ -54,11 +54,13 @@ class Terminal:
 
     def wait_for(self, text: str) -> None:
         """Read the screen until a text appears on it."""
-        deadline_s = time.monotonic() + 40
-        while text not in self.shown:
-            assert time.monotonic() < deadline_s, self.shown
-            if select.select([self._master], [], [], 0.2)[0]:
+
+        def appeared() -> bool:
+            while text not in self.shown and select.select([self._master], [], [], 0)[0]:
                 self.shown += os.read(self._master, 65536).decode(errors="replace")
+            return text in self.shown
+
+        until(appeared, lambda: self.shown)
 
     def type(self, text: str) -> None:
         """Type a line; the text awaited next must appear after it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -30,7 +30,7 @@ class CardPerson(Person):
 
     folder: Path = Path()
     watch: PhotoWatch | None = None
-    began: datetime = field(default_factory=lambda: datetime.now(UTC))  # start of the step, from its first words on
+    began: datetime = field(init=False)  # start of the step, from its first words on
 
     def read(self, message: str) -> None:
         if not message.startswith("next: "):
@@ -38,7 +38,7 @@ class CardPerson(Person):
         self.rig.card = self.watch  # the robot's calibration images came through the cable
         self.presses += 1
         if self.presses == 1:
-            self.began = datetime.now(UTC)
+            self.began = self.rig.arm.clock.utc_now()
         mishap = self.mishaps.get(self.presses, "")
         if mishap == "copied twice":
             put(self.folder, f"DSC{self.presses - 1:05d} (1).JPG", self.file(self.presses - 1))

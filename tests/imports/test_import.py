@@ -6,7 +6,6 @@ import json
 import shutil
 import signal
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +32,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import web_site
 from tests.support.processes.forked import Forked
+from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, command, orthocapture
 from tests.support.runs.import_folder import Photographer, around, over_the_board
 
@@ -255,9 +255,12 @@ def test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere(
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    while not imported_so_far(data):
+
+    def begun() -> bool:
         assert process.poll() is None
-        time.sleep(0.05)
+        return bool(imported_so_far(data))
+
+    until(begun, "nothing is imported", 600, every_s=0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
     before = imported_so_far(data)

@@ -19,6 +19,7 @@ from service.monitor.devices import OpenDevices
 from service.monitor.reporter import Reporter
 from service.rig import AlertsSection, load_rig
 from tests.support.processes.waiting import until
+from tests.support.record.stepped_clock import SteppedClock
 from tests.support.rig.bench_rig import BenchArm, BenchRig
 
 RIG = "name: bench\nsimulated: true\ndevices: {}\n"
@@ -102,13 +103,14 @@ def test_a_stop_is_told_at_once_and_once(hook: tuple[type[Hook], str]) -> None:
 
 def test_waiting_is_told_when_it_has_lasted_and_again_after_work(hook: tuple[type[Hook], str]) -> None:
     kind, url = hook
-    now_s = [0.0]
-    alarm = Alarm(section(webhook={"url": url}, waits_after_s=30), "run", "bench", monotonic_s=lambda: now_s[0])
-    for now_s[0] in (0.0, 29.0):
+    clock = SteppedClock()
+    alarm = Alarm(section(webhook={"url": url}, waits_after_s=30), "run", "bench", clock=clock)
+    for clock.passed_s in (0.0, 29.0):
         alarm.follow("waits", "Spray: a signature is due")
-    for standing, now_s[0] in (("works", 29.5), ("waits", 30.0), ("waits", 59.0), ("waits", 60.0), ("waits", 61.0)):
+    course = (("works", 29.5), ("waits", 30.0), ("waits", 59.0), ("waits", 60.0), ("waits", 61.0))
+    for standing, clock.passed_s in course:
         alarm.follow(standing, "Spray: a signature is due")  # type: ignore[arg-type]
-    for standing, now_s[0] in (("works", 70.0), ("waits", 71.0), ("waits", 102.0)):
+    for standing, clock.passed_s in (("works", 70.0), ("waits", 71.0), ("waits", 102.0)):
         alarm.follow(standing, "Spray: a signature is due")  # type: ignore[arg-type]
     alarm.close()
     assert len(kind.taken) == 2
@@ -126,7 +128,7 @@ def test_what_is_not_asked_for_is_not_told(hook: tuple[type[Hook], str]) -> None
 def test_a_server_that_refuses_is_asked_again(hook: tuple[type[Hook], str]) -> None:
     kind, url = hook
     kind.refusals = 1
-    alarm = Alarm(section(webhook={"url": url}), "run", "bench")
+    alarm = Alarm(section(webhook={"url": url}), "run", "bench", clock=SteppedClock())
     alarm.follow("stopped", "no link")
     alarm.close()
     assert len(kind.taken) == 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,7 @@ from service.core.records.events import ItemTicked, OperatorAction
 from service.core.run.decide import record_to_sign
 from service.core.run.fold import fold
 from service.core.run.state import RunState
-from service.monitor.snapshot import ask_for_frames, frame_path, read_snapshot
+from service.monitor.snapshot import Snapshot, ask_for_frames, frame_path, read_snapshot
 from service.rig import load_rig
 from service.run_start import start_run
 from service.steps import params_models
@@ -52,6 +51,11 @@ class Watched:
         now = self.state().step
         self.act(action="confirm", step=now.step, checklist=now.ticked)
 
+    @property
+    def told(self) -> Snapshot:
+        """What the runner told last."""
+        return read_snapshot(self.data, self.run_id, self.store.clock.utc_now().timestamp())
+
     def at(self, step: str, phase: str) -> bool:
         state = self.state()
         return (state.current, state.phase) == (step, phase)
@@ -71,7 +75,7 @@ def test_a_run_driven_from_screens_and_pedal_survives_its_starter(tmp_path: Path
         watched = Watched(store, data, run_id, loaded.protocol)
         launcher = Launcher(data, store)
         launcher.start(run_id)
-        until(lambda: read_snapshot(data, run_id).doing == "asking", "the runner asks")
+        until(lambda: watched.told.doing == "asking", "the runner asks")
         # A web process that starts meanwhile finds the runner by its lease.
         assert Launcher(data, store).driven(run_id)
 
@@ -89,24 +93,25 @@ def test_a_run_driven_from_screens_and_pedal_survives_its_starter(tmp_path: Path
 
         # One press arms, and nothing moves.
         press_pedal(ready["world"])
-        until(lambda: read_snapshot(data, run_id).pedal_armed, "the screens show that the pedal is armed")
-        time.sleep(1.0)
+        until(lambda: watched.told.pedal_armed, "the screens show that the pedal is armed")
+        armed_utc_s = watched.told.at_utc_s
+        until(lambda: watched.told.at_utc_s > armed_utc_s + 1.0, "a second later")
         assert watched.at("viewpoint_capture_1", "ready")
         press_pedal(ready["world"])
         until(lambda: len(watched.state().step.captured) >= 1, "the first image")
-        assert read_snapshot(data, run_id).robot in ("moving", "standing")
+        assert watched.told.robot in ("moving", "standing")
 
         watched.act(action="pause")
-        until(lambda: read_snapshot(data, run_id).doing == "paused", "paused, and said so")
-        assert read_snapshot(data, run_id).robot == "standing"
+        until(lambda: watched.told.doing == "paused", "paused, and said so")
+        assert watched.told.robot == "standing"
         taken = set(watched.state().step.captured)
-        runner = read_snapshot(data, run_id).pid
+        runner = watched.told.pid
         os.kill(runner, signal.SIGKILL)
         until(lambda: not launcher.driven(run_id), "the death is noticed")
-        until(lambda: read_snapshot(data, run_id).doing == "unknown", "the screens say unknown, never wrong")
+        until(lambda: watched.told.doing == "unknown", "the screens say unknown, never wrong")
 
         launcher.start(run_id)
-        until(lambda: read_snapshot(data, run_id).doing == "paused", "it goes on where it was")
+        until(lambda: watched.told.doing == "paused", "it goes on where it was")
         watched.act(action="resume")
         until(lambda: watched.at("photographs", "ready"), "the capture is complete", 120)
         assert taken < set(watched.state().steps["viewpoint_capture_1"].captured)
@@ -117,7 +122,7 @@ def test_a_run_driven_from_screens_and_pedal_survives_its_starter(tmp_path: Path
         watched.tick_all()
         watched.confirm()
         until(lambda: watched.state().status == "completed", "the end")
-        until(lambda: read_snapshot(data, run_id).doing == "ended", "the runner has ended")
+        until(lambda: watched.told.doing == "ended", "the runner has ended")
         until(lambda: not launcher.driven(run_id), "the lease is let go")
     report = verify(data, run_id)
     assert report.ok, report.first_fault

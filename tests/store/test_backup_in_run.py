@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
@@ -12,6 +11,7 @@ import pytest
 from service.core.records.events import ViewpointCaptured
 from service.store.store import Store
 from tests.support.processes.started import started
+from tests.support.processes.waiting import until
 from tests.support.protocols.short_protocol import short_protocol
 from tests.support.rig.rig import orthocapture, simulated_rig
 
@@ -30,11 +30,11 @@ def captured(data: Path) -> list[str]:
 
 
 def wait_for_captures(data: Path, count: int, runner: subprocess.Popen[bytes], log: Path) -> None:
-    deadline_s = time.monotonic() + 120
-    while len(captured(data)) < count:
+    def there() -> bool:
         assert runner.poll() is None, log.read_text()
-        assert time.monotonic() < deadline_s, log.read_text()
-        time.sleep(0.1)
+        return len(captured(data)) >= count
+
+    until(there, log.read_text, 120)
 
 
 def test_a_run_is_backed_up_in_its_capture_and_finished_where_it_was_restored(tmp_path: Path) -> None:

@@ -6,16 +6,18 @@ import json
 import os
 import subprocess
 import sys
-import time
+from datetime import datetime
 from pathlib import Path
 
 import pytest
 
 from service.core.records.events import ArtefactRef, LeftoversRemoved
-from service.store.files.leftovers import leftovers, remove_leftovers
+from service.store.files.leftovers import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.processes.waiting import until
+from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import capture, captured, enqueue, files_of, put_image, start_run
 from tests.support.rig.rig import REPOSITORY, orthocapture
 
@@ -78,15 +80,25 @@ def test_removal_takes_leftovers_alone_and_is_recorded(tmp_path: Path) -> None:
 
 
 def test_what_is_young_stays_also_where_old_bytes_were_stored_again(tmp_path: Path) -> None:
-    with Store.open(tmp_path) as store:
+    clock = SteppedClock.from_now()  # the file system's time goes on beside it
+    with Store.open(tmp_path, clock) as store:
         start_run(store)
         path = crash_left(store, "v1")
-        time.sleep(0.4)
-        assert [one.stays for one in leftovers(store, min_age_s=0.3)] == [""]
-        put_image(store, "v1")
-        (young,) = leftovers(store, min_age_s=0.3)
+        clock.passed_s = 2 * USUAL_AGE_S
+        (old,) = leftovers(store)
+        assert old.stays == ""
+
+        def is_newer() -> bool:
+            put_image(store, "v1")
+            return leftovers(store)[0].written_utc > old.written_utc
+
+        until(is_newer, "the file keeps its old time", every_s=0.002)
+        clock.passed_s = 0.0
+        since_written_s = clock.utc_s() - datetime.fromisoformat(old.written_utc).timestamp()
+        clock.passed_s = USUAL_AGE_S - since_written_s  # when it would be old enough, were it not stored again
+        (young,) = leftovers(store)
         assert "younger" in young.stays
-        assert remove_leftovers(store, actor="Ada", min_age_s=0.3) == []
+        assert remove_leftovers(store, actor="Ada") == []
         assert path.exists()
 
 

@@ -215,8 +215,13 @@ def test_a_lease_is_renewed_by_itself_also_after_a_store_that_failed(
         really(lease)
 
     monkeypatch.setattr(RunLease, "renew", renew)
-    with store.lease(run, "runner", 0.03):
-        until(lambda: len(renewals) > 2, "the lease is not renewed again")
+
+    def renewed() -> bool:
+        clock.sleep(10.0)
+        return len(renewals) > 2
+
+    with store.lease(run, "runner", 30.0):
+        until(renewed, "the lease is not renewed again", every_s=0.01)
 
 
 HOLDER = """

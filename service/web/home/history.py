@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request
@@ -43,7 +42,7 @@ def history_page(
 @router.get("/history.csv", name="history_csv", dependencies=_READ)
 def history_file(site: CurrentSite) -> Response:
     """All rows as CSV."""
-    name = f"orthocapture-history-{datetime.now(UTC):%Y%m%d}.csv"
+    name = f"orthocapture-history-{site.store.clock.utc_now():%Y%m%d}.csv"
     return Response(
         history_csv(history(site.store)),
         media_type="text/csv; charset=utf-8",

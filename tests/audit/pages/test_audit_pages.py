@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from pathlib import Path
 from urllib.parse import quote
 
@@ -16,6 +15,7 @@ from service.store.verification.verify import verify
 from service.web.audit import corrections, overview, runs, signatures
 from service.web.evidence import artefacts, events
 from tests.support.pages.web import WebSite, web_site
+from tests.support.processes.waiting import until
 from tests.support.record.store import rows, tamper
 from tests.support.recorded.large_run import digest_of
 from tests.support.runs.recorded_run import record_run
@@ -38,15 +38,17 @@ def addresses(web: WebSite, run: str) -> list[str]:
 
 
 def settle(web: WebSite, address: str) -> str:
-    browser = web.browser("auditor")
-    deadline = time.monotonic() + 30
-    while True:
+    browser, page = web.browser("auditor"), ""
+
+    def complete() -> bool:
+        nonlocal page
         answer = browser.get(address)
         assert answer.status_code == 200, (address, answer.text[:300])
-        if "data-pending" not in answer.text:
-            return answer.text
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+        page = answer.text
+        return "data-pending" not in page
+
+    until(complete, f"{address} is still being computed", every_s=0.05)
+    return page
 
 
 @pytest.mark.slow

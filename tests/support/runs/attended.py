@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,8 +21,9 @@ def attended(data: Path, runs: Mapping[str, Mapping[str, Any]]) -> Generator[Non
     over = threading.Event()
 
     def tell() -> None:
+        now_utc_s = store.clock.utc_now().timestamp()
         for run_id, fields in runs.items():
-            write_snapshot(data, run_id, Snapshot.model_validate({"at_utc_s": time.time(), **fields}))
+            write_snapshot(data, run_id, Snapshot.model_validate({"at_utc_s": now_utc_s, **fields}))
 
     def go_on_telling() -> None:
         while not over.wait(1.0):
