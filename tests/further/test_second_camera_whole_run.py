@@ -32,7 +32,7 @@ from tests.support.protocols.small_demo import SLICE_MM, VIEWS, small_demo
 from tests.support.rig.rig import orthocapture, simulated_rig
 from tests.support.runs.ended_run import ended_run, patient
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
+pytestmark = [pytest.mark.slow, pytest.mark.whole(always=True), pytest.mark.timeout(1500)]
 SCANNER = "structured_light"
 FIXED, STEREO = "camera_2", "camera_3"  # a Sony on a stand; a Canon beside the first one
 PLACES = pytest.mark.parametrize("name", [FIXED, STEREO])

@@ -22,7 +22,7 @@ from tests.support.protocols.two_arms import FIRST, SECOND, for_two_arms, kuka_d
 from tests.support.rig.rig import orthocapture, simulated_rig
 from tests.support.runs.ended_run import EndedRun, ended_run, patient
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
+pytestmark = [pytest.mark.slow, pytest.mark.whole, pytest.mark.timeout(1200)]
 ARM = "LBR Med 14"
 SCANNER, PARTS = "zivid", 3  # views of it that are one scan
 

@@ -21,7 +21,7 @@ from tests.support.pages.browser import DESKTOP, PASSWORD, Screen, Served, add_p
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.slow, pytest.mark.whole(always=True), pytest.mark.timeout(900)]
 
 MOST_MENDS = 4  # per step, as of the automatic operator
 PRESSED_IN_VAIN = 3  # in the whole run
