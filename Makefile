@@ -10,18 +10,39 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-all test-versions lint format docs reference bench torture-audit torture-crash torture-faults torture-fuzz soak lock clean
+.PHONY: demo test test-all test-drawn test-whole test-sweeps test-versions marks lint format docs reference bench torture-audit torture-crash torture-faults torture-fuzz soak lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
 
-# Units, wires and one short run, in minutes.
+# Units, wires and one short run, in minutes; nothing of it needs more than Python and what pip installs.
 test: $(TOOLS)
-	$(BIN)/pytest -m "not slow"
+	$(BIN)/pytest -m "not (slow or realtime or packages)"
 
-# The same and all that takes long: whole runs, browsers, the package, sweeps for faults.
+# All tests: those that meet the clock run alone, after the others.
 test-all: $(TOOLS) $(NETWORKS)
-	$(BIN)/pytest
+	.ci/packages
+	$(BIN)/pytest -m "not realtime"
+	$(BIN)/pytest -m realtime -n 0
+
+# What `make test` leaves out, with a tenth of the whole runs and sweeps: SEED draws them.
+SEED = $(shell git rev-parse HEAD)
+test-drawn: $(TOOLS) $(NETWORKS)
+	.ci/packages
+	$(BIN)/pytest -m "(slow or packages) and not realtime" --draw $(SEED)
+	$(BIN)/pytest -m realtime -n 0
+
+# Every whole run; every row of every systematic sweep.
+test-whole test-sweeps: $(TOOLS) $(NETWORKS)
+	.ci/packages
+	$(BIN)/pytest -m $(subst test-sweeps,sweep,$(subst test-whole,whole,$@))
+
+# Measures what each test costs, or those of FILES, and renews the marks `slow` and the list tests/cpu_seconds.json.
+marks: $(TOOLS) $(NETWORKS)
+	.ci/packages
+	rm -rf build/cpu
+	$(BIN)/pytest $(or $(FILES),tests) --cpu-record=build/cpu
+	$(BIN)/python -m bench.suite.marks build/cpu
 
 # Installs the locks under every supported Python of this machine and runs the fast tests there.
 test-versions:
@@ -32,6 +53,7 @@ lint: $(TOOLS)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --threads 2
 	$(BIN)/lint-imports
+	$(BIN)/python -m bench.suite.marks --check
 
 format: $(TOOLS)
 	$(BIN)/ruff check --fix .

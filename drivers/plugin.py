@@ -16,7 +16,7 @@ READING_TIMEOUT_S = 45.0
 class DriverConfig(BaseModel):
     """Base class of a driver's section in rig.yaml."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     @property
     def longest_call_s(self) -> float:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock
 from typing import Literal
@@ -63,7 +61,7 @@ class RunFollower:
     """Follows the events of one run and folds them; several threads may use it.
 
     An impossible event is not added, so every later `refresh` and `now` raises IntegrityError again.
-    `leave_not_before_s` is a time.monotonic() of the host at which the newest leave to move was not yet recorded.
+    `leave_not_before_s` is a monotonic time of the store's clock at which the newest leave was not yet recorded.
     """
 
     store: Store
@@ -99,7 +97,7 @@ class RunFollower:
             return self._log
 
     def _read(self) -> RunState:
-        leave, looked_s = self._state.leave, time.monotonic()
+        leave, looked_s = self._state.leave, self.store.clock.monotonic_s()
         known = len(self._events)
         if self.store.head(self.run_id) != known:  # steps that wait look often, and seldom is anything new
             for event in self.store.events(self.run_id, after_seq=known):
@@ -121,7 +119,7 @@ def results_to_come(log: RunRecord) -> list[PendingResult]:
     """The planned registrations that have not arrived yet, with the time left; empty if all have."""
     started = log.store.jobs_started(log.run_id)
     cores = os.cpu_count() or 1
-    left = missing_results(log.protocol, log.state, started, datetime.now(UTC).isoformat(), cores)
+    left = missing_results(log.protocol, log.state, started, log.store.clock.utc_now().isoformat(), cores)
     return [replace(one, waits=not started) for one in left]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import signal
@@ -31,6 +32,17 @@ def announce(**fields: object) -> None:
 def told() -> bool:
     """Wait for a line on stdin. Returns False at its end: nobody is there to tell any more."""
     return bool(sys.stdin.readline())
+
+
+def add_patience(parser: argparse.ArgumentParser) -> None:
+    """Declare the option of controllers that guard against a dead client."""
+    parser.add_argument(
+        "--patience",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="no guard against a dead program waits less than this, because the machine has other work too",
+    )
 
 
 class Termination:

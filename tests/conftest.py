@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -27,8 +28,13 @@ settings.load_profile("repeatable")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options of this suite."""
-    parser.addoption("--cpu-record", type=Path, metavar="DIR", help="write the CPU seconds of tests and fixtures to DIR")
+    parser.addoption(
+        "--cpu-record", type=Path, metavar="DIR", help="write the CPU seconds of tests and fixtures to DIR"
+    )
     parser.addoption("--draw", metavar="SEED", help="run a tenth of the whole runs and sweeps, chosen by SEED")
+    parser.addoption(
+        "--repeat", type=int, default=1, metavar="N", help="run every test N times (bench.suite.realtime)"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -41,16 +47,33 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(Draw(seed))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the files with slow tests first, so that none keeps one process busy while all others have ended."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Put the files with slow tests first, so that none keeps one process busy while all others have ended.
+
+    A test that meets the clock may run once more if it failed.
+    """
+    for item in items:
+        if item.get_closest_marker("realtime") is not None:
+            item.add_marker(pytest.mark.flaky(reruns=1))
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
+    items *= int(config.getoption("--repeat") or 1)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Let the failure of a set-up stand: only the body of a test that meets the clock may run again."""
+    report = yield
+    if report.failed and report.when == "setup":
+        item.add_marker(pytest.mark.flaky(reruns=0, condition=False), append=False)
+    return report
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print why tests failed that passed when they ran again."""
-    failed = {report.nodeid for report in terminalreporter.getreports("failed")}
-    for report in terminalreporter.getreports("rerun"):
-        if report.nodeid not in failed:
-            terminalreporter.section(f"first failure of {report.nodeid}")
-            terminalreporter.line(report.longreprtext)
+    """Count the tests that ran again, and print why each failed at first."""
+    rerun = terminalreporter.getreports("rerun")
+    if rerun:
+        terminalreporter.section(f"{len(rerun)} realtime tests ran again")
+    for report in rerun:
+        terminalreporter.section(f"first failure of {report.nodeid}")
+        terminalreporter.line(report.longreprtext)

@@ -123,7 +123,7 @@ class _Soak:
     stops: int = 0  # of the arm by its watchdog, after each of which the person let it go on
 
     def go(self, seconds: float, every_s: float) -> None:
-        """Run, read pages and sample until the time is up; then end the run and its processes."""
+        """Run, read pages and sample until the time is up and there are enough samples; then end all processes."""
         words = ("run", str(self.protocol), "--rig", str(self.rig), "--data", str(self.data))
         with self.log.open("wb") as log:
             runner = subprocess.Popen(

@@ -25,7 +25,7 @@ from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
-from tests.support.runs.bench_run import PROTOCOL, Bench
+from tests.support.runs.bench_run import PROTOCOL, Bench, HastyClock
 
 STEP = "capture"
 TIMED = 200  # viewpoints before each size that are recorded with every fsync and timed
@@ -61,7 +61,7 @@ class LargeRecord:
     def __post_init__(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._files = SparseFiles()
-        self.store = Store.open(self.folder / "data", files=self._files)
+        self.store = Store.open(self.folder / "data", HastyClock(), files=self._files)
         text = PROTOCOL.replace("count: 4", f"count: {self.planned}")
         assert text != PROTOCOL
         rig = self.folder / "large.yaml"

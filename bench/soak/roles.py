@@ -26,7 +26,7 @@ from service.store.records import NewJob
 from service.store.store import Store
 from service.worker import loop
 from service.worker.job import JobAnswer, RecordedContext
-from tests.support.runs.bench_run import Bench
+from tests.support.runs.bench_run import Bench, HastyClock
 
 KIND = "coverage_points"  # a job kind from which no page reads anything
 _COMPUTED_S = 0.02  # computing time of a job
@@ -157,7 +157,8 @@ def main(role: str, data: Path, run: str, log: Path, url: str, cookie: str) -> N
     signal.signal(signal.SIGTERM, on_terminate)
     diary = Diary(log)
     try:
-        with Store.open(data) as store, file_log(data, "worker" if role == "worker" else "runner"):
+        clock = HastyClock() if role == "runner" else None
+        with Store.open(data, clock) as store, file_log(data, "worker" if role == "worker" else "runner"):
             match role:
                 case "status":
                     read(diary, "status", "latest", "--data", str(data))

@@ -15,11 +15,14 @@ from bench.machine import commit, machine
 from bench.whole_runs.whole_run import orthocapture, simulated_rig
 from service.dataset.summary import RunSummary
 from tests.support.protocols.two_arms import for_two_arms, kuka_demo
-from tests.support.runs.ended_run import ended_run, patient
+from tests.support.runs.ended_run import ended_run
 
 SCENE, ARM = 7, "LBR Med 14"
 POSES = ("robot", "robot_corrected", "triangulated", "hybrid")
-OPTIONS = ("--image-width", "960", "--ct-voxel-mm", "1.0", "--speed-up", "10", "--arm", ARM, "--arms", "2")
+OPTIONS = (
+    "--image-width", "960", "--ct-voxel-mm", "1.0", "--speed-up", "10", "--arm", ARM, "--arms", "2",
+    "--patience", "20",
+)  # fmt: skip
 
 
 def main() -> None:
@@ -38,7 +41,6 @@ def _rows(folder: Path, name: str, *, each: bool) -> list[str]:
     protocol, data = folder / "demo.yaml", folder / "data"
     protocol.write_text(yaml.safe_dump(_protocol(protocol, each=each), sort_keys=False), encoding="utf-8")
     with simulated_rig(folder / "rig", SCENE, (*OPTIONS, "--host", "127.0.0.181")) as ready:
-        patient(Path(ready["rig"]), answer_timeout_s=20.0)
         done = orthocapture(
             "run", str(protocol), "--rig", ready["rig"], "--data", str(data), "--operator", "bench", "--auto-confirm",
             "--json", timeout_s=3600, log=folder / "run.log",

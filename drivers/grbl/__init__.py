@@ -14,6 +14,10 @@ if TYPE_CHECKING:
 Vector3 = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 LETTERS = "XYZABC"  # in the order of GRBL's status reports
+POLL_S = 0.05  # between requests for a status report
+AHEAD_S = 0.15  # of motion in the controller's buffer beyond its braking distance; it moves as long without its host
+PIECE_S = 0.05  # of motion in a jog
+SHORTEST_BRAKING_S = 0.1  # with less time to brake the axes would creep
 
 
 class GrblAxis(BaseModel):
@@ -85,7 +89,11 @@ class GrblConfig(DriverConfig):
     unattended_s: float = Field(
         default=5.0, gt=0, description="time after which moving axes are stopped whose program does not query them"
     )
-
+    watchdog_s: float = Field(
+        default=0.2,
+        ge=0.1,
+        description="time without a heartbeat of the program that drives the axes after which they are stopped",
+    )
     rest_within_s: float = Field(
         default=0.5,
         ge=0.4,
@@ -98,6 +106,26 @@ class GrblConfig(DriverConfig):
         if len({axis.letter for axis in self.axes}) != len(self.axes):
             raise ValueError("each letter names one axis")
         return self
+
+    @model_validator(mode="after")
+    def _time_to_brake(self) -> Self:
+        if self.rest_within_s < self.reaction_s + SHORTEST_BRAKING_S - 1e-9:
+            least_s = self.reaction_s + SHORTEST_BRAKING_S
+            raise ValueError(f"with this watchdog_s the axes rest after {least_s:g} s at the earliest: rest_within_s")
+        return self
+
+    @property
+    def reaction_s(self) -> float:
+        """Time until the axes brake after the death of program, driver or line.
+
+        Until then what was handed over is moved, or a heartbeat is missed and a report comes.
+        """
+        return max(AHEAD_S + 1.5 * PIECE_S, self.watchdog_s + POLL_S) + 0.05
+
+    @property
+    def stood_still_s(self) -> float:
+        """A longer gap between two looks at the line means that this process was suspended."""
+        return self.watchdog_s + 0.1
 
     @property
     def longest_call_s(self) -> float:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import serial
 
 from drivers.errors import DeviceRefusedError, DeviceTimeoutError, DeviceUnavailableError
+from drivers.grbl import POLL_S, GrblConfig
 from drivers.grbl.wire import (
     LONGEST_LINE,
     RESET,
@@ -31,8 +32,6 @@ from drivers.grbl.wire import (
 )
 
 LINK_ERRORS = (serial.SerialException, OSError, termios.error)
-POLL_S = 0.05  # between requests for a status report
-STOOD_STILL_S = 0.3  # a longer gap between two looks at the line: this process was suspended
 _LOST_S = 0.2  # a request whose report did not come by then is repeated: noise, homing, an alarm
 _CABLE = "Check the cable and the power of the controller, then reconnect"
 
@@ -55,7 +54,7 @@ class Link:
 
     Args:
         port: serial device or URL.
-        baudrate: of the line.
+        config: the line's baud rate, and when this process was suspended.
         receive: called in the reading thread for each status report, alarm and welcome, with the host's
             time.monotonic() at which the report was asked for, or the message arrived.
 
@@ -63,8 +62,9 @@ class Link:
         DeviceUnavailableError: the port cannot be opened.
     """
 
-    def __init__(self, port: str, baudrate: int, receive: Callable[[Message, float], None]) -> None:
+    def __init__(self, port: str, config: GrblConfig, receive: Callable[[Message, float], None]) -> None:
         self._where, self._receive = port, receive
+        self._stood_still_s = config.stood_still_s
         self._news = threading.Condition()
         self._writing = threading.Lock()
         self._waiting: deque[Sent] = deque()
@@ -77,7 +77,7 @@ class Link:
         self.version = ""
         self.death = ""  # why the connection ended
         try:
-            self._port = serial.serial_for_url(port, baudrate=baudrate, timeout=0.01, write_timeout=1.0)
+            self._port = serial.serial_for_url(port, baudrate=config.baudrate, timeout=0.01, write_timeout=1.0)
         except (*LINK_ERRORS, ValueError) as error:
             what = f"the port cannot be opened ({error})"
             remedy = "Check the cable, and the port in rig.yaml"
@@ -211,7 +211,7 @@ class Link:
                     self.act(STATUS)
                 heard += self._port.read(max(1, self._port.in_waiting))
                 before_s, looked_s = looked_s, time.monotonic()
-                if looked_s - before_s > STOOD_STILL_S:
+                if looked_s - before_s > self._stood_still_s:
                     self.went_on_s = looked_s
                 *lines, heard = heard.split(b"\n")
                 heard = heard[-LONGEST_LINE:]  # noise without line ends must not accumulate

@@ -6,11 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from drivers.grbl import AHEAD_S, PIECE_S
 from drivers.grbl.wire import jog
 from service.core.geometry import Array
 
-AHEAD_S = 0.15  # of motion in the controller's buffer beyond its braking distance; it moves as long without its host
-PIECE_S = 0.05  # of motion in a jog
 _BLOCKS = 10  # of the 15 that GRBL's planner holds
 ARRIVED = 0.02  # degrees or millimetres; positions are rounded to 0.001 and to whole steps
 

@@ -13,15 +13,12 @@ import numpy as np
 from drivers.arm.latch import Latch
 from drivers.errors import DeviceBusyError, DeviceError, DeviceUnavailableError, LeaveNeededError, SafetyStopError
 from drivers.grbl import LETTERS, GrblConfig
-from drivers.grbl.link import POLL_S, STOOD_STILL_S, Link, Sent
-from drivers.grbl.motion import AHEAD_S, PIECE_S, Motion
+from drivers.grbl.link import Link, Sent
+from drivers.grbl.motion import Motion
 from drivers.grbl.setup import Setup
 from drivers.grbl.wire import JOG_CANCEL, RESET, Alarm, Message, Refused, Status, Welcome
 from drivers.interfaces import Array, SafetyState
 
-HEARTBEAT_S = 0.2  # the axes are stopped if the program gives no sign of life for longer
-# Until the axes brake after the death of program, driver or line: what was handed over, or a heartbeat and a report.
-REACTION_S = max(AHEAD_S + 1.5 * PIECE_S, HEARTBEAT_S + POLL_S) + 0.05
 _UNANSWERED = 3  # lines that fit into the controller's 128 bytes
 _DRIVEN = ("Run", "Jog", "Home")
 _STOOD_STILL = "the driver's process stood still, and the axes were stopped"
@@ -233,7 +230,8 @@ class Mover:
         try:
             while link.unanswered < _UNANSWERED and (piece := motion.next_piece(position)) is not None:
                 self._sent.append(link.send(piece))
-                if time.monotonic() - now_s > STOOD_STILL_S:  # suspended between the checks above and this line
+                # Suspended between the checks above and this line?
+                if time.monotonic() - now_s > self._config.stood_still_s:
                     self._end(link, _STOOD_STILL)
                     return
         except DeviceError:
@@ -245,7 +243,7 @@ class Mover:
     def _unsupervised(self, link: Link, now_s: float) -> str:
         if link.went_on_s > self._began_s:  # the axes came to rest meanwhile, and must not move on by themselves
             return _STOOD_STILL
-        if now_s - self._beat_s > HEARTBEAT_S:
+        if now_s - self._beat_s > self._config.watchdog_s:
             return "the program gave no sign of life, and the axes were stopped"
         if now_s - self._attended_s > self._config.unattended_s:
             return f"the axes were stopped: nobody had looked at them for {self._config.unattended_s:g} s"

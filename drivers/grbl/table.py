@@ -23,7 +23,7 @@ from drivers.grbl import GrblConfig
 from drivers.grbl.axes import Axes
 from drivers.grbl.homing import home
 from drivers.grbl.link import Link
-from drivers.grbl.mover import REACTION_S, Mover
+from drivers.grbl.mover import Mover
 from drivers.grbl.setup import Setup, setup_of
 from drivers.grbl.wire import FEED_HOLD, JOG_CANCEL, Message, Status
 from drivers.interfaces import (
@@ -71,7 +71,7 @@ class GrblTable:
         self.close()
         self._arrived.clear()
         self._before = None
-        self._link = link = Link(self._where, self._config.baudrate, self._receive)
+        self._link = link = Link(self._where, self._config, self._receive)
         try:
             link.reset(self._config.connect_timeout_s)
             settings = link.request(b"$$", self._config.answer_timeout_s)
@@ -225,7 +225,7 @@ class GrblTable:
             [np.degrees(speed_rad_s) if a.turns else mm(self._config.slide_speed_m_s) for a in self._config.axes]
         )
         # From a higher speed they would not stand in time if nobody were left to stop them.
-        fastest = setup.acceleration * (self._config.rest_within_s - REACTION_S)
+        fastest = setup.acceleration * (self._config.rest_within_s - self._config.reaction_s)
         self._mover.begin(target, np.minimum(speeds, fastest))
 
     def stop(self) -> None:

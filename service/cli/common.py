@@ -16,7 +16,6 @@ from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
 from rich.measure import Measurement
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from typer.models import OptionInfo
 
@@ -146,6 +145,14 @@ def _unwritable(path: Path, error: OSError) -> ConfigurationError:
 @contextmanager
 def progress_bar(*, quiet: bool = False) -> Generator[Callable[[str, int, int], None]]:
     """A progress bar on stderr, shown after PROGRESS_AFTER_S seconds. Yields report(what, done, total)."""
+    from rich.progress import (  # noqa: PLC0415 - most commands have none
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
     started = time.monotonic()
     bar = Progress(
         TextColumn("{task.description}"),

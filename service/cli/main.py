@@ -13,6 +13,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from service.core.loading import begin_loading, end_loading
+
 
 @dataclass(frozen=True, slots=True)
 class _Command:
@@ -164,6 +166,7 @@ class _Commands(TyperGroup):
 def _loaded(name: str) -> Any:
     module, _, attribute = _COMMANDS[name].place.partition(":")
     found = getattr(importlib.import_module(module), attribute)
+    end_loading()
     if isinstance(found, typer.Typer):
         group = typer.main.get_group(found)
         group.name = name
@@ -194,6 +197,7 @@ def orthocapture(
 
 def main() -> None:
     """Entry point of the distribution."""
+    begin_loading()  # until the command is loaded
     # With small matrices and many processes, threads of the linear algebra wait for each other and are ten times
     # slower on a busy machine. The library reads this when it is loaded, here and in every child process.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

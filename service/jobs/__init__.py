@@ -6,6 +6,7 @@ from functools import cache
 from typing import Any
 
 from service.core.declared_kinds import declared_kinds
+from service.core.loading import loading
 from service.jobs.kind import JobKind
 
 GROUP = "orthocapture.jobs"  # entry points of plug-ins; each names a JobKind
@@ -18,5 +19,6 @@ def job_kinds() -> dict[str, JobKind[Any, Any]]:
     Raises:
         ConfigurationError: two declare the same name, or an entry point names something that is not a JobKind.
     """
-    kinds: dict[str, JobKind[Any, Any]] = declared_kinds(__name__, GROUP, JobKind)
+    with loading():
+        kinds: dict[str, JobKind[Any, Any]] = declared_kinds(__name__, GROUP, JobKind)
     return dict(sorted(kinds.items(), key=lambda item: (item[1].order, item[0])))

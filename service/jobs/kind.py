@@ -18,7 +18,7 @@ class JobRecord(BaseModel):
     Only fields that were set are written, so that a recorded answer and its recomputation are equal.
     """
 
-    model_config = ConfigDict(extra="allow", frozen=True)
+    model_config = ConfigDict(extra="allow", frozen=True, defer_build=True)
 
     def plain(self) -> dict[str, Any]:
         """The record as it is written into an event."""

@@ -10,7 +10,6 @@ import queue
 import smtplib
 import ssl
 import threading
-import time
 import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from email.message import EmailMessage
 from service.core.errors import ConfigurationError
 from service.monitor.snapshot import Standing
 from service.rig import AlertsSection, EmailSection, Rig, WebhookSection
+from service.store.durable_effects import Clock, SystemClock
 
 _TIMEOUT_S = 10.0
 _TRIES_S = (0.0, 2.0, 10.0)  # pause before each attempt
@@ -51,11 +51,9 @@ class Alert:
 class Alarm:
     """Follows the state of a run and sends alerts in a thread of its own: no capture waits for a mail server."""
 
-    def __init__(
-        self, section: AlertsSection, run_id: str, rig: str, *, monotonic_s: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, section: AlertsSection, run_id: str, rig: str, *, clock: Clock | None = None) -> None:
         """Raises ConfigurationError if a secret named in the rig file is missing from the environment."""
-        self._section, self._run_id, self._rig, self._monotonic_s = section, run_id, rig, monotonic_s
+        self._section, self._run_id, self._rig, self._clock = section, run_id, rig, clock or SystemClock()
         self._senders = _senders(section)
         self._since: tuple[tuple[str, str], float] = (("", ""), 0.0)
         self._told: tuple[str, str] = ("", "")
@@ -67,15 +65,15 @@ class Alarm:
         """Report the run's current state; called repeatedly. Waiting is reported after a delay, the rest at once."""
         now = (standing, words)
         if now != self._since[0]:
-            self._since = (now, self._monotonic_s())
+            self._since = (now, self._clock.monotonic_s())
         if standing == "works":
             self._told = ("", "")  # after work has resumed, the same stop is reported again
-        lasted_s = self._monotonic_s() - self._since[1]
+        lasted_s = self._clock.monotonic_s() - self._since[1]
         due_s = self._section.waits_after_s if standing == "waits" else 0.0
         if standing not in self._section.on or now == self._told or lasted_s < due_s:
             return
         self._told = now
-        self._queue.put(Alert(standing, self._run_id, self._rig, words, time.time()))
+        self._queue.put(Alert(standing, self._run_id, self._rig, words, self._clock.utc_now().timestamp()))
 
     def close(self) -> None:
         """Send pending alerts, for some seconds at most."""
@@ -85,18 +83,18 @@ class Alarm:
     def _send_all(self) -> None:
         while (alert := self._queue.get()) is not None:
             for name, send in self._senders:
-                _try(name, send, alert)
+                _try(name, send, alert, self._clock)
 
 
-def alarm_of(rig: Rig, run_id: str) -> Alarm | None:
+def alarm_of(rig: Rig, run_id: str, clock: Clock) -> Alarm | None:
     """The alarm configured in the rig file; None if it has no `alerts`."""
     section = rig.section.alerts
-    return None if section is None else Alarm(section, run_id, rig.section.name)
+    return None if section is None else Alarm(section, run_id, rig.section.name, clock=clock)
 
 
-def _try(name: str, send: Callable[[Alert], None], alert: Alert) -> None:
+def _try(name: str, send: Callable[[Alert], None], alert: Alert, clock: Clock) -> None:
     for pause_s in _TRIES_S:
-        time.sleep(pause_s)
+        clock.sleep(pause_s)
         try:
             send(alert)
         except (OSError, http.client.HTTPException, smtplib.SMTPException) as error:

@@ -66,12 +66,13 @@ class Figures:
 
 def read_figures(store: Store, data: Path, driven: Sequence[str]) -> Figures:
     """Read all figures; `driven` are the runs driven now. Raises StoreError; OSError if the disk fails."""
+    now_utc_s = store.clock.utc_now().timestamp()
     with store.database.reading() as connection:
         latest = select(runs.c.run_id).where(runs.c.run_id != SITE).order_by(runs.c.created_utc.desc()).limit(1)
         shown = list(driven) or list(connection.execute(latest).scalars())
         return Figures(
             runs=_runs(connection),
-            driven=[_driven(connection, data, run_id) for run_id in driven],
+            driven=[_driven(connection, data, run_id, now_utc_s) for run_id in driven],
             shown=shown,
             captures=connection.execute(
                 select(func.count()).select_from(event_index).where(event_index.c.kind.in_(CAPTURED))
@@ -85,7 +86,7 @@ def read_figures(store: Store, data: Path, driven: Sequence[str]) -> Figures:
             job_seconds=_job_seconds(connection),
             queue=_queue(connection),
             devices=[device for run_id in shown for device in _devices(connection, run_id)],
-            workers=len(living_workers(data)),
+            workers=len(living_workers(data, store.clock)),
             database_bytes=_database_bytes(store.database_path),
             free_bytes=shutil.disk_usage(data).free,
         )
@@ -99,9 +100,9 @@ def _runs(connection: Connection) -> dict[str, int]:
     return {"completed": completed, "aborted": known - completed - still, "open": still}
 
 
-def _driven(connection: Connection, data: Path, run_id: str) -> DrivenRun:
-    snapshot = read_snapshot(data, run_id)
-    silent_s = snapshot.unattended_s() if snapshot.at_utc_s else float("inf")
+def _driven(connection: Connection, data: Path, run_id: str, now_utc_s: float) -> DrivenRun:
+    snapshot = read_snapshot(data, run_id, now_utc_s)
+    silent_s = snapshot.unattended_s(now_utc_s) if snapshot.at_utc_s else float("inf")
     return DrivenRun(run_id, snapshot.doing, snapshot.robot, max(0.0, silent_s), _viewpoint_s(connection, run_id))
 
 

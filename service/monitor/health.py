@@ -15,6 +15,7 @@ from service.core.errors import OrthocaptureError
 from service.core.units import gigabytes
 from service.monitor.snapshot import read_snapshot
 from service.monitor.worker_sign import living_workers
+from service.store.durable_effects import Clock
 from service.store.store import Store
 
 _SILENT_S = 60.0  # a runner's longest call, fetching one photograph, is shorter
@@ -44,7 +45,12 @@ def read_health(store: Store, data: Path, driven: Sequence[str]) -> Health:
         database, queued = "", store.open_jobs()
     except OrthocaptureError as error:
         database, queued = error.what, 0
-    return Health(database, _data_folder(data), _worker(data, queued), _runners(data, driven))
+    return Health(
+        database,
+        _data_folder(data),
+        _worker(data, queued, store.clock),
+        _runners(data, driven, store.clock.utc_now().timestamp()),
+    )
 
 
 def _data_folder(data: Path) -> str:
@@ -57,14 +63,14 @@ def _data_folder(data: Path) -> str:
     return f"{gigabytes(free):.2f} GB are free: too little to capture" if free < LEAST_FREE_BYTES else ""
 
 
-def _worker(data: Path, queued: int) -> str:
-    if not queued or living_workers(data):
+def _worker(data: Path, queued: int, clock: Clock) -> str:
+    if not queued or living_workers(data, clock):
         return ""
     waiting = "a job waits" if queued == 1 else f"{queued} jobs wait"
     return f"{waiting}, and no worker is running"
 
 
-def _runners(data: Path, driven: Sequence[str]) -> str:
-    snapshots = [read_snapshot(data, run_id) for run_id in driven]
-    silent = [snapshot for snapshot in snapshots if snapshot.at_utc_s and snapshot.unattended_s() > _SILENT_S]
+def _runners(data: Path, driven: Sequence[str], now_utc_s: float) -> str:
+    snapshots = [read_snapshot(data, run_id, now_utc_s) for run_id in driven]
+    silent = [shot for shot in snapshots if shot.at_utc_s and shot.unattended_s(now_utc_s) > _SILENT_S]
     return f"{len(silent)} of {len(driven)} runners have not reported for {_SILENT_S:.0f} s" if silent else ""

@@ -5,13 +5,15 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
+from service.store.durable_effects import Clock
+
 
 class Heartbeat:
     """Calls each function repeatedly in a thread of its own, so that one that blocks does not hold up the others."""
 
-    def __init__(self, *works: Callable[[], None], every_s: float = 0.5) -> None:
+    def __init__(self, clock: Clock, *works: Callable[[], None], every_s: float = 0.5) -> None:
         self._every_s = every_s
-        self._stop = threading.Event()
+        self._stop = clock.signal()
         self._threads = [
             threading.Thread(target=self._run, args=(work,), name="reporter heartbeat", daemon=True) for work in works
         ]

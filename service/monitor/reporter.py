@@ -5,10 +5,8 @@ from __future__ import annotations
 import logging
 import shutil
 import threading
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from os import getpid
 from pathlib import Path
 
@@ -39,6 +37,7 @@ from service.monitor.snapshot import (
     write_frame,
     write_snapshot,
 )
+from service.store.durable_effects import Clock, SystemClock
 
 _log = logging.getLogger(__name__)
 _EVERY_S = 0.4
@@ -81,7 +80,7 @@ class Reporter:
     camera: Callable[[str], Camera]  # opens it by its name, for the live view that somebody asked for; "": the first
     alarm: Alarm | None = None
     outcome: str = "its program ended before the run did"  # the final alert's text
-    monotonic_s: Callable[[], float] = time.monotonic
+    clock: Clock = field(default_factory=SystemClock)
     _news: tuple[Message, ...] = ()
     _progress: tuple[str, int, int] = ("", 0, 0)
     _activity: tuple[str, float] = ("", 0.0)
@@ -96,11 +95,11 @@ class Reporter:
     _due_s: dict[str, float] = field(default_factory=dict[str, float])
 
     def __post_init__(self) -> None:
-        self._heartbeat = Heartbeat(self.beat, self.watch)
+        self._heartbeat = Heartbeat(self.clock, self.beat, self.watch)
 
     def begin(self) -> None:
         """Write twice a second from now on, until `end`."""
-        self._newest = self._newest.model_copy(update={"attended_utc_s": time.time()})
+        self._newest = self._newest.model_copy(update={"attended_utc_s": self._utc_s()})
         self.busy("starting")
         self._heartbeat.begin()
 
@@ -110,11 +109,11 @@ class Reporter:
 
     def busy(self, what: str) -> None:
         """Announce a call of the main loop that may take long."""
-        self._activity = (what, time.time())
+        self._activity = (what, self._utc_s())
 
     def tell(self, message: str) -> None:
         """Add one message."""
-        news = Message(at_utc=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"), text=message)
+        news = Message(at_utc=self.clock.utc_now().strftime("%Y-%m-%dT%H:%M:%SZ"), text=message)
         self._news = (*self._news, news)[-_MESSAGES:]
         self._due_s.pop("snapshot", None)
 
@@ -152,7 +151,7 @@ class Reporter:
         for camera in devices.cameras.values():
             if self._due("camera", _CAMERA_S):
                 self._camera = read_camera(camera)
-        now_s = time.time()
+        now_s = self._utc_s()
         return Snapshot(
             at_utc_s=now_s,
             attended_utc_s=now_s,
@@ -182,7 +181,7 @@ class Reporter:
             if newest.doing == "ended":
                 return
             told: dict[str, object] = {
-                "at_utc_s": time.time(), "pid": getpid(), "what": what, "done": done, "total": total,
+                "at_utc_s": self._utc_s(), "pid": getpid(), "what": what, "done": done, "total": total,
                 "messages": self._news, "activity": activity, "activity_utc_s": since_s,
             }  # fmt: skip
             if watched_s > newest.robot_utc_s:
@@ -193,10 +192,10 @@ class Reporter:
     def watch(self) -> None:
         """Read the robot's pose stream while the main loop is in a long call. May block on the robot."""
         newest = self._newest
-        if time.time() - newest.attended_utc_s < _QUIET_S or newest.doing == "ended":
+        if self._utc_s() - newest.attended_utc_s < _QUIET_S or newest.doing == "ended":
             return
-        asked_s = time.time()
-        self._watched = (asked_s, watch_robot(self.devices(), self.monotonic_s()))
+        asked_s = self._utc_s()
+        self._watched = (asked_s, watch_robot(self.devices(), self.clock.monotonic_s()))
 
     def _elsewhere(self) -> str:
         """The run's state in a few words, for alerts."""
@@ -211,7 +210,7 @@ class Reporter:
         self._tower(self.devices(), "ended")
         with self._writing:
             self._newest = Snapshot(
-                at_utc_s=time.time(),
+                at_utc_s=self._utc_s(),
                 pid=getpid(),
                 doing="ended",
                 step=last.step,
@@ -228,31 +227,34 @@ class Reporter:
         """Set the signal tower; a light box without one, or one that does not answer, is ignored."""
         light = _TOWER[standing]
         for box in devices.lightboxes.values():
-            if light == self._tower_light or self.monotonic_s() < self._due_s.get("tower", 0.0):
+            if light == self._tower_light or self.clock.monotonic_s() < self._due_s.get("tower", 0.0):
                 continue
             try:
                 box.show_tower(light)
             except DeviceError as error:
                 _log.warning("the signal tower cannot be switched: %s", error)
-                self._due_s["tower"] = self.monotonic_s() + _CAMERA_S
+                self._due_s["tower"] = self.clock.monotonic_s() + _CAMERA_S
             else:
                 self._tower_light = light
 
     def _frame(self) -> None:
         """Write a frame of the live view while somebody looks; only when the camera is idle."""
-        wanted = frames_wanted(self.data, self.run_id)
+        wanted = frames_wanted(self.data, self.run_id, self._utc_s())
         if wanted is None or not self._due("frame", _FRAME_S):
             return
         try:
             jpeg = self.camera(wanted).preview()
         except OrthocaptureError as error:
             self.tell(f"the live view does not work: {error}")
-            self._due_s["frame"] = self.monotonic_s() + _CAMERA_S
+            self._due_s["frame"] = self.clock.monotonic_s() + _CAMERA_S
             return
         self._write(lambda: write_frame(self.data, self.run_id, jpeg, wanted))
 
+    def _utc_s(self) -> float:
+        return self.clock.utc_now().timestamp()
+
     def _due(self, what: str, every_s: float) -> bool:
-        now_s = self.monotonic_s()
+        now_s = self.clock.monotonic_s()
         if now_s < self._due_s.get(what, 0.0):
             return False
         self._due_s[what] = now_s + every_s

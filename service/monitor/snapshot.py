@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-import time
 from pathlib import Path
 from typing import Any, Literal
 
@@ -67,9 +66,9 @@ class Snapshot(Record):
     question: str = ""
     pedal_armed: bool = False  # pressed once; a second press lets the robot move
 
-    def age_s(self) -> float:
+    def age_s(self, now_utc_s: float) -> float:
         """Seconds since it was written, by now."""
-        return time.time() - self.at_utc_s
+        return now_utc_s - self.at_utc_s
 
     def shown(self) -> tuple[object, ...]:
         """What a screen shows, rounded to visible steps: without rounding, noise would redraw every page."""
@@ -80,10 +79,9 @@ class Snapshot(Record):
             seen["light_lux"] = math.log(self.light_lux)
         return tuple(round(value / steps[name]) if name in steps and value else value for name, value in seen.items())
 
-    @property
-    def stale(self) -> bool:
-        """Whether it is too old to tell the current state."""
-        return self.age_s() > (STARTING_S if self.doing == "starting" else STALE_S)
+    def stale(self, now_utc_s: float) -> bool:
+        """Whether it is by now too old to tell the current state."""
+        return self.age_s(now_utc_s) > (STARTING_S if self.doing == "starting" else STALE_S)
 
     @property
     def standing(self) -> Standing:
@@ -99,9 +97,9 @@ class Snapshot(Record):
         """Seconds since the main loop's last report, when this was written."""
         return max(0.0, self.at_utc_s - self.attended_utc_s) if self.attended_utc_s else 0.0
 
-    def unattended_s(self) -> float:
+    def unattended_s(self, now_utc_s: float) -> float:
         """Seconds since the main loop's last report, by now."""
-        return time.time() - (self.attended_utc_s or self.at_utc_s)
+        return now_utc_s - (self.attended_utc_s or self.at_utc_s)
 
     @property
     def robot_silent_s(self) -> float:
@@ -133,13 +131,13 @@ def write_snapshot(data: Path, run_id: str, snapshot: Snapshot) -> None:
     _replace(_path(data, run_id, "json"), snapshot.model_dump_json().encode())
 
 
-def read_snapshot(data: Path, run_id: str) -> Snapshot:
-    """The latest snapshot; an unknown one if there is none, or if its runner has fallen silent."""
+def read_snapshot(data: Path, run_id: str, now_utc_s: float) -> Snapshot:
+    """The latest snapshot; an unknown one if there is none, or if its runner has by now fallen silent."""
     try:
         snapshot = Snapshot.model_validate_json(_path(data, run_id, "json").read_bytes())
     except (OSError, ValidationError):
         return Snapshot()
-    if snapshot.stale and snapshot.doing != "ended":
+    if snapshot.stale(now_utc_s) and snapshot.doing != "ended":
         return snapshot.model_copy(update={"doing": "unknown", "robot": "unknown"})
     return snapshot
 
@@ -152,11 +150,11 @@ def ask_for_frames(data: Path, run_id: str, camera: str = "") -> None:
     _replace(_path(data, run_id, "wanted"), camera.encode())
 
 
-def frames_wanted(data: Path, run_id: str, *, within_s: float = 3.0) -> str | None:
+def frames_wanted(data: Path, run_id: str, now_utc_s: float, *, within_s: float = 3.0) -> str | None:
     """The camera at whose live view somebody has looked within this time, last; "": the first one; None: nobody."""
     path = _path(data, run_id, "wanted")
     try:
-        return path.read_text() if time.time() - path.stat().st_mtime < within_s else None
+        return path.read_text() if now_utc_s - path.stat().st_mtime < within_s else None
     except OSError:
         return None
 

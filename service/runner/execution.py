@@ -24,6 +24,7 @@ from service.runner.held_run import HeldRun
 from service.runner.operator import Operator
 from service.steps import step_kinds
 from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
+from service.store.durable_effects import Clock
 
 _NOBODY_S = 30.0  # a worker that died has been replaced by then
 _TOLD_AGAIN_S = 300.0
@@ -36,18 +37,18 @@ class WorkerWatch:
 
     data: Path
     tell: Callable[[str], None]
-    monotonic_s: Callable[[], float]
+    clock: Clock
     _look_at_s: float = field(default=-math.inf, init=False)
     _tell_at_s: float | None = field(default=None, init=False)
 
     def look(self, jobs: Collection[JobState]) -> None:
         """Look at the jobs of the step under way. Called again and again; looks every few seconds."""
-        now_s = self.monotonic_s()
+        now_s = self.clock.monotonic_s()
         if now_s < self._look_at_s:
             return
         self._look_at_s = now_s + _EVERY_S
         open_jobs = sum(job.status == "enqueued" for job in jobs)
-        if not open_jobs or living_workers(self.data):
+        if not open_jobs or living_workers(self.data, self.clock):
             self._tell_at_s = None
             return
         if self._tell_at_s is None:
@@ -68,8 +69,7 @@ class StepExecution:
     operator: Operator
     disk: DiskWatch
     workers: WorkerWatch
-    monotonic_s: Callable[[], float]
-    wait: Callable[[float], None]
+    clock: Clock
 
     def execute(self, step_id: str, attempt: int) -> None:
         """Execute a step and record its outcome or failure; an interruption by an operator is only told."""
@@ -106,13 +106,13 @@ class StepExecution:
                 attempt,
                 checkpoint,
                 operator.show,
-                self.wait,
+                self.clock.sleep,
                 self.disk.require,
             ),
             checkpoint=checkpoint,
             progress=operator.show,
-            monotonic_s=self.monotonic_s,
-            wait=self.wait,
+            monotonic_s=self.clock.monotonic_s,
+            wait=self.clock.sleep,
             operator=operator.name,
             tell=operator.tell,
             busy=operator.busy,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import socket
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from os import getpid
 from pathlib import Path
@@ -57,7 +55,7 @@ _POLL_S = 0.1
 
 @dataclass
 class Runner:
-    """Drives one run to its end.
+    """Drives one run to its end, by the store's clock.
 
     `authority`, if given, stamps the record when the run ends; `signature_copy` is the path of the copy of the log of
     signatures.
@@ -70,8 +68,6 @@ class Runner:
     operator: Operator
     authority: Authority | None = None
     signature_copy: Path | None = None
-    monotonic_s: Callable[[], float] = time.monotonic
-    wait: Callable[[float], None] = time.sleep
     _run: HeldRun = field(init=False)
     _seal: Seal = field(init=False)
     _pedal: Pedal = field(init=False)
@@ -83,7 +79,7 @@ class Runner:
 
         Raises LeaseHeldError if another runner drives the run, LeaseLostError if one has taken it over.
         """
-        operator = self.operator
+        operator, clock = self.operator, self.store.clock
         with short_collections(), held_run(self.store, self.run_id, self.protocol) as self._run:
             self._seal = Seal(
                 self.store, self.run_id, self.authority, self.signature_copy, operator.busy, operator.tell
@@ -91,13 +87,11 @@ class Runner:
             if self._run.state.terminal:
                 self._seal.sign_if_missing()
                 return self._run.state
-            disk = DiskWatch(self._run, self.protocol, operator.tell, self.monotonic_s)
-            self._pedal = Pedal(self._presses, self.monotonic_s, operator.tell)
+            disk = DiskWatch(self._run, self.protocol, operator.tell, clock.monotonic_s)
+            self._pedal = Pedal(self._presses, clock.monotonic_s, operator.tell)
             self._clocks = ClockWatch(self._run.follower, operator.tell)
-            workers = WorkerWatch(self.store.database_path.parent, operator.tell, self.monotonic_s)
-            self._steps = StepExecution(
-                self._run, self.protocol, self.devices, operator, disk, workers, self.monotonic_s, self.wait
-            )
+            workers = WorkerWatch(self.store.database_path.parent, operator.tell, clock)
+            self._steps = StepExecution(self._run, self.protocol, self.devices, operator, disk, workers, clock)
             self._begin_session()
             disk.forecast()
             try:
@@ -157,7 +151,7 @@ class Runner:
             case Halt():
                 self.operator.show("paused", 0, 0)
                 self.operator.attend("paused", state, pedal_armed=False)
-                self.wait(_POLL_S)
+                self.store.clock.sleep(_POLL_S)
 
     def _judge(self, due: EvaluateGates, state: RunState) -> None:
         step = self.protocol.step(due.step)
@@ -172,7 +166,7 @@ class Runner:
         """Begin again after the wait, unless the decision has changed by then, such as by a pause or an abort."""
         left_s = decision.wait_s
         while left_s > 0:
-            self.wait(min(_POLL_S, left_s))
+            self.store.clock.sleep(min(_POLL_S, left_s))
             left_s -= _POLL_S
             now = self._run.refresh()
             if decide(self.protocol, now) != decision:
@@ -187,7 +181,7 @@ class Runner:
         answer = self._by_pedal(question, state) or self.operator.poll(question, state)
         self.operator.attend("asking", state, pedal_armed=self._pedal.armed, asked=question)
         if answer is None:
-            self.wait(_POLL_S)
+            self.store.clock.sleep(_POLL_S)
         elif isinstance(answer, AnswerBy):
             self.submit(answer.action, answer.actor)
         else:

@@ -6,6 +6,7 @@ from functools import cache
 from typing import Any
 
 from service.core.declared_kinds import declared_kinds
+from service.core.loading import loading
 from service.core.protocol.step_params import StepParams
 from service.steps.context import StepKind
 
@@ -19,7 +20,8 @@ def step_kinds() -> dict[str, StepKind[Any]]:
     Raises:
         ConfigurationError: two declare the same name, or an entry point names something that is not a StepKind.
     """
-    kinds: dict[str, StepKind[Any]] = declared_kinds(f"{__name__}.kinds", GROUP, StepKind)
+    with loading():
+        kinds: dict[str, StepKind[Any]] = declared_kinds(f"{__name__}.kinds", GROUP, StepKind)
     return dict(sorted(kinds.items()))
 
 

@@ -48,7 +48,7 @@ class StationLayout:
 class LeaveToMove:
     """A person's recorded confirmation that the arms may move. Each arm uses it once; after a stop it needs another.
 
-    `not_before_monotonic_s` is a time.monotonic() of the host before the confirmation was given.
+    `not_before_monotonic_s` is a time of the host's monotonic clock before the confirmation was given.
     """
 
     seq: int  # of its event

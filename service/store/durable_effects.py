@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import threading
 import time
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
@@ -111,8 +112,24 @@ def _sync(path: Path, flags: int) -> None:
         os.close(descriptor)
 
 
+class Signal(Protocol):
+    """What one thread sets and others wait for, as long as a clock says; a `threading.Event` is one."""
+
+    def set(self) -> None:
+        """Wake all that wait, and let nobody wait any more."""
+        ...
+
+    def is_set(self) -> bool:
+        """Whether it was set."""
+        ...
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until it is set, or for `timeout` seconds of the clock; returns whether it is set."""
+        ...
+
+
 class Clock(Protocol):
-    """The source of times."""
+    """The source of times, and of waits: whatever waits for a time to come waits on the clock that tells it."""
 
     def utc_now(self) -> datetime:
         """The present time in UTC, timezone-aware."""
@@ -120,6 +137,14 @@ class Clock(Protocol):
 
     def monotonic_s(self) -> float:
         """Monotonic time of the host in seconds; all processes of one boot share its origin."""
+        ...
+
+    def sleep(self, seconds: float) -> None:
+        """Return when so many seconds have passed."""
+        ...
+
+    def signal(self) -> Signal:
+        """A new signal, on which threads wait by this clock."""
         ...
 
 
@@ -133,6 +158,14 @@ class SystemClock:
     def monotonic_s(self) -> float:
         """Seconds of the host's monotonic clock."""
         return time.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Suspend this thread for so many seconds."""
+        time.sleep(seconds)
+
+    def signal(self) -> Signal:
+        """A `threading.Event`."""
+        return threading.Event()
 
 
 def utc_text(at: datetime) -> str:

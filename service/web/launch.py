@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import sys
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -63,7 +62,7 @@ class Launcher:
             ) from error
         with self._lock:
             self._children[run_id] = child
-        now_s = time.time()
+        now_s = self.store.clock.utc_now().timestamp()
         first = Snapshot(at_utc_s=now_s, pid=child.pid, doing="starting", activity="starting", activity_utc_s=now_s)
         with contextlib.suppress(OSError):  # the runner will report by itself soon
             write_snapshot(self.data, run_id, first)

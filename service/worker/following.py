@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from datetime import UTC, datetime
 from functools import partial, reduce
 from typing import Any
 
@@ -55,7 +54,7 @@ class FollowedRuns:
         follow: tuple[int, Callable[[Sequence[Event]], Sequence[NewJob]]] | None = None
         if log is not None:
             state, protocol = log.refresh(), log.protocol
-            late = late_s(protocol, state, datetime.now(UTC).isoformat())
+            late = late_s(protocol, state, self._store.clock.utc_now().isoformat())
             follow = state.seq, lambda events: due(protocol, reduce(partial(advance, protocol), events, state))
         self._store.finish_job(
             job,

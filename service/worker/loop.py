@@ -7,7 +7,6 @@ import os
 import socket
 import tempfile
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -65,13 +64,13 @@ def work(
     while not stop():
         waiting = _disk_full(store, told=waiting)
         if waiting:
-            time.sleep(_POLL_S)
+            store.clock.sleep(_POLL_S)
             continue
         job = store.claim_job(name, _LEASE_S, kinds=list(HANDLERS), lane=lane)
         if job is None:
             if until_idle:
                 return done
-            time.sleep(_POLL_S)
+            store.clock.sleep(_POLL_S)
             continue
         following = following or _following(store)
         _do(store, job, progress, following)
@@ -95,7 +94,7 @@ def _following(store: Store) -> FollowedRuns:
 
 
 def _do(store: Store, job: Job, progress: Callable[[str, int, int], None], following: FollowedRuns) -> None:
-    started_s = time.monotonic()
+    started_s = store.clock.monotonic_s()
     at(run=job.run_id, step=job.step, job=job.job_id)
     answer = JobAnswer({})
     attempt = _JobAttempt(store, job)
@@ -108,7 +107,7 @@ def _do(store: Store, job: Job, progress: Callable[[str, int, int], None], follo
             store.fail_job(job, attempt.error, retry=_worth_another_try(attempt.error))
             following.seal(job.run_id)
             return
-        following.finish(job, answer, time.monotonic() - started_s)
+        following.finish(job, answer, store.clock.monotonic_s() - started_s)
     except LeaseLostError:
         _log.warning("job %s was taken over by another worker; its result stands", job.job_id)
 
@@ -126,7 +125,7 @@ class _JobAttempt:
     def __init__(self, store: Store, job: Job) -> None:
         self.error: Exception | None = None
         self._store, self._job = store, job
-        self._stop = threading.Event()
+        self._stop = store.clock.signal()
         self._thread = threading.Thread(target=self._renew, daemon=True)
 
     def __enter__(self) -> None:

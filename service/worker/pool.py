@@ -76,9 +76,9 @@ class Pool:
                     progress(what, done, total)
         for index, child in enumerate(self._children):
             if child.died_s is None and not child.process.is_alive():
-                child.died_s = time.monotonic()
+                child.died_s = self._store.clock.monotonic_s()
                 _log.warning("process %s of the worker died; its job is computed again", child.process.pid)
-            if child.died_s is not None and time.monotonic() - child.died_s > _RESTART_S:
+            if child.died_s is not None and self._store.clock.monotonic_s() - child.died_s > _RESTART_S:
                 self._end(child)
                 self._children[index] = self._start(child.lane)
         for lane, most in self._most.items():
@@ -86,7 +86,7 @@ class Pool:
             if there < min(most, self._store.open_jobs(lane=lane)):
                 self._children.append(self._start(lane))
         if not by_pipe:
-            time.sleep(timeout_s)
+            self._store.clock.sleep(timeout_s)
         return bool(heard)
 
     @property
@@ -150,7 +150,7 @@ def work_side_by_side(
     with Store.open(data) as store:
         if until_idle and not store.open_jobs():
             return 0
-        with Pool(store, data, at_once) as pool, contextlib.closing(SignOfLife(data)) as sign:
+        with Pool(store, data, at_once) as pool, contextlib.closing(SignOfLife(data, store.clock)) as sign:
             while not stop():
                 pool.tend(progress)
                 sign.give(pool.done)

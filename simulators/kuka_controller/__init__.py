@@ -7,11 +7,11 @@ import os
 
 import numpy as np
 
-from simulators.kuka_controller.controller import MODES, Controller
+from simulators.kuka_controller.controller import HEARTBEAT_S, MODES, Controller
 from simulators.kuka_controller.fri import VERSIONS
 from simulators.kuka_controller.kinematics import MODELS, Array
 from simulators.kuka_controller.server import Server
-from simulators.serve import SimulatorError, Termination, announce
+from simulators.serve import SimulatorError, Termination, add_patience, announce
 from simulators.world_link import WorldLink
 
 HOME_RAD = (0.0, 0.5236, 0.0, -1.2217, 0.0, 1.3963, 0.0)
@@ -35,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--world", default="", metavar="HOST:PORT", help="world socket that receives the joints")
     parser.add_argument("--arm", default="robot", help="name of the arm in the world and in fault plans")
+    add_patience(parser)
 
 
 def serve(args: argparse.Namespace) -> None:
@@ -47,6 +48,7 @@ def serve(args: argparse.Namespace) -> None:
         faults=args.faults,
         device=args.arm,
         speed_up=args.speed_up,
+        heartbeat_s=max(HEARTBEAT_S, args.patience),
         true_load_kg=args.true_load_kg,
     )
     controller.mode = args.mode

@@ -86,10 +86,10 @@ class Controller:
 
     def __init__(
         self, model: Model, *, joints: Array, serial: str, faults: FaultPlan, device: str, speed_up: float = 1.0,
-        true_load_kg: float | None = None,
+        true_load_kg: float | None = None, heartbeat_s: float = HEARTBEAT_S,
     ) -> None:  # fmt: skip
         self.model, self.serial, self.faults, self.device = model, serial, faults, device
-        self.speed_up, self.true_load_kg = speed_up, true_load_kg
+        self.speed_up, self.true_load_kg, self.heartbeat_s = speed_up, true_load_kg, heartbeat_s
         self.time_s = 0.0
         self.mode, self.safety, self.locked = "AUT", "normal", True
         self.override = 1.0
@@ -188,9 +188,9 @@ class Controller:
         if self.motion is None:
             self._still_s += dt_s
             return None
-        if self.silent_s > HEARTBEAT_S and self.motion.stopping is None:
+        if self.silent_s > self.heartbeat_s and self.motion.stopping is None:
             self.locked = True
-            self.stop("heartbeat", f"the arm was stopped: no line of its client for {HEARTBEAT_S:g} s")
+            self.stop("heartbeat", f"the arm was stopped: no line of its client for {self.heartbeat_s:g} s")
         return self._move(self.motion, dt_s)
 
     def _move(self, motion: _Motion, dt_s: float) -> MotionEnd | None:

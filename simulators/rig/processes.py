@@ -28,11 +28,12 @@ from simulators.rig.deliveries import (
     scanner_sections,
 )
 from simulators.rig.export_processes import ExportProcesses
+from simulators.rig.patience import patient
 from simulators.rig.truth import truth_of
 from simulators.rig.world_server import World, WorldServer
 from simulators.scene.further_cameras import PLACES, FurtherCamera, further_cameras
 from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
-from simulators.serve import SimulatorError, Termination, announce
+from simulators.serve import SimulatorError, Termination, add_patience, announce
 
 _LOAD_KG = 1.6  # camera, lens and mount
 _TAPE_SIGMA_M = 0.003  # accuracy with which a technician measures the scene's centre with a tape
@@ -85,6 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ahead", action="store_true", help="compute what the CT and the scanner deliver before it is asked for"
     )
+    add_patience(parser)
 
 
 def serve(args: argparse.Namespace) -> None:
@@ -158,7 +160,8 @@ class _Rig:
         for arm, host in zip(self.arms, hosts, strict=True):
             self._child(
                 arm, self.scene.arm.simulator, "--host", host, "--speed-up", str(self.args.speed_up),
-                f"--initial-joints={joints}", "--world", world, "--arm", arm, *self._model(),
+                f"--initial-joints={joints}", "--world", world, "--arm", arm,
+                "--patience", str(self.args.patience), *self._model(),
             )  # fmt: skip
         camera = self._child(
             "camera", CAMERAS[self.args.camera], *place(self.args.camera, self.args.host, self.folder),
@@ -268,18 +271,19 @@ class _Rig:
     def _rig_file(self, camera: dict[str, Any], hosts: list[str]) -> dict[str, Any]:
         driver = {"ur": "ur", "kuka": "kuka_sunrise"}[self.scene.arm.simulator]
         robots = {arm: {"driver": driver, "host": host} for arm, host in zip(self.arms, hosts, strict=True)}
+        devices: dict[str, dict[str, Any]] = {
+            **robots,
+            "camera": self._camera(camera),
+            **{name: self._camera(self._ready[name]) for name in self.further},
+            **scanner_sections(self.args),
+            "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
+            "lightbox": {"driver": "lightbox", "port": "lightbox"},
+        }
         rig: dict[str, Any] = {
             "name": f"simulated rig, scene {self.scene.seed}",
             "simulated": True,
             "hands": self.server.address,
-            "devices": {
-                **robots,
-                "camera": self._camera(camera),
-                **{name: self._camera(self._ready[name]) for name in self.further},
-                **scanner_sections(self.args),
-                "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
-                "lightbox": {"driver": "lightbox", "port": "lightbox"},
-            },
+            "devices": {name: patient(section, self.args.patience) for name, section in devices.items()},
         }
         if self.further:
             rig["cameras"] = {

@@ -9,7 +9,7 @@ from types import FrameType
 
 import numpy as np
 
-from simulators.serve import SimulatorError, Termination, announce
+from simulators.serve import SimulatorError, Termination, add_patience, announce
 from simulators.ur_controller.controller import Controller
 from simulators.ur_controller.kinematics import MODELS
 from simulators.ur_controller.server import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT, Server
@@ -31,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--world", default="", metavar="HOST:PORT", help="world socket that receives the joints")
     parser.add_argument("--local", action="store_true", help="start in local control; SIGUSR1 switches to remote")
     parser.add_argument("--arm", default="robot", help="name of the arm in the world and in fault plans")
+    add_patience(parser)
 
 
 def serve(args: argparse.Namespace) -> None:
@@ -48,6 +49,7 @@ def serve(args: argparse.Namespace) -> None:
         faults=args.faults,
         device=args.arm,
         speed_up=args.speed_up,
+        patience_s=args.patience,
     )
     controller.local = args.local
 

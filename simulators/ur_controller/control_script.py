@@ -314,7 +314,7 @@ class ControlProgram:
 
     def _watch(self) -> None:
         frequency_hz = self._in(0)
-        self._watchdog_s = 1.0 / frequency_hz if frequency_hz > 0 else 0.0
+        self._watchdog_s = max(1.0 / frequency_hz, self._c.patience_s) if frequency_hz > 0 else 0.0
 
     def _payload(self) -> None:
         cog = [self._in(1), self._in(2), self._in(3)]

@@ -81,8 +81,10 @@ class Controller:
         faults: FaultPlan,
         device: str,
         speed_up: float = 1.0,
+        patience_s: float = 0.0,
     ) -> None:
         self.model, self.version, self.serial, self.speed_up = model, version, serial, speed_up
+        self.patience_s = patience_s  # the watchdog of a program waits at least so long
         self.faults, self.device = faults, device
         self.step_s = 0.002 if version[0] >= 5 else 0.008
         self.time_s = 0.0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +15,7 @@ from drivers.interfaces import Camera, CameraSettings
 from simulators.hand.technician import Press
 from simulators.rig.world_server import World, WorldServer
 from simulators.scene.world import Scene
+from tests.support.processes.waiting import until
 from tests.support.rig.camera_simulator import camera_simulator
 from tests.support.rig.gphoto_rig import PAPER, driver
 
@@ -48,11 +48,20 @@ def _open_when_ready(camera: Camera) -> None:
     raise AssertionError("the simulated body does not get ready")
 
 
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Gets a line for each exposure, once its image is made."""
+    path = tmp_path_factory.mktemp("camera") / "exposures.jsonl"
+    path.touch()
+    return path
+
+
 @pytest.fixture(scope="module", params=["camera", "canon"])
-def held(request: pytest.FixtureRequest) -> Iterator[tuple[World, Camera]]:
+def held(request: pytest.FixtureRequest, log: Path) -> Iterator[tuple[World, Camera]]:
+    options = ("--fast", "--exposures-log", str(log))
     with (
         _world() as (world, address),
-        camera_simulator((), "--world", address, "--fast", width=240, name=request.param) as simulator,
+        camera_simulator((), "--world", address, *options, width=240, name=request.param) as simulator,
     ):
         camera = driver(simulator.gphoto_port)
         try:
@@ -79,14 +88,20 @@ def test_a_press_of_the_button_brings_an_image(held: tuple[World, Camera], tmp_p
     assert released_by_software.counter == image.counter + 1
 
 
+def asked(camera: Camera) -> bool:
+    camera.report()
+    return True
+
+
 def test_an_image_announced_while_the_camera_is_asked_something_else_is_not_lost(
-    held: tuple[World, Camera], tmp_path: Path
+    held: tuple[World, Camera], log: Path, tmp_path: Path
 ) -> None:
     world, camera = held
+    before = len(log.read_text().splitlines())
     world.press_shutter(Press())
-    for _ in range(30):  # longer than an exposure takes, so that its announcement arrives in between
+    until(lambda: asked(camera) and len(log.read_text().splitlines()) > before, "no exposure")
+    for _ in range(5):  # its announcement arrives in between
         camera.report()
-        time.sleep(0.1)
     (image,) = camera.released_images(tmp_path, 90.0)
     assert image.exif == PAPER
 

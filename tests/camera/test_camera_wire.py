@@ -16,6 +16,7 @@ import pytest
 
 from simulators.geometry import look_at
 from simulators.scene.world import Scene
+from tests.support.processes.lateness import Lateness
 from tests.support.rig.camera_simulator import RunningCamera, camera_simulator
 from tests.support.vendor.camera_vendor_session import vendor_session
 
@@ -103,12 +104,13 @@ def test_a_value_that_is_not_offered_is_refused_and_nothing_changes(camera: Runn
     assert answers[3] == "100"
 
 
+@pytest.mark.realtime
 def test_settings_take_no_delayed_acknowledgements() -> None:
-    with camera_simulator() as camera:
+    with camera_simulator() as camera, Lateness() as lateness:
         steps = [["set", "iso", value] for value in ("100", "200") * 6]
         times_s = vendor_session(camera.gphoto_port, *steps)
-    # Without TCP_QUICKACK each takes 44 ms; on a busy machine up to half of them may be delayed.
-    assert sorted(times_s)[len(times_s) // 2] < 0.02
+    # Without TCP_QUICKACK each takes 44 ms; on a busy machine up to three quarters of them may be delayed.
+    assert sorted(times_s)[len(times_s) // 4] < 0.02 + 4 * lateness.usual_s
 
 
 def test_capture_raw_and_jpeg_share_a_stem_and_the_log_has_the_bytes_that_were_sent(tmp_path: Path) -> None:
@@ -121,7 +123,7 @@ def test_capture_raw_and_jpeg_share_a_stem_and_the_log_has_the_bytes_that_were_s
             ["events", 0.3],
             ["set", "imagequality", "RAW+JPEG"],
             ["trigger"],
-            ["events", 20.0, 2],
+            ["events", 60.0, 2],
         )
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     assert single["name"] == "capt_DSC00001.JPG"
@@ -138,8 +140,10 @@ def test_capture_raw_and_jpeg_share_a_stem_and_the_log_has_the_bytes_that_were_s
 @pytest.mark.parametrize(("announce", "complete"), [("event", False), ("property", True)])
 def test_end_of_capture_by_event_or_by_property(announce: str, complete: bool) -> None:
     with camera_simulator((), "--announce", announce) as camera:
-        steps = (["set", "focusmode", "Manual"], ["trigger"], ["events", 1.2])
-        events = vendor_session(camera.gphoto_port, *steps)[2]
+        steps: list[list[Any]] = [["set", "focusmode", "Manual"], ["trigger"], ["events", 60.0, 1]]
+        if complete:
+            steps.append(["events", 60.0, 99, "complete"])
+        events = [event for events in vendor_session(camera.gphoto_port, *steps)[2:] for event in events]
     files = [data["name"] for kind, data in events if kind == "file"]
     assert files == ["capt_DSC00001.JPG"]
     if complete:

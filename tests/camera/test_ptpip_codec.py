@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import time
 from pathlib import Path
 
 import pytest
@@ -18,6 +17,7 @@ from simulators.sony_camera.responder import SonyResponder
 from simulators.still_camera.body import BodyOptions
 from simulators.still_camera.operations import RefusedValueError
 from simulators.still_camera.scene import PictureFiles, StillLife, exposure_gain
+from tests.support.processes.waiting import until
 
 GUID = bytes(range(16))
 
@@ -118,9 +118,7 @@ def test_exposure_through_the_operations(body: SonyBody) -> None:
     assert responder.handle(request(0x1008, 0xFFFFC001), b"").code == 0x2009
     assert responder.handle(request(0x9207, 0xD2C1), b"\x02\x00").code == 0x2001
     assert responder.handle(request(0x9207, 0xD2C2), b"\x02\x00").code == 0x2001
-    deadline = time.monotonic() + 20
-    while body.properties.value(Code.OBJECTS_IN_MEMORY) != 0x8001 and time.monotonic() < deadline:
-        time.sleep(0.01)
+    until(lambda: body.properties.value(Code.OBJECTS_IN_MEMORY) == 0x8001, "no image in its memory", every_s=0.01)
     info = responder.handle(request(0x1008, 0xFFFFC001), b"").data
     file = responder.handle(request(0x1009, 0xFFFFC001), b"").data
     assert info is not None

@@ -20,7 +20,7 @@ from service.core import errors as core_errors
 from service.core.errors import OrthocaptureError
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.runs.bench_run import PROTOCOL, begin_run
+from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
 ROOT = Path(__file__).parents[2]
 # Errors of steps and drivers always reach a person; elsewhere some are only for programmers.
@@ -71,7 +71,7 @@ def test_a_controller_that_hangs_up_is_told_with_what_to_do() -> None:
 
 
 def test_a_data_folder_that_is_gone_is_told_with_what_to_do(tmp_path: Path) -> None:
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         (tmp_path / "data").rename(tmp_path / "aside")
         with pytest.raises(core_errors.StoreError) as raised_error:
             store.free_bytes()

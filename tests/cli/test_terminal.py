@@ -6,13 +6,13 @@ import json
 import os
 import pty
 import select
-import subprocess
 import time
 from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 
+from tests.support.processes.forked import Forked
 from tests.support.rig.rig import REPOSITORY, command, orthocapture
 
 PROTOCOL = """
@@ -45,7 +45,7 @@ class Terminal:
         self.data = folder / "data"
         self._master, slave = pty.openpty()
         words = ["run", str(folder / "p.yaml"), "--rig", str(folder / "rig.yaml"), "--data", str(self.data)]
-        self.process = subprocess.Popen(
+        self.process = Forked(
             command(*words, "--operator", "A. Tester", "--no-worker"),
             cwd=REPOSITORY, stdin=slave, stdout=slave, stderr=slave,
         )  # fmt: skip

@@ -28,12 +28,11 @@ from service.runner.operator import AnswerBy
 from service.steps import step_kinds
 from service.steps.context import StepContext, StepOutcome
 from service.steps.measures import Count, MeasureRecord
-from service.store.store import Store
 from tests.support.record.core import GOOD, Log, toy_protocol
 from tests.support.record.core import TOY as TOY_TEXT
 from tests.support.record.core_log import at_capture
 from tests.support.rig.bench_rig import ScriptedOperator
-from tests.support.runs.bench_run import Bench, begin_run
+from tests.support.runs.bench_run import Bench, begin_run, bench_store
 
 # One step of each kind; every gate may be accepted, and every step but the irreversible ones skipped.
 PROTOCOL = """\
@@ -116,7 +115,7 @@ class Walker(ScriptedOperator):
 
 @pytest.fixture
 def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Callable[[Fakes, Walker], Bench]]:
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
 
         def begun(fakes: Fakes, walker: Walker) -> Bench:
             monkeypatch.setattr("service.runner.execution.step_kinds", fakes.kinds)

@@ -21,7 +21,6 @@ from service.audit.report.output.html import render_html
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import FilesKept
 from service.core.run.state import RunState
-from service.store.store import Store
 from service.store.verification.verify import verify
 from simulators.ct_suite.suite import write_series
 from simulators.ct_suite.volume import Grid
@@ -29,7 +28,7 @@ from simulators.faults import FaultPlan
 from tests.support.ct.ct_labels import write_nifti
 from tests.support.ct.fused_scene import CENTRES_M, RADIUS_M, T_WORLD_CT
 from tests.support.rig.bench_rig import BenchRig
-from tests.support.runs.bench_run import Bench, say
+from tests.support.runs.bench_run import Bench, bench_store, say
 from tests.support.runs.computing_run import begin_computing_run
 
 pytestmark = pytest.mark.slow
@@ -90,7 +89,7 @@ def bench(tmp_path: Path, spheres: tuple[Path, NDArray[np.uint8]]) -> Iterator[B
     rig.folder = spheres[0]
     for old in spheres[0].glob("*.nii"):
         old.unlink()
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         yield begin_computing_run(store, PROTOCOL, tmp_path, rig)
 
 

@@ -1,4 +1,4 @@
-"""`orthocapture dicom-listen`, to which other programs send: dcmtk's storescu and pynetdicom's, and broken ones."""
+"""`orthocapture dicom-listen`, to which other programs send: pynetdicom's storescu and dcmtk's, and broken ones."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from drivers.dicom_folder.folder import DicomFolder
 from drivers.dicom_receiver import Receiver, ReceiverConfig
 from drivers.errors import DeviceRefusedError, DeviceUnavailableError
 from tests.support.ct.ct_series import SHAPE, hospital, pixels, write_series
+from tests.support.processes.forked import Forked, run
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY
 
@@ -36,9 +37,7 @@ UID = "1.2.826.0.1.3680043.8.498.1"
 @contextmanager
 def listening(folder: Path, *options: str) -> Generator[tuple[int, Iterator[str]]]:
     """The command in a process of its own: its port, and the sentences that it tells."""
-    process = subprocess.Popen(
-        [*LISTEN, "--folder", str(folder), *options], stdout=subprocess.PIPE, text=True, cwd=REPOSITORY
-    )
+    process = Forked([*LISTEN, "--folder", str(folder), *options], stdout=subprocess.PIPE, text=True, cwd=REPOSITORY)
     assert process.stdout is not None
     lines = (json.loads(line) for line in process.stdout)
     try:
@@ -103,13 +102,16 @@ def slices(folder: Path) -> list[Dataset]:
 # --- whole series -----------------------------------------------------------------------------------------------
 
 
-def test_dcmtk_sends_a_series_and_the_importer_reads_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sender", ["pynetdicom", pytest.param("dcmtk", marks=pytest.mark.packages("dcmtk"))])
+def test_another_program_sends_a_series_and_the_importer_reads_it(tmp_path: Path, sender: str) -> None:
     T = write_series(tmp_path / "suite", uid=UID, change=hospital)
+    program = [sys.executable, "-m", "pynetdicom"] if sender == "pynetdicom" else []
+    subfolders = "-r" if sender == "pynetdicom" else "+sd"
     with listening(tmp_path / "ct") as (port, told):
         address = ["127.0.0.1", str(port), "-aet", "CTSUITE", "-aec", "ORTHOCAPTURE"]
-        subprocess.run(["echoscu", *address], check=True, timeout=60)
+        subprocess.run([*program, "echoscu", *address], check=True, timeout=60)
         assert "CTSUITE at 127.0.0.1" in next(told)
-        subprocess.run(["storescu", *address, "+sd", str(tmp_path / "suite")], check=True, timeout=60)
+        subprocess.run([*program, "storescu", *address, subfolders, str(tmp_path / "suite")], check=True, timeout=60)
         assert f"series {UID}: 5 files are in {tmp_path / 'ct' / UID}" in next(told)
     ct = DicomFolder(DicomFolderConfig(folder=tmp_path / "ct", stable_s=0))
     (series,) = ct.series()
@@ -298,13 +300,7 @@ def test_connections_that_say_nothing_or_nonsense_block_nobody(tmp_path: Path) -
 
 
 def test_it_listens_elsewhere_only_when_told_who_may_send(tmp_path: Path) -> None:
-    refused = subprocess.run(
-        [*LISTEN, "--folder", str(tmp_path), "--host", "0.0.0.0"],
-        capture_output=True,
-        text=True,
-        cwd=REPOSITORY,
-        check=False,
-    )
+    refused = run([*LISTEN, "--folder", str(tmp_path), "--host", "0.0.0.0"], cwd=REPOSITORY, timeout_s=100)
     assert refused.returncode == 1
     assert "any caller may send" in json.loads(refused.stdout)["error"]["what"]
 

@@ -8,9 +8,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from service.compute.pixels.masks import WorldSphere
 from service.core.geometry import Array, inverse
 from service.dataset.posed.pixels import undistorted_data_set
 from service.dataset.posed.records import DataSet
+from tests.support.scenes.posed import posed_data_set
 from tests.support.scenes.read_formats import corners, document, picture, truth_px, written
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -111,3 +113,17 @@ def test_dtu_projections_and_masks(dataset: DataSet, pinholes: DataSet, tmp_path
             image = picture(folder / "image" / f"{k:06d}.png")
             assert mask.shape == image.shape[:2]
             assert ((mask == 255) <= (pinholes.pixels.depth_m(view) > 0)).all()
+
+
+def test_dtu_masks_show_the_solid_without_the_markers_in_front_of_it(tmp_path: Path) -> None:
+    on_top = WorldSphere(np.array([0.02, 0.0, 0.045]), 0.012)
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    dataset = posed_data_set(folder, more_spheres=(on_top,))
+    exported, pinholes = written(dataset, "dtu", tmp_path), undistorted_data_set(dataset)
+    for k, view in enumerate(pinholes.views):
+        mask = picture(exported / "mask" / f"{k:06d}.png")
+        solid, markers = pinholes.pixels.depth_m(view) > 0, pinholes.pixels.markers(view)
+        assert (solid & markers).sum() > 20
+        assert ((mask == 255) == (solid & pinholes.pixels.valid(view) & ~markers)).all()
+        assert set(np.unique(mask)) == {0, 255}

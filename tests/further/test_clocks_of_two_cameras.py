@@ -11,7 +11,8 @@ from service.core.equipment.clocks import clock_readings
 from service.core.records.events import ArtefactRef, DeviceOpened, FurtherExposure, ViewpointCaptured
 from service.store.records import NewArtefact
 from service.store.store import Store
-from tests.support.record.store import SteppedClock, captured, put_image, start_run
+from tests.support.record.stepped_clock import SteppedClock
+from tests.support.record.store import captured, put_image, start_run
 
 REF = ArtefactRef(sha256="0" * 64, kind="image", media_type="image/jpeg", size_bytes=1, original_name="a.jpg")
 

@@ -30,7 +30,7 @@ from tests.support.ct.dicom_listener import dicom_listener
 from tests.support.pages.web import web_site
 from tests.support.protocols.small_demo import COARSE, VIEWS, small_demo
 from tests.support.rig.rig import orthocapture, simulated_rig
-from tests.support.runs.ended_run import ended_run, patient
+from tests.support.runs.ended_run import ended_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.whole(always=True), pytest.mark.timeout(1800)]
 SCANNER = "structured_light"
@@ -77,7 +77,6 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
         ) as rig,
     ):
         only_jpeg(Path(rig["rig"]), FIXED)
-        patient(Path(rig["rig"]), watchdog_s=1.0)
         doctor = orthocapture("doctor", "--rig", rig["rig"], "--json")
         answer = orthocapture(
             "run", str(small_demo(protocol, *FURTHER_GATES, raw=True)), "--rig", rig["rig"],

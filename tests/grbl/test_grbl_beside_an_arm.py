@@ -19,8 +19,9 @@ from service.core.geometry import inverse
 from service.core.records.events import ViewpointCaptured
 from tests.support.arms.grbl_simulator import CENTRE_M, TURN, mount, table
 from tests.support.protocols.one_side import VIEWS, one_side
+from tests.support.rig.patience import PATIENT_GRBL
 from tests.support.rig.rig import orthocapture, simulated_rig
-from tests.support.runs.ended_run import EndedRun, ended_run, patient
+from tests.support.runs.ended_run import EndedRun, ended_run
 
 HOST = "127.0.0.59"
 TURNED, CONTROL = 5, 4  # views of the turntable
@@ -61,7 +62,7 @@ def add_table(rig: Path, port: str) -> None:
     record["devices"]["turntable"] = {
         "driver": "grbl", "port": port, "axes": [TURN.model_dump(mode="json", exclude_none=True)],
         "T_base_flange_zero": (mount() @ inverse(np.array(record["T_flange_camera_nominal"]))).tolist(),
-        "connect_timeout_s": 30.0, "answer_timeout_s": 20.0, "stale_after_s": 20.0, "unattended_s": 20.0,
+        **PATIENT_GRBL,
     }  # fmt: skip
     record["stations"]["table"] = {
         "robot": "turntable", "scene_centre_m": CENTRE_M.tolist(), "approach_azimuth_deg": -90.0
@@ -110,7 +111,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Generator[Run]:
         table(folder, "--world", rig["world"]) as port,
     ):
         add_table(Path(rig["rig"]), str(port))
-        patient(Path(rig["rig"]), watchdog_s=1.0)
         doctor = orthocapture("doctor", "--rig", rig["rig"], "--json")
         answer = orthocapture(
             "run", str(steps), "--rig", rig["rig"], "--data", str(data), "--operator", "Ada", "--auto-confirm",

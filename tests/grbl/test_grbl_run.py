@@ -14,6 +14,7 @@ from service.core.geometry import inverse, rotation_angle_rad
 from service.core.records.events import ViewpointCaptured
 from service.store.store import Store
 from tests.support.arms.grbl_simulator import CENTRE_M, TURN, mount, table
+from tests.support.rig.patience import PATIENT_GRBL
 from tests.support.rig.rig import orthocapture, simulated_rig
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
@@ -66,7 +67,7 @@ def rig_with_table(simulated: str, port: Path) -> dict[str, Any]:
     axis = TURN.model_dump(mode="json", exclude_none=True)
     rig["devices"]["turntable"] = {
         "driver": "grbl", "port": str(port), "axes": [axis], "T_base_flange_zero": mount().tolist(),
-        "connect_timeout_s": 30.0,
+        **PATIENT_GRBL,
     }  # fmt: skip
     rig["stations"] = {
         "table": {"robot": "turntable", "scene_centre_m": CENTRE_M.tolist(), "approach_azimuth_deg": -90.0}

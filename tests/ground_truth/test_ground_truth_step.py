@@ -27,13 +27,12 @@ from service.dataset.preview.surfaces import SimplifiedMesh, fused_mesh, shown_d
 from service.dataset.recorded_fusion import recorded_fusion
 from service.dataset.summary import summarise
 from service.steps import params_models
-from service.store.store import Store
 from service.worker.job import JobContext
 from service.worker.loop import HANDLERS
 from tests.support.ct.fused_scene import CENTRES_M, RADIUS_M, T_WORLD_CT, ct_mesh, height, scan_mesh, with_spheres
 from tests.support.recorded.registration_record import registration_record
 from tests.support.rig.bench_rig import BenchRig, ScriptedOperator, answer
-from tests.support.runs.bench_run import Bench
+from tests.support.runs.bench_run import Bench, bench_store
 from tests.support.runs.computing_run import begin_computing_run
 
 TAKEN_M = np.array([0.018, 0.012, 0.0360])  # a control sphere on the specimen, which the scan does not show
@@ -113,7 +112,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     rig.shelf = Shelf(tmp_path / "scan.ply", with_spheres(scan_mesh(), CENTRES_M))
     in_ct = with_spheres(ct_mesh(), np.vstack([CENTRES_M, TAKEN_M]))
     rig.suite = Shelf(tmp_path / "ct.stl", in_ct.moved(inverse(T_WORLD_CT)))
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         yield begin_computing_run(store, PROTOCOL, tmp_path, rig)
 
 

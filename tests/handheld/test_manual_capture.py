@@ -11,16 +11,15 @@ import pytest
 from drivers.interfaces import CameraSettings
 from service.core.geometry import inverse
 from service.core.records.events import CaptureAsked, StepFailed, StepMeasured, ViewHeld
-from service.store.store import Store
 from simulators.hand.technician import Grip
 from tests.support.rig.bench_rig import answer
-from tests.support.runs.bench_run import Bench, begin_run
+from tests.support.runs.bench_run import Bench, begin_run, bench_store
 from tests.support.runs.held_run import MIDDLE_M, STEP, held_run
 
 
 @pytest.fixture
 def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
-    with Store.open(tmp_path / "data") as opened:
+    with bench_store(tmp_path / "data") as opened:
         yield lambda text: begin_run(opened, text, tmp_path)
 
 
@@ -124,7 +123,7 @@ def test_the_pedal_releases_and_a_step_without_images_asks(
             if shown[0] == 2 and bench.rig.box is not None:
                 bench.rig.box.presses += 1
             if shown[0] == 8:
-                bench.ahead_s += 601.0
+                bench.clock.passed_s += 601.0
         serve(what)
 
     bench.operator.on_show = press

@@ -11,17 +11,16 @@ import pytest
 
 from drivers.video import VideoCamera, VideoConfig
 from service.core.records.events import CaptureAsked, ViewHeld
-from service.store.store import Store
 from simulators.hand.technician import Grip
 from tests.support.rig.bench_rig import answer
-from tests.support.runs.bench_run import Bench, begin_run
+from tests.support.runs.bench_run import Bench, begin_run, bench_store
 from tests.support.runs.held_run import MIDDLE_M, STEP, held_run
 from tests.support.vendor.mjpeg_writer import jpeg
 
 
 @pytest.fixture
 def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
-    with Store.open(tmp_path / "data") as opened:
+    with bench_store(tmp_path / "data") as opened:
         yield lambda text: begin_run(opened, text, tmp_path)
 
 

@@ -32,6 +32,7 @@ from service.store.database.engine import database_path
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import web_site
+from tests.support.processes.forked import Forked
 from tests.support.rig.rig import REPOSITORY, command, orthocapture
 from tests.support.runs.import_folder import Photographer, around, over_the_board
 
@@ -248,7 +249,7 @@ def test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere(
     folder, photographer = spine
     data = tmp_path / "data"
     words = ["import", str(folder), "--protocol", str(short), "--simulated", "--operator", "Ada", "--data", str(data)]
-    process = subprocess.Popen(
+    process = Forked(
         command(*words),
         cwd=REPOSITORY,
         stdin=subprocess.DEVNULL,

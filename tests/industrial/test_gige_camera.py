@@ -30,6 +30,8 @@ from simulators.still_camera.exif import ExposureSettings
 from simulators.still_camera.scene import Moment, StillLife
 from tests.support.rig.gentl_producer import ADDRESS_VARIABLE, compiled_producer, industrial_camera
 
+pytestmark = pytest.mark.packages("aravis-tools", "gcc", "libc6-dev")
+
 HOST, FAULTY = "127.0.0.62", "127.0.0.63"
 SET = CameraSettings(22.0, 1 / 15, 100)
 
@@ -118,7 +120,7 @@ def test_faults_of_the_link_and_of_the_camera(way: dict[str, str], tmp_path: Pat
     ]
     with (
         industrial_camera(FAULTY, faults=(*faults, {"kind": "stale", "nth": 6})),
-        opened(way, FAULTY, frame_timeout_s=1.5) as camera,
+        opened(way, FAULTY, frame_timeout_s=3.0) as camera,
     ):
         first, second = (pixels(camera.capture(tmp_path).jpeg.path).astype(float) for _ in range(2))
         assert np.abs(first - second)[:200].max() <= 2.0  # lost packets were sent again; only the number differs
@@ -136,7 +138,7 @@ def test_a_camera_that_dies_and_one_that_comes_back(producer: Path, tmp_path: Pa
     with ExitStack() as until_the_end:
         with industrial_camera(FAULTY):
             way = {"producer": str(producer)}
-            camera = until_the_end.enter_context(opened(way, FAULTY, frame_timeout_s=1.5))
+            camera = until_the_end.enter_context(opened(way, FAULTY, frame_timeout_s=3.0))
             camera.capture(tmp_path)
         with pytest.raises((DeviceUnavailableError, DeviceTimeoutError)):
             camera.capture(tmp_path)

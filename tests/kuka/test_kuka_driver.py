@@ -29,24 +29,20 @@ from service.core.geometry import inverse, rotation_angle_rad, transform
 from service.core.seven_axes import forward, nearest_posture, postures
 from simulators.kuka_controller.kinematics import MODELS, frames
 from tests.support.arms.kuka_simulator import Controller, pendant, simulated_kuka
-from tests.support.arms.sunrise import sunrise_engine
+from tests.support.arms.sunrise import needs_jdk, sunrise_engine
 from tests.support.arms.ur_simulator import address
 from tests.support.processes.waiting import until
+from tests.support.rig.patience import PATIENT_KUKA
 
-both = pytest.mark.parametrize("controller", [simulated_kuka, sunrise_engine])
+both = pytest.mark.parametrize("controller", [simulated_kuka, pytest.param(sunrise_engine, marks=needs_jdk)])
 PAYLOAD = Payload(1.6, (0.0, 0.0, 0.08))
 TCP = transform(Rotation.from_euler("z", 0.3), np.array([0.01, 0.0, 0.1]))
 
 
 @contextlib.contextmanager
-def opened(host: str, unattended_s: float = 5.0) -> Generator[RobotArm]:
-    arm = hosted(
-        RobotArm,
-        "drivers.kuka:DRIVER",
-        KukaConfig(host=host, unattended_s=unattended_s, stale_after_s=20.0),  # on a busy machine
-        call_timeout_s=30,
-        name="robot",
-    )
+def opened(host: str, **limits: float) -> Generator[RobotArm]:
+    config = KukaConfig.model_validate({"host": host, **PATIENT_KUKA, **limits})
+    arm = hosted(RobotArm, "drivers.kuka:DRIVER", config, call_timeout_s=60, name="robot")
     try:
         arm.open()
         arm.let_move("Ada", time.monotonic())
@@ -64,8 +60,8 @@ def fresh(arm: RobotArm) -> bool:
     return True
 
 
-def wait_for(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
-    until(condition, "waited in vain", timeout_s, every_s=0.02)
+def wait_for(condition: Callable[[], bool]) -> None:
+    until(condition, "waited in vain", every_s=0.02)
 
 
 def move(arm: RobotArm, joints: Array) -> None:
@@ -143,10 +139,11 @@ def test_a_stop_latches_until_a_person_confirms_and_nothing_clears_it_by_itself(
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 @both
 def test_a_moving_arm_that_nobody_looks_at_is_stopped(controller: Controller) -> None:
     host = address(73)
-    with controller(host), opened(host, unattended_s=0.3) as arm:
+    with controller(host, patience_s=0), opened(host, unattended_s=0.3) as arm:
         start = arm.state().sample.joints_rad[0]
         move(arm, turned(arm, 2.5))
         time.sleep(1.5)
@@ -160,10 +157,11 @@ def test_a_moving_arm_that_nobody_looks_at_is_stopped(controller: Controller) ->
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 @both
 def test_a_driver_that_stands_still_sends_no_heartbeat_and_the_arm_stops(controller: Controller) -> None:
     host = address(77)
-    with controller(host), opened(host) as arm:
+    with controller(host, patience_s=0), opened(host) as arm:
         children = psutil.Process().children(recursive=True)
         (driver,) = [child.pid for child in children if "drivers.host" in " ".join(child.cmdline())]
         start = arm.state().sample.joints_rad[0]
@@ -188,9 +186,10 @@ def test_an_arm_whose_brakes_closed_moves_once_they_are_released() -> None:
     host = address(78)
     with simulated_kuka(host, "--speed-up", "4"), opened(host) as arm:
         travel(arm, turned(arm, 0.1))
-        time.sleep(6.0)  # the brakes close after 20 s, here 5 s
+        closed_s = arm.state().sample.controller_time_s + 5.0  # the brakes close after 20 s, here 5 s
+        wait_for(lambda: arm.state().sample.controller_time_s > closed_s)
         start = arm.state().sample.joints_rad
-        goal = turned(arm, 1.0)
+        goal = turned(arm, 2.5)
         begin = time.monotonic()
         move(arm, goal)
         assert arm.is_moving()

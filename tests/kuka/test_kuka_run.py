@@ -21,7 +21,7 @@ from service.jobs.calibration import calibrate
 from tests.support.protocols.small_demo import COARSE
 from tests.support.protocols.two_arms import FIRST, SECOND, for_two_arms, kuka_demo
 from tests.support.rig.rig import orthocapture, simulated_rig
-from tests.support.runs.ended_run import EndedRun, ended_run, patient
+from tests.support.runs.ended_run import EndedRun, ended_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.whole, pytest.mark.timeout(1200)]
 ARM = "LBR Med 14"
@@ -51,7 +51,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Generator[Run]:
     options = ("--scene", "7", "--image-width", "960", *COARSE, "--speed-up", "10", "--arm", ARM)
     two = ("--arms", "2", "--further-scanner", SCANNER)
     with simulated_rig(folder, *options, *two, host="127.0.0.44") as rig:
-        patient(Path(rig["rig"]), answer_timeout_s=20.0)
         doctor = orthocapture("doctor", "--rig", rig["rig"], "--json")
         answer = orthocapture(
             "run", str(protocol), "--rig", rig["rig"], "--data", str(data), "--operator", "Ada", "--auto-confirm",

@@ -16,13 +16,14 @@ from drivers.kuka import DRIVER, KukaConfig
 from drivers.kuka.wire import WireError, from_abc, hello_of, parse, state_of, to_abc
 from service.core.geometry import transform
 from tests.support.arms.kuka_simulator import Controller, agrees, simulated_kuka, transcript
-from tests.support.arms.sunrise import sunrise_engine
+from tests.support.arms.sunrise import needs_jdk, sunrise_engine
 from tests.support.arms.ur_simulator import address
 from tests.support.processes.waiting import until
+from tests.support.rig.patience import PATIENT_KUKA
 
 
 @pytest.mark.parametrize("name", ["session.jsonl", "refusals.jsonl"])
-@pytest.mark.parametrize("controller", [simulated_kuka, sunrise_engine])
+@pytest.mark.parametrize("controller", [simulated_kuka, pytest.param(sunrise_engine, marks=needs_jdk)])
 def test_simulator_and_application_answer_as_the_transcript(controller: Controller, name: str) -> None:
     host = address(70)
     with (
@@ -42,7 +43,7 @@ def test_simulator_and_application_answer_as_the_transcript(controller: Controll
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("controller", [simulated_kuka, sunrise_engine])
+@pytest.mark.parametrize("controller", [simulated_kuka, pytest.param(sunrise_engine, marks=needs_jdk)])
 def test_a_client_that_stays_silent_gives_way_to_a_new_one(controller: Controller) -> None:
     host = address(70)
     said: list[str] = []
@@ -53,7 +54,7 @@ def test_a_client_that_stays_silent_gives_way_to_a_new_one(controller: Controlle
         return said[-1] == "hello"
 
     with controller(host), socket.create_connection((host, 30010), timeout=30):
-        until(second_is_greeted, "the first client stays", 60)
+        until(second_is_greeted, "the first client stays")
     assert said[0] == "taken"
 
 
@@ -106,15 +107,17 @@ class _Golden(threading.Thread):
 def test_the_driver_speaks_as_the_transcript() -> None:
     golden = _Golden("127.0.0.1", transcript("session.jsonl"))
     golden.start()
-    robot = cast(RobotArm, DRIVER.build(KukaConfig(host="127.0.0.1", port=golden.port)))
+    robot = cast(
+        RobotArm, DRIVER.build(KukaConfig.model_validate({"host": "127.0.0.1", "port": golden.port, **PATIENT_KUKA}))
+    )
     robot.open()
     robot.let_move("Ada", time.monotonic())
     robot.configure(Payload(1.6, (0.0, 0.0, 0.08)), transform(np.eye(3), np.array([0.0, 0.0, 0.1])))
     goal = np.array([0.01, 0.5236, 0.0, -1.2217, 0.0, 1.3963, 0.0])
     robot.move_joints(goal, speed_rad_s=0.5, acceleration_rad_s2=1.0)
-    until(lambda: not robot.is_moving(), "the motion did not end", 10, every_s=0.02)
+    until(lambda: not robot.is_moving(), "the motion did not end", every_s=0.02)
     robot.stop()
-    assert golden.complete.wait(10)
+    assert golden.complete.wait(90)
     assert golden.wrong == []
     robot.close()
 

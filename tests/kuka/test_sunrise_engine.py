@@ -17,13 +17,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.arms.kuka_simulator import pendant
-from tests.support.arms.sunrise import APPLICATION, TEST_SIDE, compile_java, java_program, sunrise_engine
+from tests.support.arms.sunrise import (
+    APPLICATION,
+    TEST_SIDE,
+    compile_java,
+    java_program,
+    needs_jdk,
+    sunrise_engine,
+)
 from tests.support.arms.ur_simulator import address
+from tests.support.processes.lateness import Lateness
 from tests.support.processes.waiting import until
+
+pytestmark = needs_jdk
 
 HOME = [0.0, 0.5236, 0.0, -1.2217, 0.0, 1.3963, 0.0]
 FAR = [2.5, *HOME[1:]]
 MOVE = {"do": "move", "q": FAR, "speed_rad_s": 0.5, "acceleration_rad_s2": 2.0}
+LATE_TIMES = 5  # client, reader, watching thread and arm wake one after the other
 Line = dict[str, Any]
 
 
@@ -31,7 +42,7 @@ class Client:
     """A client that says exactly what the test wants, and when."""
 
     def __init__(self, host: str) -> None:
-        self._socket = socket.create_connection((host, 30010), timeout=30)
+        self._socket = socket.create_connection((host, 30010), timeout=90)
         self._lines = self._socket.makefile("rb")
         self._sequence = 0
 
@@ -101,9 +112,10 @@ def test_only_the_layer_of_a_version_names_the_maker_s_classes() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_a_silent_client_has_its_arm_stopped_after_0_3_s_and_must_permit_again() -> None:
     host = address(81)
-    with sunrise_engine(host), connected(host) as client:
+    with sunrise_engine(host, patience_s=0), Lateness() as lateness, connected(host) as client:
         client.ask(do="permit", by="Ada")
         assert client.ask(**MOVE)["is"] == "ack"
         moving = client.state()
@@ -116,8 +128,8 @@ def test_a_silent_client_has_its_arm_stopped_after_0_3_s_and_must_permit_again()
         assert ended["code"] == "heartbeat"
         stood = client.state()
         assert stood["locked"]
-        # 0.3 s of silence and the braking at 6 rad/s²; the rest is leave for a busy machine.
-        assert stood["q"][0] - moving["q"][0] < 0.5 * (0.3 + 0.5)
+        # 0.3 s of silence and the braking at 6 rad/s², and how late this machine's threads wake.
+        assert stood["q"][0] - moving["q"][0] < 0.5 * (0.3 + 0.3 + LATE_TIMES * lateness.worst_s)
         assert client.ask(**MOVE)["code"] == "locked"
         client.ask(do="permit", by="Ada")
         assert client.ask(**MOVE)["is"] == "ack"
@@ -133,16 +145,17 @@ def test_a_stop_of_the_safety_controller_latches_and_cancels_the_motion() -> Non
         assert (ended["code"], ended["what"]) == ("safety", "the arm is in enabling switch")
         assert client.ask(do="permit", by="Ada")["code"] == "safety"
         pendant(host, "release")
-        until(lambda: client.state()["safety"] == "normal", "the stop is not over", 10, every_s=0)
+        until(lambda: client.state()["safety"] == "normal", "the stop is not over", every_s=0)
         stood = client.state()
         assert stood["locked"]
         assert stood["motion"] == 0, "the motion does not go on by itself"
         assert client.ask(**MOVE)["code"] == "locked"
 
 
+@pytest.mark.realtime
 def test_a_call_to_the_controller_that_hangs_does_not_keep_the_arm_moving() -> None:
     host = address(83)
-    with sunrise_engine(host), connected(host) as client:
+    with sunrise_engine(host, patience_s=0), Lateness() as lateness, connected(host) as client:
         client.ask(do="permit", by="Ada")
         client.ask(**MOVE)
         moving = client.state()
@@ -151,7 +164,7 @@ def test_a_call_to_the_controller_that_hangs_does_not_keep_the_arm_moving() -> N
         pendant(host, "hang off")
         ended = client.end()
         assert ended["code"] == "heartbeat"
-        assert client.state()["q"][0] - moving["q"][0] < 0.6
+        assert client.state()["q"][0] - moving["q"][0] < 0.5 * (0.3 + 0.6 + LATE_TIMES * lateness.worst_s)
 
 
 def test_the_end_of_the_connection_stops_and_locks_and_the_next_client_may_come_at_once() -> None:
@@ -164,8 +177,8 @@ def test_the_end_of_the_connection_stops_and_locks_and_the_next_client_may_come_
                 assert second.line()["code"] == "taken"
         with connected(host) as client:
             assert client.state()["locked"]
-            until(lambda: client.state()["motion"] == 0, "the arm goes on", 10, every_s=0)
-            assert client.state()["q"][0] < 1.0
+            until(lambda: client.state()["motion"] == 0, "the arm goes on", every_s=0)
+            assert client.state()["q"][0] < 2.4, "it stopped on its way"
 
 
 def test_lines_that_are_no_requests_are_refused_and_the_connection_stays() -> None:

@@ -154,7 +154,7 @@ def test_the_reporter_tells_of_the_robots_stop_and_of_the_end(hook: tuple[type[H
     reporter = Reporter(tmp_path, "run", lambda: devices, BenchRig().camera_named, alarm)
     reporter.attend("working", "capture", 1)
     reporter.attend("asking", "capture", 1, asks="confirm", words="Capture: a confirmation is awaited")
-    until(lambda: len(kind.taken) == 1, "no alert", 20)
+    until(lambda: len(kind.taken) == 1, "no alert")
     arm.safety = type(arm.safety).PROTECTIVE_STOP
     reporter.attend("working", "capture", 2)
     reporter.outcome = "it is aborted: the board slipped"

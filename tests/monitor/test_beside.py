@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import psutil
@@ -12,6 +11,7 @@ from service.cli.run.beside import worker_beside
 from service.core.records.events import JobFailed
 from service.store.records import NewJob
 from service.store.store import Store
+from tests.support.processes.waiting import until
 from tests.support.record.store import enqueue, start_run
 
 
@@ -30,10 +30,7 @@ def test_a_worker_that_is_killed_is_replaced_and_the_run_gets_its_answer(tmp_pat
             worker.kill()
             job = NewJob("locate_spheres", "capture", 1, "key", {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10})
             enqueue(store, run, job, actor="runner")
-            deadline_s = time.monotonic() + 90
-            while not any(isinstance(event.payload, JobFailed) for event in store.events(run)):
-                assert time.monotonic() < deadline_s, told
-                time.sleep(0.1)
+            until(lambda: any(isinstance(event.payload, JobFailed) for event in store.events(run)), lambda: str(told))
             another = worker_of(tmp_path)
         assert another.pid != worker.pid
         assert not another.is_running()

@@ -16,7 +16,8 @@ from service.monitor.host_clock import host_clock
 from service.store.records import NewArtefact
 from service.store.store import Store
 from tests.support.pages.web import web_site
-from tests.support.record.store import SteppedClock, captured, put_image, start_run
+from tests.support.record.stepped_clock import SteppedClock
+from tests.support.record.store import captured, put_image, start_run
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 
 _CHRONY = """#!/bin/sh

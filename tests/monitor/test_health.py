@@ -15,6 +15,8 @@ from service.core.records.events import DeviceOpened, DeviceTrouble
 from service.monitor.snapshot import Snapshot, write_snapshot
 from service.store.records import NewJob
 from tests.support.pages.web import HOST, Browser, WebSite, web_site
+from tests.support.processes.forked import Forked
+from tests.support.processes.waiting import until
 from tests.support.record.store import enqueue
 from tests.support.runs.bench_run import Bench
 
@@ -66,12 +68,9 @@ def test_a_job_without_a_worker_is_not_healthy_until_one_lives(site: WebSite) ->
     assert (answer.status_code, answer.json()["worker"]["what"]) == (503, "a job waits, and no worker is running")
     # In an empty folder beside it: the worker has nothing to do and stays alive.
     words = [sys.executable, "-m", "service.cli.main", "worker", "--data", str(site.site.data), "--json"]
-    with subprocess.Popen(words, stdout=subprocess.DEVNULL) as worker:
+    with Forked(words, stdout=subprocess.DEVNULL) as worker:
         try:
-            deadline = time.monotonic() + 60
-            while scrape(site)["orthocapture_workers"][()] < 1:
-                assert time.monotonic() < deadline
-                time.sleep(0.1)
+            until(lambda: scrape(site)["orthocapture_workers"][()] >= 1, "no worker shows")
             assert site.browser().get("/health").json()["worker"]["ok"]
         finally:
             worker.kill()  # so that it can no longer remove its heartbeat file

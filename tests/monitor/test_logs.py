@@ -21,6 +21,7 @@ from service.logs.secrets import without_secrets
 from service.store.records import NewJob
 from service.store.store import Store
 from service.worker.loop import work
+from tests.support.processes.forked import Forked, run
 from tests.support.record.store import capture, enqueue, start_run
 from tests.support.rig.host_fake_driver import Fake, FakeConfig
 from tests.support.rig.rig import REPOSITORY, command
@@ -83,9 +84,7 @@ def test_a_run_says_of_what_it_speaks_and_the_terminal_shows_what_it_showed(
 def test_the_processes_of_a_run_log_and_speak_to_the_terminal_as_ever(tmp_path: Path) -> None:
     _, begun = record_runs(tmp_path)
     resume = command("resume", "latest", "--data", str(tmp_path / "data"))
-    done = subprocess.run(
-        resume, cwd=REPOSITORY, input="abort a test\n", capture_output=True, text=True, timeout=100, check=False
-    )
+    done = run(resume, cwd=REPOSITORY, typed="abort a test\n", timeout_s=100)
     assert f"Run {begun} is aborted" in done.stdout
     assert "Type one of: confirm" in done.stderr
     assert '{"' not in done.stdout + done.stderr
@@ -241,7 +240,7 @@ def test_a_server_logs_no_password_pin_token_or_link(tmp_path: Path) -> None:
     rig.write_text("name: a small site\nsimulated: true\ndevices: {}\n")
     data = tmp_path / "data"
     words = command("serve", "--rig", str(rig), "--data", str(data), "--port", "0", "--json")
-    with subprocess.Popen(words, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True) as server:
+    with Forked(words, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None
             ready = json.loads(server.stdout.readline())

@@ -11,7 +11,7 @@ from service.people.sessions import People
 from service.store.store import Store
 from tests.support.pages.web import QUICK_HASHES, populate
 from tests.support.record.office import Office
-from tests.support.record.store import SteppedClock
+from tests.support.record.stepped_clock import SteppedClock
 
 
 @pytest.fixture

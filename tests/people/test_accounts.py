@@ -19,7 +19,8 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of, populate
 from tests.support.record.office import Office, refused
-from tests.support.record.store import CrashingFiles, SteppedClock
+from tests.support.record.stepped_clock import SteppedClock
+from tests.support.record.store import CrashingFiles
 
 
 def test_first_link_makes_the_administrator_once(tmp_path: Path) -> None:

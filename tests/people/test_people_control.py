@@ -17,7 +17,8 @@ from service.store.errors import UnknownRunError
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import QUICK_HASHES, password_of, populate
-from tests.support.record.store import SteppedClock, start_run
+from tests.support.record.stepped_clock import SteppedClock
+from tests.support.record.store import start_run
 
 
 @dataclass

@@ -19,7 +19,7 @@ TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 def cpu_s_of_tree(pid: int) -> float:
-    """Return the CPU seconds of process `pid`, of its living descendants, and of those that have ended and were waited for.
+    """Return the CPU seconds of process `pid`, of its living descendants, and of those that it has waited for.
 
     Descendants whose parent ended before them have left the tree and are not counted. Linux only (`/proc`).
     """
@@ -36,7 +36,7 @@ def cpu_s_of_tree(pid: int) -> float:
 
 
 class CpuRecord:
-    """The plug-in: measures before and after every test, and around every fixture whose scope is wider than one test."""
+    """The plug-in: measures around every test, and around every fixture whose scope is wider than one test."""
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -72,7 +72,7 @@ class CpuRecord:
     def pytest_fixture_setup(
         self, fixturedef: pytest.FixtureDef[Any], request: pytest.FixtureRequest
     ) -> Generator[None, object, object]:
-        """Record what setting up a shared fixture cost, without the shared ones that it asked for while it was made."""
+        """Record what setting up a shared fixture cost, without the shared ones that were made within it."""
         if fixturedef.scope == "function":
             return (yield)
         before_s = cpu_s_of_tree(os.getpid())

@@ -1,8 +1,8 @@
-"""Draws a tenth of the tests that take too long to run them all each time: whole runs, and rows of systematic sweeps.
+"""Draws a tenth of the tests that are too many to run each time: whole runs, and rows of systematic sweeps.
 
-`pytest --draw SEED` keeps every test but those marked `whole` or `sweep`, of which it keeps a tenth, chosen by the seed
-(continuous integration gives the commit's hash), and prints which. Tests marked `whole(always=True)` are kept whatever
-the seed. Without `--draw` all of them run.
+`pytest --draw SEED` keeps every test but those marked `whole` or `sweep`, of which it keeps a tenth, chosen by the
+seed (continuous integration gives the commit's hash), and prints which. Tests marked `whole(always=True)` are kept
+whatever the seed. Without `--draw` all of them run.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Draw:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
-        """Deselect what was not drawn: whole runs by file, since its tests share the run; rows of sweeps one by one."""
+        """Deselect what was not drawn: whole runs by file, since a file's tests share one; sweeps by row."""
         left_out: set[pytest.Item] = set()
         for mark in ("whole", "sweep"):
             units: dict[str, list[pytest.Item]] = {}

@@ -54,6 +54,7 @@ from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import web_site
+from tests.support.processes.forked import Forked
 from tests.support.processes.waiting import until
 from tests.support.record.store import enqueue, rows
 from tests.support.recorded.registration_record import registration_record
@@ -297,7 +298,7 @@ def test_a_terminal_that_waits_can_be_left_and_nothing_is_lost(tmp_path: Path) -
         run_id = run.run_id
     master, slave = pty.openpty()
     words = command("resume", run_id, "--data", str(data))
-    waiting = subprocess.Popen(words, cwd=REPOSITORY, stdin=slave, stdout=slave, stderr=slave, start_new_session=True)
+    waiting = Forked(words, cwd=REPOSITORY, stdin=slave, stdout=slave, stderr=slave, start_new_session=True)
     os.close(slave)
     said = ""
 

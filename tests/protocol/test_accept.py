@@ -37,7 +37,7 @@ from tests.support.pages.web import WebSite, password_of
 from tests.support.record.core import TOY, Log, load, toy_protocol
 from tests.support.recorded.reported_run import record_reported_run
 from tests.support.rig.bench_rig import BenchRig
-from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
+from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run, bench_store
 
 ROOT = Path(__file__).parents[2]
 TOY_ACCEPTING = TOY.replace("min: 3, unit: views}", "min: 3, unit: views, accept_by: supervisor}").replace(
@@ -320,7 +320,7 @@ def test_without_accounts_a_name_is_a_claim_and_the_record_says_so(tmp_path: Pat
     assert act(tmp_path, run, "Emmy").exit_code == 1  # this protocol allows nobody to accept it
     other = tmp_path / "other"
     other.mkdir()
-    with Store.open(other / "data") as store:
+    with bench_store(other / "data") as store:
         bench = begin_run(store, ACCEPTING, other)
         bench.script("capture", "recovery", leave)
         with pytest.raises(LeftError):

@@ -83,14 +83,14 @@ def test_a_failed_job_shows_the_workers_reason_and_a_repeated_step_enqueues_it_a
 @pytest.mark.slow
 def test_that_nobody_computes_is_told_and_again_when_the_worker_has_gone(begin: Callable[[str], Bench]) -> None:
     bench = begin(PROTOCOL + CALIBRATION)
-    sign = SignOfLife(bench.data)
+    sign = SignOfLife(bench.data, bench.clock)
     waited: list[int] = []
 
     def work(what: str) -> None:
         if what != "looking for the board":
             return
         waited.append(len([told for told in bench.operator.told if "no worker is running" in told]))
-        bench.ahead_s += 6
+        bench.clock.passed_s += 6
         match len(waited):
             case 20:
                 sign.give(0)

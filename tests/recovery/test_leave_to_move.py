@@ -49,7 +49,15 @@ def failing(text: str = TOY) -> Log:
     return log
 
 
-@pytest.mark.parametrize("begin", [confirmed, running, failing])
+def granted(text: str = TOY) -> Log:
+    """A failure, and a person who has let the robot try again."""
+    log = running(text)
+    log.append(StepFailed(step="capture", attempt=1, error="BlurError", message="not sharp", recovery="ask"))
+    log.act("confirm", step="capture", checklist=log.protocol.step("capture").checklist)
+    return log
+
+
+@pytest.mark.parametrize("begin", [confirmed, running, failing, granted])
 def test_it_is_asked_again_whatever_was_confirmed_before(begin: Callable[[], Log]) -> None:
     log = begin()
     assert isinstance(log.decision, RunStep | Retry)
@@ -58,6 +66,19 @@ def test_it_is_asked_again_whatever_was_confirmed_before(begin: Callable[[], Log
     log.act("confirm", actor="Grace", step="capture")
     assert isinstance(log.decision, RunStep | Retry)
     assert log.state.step.confirmed_by == "Grace"
+
+
+def test_a_retry_that_was_granted_before_the_restart_is_granted_again_or_not_at_all() -> None:
+    """The leave to move ended with the process that had it, also the leave to try again."""
+    log = granted()
+    assert log.decision == Retry("capture", 2, "the operator asked for it", 0.0)
+    restart(log)
+    assert log.question.for_ == "recovery"
+    assert "BlurError: not sharp" in log.question.text
+    restart(log)
+    assert isinstance(log.decision, AskOperator)
+    log.act("confirm", actor="Grace", step="capture")
+    assert log.decision == Retry("capture", 2, "the operator asked for it", 0.0)
 
 
 def test_the_words_say_what_happens_and_what_is_kept() -> None:

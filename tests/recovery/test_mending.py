@@ -6,7 +6,6 @@ import io
 import json
 import socketserver
 import threading
-import time
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,9 +28,8 @@ from service.runner.loop import Runner
 from service.steps import params_models
 from service.steps.context import StepContext
 from service.steps.kinds.captures import viewpoint_capture
-from service.store.store import Store
 from tests.support.rig.bench_rig import other_settings
-from tests.support.runs.bench_run import PROTOCOL, Bench
+from tests.support.runs.bench_run import PROTOCOL, Bench, bench_store
 
 ADVICE = {
     "advice": "Turn the ISO wheel back",
@@ -76,7 +74,7 @@ def world() -> Iterator[_World]:
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         (tmp_path / "rig.yaml").write_text("name: bench\nsimulated: true\ndevices: {}\n")
         loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="bench.yaml")
         run_id = start_run(store, loaded, load_rig(tmp_path / "rig.yaml"), operator="Ada", auto_confirm=True)
@@ -91,9 +89,7 @@ def automatic_run(bench: Bench, world: _World) -> RunState:
     operator = AutomaticOperator(
         "Ada", protocol, Display(Console(file=io.StringIO()), reporter), SimulatedHands(f"{host!s}:{port}")
     )
-    return Runner(
-        bench.store, bench.run_id, protocol, bench.rig, operator, wait=lambda s: time.sleep(min(s, 0.002))
-    ).run()
+    return Runner(bench.store, bench.run_id, protocol, bench.rig, operator).run()
 
 
 def advise(monkeypatch: pytest.MonkeyPatch, data: dict[str, Any] | None) -> None:

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,13 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.support.arms.arm_watch import watched_arm
 from tests.support.processes.started import started
+from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig, without_calibration_and_ct
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+HOST = "127.0.0.31"
 
 
 def short_protocol(folder: Path) -> Path:
@@ -37,9 +39,7 @@ def short_protocol(folder: Path) -> Path:
 
 def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> None:
     data = tmp_path / "data"
-    with simulated_rig(
-        tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3", host="127.0.0.31"
-    ) as ready:
+    with simulated_rig(tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3", host=HOST) as ready:
         words = ["run", str(short_protocol(tmp_path)), "--rig", ready["rig"], "--data", str(data), "--auto-confirm"]
         with started(words, tmp_path / "run.log") as runner:
             wait_for_captures(data, 2, runner, tmp_path / "run.log")
@@ -49,10 +49,13 @@ def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> Non
         assert 2 <= len(before) < 6
 
         words = ["resume", "latest", "--data", str(data), "--screens"]
-        with started(words, tmp_path / "resume.log") as again:
+        with started(words, tmp_path / "resume.log") as again, watched_arm(HOST) as arm:
             wait_for(lambda: "session_started" in kinds(data)[-2:], again, tmp_path / "resume.log")
-            time.sleep(5)
-            assert captured(data) == before, "the arm moves for nobody"
+            arm.wait_resting()
+            rested = arm.mark()
+            arm.pass_s(3.0)
+            assert arm.moved_for_s(rested) == 0.0, "the arm moves for nobody"
+            assert captured(data) == before
             answer = orthocapture("act", "confirm", "--data", str(data), "--operator", "Grace")
             assert answer.returncode == 0, answer.stdout + answer.stderr
             assert again.wait(timeout=240) == 0, (tmp_path / "resume.log").read_text()
@@ -72,11 +75,11 @@ def wait_for_captures(data: Path, count: int, runner: subprocess.Popen[bytes], l
 
 
 def wait_for(reached: Callable[[], bool], runner: subprocess.Popen[bytes], log: Path) -> None:
-    deadline_s = time.monotonic() + 180
-    while not reached():
+    def alive_and_reached() -> bool:
         assert runner.poll() is None, log.read_text()
-        assert time.monotonic() < deadline_s, log.read_text()
-        time.sleep(0.3)
+        return reached()
+
+    until(alive_and_reached, log.read_text, 180.0, every_s=0.3)
 
 
 def kinds(data: Path) -> list[str]:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
-import socket
-import time
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
@@ -27,9 +26,11 @@ from service.station import Station
 from service.steps import params_models
 from service.store.store import Store
 from tests.support.arms.arm_watch import ArmWatch, watched_arm
+from tests.support.arms.ur_driver import dashboard
 from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.processes.waiting import until
 from tests.support.rig.bench_rig import BenchCamera, ScriptedOperator, answer, numbered
+from tests.support.rig.patience import PATIENT_UR
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -38,7 +39,7 @@ RIG = """\
 name: one arm
 simulated: true
 devices:
-  robot: {{driver: ur, host: {host}, watchdog_s: 1.0, stale_after_s: 10}}  # on a machine that is shared
+  robot: {robot}
 stations:
   station_1: {{robot: robot, scene_centre_m: [0.75, 0.0, -0.1], approach_azimuth_deg: 180}}
 T_flange_camera_nominal: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]]
@@ -68,20 +69,25 @@ steps:
 VIEWS = ["v001", "v002", "v003"]
 
 
-def slowly(number: int) -> NDArray[np.uint8]:
-    """A picture that takes as long as a real one, so that samples of the arm arrive meanwhile."""
-    time.sleep(0.5)
-    return numbered(number)
+def slowly(arm: ArmWatch) -> Callable[[int], NDArray[np.uint8]]:
+    """Pictures that take as long as real ones, so that samples of the arm arrive meanwhile."""
+
+    def picture(number: int) -> NDArray[np.uint8]:
+        arm.pass_s(0.5)
+        return numbered(number)
+
+    return picture
 
 
 class OneArm(Station):
     """A station with the real driver for its arm and an in-memory camera."""
 
-    def __init__(self, folder: Path, host: str) -> None:
+    def __init__(self, folder: Path, host: str, arm: ArmWatch) -> None:
         path = folder / "rig.yaml"
-        path.write_text(RIG.format(host=host))
+        robot = {"driver": "ur", "host": host, **PATIENT_UR}
+        path.write_text(RIG.format(robot=json.dumps(robot)))
         super().__init__(load_rig(path))
-        self.shutter = BenchCamera(picture=slowly)
+        self.shutter = BenchCamera(picture=slowly(arm))
         self.shutter.open()
 
     def camera(self) -> Camera:
@@ -106,8 +112,8 @@ class OneArm(Station):
 class Run:
     """A run on it, with a person who answers its questions."""
 
-    def __init__(self, store: Store, folder: Path, host: str) -> None:
-        self.station = OneArm(folder, host)
+    def __init__(self, store: Store, folder: Path, host: str, arm: ArmWatch) -> None:
+        self.station = OneArm(folder, host, arm)
         loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="stops.yaml")
         self.store = store
         self.run_id = start_run(store, loaded, self.station.rig, operator="Ada", auto_confirm=False)
@@ -145,43 +151,39 @@ def arm_at(number: int, *options: str) -> Generator[tuple[str, ArmWatch]]:
 
 
 def looks_for(seconds: float, arm: ArmWatch, words: str) -> Callable[[AskOperator, RunState], OperatorAction | None]:
-    """Leave the question open for some time, in which nothing may move, then confirm."""
-    began: list[tuple[float, int]] = []
+    """Leave the question open for some time of the controller, in which nothing may move, then confirm."""
+    began: list[int] = []
 
     def look(question: AskOperator, _state: RunState) -> OperatorAction | None:
         if not began:
             arm.wait_resting()
-            began.append((time.monotonic(), arm.mark()))
+            began.append(arm.mark())
         assert words in question.text
-        time.sleep(seconds)
-        assert arm.moved_for_s(began[0][1]) == 0.0, "the arm moves while a person is asked"
+        arm.pass_s(seconds)
+        assert arm.moved_for_s(began[0]) == 0.0, "the arm moves while a person is asked"
         return answer(question, "confirm")
 
     return look
 
 
-def stop_and_release(host: str) -> None:
+def stop_and_release(host: str, arm: ArmWatch) -> None:
     """Cause a stop of the arm and clear it on the pendant while nobody queries the robot."""
     client = RtdeClient(host)
     client.pause()
     client.close()
-    until(lambda: unlock(host), "the stop is released", 20.0)
-    time.sleep(0.3)
+    until(lambda: unlock(host), "the stop is released")
+    arm.pass_s(0.3)
 
 
 def unlock(host: str) -> bool:
-    with socket.create_connection((host, 29999), timeout=30) as connection, connection.makefile("rw") as lines:
-        lines.readline()
-        lines.write("unlock protective stop\n")
-        lines.flush()
-        return lines.readline().startswith("Protective stop rel")
+    return dashboard(host, "unlock protective stop")[0].startswith("Protective stop rel")
 
 
 def test_a_stop_during_an_exposure_is_asked_about_though_it_was_released(tmp_path: Path, store: Store) -> None:
     plan = '[{"device": "robot", "on": "rtde_P", "kind": "protective_stop"}]'
     with arm_at(80, "--speed-up", "3", "--faults", plan) as (host, arm):
-        run = Run(store, tmp_path, host)
-        run.station.shutter.on_capture = lambda exposure: stop_and_release(host) if exposure == 2 else None
+        run = Run(store, tmp_path, host, arm)
+        run.station.shutter.on_capture = lambda exposure: stop_and_release(host, arm) if exposure == 2 else None
         run.answers(looks_for(2.0, arm, "was in protective stop"))
         assert run.drive().status == "completed"
     assert run.failures() == ["SafetyStopError"]
@@ -190,7 +192,7 @@ def test_a_stop_during_an_exposure_is_asked_about_though_it_was_released(tmp_pat
 
 def test_a_driver_killed_in_mid_motion_is_asked_about_before_the_arm_moves_on(tmp_path: Path, store: Store) -> None:
     with arm_at(81) as (host, arm):
-        run = Run(store, tmp_path, host)
+        run = Run(store, tmp_path, host, arm)
         killed: list[int] = []
 
         def kill(_doing: str) -> None:
@@ -210,9 +212,11 @@ def test_a_confirmation_from_before_the_stop_lets_nothing_move(tmp_path: Path, s
     """The stop comes after the person has confirmed and before the arm was told."""
     plan = '[{"device": "robot", "on": "rtde_P", "kind": "protective_stop"}]'
     with arm_at(82, "--speed-up", "3", "--faults", plan) as (host, arm):
-        run = Run(store, tmp_path, host)
+        run = Run(store, tmp_path, host, arm)
         run.station.device("robot")  # it streams while the question is open
-        run.operator.on_prepare = lambda: stop_and_release(host)  # the confirmation is recorded, no step has begun
+        run.operator.on_prepare = lambda: stop_and_release(
+            host, arm
+        )  # the confirmation is recorded, no step has begun
         run.answers(looks_for(0.5, arm, "was in protective stop"))
         assert run.drive().status == "completed"
     assert run.failures() == ["SafetyStopError"]
@@ -222,13 +226,13 @@ def test_a_confirmation_from_before_the_stop_lets_nothing_move(tmp_path: Path, s
 def test_a_key_turned_to_remote_while_a_person_is_asked_is_seen(tmp_path: Path, store: Store) -> None:
     """The controller was in local control when it was connected."""
     host = address(83)
-    with simulated_ur(host, "--speed-up", "3", "--local") as ready:
-        run = Run(store, tmp_path, host)
+    with simulated_ur(host, "--speed-up", "3", "--local") as ready, watched_arm(host) as arm:
+        run = Run(store, tmp_path, host, arm)
 
         def turn_key(question: AskOperator, _state: RunState) -> OperatorAction:
             assert "local control" in question.text
             os.kill(int(ready["pid"]), signal.SIGUSR1)
-            time.sleep(0.3)
+            until(lambda: dashboard(host, "is in remote control") == ["true"], "the key is not turned")
             return answer(question, "confirm")
 
         run.answers(turn_key)

@@ -216,7 +216,7 @@ def test_a_device_that_dies_ends_the_rig_with_a_reason(tmp_path: Path) -> None:
         camera = next(p for p in processes if "camera" in p.cmdline())
         os.kill(camera.pid, signal.SIGKILL)
         process.wait(timeout=20)
-        until(lambda: not any(p.is_running() for p in processes), "all have ended", 20)
+        until(lambda: not any(p.is_running() for p in processes), "all have ended")
         log = (tmp_path / "rig.log").read_text()
         assert "camera ended with status -9" in log
         assert "Traceback" not in log
@@ -226,7 +226,7 @@ def test_a_killed_rig_takes_its_devices_with_it(tmp_path: Path) -> None:
     with rig_process(tmp_path) as (process, _, processes):
         process.kill()
         process.wait(timeout=60)
-        until(lambda: not any(p.is_running() for p in processes[1:]), "its devices have ended", 20)
+        until(lambda: not any(p.is_running() for p in processes[1:]), "its devices have ended")
 
 
 def test_sigterm_also_ends_a_ct_scan_that_is_under_way(tmp_path: Path) -> None:

@@ -22,11 +22,10 @@ from service.run_start import start_run
 from service.steps import params_models
 from service.store.files.space_used import forecast_of
 from service.store.records import NewJob
-from service.store.store import Store
 from service.worker.loop import work
 from tests.support.pages.web import web_site
 from tests.support.record.store import enqueue
-from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
+from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run, bench_store
 
 GB = 10**9
 SetFree = Callable[[int], None]
@@ -48,7 +47,7 @@ def set_free(monkeypatch: pytest.MonkeyPatch) -> SetFree:
 @pytest.fixture
 def bench(tmp_path: Path, set_free: SetFree) -> Generator[Bench]:
     set_free(100 * GB)
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         yield begin_run(store, PROTOCOL, tmp_path)
 
 
@@ -97,7 +96,7 @@ def test_a_run_pauses_with_a_question_before_the_disk_is_full_and_goes_on(bench:
     def fill(number: int) -> None:
         if number == 2:
             set_free(LEAST_FREE_BYTES + 100)
-        bench.ahead_s += 3  # the disk is checked every two seconds
+        bench.clock.passed_s += 3  # the disk is checked every two seconds
 
     def answer(question: AskOperator, _state: RunState) -> OperatorAction | None:
         asked.append(question.text)
@@ -119,7 +118,7 @@ def test_a_run_pauses_with_a_question_before_the_disk_is_full_and_goes_on(bench:
 
 
 def test_a_run_that_will_not_fit_says_so_once_with_the_figures(tmp_path: Path, set_free: SetFree) -> None:
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         set_free(LEAST_FREE_BYTES + 30_000_000)  # for 20 views of a simulated rig, estimated at 4 MB
         bench = begin_run(store, PROTOCOL.replace("count: 4", "count: 20"), tmp_path)
         assert bench.run().status == "completed"  # they are smaller than estimated

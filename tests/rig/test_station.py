@@ -100,12 +100,12 @@ def test_a_wrong_rig_file_says_where(tmp_path: Path, old: str, new: str, words: 
 
 
 HOLDER = """
-import os, time
+import os, signal
 from drivers.host.device_lock import DeviceLock
 os.umask(0o077)
 lock = DeviceLock.take("ur 127.0.0.9", "arm")
 print("held", flush=True)
-time.sleep(100)
+signal.pause()
 """
 
 

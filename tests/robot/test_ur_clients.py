@@ -7,7 +7,6 @@ import socket
 import struct
 import subprocess
 import sys
-import time
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -145,14 +144,14 @@ def test_handshake_and_stream(controller: tuple[str, str], client: RtdeClient) -
     packages = [client.data() for _ in range(50)]
     times = np.array([p["timestamp"][0] for p in packages])
     assert np.all(np.diff(times) > 0)
-    assert np.median(np.diff(times)) == pytest.approx(0.008, abs=0.003)
+    assert np.mean(np.diff(times)) > 0.007, "never more than 125 Hz"
+    assert np.quantile(np.diff(times), 0.25) < 0.011, "nor less, but where the simulator was not scheduled"
     assert packages[-1]["robot_mode"] == (7,)
     assert packages[-1]["safety_status_bits"][0] == 1
     assert len(packages[-1]["actual_q"]) == 6
     assert client.pause()
-    client.socket.settimeout(0.2)
-    with pytest.raises(TimeoutError):
-        client.data()
+    kinds = [client.answered_by("v") for _ in range(20)]
+    assert kinds == ["v"] * 20, "no data package comes any more"
 
 
 def test_fields_depend_on_the_version(controller: tuple[str, str], client: RtdeClient) -> None:
@@ -193,8 +192,7 @@ def test_inputs_are_owned_and_written(controller: tuple[str, str], client: RtdeC
     other.output_setup(["input_int_register_5", "input_double_register_6", "actual_digital_output_bits"], 500.0)
     other.start()
     client.send("U", struct.pack(">BidBB", 1, -7, 2.5, 0b0110, 0b0100))
-    deadline = time.monotonic() + 30
-    while (data := other.data())["input_int_register_5"] != (-7,) and time.monotonic() < deadline:
+    while (data := other.data())["input_int_register_5"] != (-7,):
         pass
     other.close()
     assert data["input_int_register_5"] == (-7,)
@@ -257,7 +255,7 @@ def test_unmodified_ur_rtde(controller: tuple[str, str]) -> None:
     assert said["outputs"] & 0x1020A == 0x10208 & 0x1020A
     assert said["analog"] == pytest.approx(0.25)
     assert said["moveJ"] is True
-    assert said["moveJ_s"] == pytest.approx(2 * np.sqrt(0.2 / 1.4) / 5, abs=0.15)
+    assert said["moveJ_s"] >= 2 * np.sqrt(0.2 / 1.4) / 5 - 0.02
     assert said["moveJ_error"] < 1e-6
     assert said["tcp"] == pytest.approx([0, 0, 0.1, 0, 0, 0])
     assert said["setPayload"] is True
@@ -281,7 +279,7 @@ def test_unmodified_ur_rtde(controller: tuple[str, str]) -> None:
 def rare_calls() -> dict[str, Any]:
     """The client's answers to rare calls, in one session."""
     host = address(48)
-    with simulated_ur(host, "--version", "5.12", "--model", "UR10e", "--speed-up", "5"):
+    with simulated_ur(host, "--version", "5.12", "--model", "UR10e", "--speed-up", "5", patience_s=0):
         command = [sys.executable, "-m", "tests.support.vendor.ur_vendor_calls", host]
         done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
     assert done.returncode == 0, done.stderr
@@ -335,14 +333,15 @@ def test_a_program_file_is_loaded_played_held_and_stopped(rare_calls: dict[str, 
 def test_world_is_told_the_joints() -> None:
     host = address(49)
     with socket.create_server(("127.0.0.1", 0)) as world:
-        world.settimeout(10)
+        world.settimeout(90)
         port = world.getsockname()[1]
         joints = "0.1,-1.2,1.3,-1.4,-1.5,0.6"
         with simulated_ur(host, "--world", f"127.0.0.1:{port}", "--arm", "robot", "--initial-joints", joints):
             connection, _ = world.accept()
-            connection.settimeout(10)
+            connection.settimeout(90)
             with connection, connection.makefile("r") as lines:
-                still = [json.loads(lines.readline()) for _ in range(4)]
+                still = [json.loads(lines.readline()) for _ in range(8)]
                 assert {(m["op"], m["arm"]) for m in still} == {("robot", "robot")}
                 assert still[0]["q"] == [0.1, -1.2, 1.3, -1.4, -1.5, 0.6]
-                assert 0 < still[3]["t"] - still[0]["t"] < 0.6, "ten times a second at rest"
+                gaps_s = np.diff([told["t"] for told in still])
+                assert 0.05 < np.min(gaps_s) < 0.2, "ten times a second at rest"

@@ -25,6 +25,7 @@ from tests.support.arms.ur_driver import (
     T_FLANGE_TCP,
     move,
     opened,
+    pass_s,
     turned,
     wait_for,
 )
@@ -47,8 +48,10 @@ def test_identity_and_report(robot: RobotArm) -> None:
     assert report.identity.firmware.startswith("5.12")
     assert "ur_rtde 1." in report.identity.driver_version
     assert report.problems == ()
-    sample = robot.state().sample
-    assert report.clock_offset_s == pytest.approx(sample.controller_time_s - sample.monotonic_s, abs=0.05)
+    assert report.clock_offset_s is not None
+    for _ in range(5):  # a sample that arrives late makes the offset smaller, never larger
+        sample = robot.state().sample
+        assert sample.controller_time_s - sample.monotonic_s <= report.clock_offset_s + 0.05
 
 
 @pytest.mark.skipif(
@@ -99,24 +102,26 @@ def test_move_to_a_pose_settle_and_read_the_exposure(robot: RobotArm) -> None:
     assert np.linalg.norm(difference[:3, 3]) < 1e-6
     assert rotation_angle_rad(difference) < 1e-6
     begin = time.monotonic()
-    time.sleep(0.3)
+    pass_s(robot, 0.3)
     samples = robot.samples(begin, time.monotonic())
-    assert 15 <= len(samples) <= 45, "125 Hz"
-    assert np.all(np.diff([s.controller_time_s for s in samples]) > 0)
+    steps_s = np.diff([s.controller_time_s for s in samples])
+    assert np.all(steps_s > 0)
+    assert np.mean(steps_s) > 0.007, "never more than 125 Hz"
+    assert np.quantile(steps_s, 0.25) < 0.011, "nor less, but where the simulator was not scheduled"
     assert all(begin <= s.monotonic_s for s in samples)
     assert {s.safety for s in samples} == {SafetyState.NORMAL}
 
 
 def test_stop_in_mid_motion(robot: RobotArm) -> None:
     start = robot.state().sample.joints_rad[0]
-    move(robot, turned(robot, 1.5))
-    time.sleep(0.3)
+    move(robot, turned(robot, 4.0))
+    wait_for(lambda: robot.state().sample.joints_rad[0] - start > 0.05)
     robot.stop()
-    wait_for(lambda: not robot.is_moving(), 2)
-    wait_for(lambda: robot.settle(SettleCriteria(window_s=0.2)).settled, 3)
+    wait_for(lambda: not robot.is_moving())
+    wait_for(lambda: robot.settle(SettleCriteria(window_s=0.2)).settled)
     done = robot.state().sample.joints_rad[0] - start
-    assert 0.05 < done < 1.4
-    time.sleep(0.2)
+    assert 0.05 < done < 3.9
+    pass_s(robot, 0.2)
     assert robot.state().sample.joints_rad[0] - start == pytest.approx(done, abs=1e-4)
     move(robot, turned(robot, -done))
     wait_for(lambda: not robot.is_moving())

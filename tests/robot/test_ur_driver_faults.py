@@ -13,7 +13,7 @@ from drivers.errors import (
     LeaveNeededError,
     SafetyStopError,
 )
-from drivers.interfaces import SafetyState, SettleCriteria
+from drivers.interfaces import RobotArm, SafetyState, SettleCriteria
 from tests.support.arms.arm_watch import watched_arm
 from tests.support.arms.ur_driver import (
     PAYLOAD,
@@ -30,6 +30,8 @@ from tests.support.arms.ur_driver import (
 )
 from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
+
+STALE_S = 4.0  # of a stream that a test lets end, and far more than a busy machine holds one up
 
 
 @pytest.mark.slow
@@ -81,10 +83,8 @@ def test_a_stop_that_came_and_was_released_between_two_motions_is_not_forgotten(
             return dashboard(host, "unlock protective stop")[0].startswith("Protective stop rel")
 
         wait_for(unlocked)
+        wait_for(lambda: arm.state().sample.safety is SafetyState.NORMAL)
         over = time.monotonic()
-        assert over - begin > 1.0, "a person took a while"
-        time.sleep(0.1)
-        assert arm.state().sample.safety is SafetyState.NORMAL
         assert not arm.is_moving(), "nothing was cut short"
         since = watch.mark()
         for _ in range(3):
@@ -93,10 +93,10 @@ def test_a_stop_that_came_and_was_released_between_two_motions_is_not_forgotten(
         assert any("nobody has confirmed since" in problem for problem in arm.report().problems)
         with pytest.raises(SafetyStopError, match="nobody has confirmed since"):
             arm.let_move("Ada", begin)  # she confirmed before the stop was over
-        time.sleep(0.5)
+        watch.pass_s(0.5)
         assert watch.moved_for_s(since) == 0.0
         assert not watch.now.program_runs, "nothing is sent anew either"
-        arm.let_move("Ada", over + 0.05)
+        arm.let_move("Ada", over)
         travel(arm, turned(arm, 0.1))
         assert watch.moved_for_s(since) > 0.0
 
@@ -138,9 +138,7 @@ def test_emergency_stop() -> None:
         move(arm, turned(arm, 2.5))
         with pytest.raises(SafetyStopError, match="emergency stop"):
             wait_for(lambda: not arm.is_moving())
-        time.sleep(0.4)  # the button is released
-        dashboard(host, "power on")
-        wait_for(lambda: arm.state().robot_mode == "IDLE")
+        wait_for(lambda: switched_on(arm, host))  # as soon as the button is released
         wait_for(lambda: arm.state().sample.safety is SafetyState.NORMAL)
         with pytest.raises(DeviceRefusedError, match="mode IDLE"):
             move(arm, turned(arm, 0.1))
@@ -150,6 +148,11 @@ def test_emergency_stop() -> None:
             move(arm, turned(arm, 0.1))
         let_move(arm)
         travel(arm, turned(arm, 0.1))
+
+
+def switched_on(arm: RobotArm, host: str) -> bool:
+    dashboard(host, "power on")
+    return arm.state().robot_mode == "IDLE"
 
 
 @pytest.mark.slow
@@ -166,10 +169,10 @@ def test_reconnect_after_the_controller_restarted() -> None:
     host = address(54)
     with contextlib.ExitStack() as stack:
         with simulated_ur(host, "--speed-up", SPEED_UP):
-            arm = stack.enter_context(opened(host, connect_timeout_s=1.0))
+            arm = stack.enter_context(opened(host, stale_after_s=STALE_S))
             arm.state()
         with pytest.raises(DeviceUnavailableError):
-            wait_for(lambda: not arm.state(), 5)
+            wait_for(lambda: not arm.state())
         with pytest.raises(DeviceUnavailableError):
             arm.open()
         with simulated_ur(host, "--speed-up", SPEED_UP):
@@ -182,7 +185,7 @@ def test_reconnect_after_the_controller_restarted() -> None:
 @pytest.mark.slow
 def test_dropped_link_ends_in_an_error_and_a_reconnect() -> None:
     host = address(60)
-    with faulty(60, {"on": "move", "kind": "drop"}), opened(host, stale_after_s=0.5) as arm:
+    with faulty(60, {"on": "move", "kind": "drop"}), opened(host, stale_after_s=STALE_S) as arm:
         with pytest.raises(DeviceUnavailableError):
             travel(arm, turned(arm, 0.5))
         arm.open()
@@ -193,7 +196,7 @@ def test_dropped_link_ends_in_an_error_and_a_reconnect() -> None:
 @pytest.mark.slow
 def test_motion_that_ended_on_a_dead_stream_is_not_taken_for_an_arm_at_rest() -> None:
     drop: dict[str, object] = {"on": "move", "kind": "drop", "value": "receivers"}  # no samples; commands still pass
-    with faulty(61, drop), opened(address(61), stale_after_s=3.0) as arm:
+    with faulty(61, drop), opened(address(61), stale_after_s=STALE_S) as arm:
         with pytest.raises(DeviceUnavailableError, match="no new sample"):
             travel(arm, turned(arm, 0.1))
         arm.open()
@@ -203,7 +206,7 @@ def test_motion_that_ended_on_a_dead_stream_is_not_taken_for_an_arm_at_rest() ->
 
 @pytest.mark.slow
 def test_stalled_stream_is_not_taken_for_a_still_arm() -> None:
-    with faulty(55, {"on": "move", "kind": "stall"}), opened(address(55), stale_after_s=0.5) as arm:
+    with faulty(55, {"on": "move", "kind": "stall"}), opened(address(55), stale_after_s=STALE_S) as arm:
         with pytest.raises(DeviceUnavailableError, match="no new sample"):
             travel(arm, turned(arm, 0.5))
         with pytest.raises(DeviceUnavailableError):
@@ -214,8 +217,8 @@ def test_stalled_stream_is_not_taken_for_a_still_arm() -> None:
 def test_mute_server_does_not_hang_the_driver(on: str, server: str) -> None:
     with (
         faulty(56, {"on": on, "kind": "stall"}),
-        pytest.raises(DeviceUnavailableError, match=rf"the {server} server did not answer within 0\.5 s"),
-        opened(address(56), connect_timeout_s=0.5),
+        pytest.raises(DeviceUnavailableError, match=rf"the {server} server did not answer within 3 s"),
+        opened(address(56), connect_timeout_s=3.0),
     ):
         pass
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,39 +15,59 @@ from service.core.run.state import RunState
 from service.monitor.devices import OpenDevices
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import STALE_S, Snapshot, read_snapshot, write_snapshot
-from service.store.store import Store
 from service.web.page.run_frame import Banner, robot_banner
 from tests.support.pages.web import web_site
 from tests.support.processes.waiting import until
+from tests.support.record.stepped_clock import SteppedClock
 from tests.support.rig.bench_lightbox import BenchLightbox
 from tests.support.rig.bench_rig import BenchArm, BenchRig
-from tests.support.runs.bench_run import PROTOCOL, begin_run
+from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
 RUN = "run"
 
 
 class Bench:
-    """A reporter on a folder, and its output."""
+    """A reporter on a folder, and its output. Its threads wait for the time that the test lets pass."""
 
-    def __init__(self, folder: Path, robots: Mapping[str, RobotArm]) -> None:
-        self.folder = folder
-        self.reporter = Reporter(folder, RUN, lambda: OpenDevices(robots=robots), BenchRig().camera_named)
+    def __init__(self, folder: Path, robots: Mapping[str, RobotArm], clock: SteppedClock) -> None:
+        self.folder, self.clock = folder, clock
+        self.reporter = Reporter(
+            folder, RUN, lambda: OpenDevices(robots=robots), BenchRig().camera_named, clock=clock
+        )
 
     @property
     def told(self) -> Snapshot:
-        return read_snapshot(self.folder, RUN)
+        return read_snapshot(self.folder, RUN, self.clock.utc_s())
+
+    def becomes(self, condition: Callable[[Snapshot], bool]) -> Snapshot:
+        """Let time pass until what is told is so and not stale; return that."""
+        told = self.told
+
+        def so() -> bool:
+            nonlocal told
+            self.clock.sleep(0.25)
+            told = self.told
+            return not told.stale(self.clock.utc_s()) and condition(told)
+
+        until(so, lambda: str(told), every_s=0.01)
+        return told
 
 
 @pytest.fixture
-def arm() -> BenchArm:
-    arm = BenchArm()
+def clock() -> SteppedClock:
+    return SteppedClock()
+
+
+@pytest.fixture
+def arm(clock: SteppedClock) -> BenchArm:
+    arm = BenchArm(clock=clock)
     arm.open()
     return arm
 
 
 @pytest.fixture
-def bench(tmp_path: Path, arm: BenchArm) -> Generator[Bench]:
-    bench = Bench(tmp_path, {"robot": arm})
+def bench(tmp_path: Path, arm: BenchArm, clock: SteppedClock) -> Generator[Bench]:
+    bench = Bench(tmp_path, {"robot": arm}, clock)
     bench.reporter.begin()
     yield bench
     bench.reporter.end()
@@ -56,60 +75,53 @@ def bench(tmp_path: Path, arm: BenchArm) -> Generator[Bench]:
 
 @pytest.fixture
 def active(tmp_path: Path) -> Generator[RunState]:
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         yield begin_run(store, PROTOCOL, tmp_path).state()
+
+
+NOW_S = 1.8e9
 
 
 def banner(state: RunState, **fields: object) -> Banner:
     """The banner for a snapshot of this moment."""
-    return robot_banner(state, Snapshot.model_validate({"at_utc_s": time.time(), **fields}), driven=True)
+    return robot_banner(state, Snapshot.model_validate({"at_utc_s": NOW_S, **fields}), NOW_S, driven=True)
 
 
-@pytest.mark.slow
 def test_a_long_call_is_told_while_it_lasts(bench: Bench) -> None:
     bench.reporter.attend("working", "capture", 1)
     bench.reporter.show("viewpoints", 12, 54)
     bench.reporter.busy("taking v1_013 and fetching it from the camera, 61 MP")
     # This thread is the runner's and does not return to the reporter from here on.
-    until(
-        lambda: bench.told.lasting == "taking v1_013 and fetching it from the camera, 61 MP",
-        lambda: str(bench.told),
-        10,
-    )
-    first = bench.told
+    first = bench.becomes(lambda told: told.lasting == "taking v1_013 and fetching it from the camera, 61 MP")
     assert (first.doing, first.robot, first.done, first.total) == ("working", "standing", 12, 54)
-    until(lambda: bench.told.activity_s > first.activity_s + 1, lambda: str(bench.told), 10)
-    assert not bench.told.stale
+    bench.becomes(lambda told: told.activity_s > first.activity_s + 1)
     bench.reporter.attend("working", "capture", 1)
-    until(lambda: bench.told.activity == "", lambda: str(bench.told), 10)
+    bench.becomes(lambda told: told.activity == "")
 
 
-@pytest.mark.slow
 def test_a_call_of_which_nothing_was_said_is_seen_to_last(bench: Bench) -> None:
     bench.reporter.attend("working", "capture", 1)
-    until(lambda: bench.told.quiet_s > 2, lambda: str(bench.told), 10)
-    assert bench.told.age_s() < 2
+    bench.becomes(lambda told: told.quiet_s > 2 and told.age_s(bench.clock.utc_s()) < 2)
 
 
-@pytest.mark.slow
 def test_the_arm_is_watched_from_beside_the_call(bench: Bench, arm: BenchArm) -> None:
     bench.reporter.attend("working", "capture", 1)
     assert bench.told.robot == "standing"
     target = np.array([0.9, 0.4, 0.5, 0.0, 3.0, 0.0])
     arm.move_joints(target, speed_rad_s=1.0, acceleration_rad_s2=1.0)
     arm.dawdle()
-    until(lambda: bench.told.robot == "moving", lambda: str(bench.told), 10)
+    bench.becomes(lambda told: told.robot == "moving")
     arm.stop()
-    until(lambda: bench.told.robot == "standing", lambda: str(bench.told), 10)
+    bench.becomes(lambda told: told.robot == "standing")
     arm.safety = SafetyState.EMERGENCY_STOP
-    until(lambda: bench.told.robot == "emergency_stop", lambda: str(bench.told), 10)
+    bench.becomes(lambda told: told.robot == "emergency_stop")
 
 
 class HeldUp(BenchArm):
     """Its process is in a long call of the main loop: other callers wait."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, clock: SteppedClock) -> None:
+        super().__init__(clock=clock)
         self.free = threading.Event()
 
     def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
@@ -117,26 +129,23 @@ class HeldUp(BenchArm):
         return super().samples(start_monotonic_s, end_monotonic_s)
 
 
-@pytest.mark.slow
-def test_an_arm_that_does_not_answer_holds_nothing_up_and_gets_old(tmp_path: Path, active: RunState) -> None:
-    arm = HeldUp()
+def test_an_arm_that_does_not_answer_holds_nothing_up_and_gets_old(
+    tmp_path: Path, active: RunState, clock: SteppedClock
+) -> None:
+    arm = HeldUp(clock)
     arm.open()
-    bench = Bench(tmp_path, {"robot": arm})
+    bench = Bench(tmp_path, {"robot": arm}, clock)
     bench.reporter.begin()
     try:
         bench.reporter.attend("working", "capture", 1)
         bench.reporter.busy("connecting the robot")
-        until(lambda: bench.told.robot_silent_s > STALE_S, lambda: str(bench.told), 20)
-        shown = robot_banner(active, bench.told, driven=True)
+        told = bench.becomes(lambda told: told.robot_silent_s > STALE_S)
+        shown = robot_banner(active, told, clock.utc_s(), driven=True)
         assert shown.key == "unknown"
         assert "not been heard of for" in shown.text
         assert "connecting the robot, for" in shown.text
         arm.free.set()
-        until(
-            lambda: bench.told.robot_silent_s < STALE_S and bench.told.robot == "standing",
-            lambda: str(bench.told),
-            10,
-        )
+        bench.becomes(lambda told: told.robot_silent_s < STALE_S and told.robot == "standing")
     finally:
         arm.free.set()
         bench.reporter.end()
@@ -150,11 +159,11 @@ def test_an_arm_whose_link_is_dead_is_unknown(bench: Bench, arm: BenchArm, monke
         raise DeviceUnavailableError("no link", where="arm")
 
     monkeypatch.setattr(arm, "samples", dead)
-    until(lambda: bench.told.robot == "unknown", lambda: str(bench.told), 10)
+    bench.becomes(lambda told: told.robot == "unknown")
 
 
 def test_the_banner_says_what_goes_on_and_for_how_long(active: RunState) -> None:
-    now_s = time.time()
+    now_s = NOW_S
     taking = {"activity": "taking v1_013 and fetching it from the camera, 61 MP", "activity_utc_s": now_s - 12}
     busy = {"doing": "working", "attended_utc_s": now_s - 12, "robot_utc_s": now_s - 1, "robot": "standing", **taking}
     shown = banner(active, **busy)
@@ -174,11 +183,10 @@ def test_a_run_that_has_just_been_started_says_so(tmp_path: Path, active: RunSta
     shown = banner(active, doing="starting")
     assert shown.key == "starting"
     assert "asks before it does" in shown.text
-    write_snapshot(tmp_path, RUN, Snapshot(at_utc_s=time.time() - 30, doing="starting"))
-    assert read_snapshot(tmp_path, RUN).doing == "starting"
-    write_snapshot(tmp_path, RUN, Snapshot(at_utc_s=time.time() - 300, doing="starting"))
-    silent = read_snapshot(tmp_path, RUN)
-    assert "not told anything for 300 s" in robot_banner(active, silent, driven=True).text
+    write_snapshot(tmp_path, RUN, Snapshot(at_utc_s=NOW_S, doing="starting"))
+    assert read_snapshot(tmp_path, RUN, NOW_S + 30).doing == "starting"
+    silent = read_snapshot(tmp_path, RUN, NOW_S + 300)
+    assert "not told anything for 300 s" in robot_banner(active, silent, NOW_S + 300, driven=True).text
 
 
 def test_a_runner_that_is_started_is_told_of_at_once(tmp_path: Path) -> None:
@@ -190,7 +198,7 @@ def test_a_runner_that_is_started_is_told_of_at_once(tmp_path: Path) -> None:
         launcher.start(run_id)
         try:
             assert launcher.driven(run_id)
-            assert read_snapshot(web.site.data, run_id).doing != "unknown"
+            assert read_snapshot(web.site.data, run_id, web.now_utc_s).doing != "unknown"
         finally:
             children = vars(launcher)["_children"]
             children[run_id].terminate()
@@ -198,7 +206,7 @@ def test_a_runner_that_is_started_is_told_of_at_once(tmp_path: Path) -> None:
 
 
 def test_the_runner_says_what_it_is_about_to_do(tmp_path: Path) -> None:
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         run = begin_run(store, PROTOCOL, tmp_path)
         run.run()
         said = run.operator.busy_with
@@ -210,13 +218,13 @@ def test_the_runner_says_what_it_is_about_to_do(tmp_path: Path) -> None:
     assert "signing the record" in said
 
 
-def test_the_signal_tower_shows_how_the_run_stands(tmp_path: Path, arm: BenchArm) -> None:
+def test_the_signal_tower_shows_how_the_run_stands(tmp_path: Path, arm: BenchArm, clock: SteppedClock) -> None:
     box = BenchLightbox()
     devices = OpenDevices(robots={"robot": arm}, lightboxes={"box": box})
-    reporter = Reporter(tmp_path, RUN, lambda: devices, BenchRig().camera_named)
+    reporter = Reporter(tmp_path, RUN, lambda: devices, BenchRig().camera_named, clock=clock)
     reporter.attend("working", "capture", 1)
     reporter.attend("asking", "capture", 1, asks="recovery", words="Capture: no link")
-    assert read_snapshot(tmp_path, RUN).standing == "stopped"
+    assert read_snapshot(tmp_path, RUN, clock.utc_s()).standing == "stopped"
     reporter.attend("asking", "spraying", 1, asks="sign", words="Spray: a signature is due")
     reporter.attend("working", "spraying", 1)
     arm.safety = SafetyState.PROTECTIVE_STOP

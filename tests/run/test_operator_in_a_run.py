@@ -89,7 +89,7 @@ def test_a_long_planning_shows_its_progress_and_heeds_pause(begin: Callable[[str
         return [(done, total) for what, done, total in operator.shown if what == words]
 
     def attended(_doing: Doing) -> None:
-        bench.ahead_s += 1.0  # the main loop attends to buttons and devices again once the clock has gone on
+        bench.clock.passed_s += 1.0  # the main loop attends to buttons and devices again once the clock has gone on
         if len(planning()) == 3 and not bench.state().paused:
             bench.act("pause")
 
@@ -249,7 +249,7 @@ def test_where_the_robot_will_move_the_pedal_is_pressed_twice_within_seconds(ben
 
     def press(after_s: float) -> Answer:
         def act(_question: AskOperator, _state: RunState) -> None:
-            bench.ahead_s += after_s
+            bench.clock.passed_s += after_s
             box.presses += 1
 
         return act

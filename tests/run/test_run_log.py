@@ -13,9 +13,8 @@ from service.core.errors import IntegrityError
 from service.core.records.events import StepNote, StepPassed
 from service.run_record import RunFollower
 from service.run_start import recorded_run
-from service.store.store import Store
 from tests.support.pages.web import WebSite, web_site
-from tests.support.runs.bench_run import PROTOCOL, begin_run
+from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
 
 @pytest.fixture
@@ -25,7 +24,7 @@ def web(tmp_path: Path) -> Generator[WebSite]:
 
 
 def test_a_log_that_many_threads_bring_up_to_date_takes_every_event_once(tmp_path: Path) -> None:
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         run_id = begin_run(store, PROTOCOL, tmp_path).run_id
         protocol, _ = recorded_run(store, run_id)
         run = RunFollower(store, run_id, protocol)
@@ -53,7 +52,7 @@ def test_a_log_that_many_threads_bring_up_to_date_takes_every_event_once(tmp_pat
 
 
 def test_an_event_that_cannot_have_happened_stays_an_error_for_everybody(tmp_path: Path) -> None:
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         run_id = begin_run(store, PROTOCOL, tmp_path).run_id
         run = RunFollower(store, run_id, recorded_run(store, run_id)[0])
         sound = run.now()

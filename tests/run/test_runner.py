@@ -18,7 +18,7 @@ from service.store.records import Checkpoint
 from service.store.signatures import timestamps as timestamping
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, begin_run
+from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, begin_run, bench_store
 
 
 def test_a_run_goes_from_its_checklist_through_the_captures_to_its_end(bench: Bench) -> None:
@@ -91,7 +91,7 @@ def test_a_database_that_is_moved_away_in_the_capture_ends_the_run_loudly(tmp_pa
             for path in data.glob("orthocapture.sqlite*"):
                 path.rename(path.with_name(f"gone-{path.name}"))
 
-    with Store.open(data) as store:
+    with bench_store(data) as store:
         bench = begin_run(store, PROTOCOL, tmp_path)
         bench.on_wait = move_away
         with pytest.raises(StoreError, match=r"orthocapture\.sqlite was removed while it was in use"):

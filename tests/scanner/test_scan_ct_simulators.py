@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,7 +56,6 @@ def fit_sphere(points: Array, near: Array, band_m: float) -> Fit:
 class Scanned:
     mesh: ScannedMesh
     T_world_scan: Array
-    seconds: float
 
     @property
     def world_m(self) -> Array:
@@ -71,12 +69,10 @@ class Scanned:
 
 
 def scanned(folder: Path, *options: str) -> Scanned:
-    start = time.monotonic()
     with simulator("scanner", "--scene", str(SEED), "--folder", str(folder), "--once", *options) as running:
         truth = np.array(running.ready["truth"]["T_world_scan"])
-        assert running.process.wait(20) == 0
-    seconds = time.monotonic() - start
-    return Scanned(read_mesh_file(folder / running.ready["export"]), truth, seconds)
+        assert running.process.wait(90) == 0
+    return Scanned(read_mesh_file(folder / running.ready["export"]), truth)
 
 
 @pytest.fixture(scope="module")
@@ -148,15 +144,15 @@ def test_a_scan_appears_gradually_and_is_not_taken_before_it_is_whole(tmp_path: 
             for export in scanner.exports():
                 scanner.read(export)
                 done.set()
-            time.sleep(0.01)
+            done.wait(0.01)
 
-    plan = json.dumps([{"device": "scanner", "on": "export", "kind": "stall", "value": 0.3}])
+    plan = json.dumps([{"device": "scanner", "on": "export", "kind": "stall", "value": 2.0}])
     watcher = threading.Thread(target=watch)
     watcher.start()
     try:
         scanned(tmp_path, "--spacing-mm", "1.2", "--faults", plan)
     finally:
-        watcher.join(20)
+        watcher.join(90)
         done.set()
     assert any("cut short" in text for text in seen)
 
@@ -174,22 +170,19 @@ def test_a_truncated_scan_is_recognised(tmp_path: Path) -> None:
 class Ct:
     volume: CtVolume
     T_world_ct: Array
-    seconds: float
 
 
 @pytest.fixture(scope="module")
 def ct(tmp_path_factory: pytest.TempPathFactory) -> Ct:
     folder = tmp_path_factory.mktemp("ct")
-    start = time.monotonic()
     words = ("ct", "--scene", str(SEED), "--folder", str(folder), "--once", "--voxel-mm", "1.0", "--implicit-vr")
     with simulator(*words) as running:
         truth = np.array(running.ready["truth"]["T_world_ct"])
-        assert running.process.wait(20) == 0
-    seconds = time.monotonic() - start
+        assert running.process.wait(90) == 0
     source = DicomFolder(DicomFolderConfig(folder=folder, stable_s=0.0))
     (series,) = source.series()
     assert series.problems == ()
-    return Ct(source.read(series), truth, seconds)
+    return Ct(source.read(series), truth)
 
 
 def test_ct_spheres_are_where_they_are_to_a_tenth_of_a_voxel(ct: Ct) -> None:
@@ -276,6 +269,6 @@ def test_a_ct_fault_plan_reaches_the_simulator(tmp_path: Path) -> None:
     plan = json.dumps([{"device": "ct", "on": "slice", "nth": 20, "kind": "drop", "times": 2}])
     words = ("ct", "--scene", str(SEED), "--folder", str(tmp_path), "--once", "--voxel-mm", "4", "--faults", plan)
     with simulator(*words) as running:
-        assert running.process.wait(20) == 0
+        assert running.process.wait(90) == 0
     (series,) = DicomFolder(DicomFolderConfig(folder=tmp_path, stable_s=0.0)).series()
     assert "gap: 2 slices" in " ".join(series.problems)

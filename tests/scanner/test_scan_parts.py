@@ -19,8 +19,7 @@ from service.compute.surfaces.part_merging import merge_parts
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import StepFailed
-from service.store.store import Store
-from tests.support.runs.bench_run import begin_run, say
+from tests.support.runs.bench_run import begin_run, bench_store, say
 from tests.support.runs.computing_run import OneScanner, begin_computing_run
 
 RADIUS_M = 0.006
@@ -101,7 +100,7 @@ def test_a_run_waits_for_all_parts_and_makes_one_mesh(tmp_path: Path) -> None:
             for centre in apply(inverse(T), SPHERES_M[list(shown)])
         ]
         trimesh.util.concatenate(balls).export(rig.folder / f"part{number}.ply")
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         bench = begin_computing_run(store, PROTOCOL, tmp_path, rig)
         state = bench.run()
         assert state.status == "completed", state
@@ -133,14 +132,10 @@ def test_a_step_that_waits_in_vain_says_what_is_wrong_with_the_file_that_came(tm
     rig.folder = tmp_path / "scans"
     rig.folder.mkdir()
     trimesh.creation.icosphere(1, 1e3 * RADIUS_M).export(rig.folder / "part.stl")
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         bench = begin_run(store, PROTOCOL, tmp_path)
         bench.rig = rig
 
-        def pass_by(_seconds: float) -> None:
-            bench.ahead_s += 2.0
-
-        bench.on_wait = pass_by
         bench.script("scan", "recovery", say("abort", reason="another program exported it"))
         assert bench.run().status == "aborted"
         *_, failed = bench.payloads(StepFailed)

@@ -10,7 +10,7 @@ import pytest
 from service.store.records import SITE
 from service.web.security.guards import cookie_name
 from tests.support.pages.web import PIN, WebSite, web_site
-from tests.support.record.store import SteppedClock
+from tests.support.record.stepped_clock import SteppedClock
 
 
 def test_the_cookie(site: WebSite) -> None:

@@ -11,15 +11,14 @@ import numpy as np
 import pytest
 
 from service.core.records.events import GatesEvaluated, StepMeasured, StepNote, StepRetried
-from service.store.store import Store
 from tests.support.boards.board_bench import MOUNT, PROTOCOL, Picture, board_room
 from tests.support.rig.bench_rig import answer
-from tests.support.runs.bench_run import Bench, begin_run
+from tests.support.runs.bench_run import Bench, begin_run, bench_store
 
 
 @pytest.fixture
 def begin(tmp_path: Path) -> Generator[Callable[[str], Bench]]:
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         yield lambda text: begin_run(store, text, tmp_path)
 
 

@@ -32,7 +32,7 @@ from service.worker.job import JobAnswer, JobContext, RecordedContext
 from service.worker.loop import HANDLERS
 from service.worker.poses.robot_poses import robot_camera_poses
 from tests.support.rig.bench_rig import answer, other_settings
-from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
+from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run, bench_store
 from tests.support.runs.computing_run import compute_jobs
 from tests.support.runs.measuring_rig import CENTRE_M, MEASURED, SPHERES_M, BenchCt, MeasuringRig, hill
 from tests.support.scenes.sphere_images import (
@@ -212,7 +212,7 @@ def test_jobs_go_from_images_to_a_gate_and_a_suggestion(
 
 @pytest.fixture
 def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
-    with Store.open(tmp_path / "data") as opened:
+    with bench_store(tmp_path / "data") as opened:
         yield lambda text: begin_run(opened, text, tmp_path)
 
 

@@ -10,14 +10,13 @@ import pytest
 
 from drivers.interfaces import CameraSettings
 from service.core.records.events import StepNote
-from service.store.store import Store
 from tests.support.rig.bench_rig import answer, other_settings
-from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
+from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run, bench_store
 
 
 @pytest.fixture
 def begin(tmp_path: Path) -> Generator[Callable[[str], Bench]]:
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         yield lambda text: begin_run(store, text, tmp_path)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -24,6 +23,7 @@ from service.store.records import SITE
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.processes.forked import run
 from tests.support.record.store import Crash, CrashingFiles, capture, files_of, rows, start_run, tamper
 from tests.support.record.tampering import cut
 from tests.support.runs.bench_run import record_runs
@@ -238,9 +238,7 @@ def test_a_run_goes_on_in_the_restored_folder(tmp_path: Path) -> None:
     assert command("store", "restore", tmp_path / "backup", restored)[0] == 0
     assert command("audit", "rotate-key", "--lost", "--reason", "disk died", "--data", restored)[0] == 0
     resume = [sys.executable, "-m", "service.cli.main", "resume", "latest", "--data", str(restored)]
-    done = subprocess.run(
-        resume, input="abort the disk died\n", capture_output=True, text=True, timeout=60, check=False
-    )
+    done = run(resume, typed="abort the disk died\n", timeout_s=60)
     assert f"Run {begun} is aborted" in done.stdout, done.stderr
     assert command("audit", "verify", "all", "--data", restored)[0] == 0
 

@@ -22,7 +22,8 @@ from service.store.records import SITE, NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import show, verify
-from tests.support.record.store import CountedIds, SteppedClock, capture, enqueue, rows, start_run, tamper
+from tests.support.record.stepped_clock import SteppedClock
+from tests.support.record.store import CountedIds, capture, enqueue, rows, start_run, tamper
 
 RUN = "20261121-120000-000003"
 

@@ -33,7 +33,8 @@ from service.store.records import NewArtefact
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.record.store import CountedIds, SteppedClock, capture, captured, put_image, rows, start_run, tamper
+from tests.support.record.stepped_clock import SteppedClock
+from tests.support.record.store import CountedIds, capture, captured, put_image, rows, start_run, tamper
 
 ROOT_DIR = Path(__file__).parents[2]
 

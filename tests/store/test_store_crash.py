@@ -21,11 +21,11 @@ from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
 from service.store.verification.verify import AuditReport, verify
 from tests.support.processes.waiting import until
+from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import (
     CountedIds,
     Crash,
     CrashingFiles,
-    SteppedClock,
     capture,
     captured,
     files_of,

@@ -20,7 +20,8 @@ from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.processes.waiting import until
-from tests.support.record.store import CountedIds, SteppedClock, enqueue, start_run
+from tests.support.record.stepped_clock import SteppedClock
+from tests.support.record.store import CountedIds, enqueue, start_run
 
 ROOT_DIR = Path(__file__).parents[2]
 JOB = NewJob("registration", "register", 1, "register-1", {"sigma_px": 0.5, "views": [1, 2]})

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+from typing import IO
+
 import pytest
 import rfc8785
 from hypothesis import example, given, settings
@@ -21,6 +24,17 @@ VALUES = st.recursive(
     ),
     max_leaves=10,
 )
+
+
+class Lines(bundle_verifier.Bundle):
+    """Files of a bundle that are only in memory."""
+
+    def __init__(self, files: dict[str, bytes]) -> None:
+        self._files = files
+        self.sizes = {name: len(content) for name, content in files.items()}
+
+    def open(self, name: str) -> IO[bytes]:
+        return io.BytesIO(self._files[name])
 
 
 @given(VALUES)
@@ -63,3 +77,32 @@ def test_numbers_are_written_as_ecmascript_does(value: float) -> None:
 def test_what_is_no_json_is_refused(text: bytes, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         bundle_verifier.parse(text)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{ "job_id":"a"}', b'{"job_id": "a"}', b'{"job_id":"a"} ', b'{"job_id":"\\u0061"}',
+        b'{"job_id":"a","n":1.0}', b'{"job_id":"a","n":-0}', b'{"job_id":"a","n":1e2}', b'{"z":1,"job_id":"a"}',
+        b'["a"]', b'"a"', b"null",
+    ],
+)  # fmt: skip
+def test_records_in_another_spelling_are_named_and_not_used(line: bytes) -> None:
+    """Their hashes would be those of the canonical text, not of what stands there."""
+    canonical = b'{"job_id":"b","n":1}'
+    check, bundle = bundle_verifier.Check(), Lines({"jobs.jsonl": line + b"\n" + canonical + b"\n"})
+    assert list(check.records(bundle, "jobs.jsonl", frozenset(bundle.sizes))) == [{"job_id": "b", "n": 1}]
+    assert check.faults == [{"where": "jobs.jsonl, line 1", "what": "it is not canonical JSON: its text was altered"}]
+
+
+@pytest.mark.parametrize("line", [b'{"job_id":1}', b'{"job":"a"}', b'{"job_id":null}', b'{"job_id":true}'])
+def test_records_without_what_they_are_for_are_named_and_not_used(line: bytes) -> None:
+    check, bundle = bundle_verifier.Check(), Lines({"jobs.jsonl": line + b"\n"})
+    assert list(check.records(bundle, "jobs.jsonl", frozenset(bundle.sizes))) == []
+    assert [fault["what"] for fault in check.faults] == ["its field job_id is missing or of another kind"]
+
+
+def test_a_file_of_records_ends_with_a_line() -> None:
+    check, bundle = bundle_verifier.Check(), Lines({"jobs.jsonl": b'{"job_id":"a"}\n{"job_id":"b"}'})
+    assert list(check.records(bundle, "jobs.jsonl", frozenset(bundle.sizes))) == [{"job_id": "a"}]
+    assert [fault["where"] for fault in check.faults] == ["jobs.jsonl"]

@@ -21,7 +21,8 @@ from service.store.signatures.log_copy import bring_up_to_date, keep_elsewhere
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.record.store import CountedIds, SteppedClock, capture, start_run, tamper
+from tests.support.record.stepped_clock import SteppedClock
+from tests.support.record.store import CountedIds, capture, start_run, tamper
 from tests.support.record.tampering import WORDS_AGAIN, cut, rewrite_to_the_end, without_signatures_from
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 

@@ -17,7 +17,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.store import rows, tamper
 from tests.support.record.tampering import WORDS_AGAIN, cut, rewrite_to_the_end, without_signatures_from
-from tests.support.runs.bench_run import PROTOCOL, begin_run
+from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
 UNSIGNED = PROTOCOL.replace(
     "    irreversible: true\n    sign: true\n", ""
@@ -33,7 +33,7 @@ COUNTED_AGAIN = (
 def data(tmp_path: Path) -> Path:
     """A signed run, and a completed one after it."""
     folder = tmp_path / "data"
-    with Store.open(folder) as store:
+    with bench_store(folder) as store:
         checkpoint(store, begin_run(store, PROTOCOL, tmp_path).run_id)
         assert begin_run(store, UNSIGNED, tmp_path).run().status == "completed"
     return folder

@@ -25,7 +25,8 @@ from service.store.signatures.keys import KeyFolder
 from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.record.store import CountedIds, SteppedClock, capture, rows, start_run, tamper
+from tests.support.record.stepped_clock import SteppedClock
+from tests.support.record.store import CountedIds, capture, rows, start_run, tamper
 from tests.support.record.tampering import WORDS_AGAIN, alter_row, rewrite_to_the_end
 
 ROOT_DIR = Path(__file__).parents[2]

@@ -23,7 +23,8 @@ from service.store.signatures.timestamps import Authority, timestamp
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of, populate
-from tests.support.record.store import SteppedClock, capture, enqueue, rows, start_run, tamper
+from tests.support.record.stepped_clock import SteppedClock
+from tests.support.record.store import capture, enqueue, rows, start_run, tamper
 from tests.support.record.time_stamp_authority import time_stamp_authority
 
 

@@ -20,7 +20,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.store import rows, tamper
 from tests.support.record.time_stamp_authority import TimeStampAuthority, make_certificates, time_stamp_authority
-from tests.support.runs.bench_run import PROTOCOL, begin_run, record_runs
+from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store, record_runs
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_a_run_ends_signed_whether_or_not_the_authority_answers(
 @pytest.mark.slow
 @pytest.mark.parametrize("end", ["completed", "aborted"])
 def test_the_runner_has_the_end_of_a_run_stamped(tmp_path: Path, authority: TimeStampAuthority, end: str) -> None:
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         bench = begin_run(store, PROTOCOL, tmp_path)
         bench.authority = ask(authority)
         if end == "aborted":
@@ -162,7 +162,7 @@ def test_an_authority_that_is_slow_delays_the_end_no_longer_than_allowed(
     tmp_path: Path, authority: TimeStampAuthority, behaviour: str
 ) -> None:
     authority.behaviour = behaviour
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         bench = begin_run(store, PROTOCOL, tmp_path)
         bench.act("abort", reason="the specimen fell")
         bench.authority = Authority(authority.url, authority.certificates, timeout_s=0.4)

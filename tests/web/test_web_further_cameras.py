@@ -85,7 +85,7 @@ def test_the_live_view_is_that_of_the_camera_asked_for(tmp_path: Path) -> None:
         browser, data = site.browser("technician"), site.site.data
         assert 'data-live-camera="side"' in browser.get(f"/runs/{run}/capture").text
         assert browser.get(f"/runs/{run}/live-view?camera=side").status_code == 204
-        assert frames_wanted(data, run) == "side"
+        assert frames_wanted(data, run, site.now_utc_s) == "side"
         write_frame(data, run, b"\xff\xd8first")
         write_frame(data, run, b"\xff\xd8side", "side")
         assert browser.get(f"/runs/{run}/live-view?camera=side").content == b"\xff\xd8side"

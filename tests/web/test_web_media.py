@@ -129,10 +129,10 @@ def test_what_is_no_picture_has_no_thumbnail(shown: RunWithImage) -> None:
 
 
 def test_live_frames_come_only_while_somebody_asks_and_never_old_ones(shown: RunWithImage) -> None:
-    data = shown.site.site.data
-    assert frames_wanted(data, shown.run) is None
+    data, now_utc_s = shown.site.site.data, shown.site.now_utc_s
+    assert frames_wanted(data, shown.run, now_utc_s) is None
     assert shown.browser.get(f"{shown.address}/live-view").status_code == 204
-    assert frames_wanted(data, shown.run) == ""
+    assert frames_wanted(data, shown.run, now_utc_s) == ""
     write_frame(data, shown.run, b"\xff\xd8frame")
     answer = shown.browser.get(f"{shown.address}/live-view")
     assert (answer.status_code, answer.content) == (200, b"\xff\xd8frame")

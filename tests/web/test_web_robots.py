@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Generator
 from pathlib import Path
 
@@ -25,7 +24,7 @@ def web(tmp_path: Path) -> Generator[WebSite]:
 
 def tell(web: WebSite, run_id: str, **fields: object) -> None:
     """Write a snapshot as a runner does."""
-    write_snapshot(web.site.data, run_id, Snapshot.model_validate({"at_utc_s": time.time(), **fields}))
+    write_snapshot(web.site.data, run_id, Snapshot.model_validate({"at_utc_s": web.now_utc_s, **fields}))
 
 
 def keys(page: str) -> list[str]:
@@ -63,7 +62,7 @@ def test_the_banners_follow_the_robot(web: WebSite) -> None:
         for robot, key in (("protective_stop", "protective_stop"), ("standing", "standing")):
             tell(web, run_id, doing="asking", robot=robot)
             assert keys(browser.get("/robots").text) == [key]
-        tell(web, run_id, at_utc_s=time.time() - 6, doing="asking", robot="standing")
+        tell(web, run_id, at_utc_s=web.now_utc_s - 6, doing="asking", robot="standing")
         assert keys(browser.get("/robots").text) == ["unknown"]
         assert keys(browser.get("/robots", params={"but": run_id}).text) == []
     assert keys(browser.get("/robots").text) == []

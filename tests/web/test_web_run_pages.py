@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Generator
 from pathlib import Path
 
@@ -34,7 +33,7 @@ def run_id(web: WebSite) -> str:
 
 def tell(web: WebSite, run_id: str, **fields: object) -> None:
     """Write a snapshot as a runner does."""
-    write_snapshot(web.site.data, run_id, Snapshot.model_validate({"at_utc_s": time.time(), **fields}))
+    write_snapshot(web.site.data, run_id, Snapshot.model_validate({"at_utc_s": web.now_utc_s, **fields}))
 
 
 @pytest.mark.parametrize("role", ROLES)

@@ -136,7 +136,7 @@ def test_every_course_of_a_run_can_be_shown(
             assert (view.mode, view.question.main, view.question.options) == ("ended", None, ())
     snapshot = Snapshot.model_validate({"doing": doing, "robot": robot, "messages": (Message(at_utc="", text="x"),)})
     run_view(log, snapshot, replace(ME, in_control=control), driven=driven, show=show)
-    assert robot_banner(log.state, snapshot, driven=driven).title
+    assert robot_banner(log.state, snapshot, 0.0, driven=driven).title
 
 
 def test_every_prefix_of_a_whole_run_can_be_shown() -> None:
@@ -194,12 +194,12 @@ def test_paused_is_shown_only_once_the_robot_stands_still() -> None:
     log.act("pause")
     moving = Snapshot(doing="pausing", robot="moving")
     assert not view_of(log, moving).question.standing
-    assert robot_banner(log.state, moving, driven=True).key == "pausing"
+    assert robot_banner(log.state, moving, 0.0, driven=True).key == "pausing"
     still = Snapshot(doing="paused", robot="standing")
     assert view_of(log, still).question.standing
-    assert robot_banner(log.state, still, driven=True).title.startswith("Paused")
+    assert robot_banner(log.state, still, 0.0, driven=True).title.startswith("Paused")
     # A silent runner says nothing about the robot.
-    silent = robot_banner(log.state, Snapshot(), driven=True)
+    silent = robot_banner(log.state, Snapshot(), 0.0, driven=True)
     assert silent.key == "unknown"
 
 

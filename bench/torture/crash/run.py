@@ -26,6 +26,7 @@ from service.run_start import recorded_run, start_run
 from service.runner import loop as runner_loop
 from service.runner.software import software_versions
 from service.steps import params_models
+from service.store.durable_effects import SystemClock
 from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
@@ -191,7 +192,7 @@ def start(role: Role, place: Place, *, die_at: Point | None = None, person: str 
         np.seterr(all="ignore")
         runner_loop.software_versions = _SOFTWARE.copy  # also read the installed packages only once
         files = MortalFiles(place.data, place.journal(role), die_at)
-        with Store.open(place.data, files=files) as store:
+        with Store.open(place.data, _HastyClock(parent), files=files) as store:
             _ROLES[role](store, place, parent, person)
         status = 0
     except BaseException:  # noqa: BLE001 - the sweep reads it in the log, and that the status is not 0
@@ -200,25 +201,33 @@ def start(role: Role, place: Place, *, die_at: Point | None = None, person: str 
         os._exit(status)
 
 
+@dataclass(frozen=True)
+class _HastyClock(SystemClock):
+    """The host's clocks, of a process that waits for hundredths of a second only, and ends with the sweep."""
+
+    parent: int
+
+    def sleep(self, seconds: float) -> None:
+        if os.getppid() != self.parent:
+            raise SystemExit("the sweep has ended")
+        time.sleep(min(seconds, 0.01))
+
+
 def _begin(store: Store, place: Place, _parent: int, person: str) -> None:
     """Begin the run, as `orthocapture run` does first."""
     loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="torture.yaml")
     start_run(store, loaded, load_rig(place.rig), operator=person, auto_confirm=False)
 
 
-def _run(store: Store, place: Place, parent: int, person: str) -> None:
+def _run(store: Store, place: Place, _parent: int, person: str) -> None:
     """Run, as service.cli.run.commands.drive does."""
     run_id = store.find_run("latest")
     protocol, _ = recorded_run(store, run_id)
     rig = CrashRig(folder=place.files, motions=place.motions)
 
-    def wait(seconds: float) -> None:
-        if os.getppid() != parent:
-            raise SystemExit("the sweep has ended")
-        time.sleep(min(seconds, 0.01))
-
+    rig.keep_time(store.clock)
     operator = ScriptedOperator(name=person)
-    runner_loop.Runner(store, run_id, protocol, rig, operator, signature_copy=place.signature_copy, wait=wait).run()
+    runner_loop.Runner(store, run_id, protocol, rig, operator, signature_copy=place.signature_copy).run()
 
 
 def _work(store: Store, place: Place, parent: int, _person: str) -> None:

@@ -147,7 +147,9 @@ def drive(
     protocol, root = recorded_run(store, run_id)
     require_rig_free(store, rig.path, run_id=run_id)
     station = Station(rig)
-    reporter = Reporter(data, run_id, partial(open_devices, station), station.camera_named, alarm_of(rig, run_id))
+    clock = store.clock
+    alarm = alarm_of(rig, run_id, clock)
+    reporter = Reporter(data, run_id, partial(open_devices, station), station.camera_named, alarm, clock=clock)
     display = Display(error_console, reporter)
     hands = SimulatedHands(rig.section.hands if rig.section.simulated else None)
     if auto_confirm:

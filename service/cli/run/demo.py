@@ -227,7 +227,7 @@ def _simulated_rig(folder: Path, scene: int, image_width: int, host: str) -> Gen
     command = [
         sys.executable, "-m", "simulators", "rig", "--scene", str(scene), "--dir", str(folder),
         "--image-width", str(image_width), "--speed-up", "10", "--ct-voxel-mm", "1.0", "--ahead",
-        "--host", host,
+        "--host", host, "--patience", "20",
         "--parent", str(os.getpid()),
     ]  # fmt: skip
     log = folder / "rig.log"

@@ -103,7 +103,7 @@ def serve_command(
         with (
             listening(host, port, limits, proxies) as listener,
             Store.open(data, patience_s=BUSY_TIMEOUT_S) as store,  # a page does not wait for minutes
-            sparing_log() as log,
+            sparing_log(store.clock) as log,
             file_log(data, "web", admits=told),
         ):
             address = f"{'https' if tls else 'http'}://{_shown(host)}:{listener.getsockname()[1]}"

@@ -7,7 +7,6 @@ than a minimum age, for processes that hold neither. Storing the same bytes agai
 
 from __future__ import annotations
 
-import time
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -58,7 +57,7 @@ def leftovers(store: Store, *, min_age_s: float = USUAL_AGE_S) -> list[Leftover]
     try:
         found = list(_candidates(store.artefact_folder))
         with store.database.reading() as connection:
-            return _judged(connection, found, min_age_s)
+            return _judged(connection, found, min_age_s, store.clock.utc_now().timestamp())
     except OSError as error:
         raise _refused(error) from error
 
@@ -114,9 +113,11 @@ def _candidates(folder: Path) -> list[tuple[Path, float, int]]:
     return found
 
 
-def _judged(connection: Connection, found: Collection[tuple[Path, float, int]], min_age_s: float) -> list[Leftover]:
+def _judged(
+    connection: Connection, found: Collection[tuple[Path, float, int]], min_age_s: float, now_utc_s: float
+) -> list[Leftover]:
     recorded = set(connection.execute(select(artefacts.c.sha256)).scalars())
-    begun_s, writer = _oldest_writer(connection)
+    begun_s, writer = _oldest_writer(connection, now_utc_s)
     judged: list[Leftover] = []
     for path, changed_s, size in found:
         part = path.suffix == ".part"
@@ -130,19 +131,19 @@ def _judged(connection: Connection, found: Collection[tuple[Path, float, int]], 
         )
         if changed_s >= begun_s:
             one = replace(one, stays=f"{writer} was already running when it was written and may still record it")
-        elif time.time() - changed_s < min_age_s:
+        elif now_utc_s - changed_s < min_age_s:
             one = replace(one, stays=f"it is younger than {min_age_s / 60:g} minutes")
         judged.append(one)
     return judged
 
 
-def _oldest_writer(connection: Connection) -> tuple[float, str]:
+def _oldest_writer(connection: Connection, now_utc_s: float) -> tuple[float, str]:
     """Start time (s, UTC) and name of the oldest process that holds a run or a job here; infinity if none does."""
-    now_s, oldest = time.time(), (float("inf"), "")
+    oldest = (float("inf"), "")
     held = [(row, row.holder) for row in connection.execute(select(leases))]
     held += [(row, row.worker) for row in connection.execute(select(jobs).where(jobs.c.state == "running"))]
     for row, name in held:
-        if is_live(row, now_s):
+        if is_live(row, now_utc_s):
             there = identity_of(row).life() == "lives"
             # The start of a process on another host is not known, so nothing is removed while it may run.
             begun_s = psutil.boot_time() + row.process_started_s if there else 0.0

@@ -96,7 +96,7 @@ class RunLease:
         self._seconds = seconds
         self._database = database
         self._clock = clock
-        self._over = threading.Event()
+        self._over = clock.signal()
         self._keeper = threading.Thread(target=self._keep, name=f"lease of {run_id}", daemon=True)
 
     def renew(self) -> None:

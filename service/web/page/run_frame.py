@@ -74,7 +74,8 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # checked when the run was read
     here = f"/runs/{run_id}"
-    driven, snapshot = site.launcher.driven(run_id), read_snapshot(site.data, run_id)
+    now_utc_s = site.store.clock.utc_now().timestamp()
+    driven, snapshot = site.launcher.driven(run_id), read_snapshot(site.data, run_id, now_utc_s)
     return RunFrame(
         run_id=run_id,
         name=run_id,
@@ -86,7 +87,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
         live=not log.state.terminal,
         pausable=log.state.status == "active" and driven,
         attention=_attention(log.protocol, log.state, snapshot, driven=driven),
-        banner=robot_banner(log.state, snapshot, driven=driven),
+        banner=robot_banner(log.state, snapshot, now_utc_s, driven=driven),
         tabs=(
             Tab(here, "Step"),
             Tab(f"{here}/capture", "Capture"),
@@ -161,12 +162,12 @@ LOST = Banner(
 )
 
 
-def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner:  # noqa: PLR0911 - one return a case
+def robot_banner(state: RunState, snapshot: Snapshot, now_utc_s: float, *, driven: bool) -> Banner:  # noqa: PLR0911 - one return a case
     """What to say of the robot; what is not known for certain is shown as unknown."""
     if state.terminal:
         return Banner("ended", "standing", "end", "The run has ended.", "It drives no robot any more.")
     if snapshot.doing in ("unknown", "ended"):
-        return _silent(snapshot, driven=driven)
+        return _silent(snapshot, now_utc_s, driven=driven)
     if snapshot.doing == "starting":
         text = f"It has moved nothing yet, and asks before it does. {NOT_THE_STOP}"
         return Banner("starting", "standing", "open", "The program that drives the robot is starting.", text)
@@ -222,10 +223,10 @@ def _not_heard_of(snapshot: Snapshot) -> Banner:
     return Banner("unknown", "unknown", "unknown", "Robot: unknown.", text)
 
 
-def _silent(snapshot: Snapshot, *, driven: bool) -> Banner:
+def _silent(snapshot: Snapshot, now_utc_s: float, *, driven: bool) -> Banner:
     if driven:
         title = "Robot: unknown."
-        since = f" for {snapshot.age_s():.0f} s" if snapshot.at_utc_s else " yet"
+        since = f" for {snapshot.age_s(now_utc_s):.0f} s" if snapshot.at_utc_s else " yet"
         last = f" The last word was: {snapshot.activity}." if snapshot.activity else ""
         text = f"The program that drives it has not told anything{since}.{last} Look at the robot."
     else:

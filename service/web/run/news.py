@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 from collections.abc import AsyncGenerator
 from typing import Annotated
 
@@ -41,11 +40,12 @@ async def stream(request: Request, site: CurrentSite, person: SignedInPerson, ru
 
 async def _news(request: Request, site: Site, screen: str, run_id: str) -> AsyncGenerator[str]:
     told: tuple[int, int, bool] | None = None
-    beat_s = checked_s = time.monotonic()
+    clock = site.store.clock
+    beat_s = checked_s = clock.monotonic_s()
     token, locked = token_of(request, site), False
     with site.streams.opened(screen) as place:
         while not await request.is_disconnected():
-            now_s = time.monotonic()
+            now_s = clock.monotonic_s()
             if place.replaced:
                 yield "event: replaced\ndata: {}\n\n"
                 return
@@ -74,6 +74,7 @@ def _signed_in(site: Site, token: str) -> Person | None:
 
 def _newest(site: Site, run_id: str) -> tuple[int, int]:
     """The last event, and a number that changes with what the runner reports, or when it falls silent."""
-    snapshot = read_snapshot(site.data, run_id)
-    silent = snapshot.age_s() // STALE_S if snapshot.stale else 0
+    now_utc_s = site.store.clock.utc_now().timestamp()
+    snapshot = read_snapshot(site.data, run_id, now_utc_s)
+    silent = snapshot.age_s(now_utc_s) // STALE_S if snapshot.stale(now_utc_s) else 0
     return site.store.head(run_id), hash((silent, *snapshot.shown()))

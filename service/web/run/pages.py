@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
 from typing import Annotated
@@ -108,7 +107,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
     log = site.run(run_id)
     view = run_view(
         log,
-        read_snapshot(site.data, run_id),
+        read_snapshot(site.data, run_id, site.store.clock.utc_now().timestamp()),
         _viewer(site, person, run_id),
         driven=site.launcher.driven(run_id),
         show=step,
@@ -131,7 +130,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         # Where the camera is set up the lens is focused: the live view belongs there.
         lens_step=view.shown.drawing == "camera" and view.shown.current and view.shown.only_ticks,
         board_plan=_board_plan(log, view.shown.id),
-        now_utc=datetime.now(UTC).isoformat(),
+        now_utc=site.store.clock.utc_now().isoformat(),
         depends=accepted_gates(log.protocol, log.state),
         result_table=evaluated(log.protocol, log.state),
         result_note=shared_adjustment_note(log.protocol, log.state),

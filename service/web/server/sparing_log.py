@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TextIO
 
+from service.store.durable_effects import Clock
+
 EVERY_S = 60.0
 _KINDS = 200  # all further ones count as one
 _LEFT_OUT = "left_out"  # in a record, for handlers that come after
@@ -32,17 +34,18 @@ class _Repeats:
 class SparingHandler(logging.StreamHandler[TextIO]):
     """Writes messages of one kind at most once a minute. A kind is a line of code and an error's place."""
 
-    def __init__(self, stream: TextIO, *, every_s: float = EVERY_S) -> None:
+    def __init__(self, stream: TextIO, clock: Clock, *, every_s: float = EVERY_S) -> None:
         super().__init__(stream)
         words = logging.Formatter("%(asctime)s %(name)s %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%SZ")
         words.converter = time.gmtime
         self.setFormatter(words)
+        self._clock = clock
         self._every_s = every_s
         self._told: dict[Kind, _Repeats] = {}
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record, or count it if one of its kind was just written; logging.Handler holds its lock."""
-        now_s = time.monotonic()
+        now_s = self._clock.monotonic_s()
         self._tell(now_s)
         kind = _kind(record)
         if kind not in self._told and len(self._told) >= _KINDS:
@@ -59,7 +62,7 @@ class SparingHandler(logging.StreamHandler[TextIO]):
         """Say how many were left out in times that are over; to be called now and then."""
         self.acquire()
         try:
-            self._tell(time.monotonic())
+            self._tell(self._clock.monotonic_s())
         finally:
             self.release()
 
@@ -92,9 +95,9 @@ def _kind(record: logging.LogRecord) -> Kind:
 
 
 @contextmanager
-def sparing_log() -> Generator[SparingHandler]:
+def sparing_log(clock: Clock) -> Generator[SparingHandler]:
     """All messages of this process go through one such handler to stderr, and through no other."""
-    handler = SparingHandler(sys.stderr)
+    handler = SparingHandler(sys.stderr, clock)
     root = logging.getLogger()
     usual = root.handlers[:]
     for each in usual:

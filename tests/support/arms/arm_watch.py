@@ -48,10 +48,19 @@ class ArmWatch:
         return self._seen[-1]
 
     def wait_moving(self, at_least_rad_s: float) -> None:
-        until(lambda: bool(self._seen) and self.now.speed_rad_s >= at_least_rad_s, "it moves", 20.0, every_s=0.002)
+        until(lambda: bool(self._seen) and self.now.speed_rad_s >= at_least_rad_s, "it moves", every_s=0.002)
 
     def wait_resting(self) -> None:
-        until(lambda: self.now.speed_rad_s == 0.0, "it rests", 20.0, every_s=0.01)
+        until(lambda: self.now.speed_rad_s == 0.0, "it rests", every_s=0.01)
+
+    def wait_stopped(self) -> None:
+        """Wait until the arm rests and the controller runs no program that could move it."""
+        until(lambda: self.now.speed_rad_s == 0.0 and not self.now.program_runs, "it is stopped", every_s=0.01)
+
+    def pass_s(self, seconds: float) -> None:
+        """Let so much time of the controller pass."""
+        end_s = self.now.time_s + seconds
+        until(lambda: self.now.time_s >= end_s, "the controller's clock stands", every_s=0.02)
 
     def moved_for_s(self, since: int) -> float:
         """Time from a mark until the arm was last driven, on the controller's clock; 0 if it never was."""

@@ -19,6 +19,7 @@ from drivers.grbl import GrblAxis, GrblConfig
 from drivers.host.hosted_device import hosted
 from drivers.interfaces import RobotArm
 from service.core.geometry import Transform, look_at
+from tests.support.rig.patience import PATIENT_GRBL
 from tests.support.rig.simulator_process import simulator
 
 CENTRE_M = np.array([0.0, 0.0, 0.05])
@@ -48,7 +49,7 @@ def grbl_config(port: Path, *axes: GrblAxis, **fields: float) -> GrblConfig:
 @contextmanager
 def opened(port: Path, *axes: GrblAxis, **config: float) -> Generator[RobotArm]:
     """The driver in its own process, not yet allowed to move."""
-    section = grbl_config(port, *(axes or (TURN,)), **{"connect_timeout_s": 30.0, **config})
+    section = grbl_config(port, *(axes or (TURN,)), **{**PATIENT_GRBL, **config})
     arm = hosted(RobotArm, "drivers.grbl:DRIVER", section, call_timeout_s=60, name="table")
     try:
         arm.open()

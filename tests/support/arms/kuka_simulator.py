@@ -6,21 +6,29 @@ import contextlib
 import json
 import os
 import socket
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
+from tests.support.rig.patience import PATIENCE_S
 from tests.support.rig.simulator_process import simulator
 
+
 #: Starts what answers at the ports of a controller on an address.
-Controller = Callable[[str], contextlib.AbstractContextManager[dict[str, Any]]]
+class Controller(Protocol):
+    def __call__(
+        self, host: str, *, patience_s: float = PATIENCE_S
+    ) -> contextlib.AbstractContextManager[dict[str, Any]]: ...
+
+
 TRANSCRIPTS = Path(__file__).parents[2] / "data" / "kuka"
 
 
 @contextlib.contextmanager
-def simulated_kuka(host: str, *options: str) -> Generator[dict[str, Any]]:
+def simulated_kuka(host: str, *options: str, patience_s: float = PATIENCE_S) -> Generator[dict[str, Any]]:
     """Run `python -m simulators kuka`; yields its ready line."""
-    with simulator("kuka", "--host", host, "--parent", str(os.getpid()), *options) as running:
+    words = ("--host", host, "--parent", str(os.getpid()), "--patience", str(patience_s))
+    with simulator("kuka", *words, *options) as running:
         yield running.ready
 
 

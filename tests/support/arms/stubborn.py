@@ -15,7 +15,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-WATCHED_S = 4.0  # an arm that moved by itself did so after 2.3 s
+from tests.support.processes.forked import Forked
 
 
 class Program:
@@ -29,7 +29,7 @@ class Program:
 
     def __init__(self, spec: str, config: BaseModel, goals_rad: tuple[float, float], *, hangs: bool = False) -> None:
         words = (spec, config.model_dump_json(), *map(str, goals_rad), "hangs" if hangs else "lives")
-        self._process = subprocess.Popen(
+        self._process = Forked(
             [sys.executable, "-m", "tests.support.processes.stubborn_program", *words],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip

@@ -12,6 +12,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from drivers.kuka.robot import HEARTBEAT_S
+from tests.support.rig.patience import PATIENCE_S
+
+needs_jdk = pytest.mark.packages("default-jdk-headless")
+
 ROOT = Path(__file__).parents[3]
 APPLICATION = ROOT / "drivers" / "kuka" / "sunrise"
 TEST_SIDE = ROOT / "tests" / "sunrise"
@@ -73,9 +80,9 @@ def java_program(name: str, *words: str, stdin: int | None = None) -> Generator[
 
 
 @contextlib.contextmanager
-def sunrise_engine(host: str) -> Generator[dict[str, Any]]:
+def sunrise_engine(host: str, *, patience_s: float = PATIENCE_S) -> Generator[dict[str, Any]]:
     """Run the application's engine at the ports of `simulated_kuka`; yields its ready line."""
-    with java_program("Main", host) as process:
+    with java_program("Main", host, str(max(HEARTBEAT_S, patience_s))) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
         assert line, "the engine did not start"

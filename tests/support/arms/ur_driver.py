@@ -17,6 +17,7 @@ from drivers.ur import UrConfig
 from service.core.geometry import transform
 from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.processes.waiting import until
+from tests.support.rig.patience import PATIENT_UR
 
 SPEED_UP = "3"
 SPEED, ACCELERATION = 1.05, 1.4
@@ -26,8 +27,8 @@ PAYLOAD = Payload(1.6, (0.0, 0.0, 0.08))
 
 @contextlib.contextmanager
 def opened(host: str, **config: float) -> Generator[RobotArm]:
-    config = {"watchdog_s": 1.0, **config}  # the machine is shared; tests/robot/test_watchdog.py tests the default
-    arm = hosted(RobotArm, "drivers.ur:DRIVER", UrConfig(host=host, **config), call_timeout_s=30, name="robot")
+    section = UrConfig(host=host, **{**PATIENT_UR, **config})
+    arm = hosted(RobotArm, "drivers.ur:DRIVER", section, call_timeout_s=60, name="robot")
     try:
         arm.open()
         let_move(arm)
@@ -56,8 +57,14 @@ def dashboard(host: str, *orders: str) -> list[str]:
         return answers
 
 
-def wait_for(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
-    until(condition, "waited in vain", timeout_s, every_s=0.02)
+def wait_for(condition: Callable[[], bool]) -> None:
+    until(condition, "waited in vain", every_s=0.02)
+
+
+def pass_s(arm: RobotArm, seconds: float) -> None:
+    """Let so much time of the controller pass."""
+    end_s = arm.state().sample.controller_time_s + seconds
+    wait_for(lambda: arm.state().sample.controller_time_s >= end_s)
 
 
 def move(arm: RobotArm, joints: Array) -> None:

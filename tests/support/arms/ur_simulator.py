@@ -6,6 +6,7 @@ import contextlib
 import os
 from collections.abc import Generator
 
+from tests.support.rig.patience import PATIENCE_S
 from tests.support.rig.simulator_process import simulator
 
 
@@ -16,7 +17,8 @@ def address(number: int) -> str:
 
 
 @contextlib.contextmanager
-def simulated_ur(host: str, *options: str) -> Generator[dict[str, str]]:
+def simulated_ur(host: str, *options: str, patience_s: float = PATIENCE_S) -> Generator[dict[str, str]]:
     """Run `python -m simulators ur`; yields its ready line."""
-    with simulator("ur", "--host", host, "--parent", str(os.getpid()), *options) as running:
+    words = ("--host", host, "--parent", str(os.getpid()), "--patience", str(patience_s))
+    with simulator("ur", *words, *options) as running:
         yield running.ready

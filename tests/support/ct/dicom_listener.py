@@ -8,6 +8,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.support.processes.forked import Forked
 from tests.support.rig.rig import REPOSITORY, command
 
 
@@ -16,7 +17,7 @@ def dicom_listener(folder: Path) -> Generator[str]:
     """Listen for CTSUITE into a folder; yields HOST:PORT."""
     folder.mkdir(parents=True, exist_ok=True)
     words = command("dicom-listen", "--port", "0", "--json", "--folder", str(folder), "--from", "CTSUITE")
-    process = subprocess.Popen(words, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True)
+    process = Forked(words, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
         yield f"127.0.0.1:{json.loads(process.stdout.readline())['port']}"

@@ -23,6 +23,7 @@ from playwright.sync_api import Browser, BrowserContext, Locator, Page, expect, 
 from service.people.roles import Role
 from service.people.sessions import People
 from service.store.store import Store
+from tests.support.processes.forked import Forked
 from tests.support.processes.runners import end_runners
 from tests.support.rig.rig import REPOSITORY, command
 
@@ -82,7 +83,7 @@ class Served:
         port = self.url.rpartition(":")[2] or "0"
         words = ["serve", "--rig", str(self.rig), "--data", str(self.data), "--port", port, "--json", *self.options]
         with (self.data.parent / "serve.log").open("a") as log:
-            self._process = subprocess.Popen(
+            self._process = Forked(
                 command(*words),
                 cwd=REPOSITORY,
                 stdin=subprocess.DEVNULL,

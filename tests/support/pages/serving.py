@@ -11,6 +11,7 @@ from pathlib import Path
 
 import httpx
 
+from tests.support.processes.forked import Forked
 from tests.support.rig.rig import REPOSITORY, command
 
 _PASSWORD = "correct horse battery"
@@ -55,7 +56,7 @@ def serving(rig: Path, *options: str, most_files: int = 0) -> Generator[Server]:
     log = rig.parent / "serve.log"
     with (
         log.open("a") as stderr,
-        subprocess.Popen(words, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=stderr, text=True) as process,
+        Forked(words, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=stderr, text=True) as process,
     ):
         assert process.stdout is not None
         try:

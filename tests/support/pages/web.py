@@ -27,6 +27,7 @@ from service.web.app import create_app
 from service.web.launch import Launcher
 from service.web.security.guards import cookie_name
 from service.web.site import Site
+from tests.support.record.stepped_clock import SteppedClock
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
 
 with warnings.catch_warnings():
@@ -107,6 +108,11 @@ class WebSite:
         return self.site.store
 
     @property
+    def now_utc_s(self) -> float:
+        """The site's time, in seconds since the epoch."""
+        return self.store.clock.utc_now().timestamp()
+
+    @property
     def people(self) -> People:
         return self.site.people
 
@@ -143,7 +149,10 @@ class WebSite:
 
 @contextmanager
 def web_site(folder: Path, *, clock: Clock | None = None, idle_lock_s: float = 600.0) -> Generator[WebSite]:
-    """A site over folder/data with a simulated rig without devices and one protocol file, bench.yaml."""
+    """A site over folder/data with a simulated rig without devices and one protocol file, bench.yaml.
+
+    Time stands still there, but for waits, unless another clock is given.
+    """
     rig_file = folder / "rig.yaml"
     rig_file.write_text("name: bench\nsimulated: true\ndevices: {}\n")
     protocols = folder / "protocols"
@@ -151,7 +160,7 @@ def web_site(folder: Path, *, clock: Clock | None = None, idle_lock_s: float = 6
     (protocols / "bench.yaml").write_text(PROTOCOL)
     parse_protocol(PROTOCOL.encode(), params_models(), name="bench.yaml")
     data = folder / "data"
-    with Store.open(data, clock) as store:
+    with Store.open(data, clock or SteppedClock.from_now()) as store:
         people = People(store, QUICK_HASHES)
         populate(people)
         site = Site(

@@ -21,6 +21,7 @@ from service.compute.poses.files.pose_files import write_poses_csv
 from service.core.records.events import JobFailed
 from service.store.records import NewJob
 from service.store.store import Store
+from tests.support.processes.forked import Forked, run
 from tests.support.record.store import enqueue
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, render, scene
 
@@ -51,9 +52,7 @@ class Site:
         """Run the command to its end, as its reader would type it."""
         words = shlex.split(command)
         words[0] = str(SCRIPTS / words[0])
-        return subprocess.run(
-            words, cwd=self.folder, input=typed, capture_output=True, text=True, timeout=110, check=False
-        )
+        return run(words, cwd=self.folder, typed=typed, timeout_s=110)
 
 
 def succeeds(site: Site, command: str) -> None:
@@ -94,7 +93,7 @@ def serves_until_terminated(site: Site, command: str) -> None:
     with Store.open(site.folder / "runs") as store:
         job = NewJob("locate_spheres", "fixation", 1, "docs", {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10})
         enqueue(store, site.begun, job, actor="test")
-        with subprocess.Popen([SCRIPTS / words[0], *words[1:]], cwd=site.folder, stdout=subprocess.DEVNULL) as worker:
+        with Forked([SCRIPTS / words[0], *words[1:]], cwd=site.folder, stdout=subprocess.DEVNULL) as worker:
             try:
                 while not any(isinstance(event.payload, JobFailed) for event in store.events(site.begun)):
                     assert worker.poll() is None
@@ -128,9 +127,7 @@ def registers(site: Site, command: str) -> None:
 def serves_pages(site: Site, command: str) -> None:
     """The web process answers on a free port, and ends when told to."""
     words = shlex.split(command + " --port 0 --json")
-    with subprocess.Popen(
-        [SCRIPTS / words[0], *words[1:]], cwd=site.folder, stdout=subprocess.PIPE, text=True
-    ) as server:
+    with Forked([SCRIPTS / words[0], *words[1:]], cwd=site.folder, stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None
             ready = json.loads(server.stdout.readline())

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.cli.run.ending import end_with_children
+from tests.support.processes.forked import Forked
 from tests.support.rig.rig import REPOSITORY, command
 
 _GRACE_S = 30.0
@@ -20,9 +21,7 @@ def started(words: Sequence[str], log: Path) -> Generator[subprocess.Popen[bytes
     A runner that a failed test left behind would keep its devices, and fail the tests after it.
     """
     with log.open("wb") as output:
-        process = subprocess.Popen(
-            command(*words), cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=output, stderr=output
-        )
+        process = Forked(command(*words), cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
     try:
         yield process
     finally:

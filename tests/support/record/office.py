@@ -15,7 +15,7 @@ from service.people.sessions import People
 from service.store.records import SITE
 from service.store.store import Store
 from tests.support.pages.web import password_of
-from tests.support.record.store import SteppedClock
+from tests.support.record.stepped_clock import SteppedClock
 
 IDLE_S = 600.0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 
 from service.core.records.events import ArtefactRef, RunStarted, ViewpointCaptured
@@ -15,19 +15,6 @@ from service.store.records import Job, NewArtefact, NewJob
 from service.store.store import Store
 
 IDENTITY4 = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-
-
-class SteppedClock:
-    """A clock that stands still unless told otherwise."""
-
-    def __init__(self) -> None:
-        self.passed_s = 0.0
-
-    def utc_now(self) -> datetime:
-        return datetime(2026, 11, 21, 12, 0, 0, 250000, tzinfo=UTC) + timedelta(seconds=self.passed_s)
-
-    def monotonic_s(self) -> float:
-        return 1000.0 + self.passed_s
 
 
 class CountedIds:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 
 from drivers.interfaces import DeviceIdentity, DeviceReport, EnvironmentReading, TowerLight
+from service.store.durable_effects import Clock, SystemClock
 
 
 @dataclass
@@ -15,6 +15,7 @@ class BenchLightbox:
     presses: int = 0
     tower: bool = True
     shown: list[TowerLight] = field(default_factory=list[TowerLight])
+    clock: Clock = field(default_factory=SystemClock)
 
     def open(self) -> DeviceIdentity:
         return self.report().identity
@@ -26,7 +27,7 @@ class BenchLightbox:
         return DeviceReport(DeviceIdentity("lightbox", "Bench box", "L-1", "1", "bench", "1", "memory"))
 
     def read(self) -> EnvironmentReading:
-        return EnvironmentReading(812.0, 21.5, False, time.monotonic())
+        return EnvironmentReading(812.0, 21.5, False, self.clock.monotonic_s())
 
     def pedal_presses(self) -> int:
         return self.presses

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -43,9 +42,11 @@ from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, LensSection, OpticsSection
 from service.runner.operator import AnswerBy
 from service.steps.context import FurtherCamera, LeaveToMove, StationLayout
+from service.store.durable_effects import Clock, SystemClock
 from tests.support.rig.bench_lightbox import BenchLightbox
 
 TRAVEL_S = 0.02
+EXPOSURE_S = 0.02  # from the release to the arrival of the file
 _RATE_HZ = 500.0
 
 
@@ -60,6 +61,7 @@ class BenchArm:
     A motion takes TRAVEL_S; the stream is the arm's actual motion, sampled at 500 Hz.
     """
 
+    clock: Clock = field(default_factory=SystemClock)
     safety: SafetyState = SafetyState.NORMAL
     on_move: Callable[[int], None] = _nothing  # called with the number of the motion once it has begun
     reachable: Callable[[Transform], bool] = lambda _T: True
@@ -74,7 +76,7 @@ class BenchArm:
 
     def __post_init__(self) -> None:
         start = np.array([0.1, 0.4, 0.5, 0.0, 3.0, 0.0])
-        self._legs.append((0.0, start, time.monotonic(), start))
+        self._legs.append((-np.inf, start, -np.inf, start))
 
     def open(self) -> DeviceIdentity:
         self.connected, self.opened = True, self.opened + 1
@@ -94,11 +96,11 @@ class BenchArm:
 
     def state(self) -> RobotState:
         self._answer()
-        return RobotState(self._sample(time.monotonic()), "RUNNING", self.is_moving(), 1.0)
+        return RobotState(self._sample(self.clock.monotonic_s()), "RUNNING", self.is_moving(), 1.0)
 
     def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
         self._answer()
-        count = int((min(end_monotonic_s, time.monotonic() + 0.05) - start_monotonic_s) * _RATE_HZ)
+        count = int((min(end_monotonic_s, self.clock.monotonic_s() + 0.05) - start_monotonic_s) * _RATE_HZ)
         return tuple(self._sample(start_monotonic_s + i / _RATE_HZ) for i in range(count))
 
     def solve_ik(self, T_base_flange: Transform, near_rad: Array) -> Array:
@@ -108,7 +110,7 @@ class BenchArm:
 
     def move_joints(self, target_rad: Array, *, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         self._answer()
-        now = time.monotonic()
+        now = self.clock.monotonic_s()
         self._legs.append((now, self._joints(now), now + TRAVEL_S, target_rad))
         self.moves += 1
         self.on_move(self.moves)
@@ -122,15 +124,15 @@ class BenchArm:
         self.stops += 1
         if self.is_moving():
             self.stopped_short += 1
-            now = time.monotonic()
+            now = self.clock.monotonic_s()
             here = self._joints(now)
             self._legs.append((now, here, now, here))
 
     def is_moving(self) -> bool:
-        return time.monotonic() < self._legs[-1][2]
+        return self.clock.monotonic_s() < self._legs[-1][2]
 
     def settle(self, criteria: SettleCriteria) -> SettleReport:
-        now = time.monotonic()
+        now = self.clock.monotonic_s()
         still = now - self._legs[-1][2] > criteria.window_s
         joints = self._joints(now)
         return SettleReport(still, 10, 0.0, 0.0, 0.0, 0.0, from_rotation_vector(joints), joints)
@@ -162,6 +164,7 @@ def numbered(exposure: int) -> NDArray[np.uint8]:
 class BenchCamera:
     """A camera that writes a small real JPEG, a different one each time."""
 
+    clock: Clock = field(default_factory=SystemClock)
     on_capture: Callable[[int], None] = _nothing  # called with the exposure's number; may raise
     exif: Callable[[CameraSettings], CameraSettings] = lambda applied: applied
     picture: Callable[[int], NDArray[np.uint8]] = numbered  # of the exposure with this number
@@ -193,7 +196,7 @@ class BenchCamera:
 
     def capture(self, folder: Path) -> CapturedImage:
         self.exposures += 1
-        trigger = time.monotonic()
+        trigger = self.clock.monotonic_s()
         try:
             self.on_capture(self.exposures)
         except DeviceUnavailableError:
@@ -204,6 +207,7 @@ class BenchCamera:
         picture = self.picture(self.exposures)
         path = folder / f"DSC{self.exposures:05d}.JPG"
         assert cv2.imwrite(str(path), picture)
+        self.clock.sleep(EXPOSURE_S)
         data = path.read_bytes()
         jpeg = CapturedFile(path, path.name, hashlib.sha256(data).hexdigest(), len(data), "image/jpeg")
         return CapturedImage(
@@ -214,7 +218,7 @@ class BenchCamera:
             lens="Bench 50 mm",
             focal_length_mm=50.0,
             trigger_monotonic_s=trigger,
-            arrival_monotonic_s=time.monotonic(),
+            arrival_monotonic_s=self.clock.monotonic_s(),
         )
 
     def released_images(self, folder: Path, timeout_s: float, since_utc_s: float = 0.0) -> tuple[CapturedImage, ...]:
@@ -242,6 +246,15 @@ class BenchRig:
     box: BenchLightbox | None = field(default_factory=BenchLightbox)
     further: tuple[FurtherCamera, ...] = ()
     _on_open: Callable[[str, DeviceReport], None] | None = None
+
+    def keep_time(self, clock: Clock) -> None:
+        """Let all devices live by this clock."""
+        self.arm.clock = self.shutter.clock = clock
+        if self.box is not None:
+            self.box.clock = clock
+        for one in self.further:
+            assert isinstance(one.camera, BenchCamera)
+            one.camera.clock = clock
 
     def robot(self, station: str) -> RobotArm:
         self._open("robot", self.arm, opened=self.arm.opened > 0)

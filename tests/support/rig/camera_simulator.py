@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+from tests.support.processes.forked import Forked
+
 
 @dataclass
 class RunningCamera:
@@ -34,7 +36,7 @@ def camera_simulator(
         json.dumps([{"device": "camera", **fault} for fault in faults]),
         *options,
     ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with Forked(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             ready = json.loads(process.stdout.readline())

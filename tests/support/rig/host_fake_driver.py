@@ -25,6 +25,7 @@ class FakeConfig(DriverConfig):
     trace: Path | None = None
     die_on_open: bool = False
     report_s: float = 0.0  # how long `report` takes
+    hangs: Path | None = None  # made when `hang` begins
 
 
 class Fake(Device, Protocol):
@@ -34,6 +35,7 @@ class Fake(Device, Protocol):
     def crash(self, signal_number: int) -> None: ...
     def crash_later(self, delay_s: float) -> None: ...
     def hang(self, seconds: float) -> None: ...
+    def hear(self, count: int) -> None: ...
     def refuse(self) -> None: ...
     def blunder(self) -> None: ...
     def unpicklable(self) -> object: ...
@@ -83,7 +85,15 @@ class FakeDriver:
         subprocess.Popen([sys.executable, "-c", f"import os,time; time.sleep({delay_s}); os.kill({os.getpid()}, 11)"])
 
     def hang(self, seconds: float) -> None:
+        if self._config.hangs is not None:
+            self._config.hangs.touch()
         time.sleep(seconds)
+
+    def hear(self, count: int) -> None:
+        """Return when so many more heartbeats have arrived."""
+        enough = len(self._beats) + count
+        while len(self._beats) < enough:
+            time.sleep(0.01)
 
     def refuse(self) -> None:
         raise SafetyStopError("protective stop", where="joint 3", remedy="Clear the cause")

@@ -13,6 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from tests.support.processes.forked import Forked, run
+from tests.support.rig.patience import PATIENCE_S
+
 REPOSITORY = Path(__file__).parents[3]
 
 
@@ -44,9 +47,7 @@ def press_pedal(world: str) -> None:
 
 def orthocapture(*words: str, timeout_s: float = 120) -> subprocess.CompletedProcess[str]:
     """Run the command to its end."""
-    return subprocess.run(
-        command(*words), cwd=REPOSITORY, capture_output=True, text=True, timeout=timeout_s, check=False
-    )
+    return run(command(*words), cwd=REPOSITORY, timeout_s=timeout_s)
 
 
 def command(*words: str) -> list[str]:
@@ -55,11 +56,17 @@ def command(*words: str) -> list[str]:
 
 
 @contextmanager
-def simulated_rig(folder: Path, *options: str, host: str = _USUAL) -> Generator[dict[str, Any]]:
-    """Start a rig around one scene; yields its ready line. On another loopback address it waits for no other rig."""
+def simulated_rig(
+    folder: Path, *options: str, host: str = _USUAL, patience_s: float = PATIENCE_S
+) -> Generator[dict[str, Any]]:
+    """Start a rig around one scene; yields its ready line. On another loopback address it waits for no other rig.
+
+    Its limits are patient, since a busy machine is no dead link; `patience_s=0` is for tests of the limits.
+    """
+    words = ("--dir", str(folder), "--host", host, "--patience", str(patience_s))
     with RigLock(host), (folder / "rig.log").open("w") as log:
-        process = subprocess.Popen(
-            command("simulate", "rig", "--dir", str(folder), "--host", host, *options),
+        process = Forked(
+            [sys.executable, "-m", "simulators", "rig", *words, *options],
             cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
         )  # fmt: skip
         try:

@@ -10,6 +10,9 @@ import time
 from collections.abc import Generator
 from dataclasses import dataclass
 
+from tests.support.processes.waiting import until
+
+_STILL = 5  # as often a device at rest tells the same place, ten times a second
 LONGEST_STEP_S = 0.05  # longest gap that counts; in a longer one the simulator or this process was not scheduled
 
 
@@ -51,6 +54,19 @@ class WorldWatch:
                 if before.place != after.place:
                     last_s = elapsed_s
         return last_s
+
+    def wait_moving(self, since_s: float, for_s: float) -> None:
+        """Wait until the device has moved for so long since a mark."""
+        until(lambda: self.moved_for_s(since_s) >= for_s, "it moves", every_s=0.02)
+
+    def wait_resting(self, since_s: float) -> None:
+        """Wait until the device has told the same place again and again since a mark."""
+
+        def rests() -> bool:
+            told = [seen.place for seen in self._seen if seen.at_s > since_s][-_STILL:]
+            return len(told) == _STILL and all(place == told[0] for place in told)
+
+        until(rests, "it rests", every_s=0.02)
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from service.store.store import Store
-from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
+from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run, bench_store
 
 
 @pytest.fixture
 def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
     """Begins a run of a protocol's text."""
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         yield lambda text: begin_run(store, text, tmp_path)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,9 +15,11 @@ from service.rig import load_rig
 from service.run_start import recorded_run, start_run
 from service.runner.loop import Runner
 from service.steps import params_models
+from service.store.durable_effects import SystemClock
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.record.stepped_clock import SteppedClock
 from tests.support.rig.bench_rig import Answer, BenchRig, ScriptedOperator, answer
 
 VIEWS = ["v001", "v002", "v003", "v004"]  # of the capture in PROTOCOL
@@ -65,7 +66,7 @@ P = TypeVar("P")
 
 @dataclass
 class Bench:
-    """One run on an in-memory rig."""
+    """One run on an in-memory rig, which lives by the store's clock."""
 
     store: Store
     run_id: str
@@ -74,11 +75,20 @@ class Bench:
     operator: ScriptedOperator = field(default_factory=ScriptedOperator)
     authority: Authority | None = None
     signature_copy: Path | None = None
-    ahead_s: float = 0.0  # offset added to the runner's clock
     on_wait: Callable[[float], None] = lambda _seconds: None
+
+    @property
+    def clock(self) -> SteppedClock:
+        """The time of store, runner and devices, of a store that `bench_store` has opened."""
+        clock = self.store.clock
+        assert isinstance(clock, SteppedClock)
+        return clock
 
     def run(self) -> RunState:
         """Run one runner process to its end."""
+        self.rig.keep_time(self.store.clock)
+        if isinstance(self.store.clock, SteppedClock):
+            self.clock.on_sleep = self.on_wait
         protocol, _ = recorded_run(self.store, self.run_id)
         return Runner(
             self.store,
@@ -88,13 +98,7 @@ class Bench:
             self.operator,
             self.authority,
             self.signature_copy,
-            monotonic_s=lambda: time.monotonic() + self.ahead_s,
-            wait=self._wait,
         ).run()
-
-    def _wait(self, seconds: float) -> None:
-        self.on_wait(seconds)
-        time.sleep(min(seconds, 0.002))
 
     def act(self, verb: str, **fields: object) -> None:
         """Append an action, as from another terminal."""
@@ -123,8 +127,22 @@ class Bench:
         assert report.ok, report.first_fault
 
 
+class HastyClock(SystemClock):
+    """The host's clocks, for a run beside other processes whose time matters: it waits for 2 ms at most."""
+
+    def sleep(self, seconds: float) -> None:
+        super().sleep(min(seconds, 0.002))
+
+
+def bench_store(data: Path) -> Store:
+    """A data folder in which time passes only when a runner waits, a device works, or a test says so."""
+    return Store.open(data, SteppedClock.from_now())
+
+
 def begin_run(store: Store, text: str, folder: Path) -> Bench:
     """Begin a run of a protocol text in the store of folder/data, without running it; its rig file has no devices."""
+    if isinstance(store.clock, SteppedClock):
+        store.clock.passed_s += 1.0  # no two runs begin at the same time
     rig_file = folder / "rig.yaml"
     rig_file.write_text("name: bench\nsimulated: true\ndevices: {}\n")
     loaded = parse_protocol(text.encode(), params_models(), name="bench.yaml")
@@ -134,7 +152,7 @@ def begin_run(store: Store, text: str, folder: Path) -> Bench:
 
 def record_runs(folder: Path) -> tuple[str, str]:
     """Record a completed run and, after it, one that waits for its first confirmation, in folder/data."""
-    with Store.open(folder / "data") as store:
+    with bench_store(folder / "data") as store:
         completed = begin_run(store, PROTOCOL, folder)
         completed.run()
         return completed.run_id, begin_run(store, PROTOCOL, folder).run_id

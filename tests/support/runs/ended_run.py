@@ -7,8 +7,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from service.cli.run.demo import true_errors_mm
 from service.dataset.summary import RunSummary, summarise
 from service.run_start import recorded_run
@@ -31,12 +29,3 @@ def ended_run(data: Path, truth: Path) -> Generator[EndedRun]:
         run_id = store.find_run("latest")
         summary = summarise(store, run_id, recorded_run(store, run_id)[0])
         yield EndedRun(data, summary, true_errors_mm(summary, truth))
-
-
-def patient(rig: Path, **robot: float) -> None:
-    """Let the rig wait longer for its arms than a real one does: a busy machine is no dead link."""
-    record = yaml.safe_load(rig.read_text(encoding="utf-8"))
-    for name in ("robot", "robot_1", "robot_2"):
-        if name in record["devices"]:
-            record["devices"][name] |= {"stale_after_s": 20.0, "unattended_s": 20.0, **robot}
-    rig.write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")

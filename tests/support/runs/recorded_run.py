@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -76,8 +79,24 @@ def record_run(folder: Path, *, complete: bool = True, version: int = 1, protoco
     """Record a run in folder/data, from its first event to its last; returns its id.
 
     With version 1 its jobs hold copies of earlier results, with version 2 references to them. A protocol may have
-    steps after those of PROTOCOL, which are not done.
+    steps after those of PROTOCOL, which are not done. Each such run is computed once in a process, which takes a
+    second; where there is no data yet, a copy of it is put there.
     """
+    if (folder / "data").exists():
+        return _record(folder, complete=complete, version=version, protocol=protocol)
+    recorded, run_id = _recorded(complete=complete, version=version, protocol=protocol)
+    shutil.copytree(recorded.name, folder, dirs_exist_ok=True)
+    return run_id
+
+
+@cache
+def _recorded(*, complete: bool, version: int, protocol: str) -> tuple[TemporaryDirectory[str], str]:
+    """A folder with such a run, which goes with this process."""
+    folder = TemporaryDirectory(prefix="recorded-run-")
+    return folder, _record(Path(folder.name), complete=complete, version=version, protocol=protocol)
+
+
+def _record(folder: Path, *, complete: bool, version: int, protocol: str) -> str:
     (folder / "rig.yaml").write_text("name: small\nsimulated: true\ndevices: {}\n")
     loaded = parse_protocol(protocol.encode(), params_models(), name="recorded.yaml")
     with Store.open(folder / "data") as store:

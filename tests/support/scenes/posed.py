@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -81,9 +81,14 @@ def posed_data_set(
     camera: CameraModel = CAMERA,
     simulated: bool = True,
     tone: Callable[[Array], Array] | None = None,
+    more_spheres: tuple[WorldSphere, ...] = (),
 ) -> DataSet:
-    """Paint the photographs into a folder, and give the data set of them; `tone` replaces that of the scene."""
+    """Paint the photographs into a folder, and give the data set of them; `tone` replaces that of the scene.
+
+    The scene's own spheres hide nothing of the solid; `more_spheres` may.
+    """
     shown = scene()
+    shown = replace(shown, spheres=shown.spheres + more_spheres)
     painted = shown.tone if tone is None else tone
     vertices, faces = np.asarray(shown.mesh.vertices), np.asarray(shown.mesh.faces, dtype=np.int64)
     surface = RayMesh(vertices, faces)

@@ -46,10 +46,13 @@ def _fetch(camera: Any, path: Any) -> dict[str, Any]:
     }
 
 
-def _events(camera: Any, seconds: float, files: int = 99) -> list[list[Any]]:
+def _events(camera: Any, seconds: float, files: int = 99, last: str = "") -> list[list[Any]]:
+    """What happens in so many seconds, until so many files have come, or until the last kind of event has."""
     seen: list[list[Any]] = []
     end = time.monotonic() + seconds
     while time.monotonic() < end and sum(kind == "file" for kind, _ in seen) < files:
+        if seen and seen[-1][0] == last:
+            break
         event, data = camera.wait_for_event(50)
         if event == gp.GP_EVENT_FILE_ADDED:
             seen.append(["file", _fetch(camera, data)])

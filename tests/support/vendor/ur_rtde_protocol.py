@@ -22,7 +22,7 @@ UR_TYPES = {
 class RtdeClient:
     """Protocol version 2 over one connection."""
 
-    def __init__(self, host: str, timeout_s: float = 5.0) -> None:
+    def __init__(self, host: str, timeout_s: float = 90.0) -> None:
         self.socket = socket.create_connection((host, 30004), timeout=timeout_s)
         self._buffer = b""
         self._formats: dict[int, tuple[list[str], list[str]]] = {}
@@ -54,6 +54,11 @@ class RtdeClient:
             got, reply = self.receive()
             if got == kind:
                 return reply
+
+    def answered_by(self, kind: str) -> str:
+        """Send a request, and return the kind of the message that comes next."""
+        self.send(kind)
+        return self.receive()[0]
 
     def negotiate(self, version: int = 2) -> bool:
         return self.ask("V", struct.pack(">H", version)) == b"\x01"

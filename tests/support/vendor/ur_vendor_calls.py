@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Callable
 from typing import Any
 
 from dashboard_client import DashboardClient
 from rtde_control import RTDEControlInterface
+from rtde_receive import RTDEReceiveInterface
+
+from tests.support.processes.waiting import until
 
 TOOL = [0.0, 0.0, 0.1, 0.0, 0.0, 0.0]
 GOAL = [0.1, -1.57, 1.57, -1.57, -1.57, 0.0]
@@ -42,13 +44,13 @@ def forward_kinematics(host: str) -> dict[str, Any]:
 
 
 def watchdog(host: str) -> dict[str, Any]:
-    control = RTDEControlInterface(host)
-    said: dict[str, Any] = {"set": control.setWatchdog(2.0)}  # at least once in half a second
-    for _ in range(20):
+    control, receive = RTDEControlInterface(host), RTDEReceiveInterface(host)
+    said: dict[str, Any] = {"set": control.setWatchdog(0.5)}  # at least once in two seconds
+    began_s = receive.getTimestamp()
+    while receive.getTimestamp() < began_s + 2.5:  # longer than it would wait for a kick
         control.kickWatchdog()
-        time.sleep(0.05)
     said["kicked"] = control.isProgramRunning()
-    time.sleep(1.0)
+    until(lambda: not control.isProgramRunning(), "it runs on")
     said["alone"] = control.isProgramRunning()
     said["moveJ"] = control.moveJ(GOAL, 2.0, 5.0)
     control.disconnect()

@@ -4,13 +4,43 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from typing import Any
 
 from dashboard_client import DashboardClient
 from rtde_control import Path, PathEntry, RTDEControlInterface
 from rtde_io import RTDEIOInterface
 from rtde_receive import RTDEReceiveInterface
+
+from tests.support.processes.waiting import until
+
+Receive = Any  # the client library has no types
+
+
+def apart(joints_rad: list[float], others_rad: list[float]) -> float:
+    return max(abs(a - b) for a, b in zip(joints_rad, others_rad, strict=True))
+
+
+def current(receive: Receive) -> float:
+    """Wait for packages that were sent after this call; the controller's time, s."""
+    start_s = receive.getTimestamp()
+    until(lambda: receive.getTimestamp() > start_s + 0.05, "no new package", every_s=0.01)
+    return receive.getTimestamp()
+
+
+def at_rest(receive: Receive) -> list[float]:
+    """Joints once the arm no longer swings."""
+    current(receive)
+    until(lambda: not any(receive.getActualQd()), "it does not come to rest")
+    return receive.getActualQ()
+
+
+def unlocked(dashboard: Any) -> bool:
+    """Whether the protective stop could be released, for which some time must have passed."""
+    try:
+        dashboard.unlockProtectiveStop()
+    except RuntimeError:
+        return False
+    return True
 
 
 def session(host: str, *, e_series: bool) -> dict[str, Any]:
@@ -42,22 +72,21 @@ def session(host: str, *, e_series: bool) -> dict[str, Any]:
     ]
     said["io"] += [io.setAnalogOutputVoltage(0, 0.25), io.setInputDoubleRegister(20, 1.5)]
     control = RTDEControlInterface(host)
-    time.sleep(0.1)
+    until(lambda: receive.getActualDigitalOutputBits() & 0x1020A == 0x10208, "no outputs")
     said["outputs"] = receive.getActualDigitalOutputBits()
     said["analog"] = receive.getStandardAnalogOutput0()
 
     goal = [said["q0"][0] + 0.2, *said["q0"][1:]]
-    start = time.monotonic()
+    start_s = receive.getTimestamp()
     said["moveJ"] = control.moveJ(goal, 1.05, 1.4)
-    said["moveJ_s"] = time.monotonic() - start
-    time.sleep(0.5)
-    said["moveJ_error"] = max(abs(a - b) for a, b in zip(receive.getActualQ(), goal, strict=True))
+    said["moveJ_s"] = current(receive) - start_s
+    said["moveJ_error"] = apart(at_rest(receive), goal)
 
     said["setTcp"] = control.setTcp([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
     said["tcp"] = control.getTCPOffset()
     said["setPayload"] = control.setPayload(1.6, [0.0, 0.0, 0.08])
     said["fk"] = control.getForwardKinematics(goal, [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
-    time.sleep(0.05)
+    current(receive)
     pose = receive.getActualTCPPose()
     said["pose"] = pose
     if e_series:
@@ -72,14 +101,14 @@ def session(host: str, *, e_series: bool) -> dict[str, Any]:
     said["moveL"] = control.moveL(below, 0.25, 1.2)
 
     said["async"] = control.moveL(pose, 0.02, 0.2, True)
-    time.sleep(0.2)
+    until(lambda: receive.getActualTCPPose()[2] - below[2] > 0.001, "it does not move")
     said["running"] = control.getAsyncOperationProgressEx().isAsyncOperationRunning()
     control.stopL(2.0)
     said["stopped_at"] = receive.getActualTCPPose()[2] - below[2]
     said["running_after_stop"] = control.getAsyncOperationProgressEx().isAsyncOperationRunning()
 
     said["speedJ"] = control.speedJ([0.1, 0, 0, 0, 0, 0], 1.0, 0)
-    time.sleep(0.3)
+    until(lambda: receive.getActualQd()[0] > 0.49, "it does not reach the speed")
     said["speed"] = receive.getActualQd()[0]
     said["speedStop"] = control.speedStop()
 
@@ -88,27 +117,23 @@ def session(host: str, *, e_series: bool) -> dict[str, Any]:
         entry = [*joints, 2.0, 5.0, 0.0]
         path.addEntry(PathEntry(PathEntry.MoveJ, PathEntry.PositionJoints, entry))
     said["path"] = control.movePath(path)
-    time.sleep(0.3)
-    said["path_error"] = max(abs(a - b) for a, b in zip(receive.getActualQ(), said["q0"], strict=True))
+    said["path_error"] = apart(at_rest(receive), said["q0"])
 
     control.triggerProtectiveStop()
-    time.sleep(0.1)
+    until(lambda: receive.isProtectiveStopped() and not control.isProgramRunning(), "no protective stop")
     said["protective"] = [receive.isProtectiveStopped(), control.isProgramRunning(), receive.getSafetyMode()]
     try:
         dashboard.unlockProtectiveStop()
         said["early_unlock"] = "allowed"
     except RuntimeError as error:
         said["early_unlock"] = str(error)
-    time.sleep(5.1 / 5)  # the simulator runs five times as fast
     dashboard.closeSafetyPopup()
-    dashboard.unlockProtectiveStop()
+    until(lambda: unlocked(dashboard), "it cannot be unlocked")
     control.reuploadScript()
-    deadline = time.monotonic() + 30
-    while (not control.isProgramRunning() or receive.isProtectiveStopped()) and time.monotonic() < deadline:
-        time.sleep(0.02)
+    until(lambda: control.isProgramRunning() and not receive.isProtectiveStopped(), "the script does not run")
     said["again"] = [receive.isProtectiveStopped(), control.moveJ(goal, 2.0, 5.0)]
     io.setSpeedSlider(0.5)
-    time.sleep(0.1)
+    until(lambda: receive.getTargetSpeedFraction() < 0.75, "the slider does not move")
     said["slider"] = receive.getTargetSpeedFraction()
     control.stopScript()
     for client in (control, io, receive, dashboard):

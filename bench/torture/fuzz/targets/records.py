@@ -245,7 +245,7 @@ def _snapshots(folder: Path) -> list[bytes]:
 def _snapshot(data: bytes, folder: Path) -> None:
     (folder / "monitor").mkdir()
     (folder / "monitor" / "run.json").write_bytes(data)
-    snapshot = read_snapshot(folder, "run")
+    snapshot = read_snapshot(folder, "run", 0.0)
     snapshot.model_dump_json()
     (folder / "monitor" / "run.verification.json").write_bytes(data)
     Verifications(folder, SystemClock()).last("run")

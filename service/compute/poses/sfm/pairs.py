@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
 
 import numpy as np
 
@@ -84,17 +83,13 @@ def _ordered(i: int, j: int) -> tuple[int, int]:
 
 def _bridges(chosen: set[tuple[int, int]], known: list[int], rays: Array, n: int) -> set[tuple[int, int]]:
     """The nearest pairs between unconnected parts of the graph: several for each, since one may not match."""
-    from scipy.sparse import csr_matrix  # noqa: PLC0415 - half a second, which most commands do without
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
+    parts = _Parts(n)
+    for i, j in chosen:
+        parts.join(i, j)
     added: set[tuple[int, int]] = set()
     while True:
-        edges = np.array(sorted(chosen | added)).reshape(-1, 2)
-        graph = csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
-        count, label = cast("tuple[int, Any]", connected_components(graph, directed=False))
-        if count == 1:
-            return added
-        inside = label[known] == label[known[0]]
+        label = np.array([parts.of(k) for k in known])
+        inside = label == label[0]
         rows, columns = np.flatnonzero(inside), np.flatnonzero(~inside)
         if len(columns) == 0:
             return added
@@ -104,4 +99,27 @@ def _bridges(chosen: set[tuple[int, int]], known: list[int], rays: Array, n: int
             block = _angles_deg(rays[rows], rays[columns])
         for flat in np.argsort(block, axis=None)[:6]:
             r, c = divmod(int(flat), len(columns))
-            added.add(_ordered(known[int(rows[r])], known[int(columns[c])]))
+            pair = _ordered(known[int(rows[r])], known[int(columns[c])])
+            added.add(pair)
+            parts.join(*pair)
+
+
+class _Parts:
+    """The connected parts of a graph that only gains edges.
+
+    SciPy's would cost half a second of imports, and the state of a run is told with these pairs.
+    """
+
+    def __init__(self, nodes: int) -> None:
+        self._towards = list(range(nodes))
+
+    def of(self, node: int) -> int:
+        """The node that stands for the part to which this one belongs."""
+        towards = self._towards
+        while towards[node] != node:
+            towards[node] = node = towards[towards[node]]
+        return node
+
+    def join(self, one: int, other: int) -> None:
+        """Add an edge."""
+        self._towards[self.of(one)] = self.of(other)

@@ -27,6 +27,7 @@ public final class Engine {
     private final Arm arm;
     private final Fri fri;
     private final Log log;
+    private final double heartbeatS;
     private final long startNs;
     private volatile boolean locked = true;
     private volatile long heardNs;
@@ -39,8 +40,9 @@ public final class Engine {
     private long motions;
     private String trouble = "";
 
-    /** `fri` is null where FRI is not installed. */
-    public Engine(Arm arm, Fri fri, Log log, long nowNs) {
+    /** `fri` is null where FRI is not installed; the arm is stopped `heartbeatS` after its client's last line. */
+    public Engine(Arm arm, Fri fri, Log log, double heartbeatS, long nowNs) {
+        this.heartbeatS = heartbeatS;
         this.arm = arm;
         this.fri = fri;
         this.log = log;
@@ -69,9 +71,9 @@ public final class Engine {
         }
         watchedNs = nowNs;
         Running motion = running;
-        if (motion != null && nowNs > patientUntilNs && silentS(nowNs) > HEARTBEAT_S) {
+        if (motion != null && nowNs > patientUntilNs && silentS(nowNs) > heartbeatS) {
             locked = true;
-            motion.end("heartbeat", "the arm was stopped: no line of its client for " + HEARTBEAT_S + " s");
+            motion.end("heartbeat", "the arm was stopped: no line of its client for " + heartbeatS + " s");
         }
     }
 

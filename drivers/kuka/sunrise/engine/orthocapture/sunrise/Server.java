@@ -38,7 +38,12 @@ public final class Server implements Connection.Owner {
 
     /** Listens on an address of the controller; null: on all. `fri` is null where FRI is not installed. */
     public Server(Arm arm, Fri fri, InetAddress address, int port, Log log) throws IOException {
-        this.engine = new Engine(arm, fri, log, System.nanoTime());
+        this(arm, fri, address, port, log, Engine.HEARTBEAT_S);
+    }
+
+    /** For a simulated arm on a machine that has other work too, which is no dead client. */
+    public Server(Arm arm, Fri fri, InetAddress address, int port, Log log, double heartbeatS) throws IOException {
+        this.engine = new Engine(arm, fri, log, heartbeatS, System.nanoTime());
         this.log = log;
         this.listener = new ServerSocket(port, 4, address);
     }

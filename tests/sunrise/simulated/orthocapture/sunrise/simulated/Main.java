@@ -1,4 +1,4 @@
-// Runs the engine on the JVM with a simulated arm; a second port takes what a person does at the smartPAD.
+// Runs the engine on the JVM with a simulated arm: its words are an address and the longest silence of a client in s.
 package orthocapture.sunrise.simulated;
 
 import java.io.BufferedReader;
@@ -24,7 +24,7 @@ public final class Main {
                 System.err.println(text);
             }
         };
-        Server server = new Server(arm, null, host, Server.PORT, log);
+        Server server = new Server(arm, null, host, Server.PORT, log, Double.parseDouble(words[1]));
         final ServerSocket pendant = new ServerSocket(Server.PORT + 1, 4, host);
         Thread thread = new Thread(new Runnable() {
             @Override
@@ -39,6 +39,7 @@ public final class Main {
         server.run();
     }
 
+    /** A second port takes what a person does at the smartPAD. */
     private static void serve(ServerSocket pendant, SimulatedArm arm) {
         while (true) {
             try {

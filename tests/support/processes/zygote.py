@@ -1,0 +1,211 @@
+"""The process from which those of the tests are forked: it has imported what they need, and never starts a thread.
+
+`python -m tests.support.processes.zygote FD` serves requests on a Unix socket until its other end is closed, so that
+it cannot outlive the tests. `tests.support.processes.forked` is the other end. A request forks a child that is the
+same as a fresh `python -m MODULE WORDS…` or `orthocapture WORDS…`: it leaves this module by returning from it, runs
+the program as `__main__`, and the interpreter ends it as any other: exit status, tracebacks, `atexit` and all. What
+differs from a fresh process: modules are loaded already, `ps` shows the command line of the zygote, and all children
+of one zygote share the seed of `hash()`.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import io
+import json
+import os
+import runpy
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, TextIO
+
+COMMANDS, SIMULATORS = "service.cli.main", "simulators"
+OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe")
+_REQUEST_BYTES, _NUMBER_BYTES = 8, 8  # lengths of a request's size, and of a process id or an exit status
+_STANDARD = (0, 1, 2)
+# What these import only when they run; everything else is imported by the module of the command or the simulator.
+_LATE = {
+    "simulators camera": ("simulators.rendering.render",),
+    "simulators canon": ("simulators.rendering.render",),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Request:
+    """One process to start."""
+
+    script: str  # the command as it is installed; "": `python -m MODULE`
+    module: str
+    words: list[str]
+    cwd: str
+    env: dict[str, str]
+    session: bool  # whether it leads a session of its own
+
+    @property
+    def main(self) -> str:
+        """The module that will run as `__main__`."""
+        return f"{self.module}.__main__" if self.module == SIMULATORS else self.module
+
+
+@dataclass
+class _Zygote:
+    """Forks children as it is asked to, and tells how each of them ended. Keeps plain descriptors, for the child."""
+
+    control: int
+    environment: dict[str, str]  # as it was when this process began
+    prepared: set[str] = field(default_factory=set[str])
+    children: dict[int, tuple[int, int]] = field(default_factory=dict[int, tuple[int, int]])  # pidfd: pid, to tell
+
+    def serve(self) -> _Request | None:
+        """Serve until the other end is closed, and return None. Return a request in the child that is to run it."""
+        poll = select.poll()
+        poll.register(self.control, select.POLLIN)
+        while True:
+            for ready, _event in poll.poll():
+                if ready != self.control:
+                    poll.unregister(ready)
+                    self._tell(ready)
+                    continue
+                told, request, standard = self._receive()
+                if request is None:
+                    self._end()
+                    return None
+                self._prepare(request)
+                pid = os.fork()
+                if pid == 0:
+                    _become(request, standard, _changed(self.environment))
+                    return request
+                for descriptor in standard:
+                    os.close(descriptor)
+                pidfd = os.pidfd_open(pid)
+                self.children[pidfd] = (pid, told)
+                poll.register(pidfd, select.POLLIN)
+                _write(told, pid)
+
+    def _receive(self) -> tuple[int, _Request | None, tuple[int, ...]]:
+        """A request, where its answers go, and its stdin, stdout and stderr; None at the end of all."""
+        control = socket.socket(fileno=os.dup(self.control))
+        with control:
+            data, descriptors, _flags, _address = socket.recv_fds(control, 1, 1 + len(_STANDARD))
+        if not data:
+            return -1, None, ()
+        told, *standard = descriptors
+        size = int.from_bytes(_read(told, _REQUEST_BYTES), "little")
+        return told, _Request(**json.loads(_read(told, size))), tuple(standard)
+
+    def _prepare(self, request: _Request) -> None:
+        """Import what the process needs, unless it was done for one like it; no thread may begin by that."""
+        kind = " ".join([request.module, *request.words[:1]])
+        if kind in self.prepared:
+            return
+        self.prepared.add(kind)
+        for name in (*_needed(request), *_LATE.get(kind, ())):
+            importlib.import_module(name)
+        assert len(os.listdir("/proc/self/task")) == 1, f"importing for {kind!r} started a thread"
+        gc.collect()
+        gc.freeze()  # the children's collections leave alone, and so share, what is here
+
+    def _tell(self, pidfd: int) -> None:
+        """Tell how a child has ended."""
+        pid, told = self.children.pop(pidfd)
+        _, status = os.waitpid(pid, 0)
+        os.close(pidfd)
+        try:
+            _write(told, os.waitstatus_to_exitcode(status))
+        except OSError:  # nobody wants to know
+            pass
+        finally:
+            os.close(told)
+
+    def _end(self) -> None:
+        """Terminate what still runs: the tests are no more."""
+        for pidfd in self.children:
+            signal.pidfd_send_signal(pidfd, signal.SIGTERM)
+
+
+def _needed(request: _Request) -> Sequence[str]:
+    """The modules of what the first word names; the command lines import them on demand."""
+    word = request.words[0] if request.words else ""
+    main: Any = importlib.import_module(request.main)
+    if request.module == SIMULATORS:
+        known: dict[str, tuple[str, str]] = main.simulators()
+        return [known[word][0]] if word in known else []
+    if request.module == COMMANDS:
+        place = vars(main)["_COMMANDS"].get(word)
+        return [place.place.partition(":")[0]] if place else []
+    return []
+
+
+def _changed(before: dict[str, str]) -> dict[str, str]:
+    """The variables that libraries have set while they were imported, as they do in every process."""
+    return {name: value for name, value in os.environ.items() if before.get(name) != value}
+
+
+def _become(request: _Request, standard: tuple[int, ...], from_imports: dict[str, str]) -> None:
+    """Turn this fork into the process that was asked for, but for its main module."""
+    if request.session:
+        os.setsid()
+    for descriptor, of_request in zip(_STANDARD, standard, strict=True):
+        os.dup2(of_request, descriptor)
+    highest = max(map(int, os.listdir("/proc/self/fd")))
+    os.closerange(len(_STANDARD), highest + 1)
+    os.chdir(request.cwd)
+    os.environ.clear()
+    os.environ.update(request.env | from_imports)
+    time.tzset()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.path[0] = os.path.dirname(request.script) or request.cwd
+    sys.argv = [request.script or request.main, *request.words]
+    _open_standard_streams()
+    if "numpy" in sys.modules:
+        sys.modules["numpy"].random.seed()  # Python's own was seeded anew by fork
+    if "multiprocessing.process" in sys.modules:
+        vars(sys.modules["multiprocessing.process"])["ORIGINAL_DIR"] = request.cwd  # where it starts further ones
+    parent, _, name = request.main.rpartition(".")
+    if sys.modules.pop(request.main, None) is not None:  # as if it was never imported
+        delattr(sys.modules[parent], name)
+
+
+def _open_standard_streams() -> None:
+    """Open `sys.stdin`, `sys.stdout` and `sys.stderr` as the interpreter does at its start."""
+
+    def opened(before: TextIO, descriptor: int, mode: Literal["rb", "wb"]) -> TextIO:
+        assert isinstance(before, io.TextIOWrapper)
+        unbuffered = before.write_through  # the option -u, or its variable
+        binary = open(descriptor, mode, 0 if unbuffered and mode == "wb" else -1, closefd=False)  # noqa: SIM115
+        lines = not unbuffered and (descriptor == _STANDARD[2] or os.isatty(descriptor))
+        return io.TextIOWrapper(
+            binary, before.encoding, before.errors, newline="\n", line_buffering=lines, write_through=unbuffered
+        )
+
+    sys.stdin = sys.__stdin__ = opened(sys.stdin, 0, "rb")
+    sys.stdout = sys.__stdout__ = opened(sys.stdout, 1, "wb")
+    sys.stderr = sys.__stderr__ = opened(sys.stderr, 2, "wb")
+
+
+def _read(descriptor: int, size: int) -> bytes:
+    data = b""
+    while len(data) < size:
+        part = os.read(descriptor, size - len(data))
+        assert part, "the request ended too early"
+        data += part
+    return data
+
+
+def _write(descriptor: int, number: int) -> None:
+    os.write(descriptor, number.to_bytes(_NUMBER_BYTES, "little", signed=True))
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tests, and they end this
+    _asked = _Zygote(int(sys.argv[1]), dict(os.environ)).serve()
+    if _asked is not None and _asked.script:
+        runpy.run_path(_asked.script, run_name="__main__")
+    elif _asked is not None:
+        runpy.run_module(_asked.module, run_name="__main__", alter_sys=True)
