@@ -29,7 +29,7 @@ from tests.support.processes.waiting import until
 from tests.support.rig.rig import RIG_LOCK, orthocapture
 
 pytestmark = [pytest.mark.slow, pytest.mark.whole(always=True), pytest.mark.timeout(900)]
-MADE = "ORTHOCAPTURE_MADE_DEMO"  # the folder in which `make demo` was called
+MADE = "ORTHOCAPTURE_DEMO_RUN"  # the folder of the demonstration that `make demo` made
 
 
 @pytest.fixture(scope="module")
@@ -41,15 +41,16 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Package:
 def demo(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The result of the demonstration: the one that `make demo` made (as in .ci/run), or else one as installed."""
     made = os.environ.get(MADE)
-    folder = tmp_path_factory.mktemp("demo") if made is None else Path(made)
-    if made is None:
-        with RIG_LOCK:
-            answer = installed_package(tmp_path_factory).run("demo", "--json", cwd=folder, timeout_s=840)
-        assert answer.returncode == 0, answer.stdout + answer.stderr
+    if made is not None:
+        (result,) = Path(made).glob("*/result.json")
+        return json.loads(result.read_text(encoding="utf-8"))
+    folder = tmp_path_factory.mktemp("demo")
+    with RIG_LOCK:
+        answer = installed_package(tmp_path_factory).run("demo", "--json", cwd=folder, timeout_s=840)
+    assert answer.returncode == 0, answer.stdout + answer.stderr
     (result,) = folder.glob("demo-run/*/result.json")
-    told = json.loads(result.read_text(encoding="utf-8"))
-    if made is None:
-        assert json.loads(answer.stdout.splitlines()[-1]) == told
+    told = json.loads(answer.stdout.splitlines()[-1])
+    assert json.loads(result.read_text(encoding="utf-8")) == told
     return told
 
 
