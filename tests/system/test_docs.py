@@ -163,9 +163,7 @@ RUN_ELSEWHERE = {
     'python -m pip install ".[fuzz]"': (  # needs a package index, which tests have not
         "tests/system/test_docs.py::test_the_extras_that_documents_install_are_declared"
     ),
-    "make torture-crash": (
-        "tests/torture/test_crash_sweep.py::test_a_death_there_leaves_nothing_behind"
-    ),
+    "make torture-crash": ("tests/torture/test_crash_sweep.py::test_a_death_there_leaves_nothing_behind"),
     "python -m bench.torture.crash --sample 100 --random-runs 1": (
         "tests/torture/test_crash_sweep.py::test_a_death_there_leaves_nothing_behind"
     ),
