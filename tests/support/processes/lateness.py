@@ -5,7 +5,6 @@ from __future__ import annotations
 import statistics
 import threading
 import time
-from types import TracebackType
 
 _NAP_S = 0.005
 
