@@ -163,6 +163,15 @@ RUN_ELSEWHERE = {
     'python -m pip install ".[fuzz]"': (  # needs a package index, which tests have not
         "tests/system/test_docs.py::test_the_extras_that_documents_install_are_declared"
     ),
+    **dict.fromkeys(
+        ("make test-drawn", "make test-whole", "make test-sweeps"),
+        "tests/house/test_suite_rules.py::"
+        "test_whole_runs_are_drawn_by_file_sweeps_by_row_and_what_was_drawn_is_printed",
+    ),
+    **dict.fromkeys(
+        ("make marks", "make marks FILES=tests/core"),
+        "tests/house/test_suite_rules.py::test_the_list_is_written_from_records_and_then_the_check_is_content",
+    ),
     "make torture-crash": ("tests/torture/test_crash_sweep.py::test_a_death_there_leaves_nothing_behind"),
     "python -m bench.torture.crash --sample 100 --random-runs 1": (
         "tests/torture/test_crash_sweep.py::test_a_death_there_leaves_nothing_behind"
@@ -252,7 +261,7 @@ RUN_ELSEWHERE = {
         "tests/grbl/test_grbl_run.py::test_a_run_with_the_turntable_instead_of_the_arm",
     ),
     "orthocapture dicom-listen --folder ct --from CTSUITE": (
-        "tests/ct/test_dicom_listen.py::test_dcmtk_sends_a_series_and_the_importer_reads_it"
+        "tests/ct/test_dicom_listen.py::test_another_program_sends_a_series_and_the_importer_reads_it"
     ),
     "orthocapture export latest --format mcap --out bag --data runs": (
         "tests/dataset/test_mcap.py::test_rosbags_opens_the_folder_as_a_recording_of_ros"
