@@ -121,7 +121,7 @@ def read_log(store: Store, run_id: str, protocol: Protocol) -> RunRecord:
 
 def results_to_come(log: RunRecord) -> list[PendingResult]:
     """The planned registrations that have not arrived yet, with the time left; empty if all have."""
-    from service.steps.poses.time_left import missing_results  # noqa: PLC0415 - all job kinds, which a page needs late
+    from service.steps.poses.time_left import missing_results  # noqa: PLC0415 - most job kinds
 
     started = log.store.jobs_started(log.run_id)
     cores = os.cpu_count() or 1
