@@ -55,10 +55,15 @@ def command(*words: str) -> list[str]:
 
 
 @contextmanager
-def simulated_rig(folder: Path, *options: str, host: str = _USUAL) -> Generator[dict[str, Any]]:
-    """Start a rig around one scene; yields its ready line. On another loopback address it waits for no other rig."""
+def simulated_rig(
+    folder: Path, *options: str, host: str = _USUAL, start: type[subprocess.Popen[str]] = Forked
+) -> Generator[dict[str, Any]]:
+    """Start a rig around one scene; yields its ready line. On another loopback address it waits for no other rig.
+
+    With `start=subprocess.Popen`, it and its devices are real starts, with command lines of their own.
+    """
     with RigLock(host), (folder / "rig.log").open("w") as log:
-        process = Forked(
+        process = start(
             [sys.executable, "-m", "simulators", "rig", "--dir", str(folder), "--host", host, *options],
             cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
         )  # fmt: skip
