@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-all test-drawn test-whole test-sweeps test-versions marks lint format docs reference bench torture-audit torture-crash torture-faults torture-fuzz soak lock clean
+.PHONY: demo test test-all test-drawn test-whole test-sweeps test-versions marks lint format docs reference bench mutants torture-audit torture-crash torture-faults torture-fuzz soak lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
@@ -84,6 +84,12 @@ torture-fuzz: $(TOOLS)
 # Every byte, row, roll-back and forgery of a small record: hours. MINUTES=60 ends it early, WORK=DIR goes on with it.
 torture-audit: $(TOOLS)
 	$(strip $(BIN)/python -m bench.torture.audit $(if $(MINUTES),--minutes $(MINUTES)) $(if $(WORK),--work $(WORK)))
+
+# Small faults in the places that matter, drawn by SEED: does a test notice each? What survives is listed.
+COUNT = 300
+AT_LEAST = 0
+mutants: $(TOOLS)
+	$(BIN)/python -m bench.suite.mutants --seed $(SEED) --count $(COUNT) --at-least $(AT_LEAST)
 
 # Searches for faults that no single test looks for (docs/howto/torture.md); takes most of an hour.
 torture-crash: $(TOOLS)

@@ -5,14 +5,15 @@ from __future__ import annotations
 import argparse
 import ast
 import ctypes
+import gc
 import importlib
 import importlib.util
 import json
 import logging
 import os
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -127,7 +128,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     chosen = words[0] if words and words[0] in simulators() else None
     try:
-        args = _parser(chosen).parse_args(words)
+        with _unsearched():
+            args = _parser(chosen).parse_args(words)
     except SimulatorError as error:
         sys.stderr.write(f"simulators: {error}\n")
         return 1
@@ -144,6 +146,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"simulators {args.simulator}: {error}\n")
         return 1
     return 0
+
+
+@contextmanager
+def _unsearched() -> Generator[None]:
+    """Load modules inside this: Python's collector does not look for garbage among them, then or later."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def _keep_freed_memory() -> None:

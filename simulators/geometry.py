@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.floating]  # single precision where it matters; numpy stubs lose it in mixed arithmetic
@@ -26,6 +25,8 @@ def transform(rotation: Array, translation_m: Array) -> Array:
 
 def from_euler(xyz_rad: Array, translation_m: Array) -> Array:
     """Build T_a_b from rotations about the fixed x, y and z axes, in this order, and a position (3,)."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - 0.2 s, which simulators without a scene do without
+
     return transform(Rotation.from_euler("xyz", xyz_rad).as_matrix(), translation_m)
 
 

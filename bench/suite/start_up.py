@@ -141,9 +141,9 @@ def markdown(rows: Sequence[dict[str, Any]], about: dict[str, Any], measured: st
     table = "\n".join(("| process | median CPU s | least CPU s |", "|---|---|---|", *lines))
     return f"""# What a process costs to start
 
-{about["processor"]}, {about["cores"]} cores, Python {about["python"]}, commit {measured}. CPU seconds (user and system)
-of {len(rows[0]["all_cpu_s"])} starts each, byte code compiled, files in the page cache. "To ready": until the first
-line on standard output; the others until they end.
+{about["processor"]}, {about["cores"]} cores, Python {about["python"]}, commit {measured}. CPU seconds (user and
+system) of {len(rows[0]["all_cpu_s"])} starts each, byte code compiled, files in the page cache. "To ready": until the
+first line on standard output; the others until they end.
 
 {table}
 """

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import entry_points
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from service.core.errors import ConfigurationError
+from service.core.loading import loading
 
 
 class DeclaredKind(Protocol):
@@ -34,9 +35,7 @@ def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
     Raises:
         ConfigurationError: two declare the same name, or an entry point names something else.
     """
-    path = importlib.import_module(package).__path__
-    names = [found.name for found in pkgutil.walk_packages(path, f"{package}.") if not found.ispkg]
-    modules = [importlib.import_module(name) for name in names]
+    modules = [importlib.import_module(name) for name in _modules(package)]
     declared: list[object] = [module.KIND for module in modules if hasattr(module, "KIND")]
     declared += [point.load() for point in entry_points(group=group)]
     kinds: dict[str, K] = {}
@@ -47,6 +46,47 @@ def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
             raise ConfigurationError(f"two kinds are called {one.name!r}", where=f"entry points {group}")
         kinds[one.name] = one
     return kinds
+
+
+def _modules(package: str) -> list[str]:
+    path = importlib.import_module(package).__path__
+    return [found.name for found in pkgutil.walk_packages(path, f"{package}.") if not found.ispkg]
+
+
+class KindsOnDemand(Mapping[str, K]):
+    """The kinds that `declared_kinds` finds, each imported when it is asked for: most programs need a few.
+
+    So the module of a kind has its name. All are imported when they are listed or counted, when an unknown name is
+    asked for, and at once where there are plug-ins: these may not use a name twice.
+    """
+
+    def __init__(self, package: str, group: str, kind: type[K], order: Callable[[K], Any]) -> None:
+        """As for `declared_kinds`; the kinds are listed by `order`. Raises ConfigurationError, as a listing does."""
+        self._package, self._group, self._kind, self._order = package, group, kind, order
+        self._modules = {name.rpartition(".")[2]: name for name in _modules(package)}
+        self._all: dict[str, K] | None = None
+        if entry_points(group=group):
+            self._whole()
+
+    def __getitem__(self, name: str) -> K:
+        if self._all is None and name in self._modules:
+            found: object = getattr(importlib.import_module(self._modules[name]), "KIND", None)
+            if isinstance(found, self._kind) and found.name == name:
+                return found
+        return self._whole()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._whole())
+
+    def __len__(self) -> int:
+        return len(self._whole())
+
+    def _whole(self) -> dict[str, K]:
+        if self._all is None:
+            with loading():
+                kinds = declared_kinds(self._package, self._group, self._kind)
+            self._all = dict(sorted(kinds.items(), key=lambda item: self._order(item[1])))
+        return self._all
 
 
 def kind_named(name: str, known: Mapping[str, K], *, what: str, option: str) -> K:

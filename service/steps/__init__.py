@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any
 
-from service.core.declared_kinds import declared_kinds
-from service.core.loading import loading
+from service.core.declared_kinds import KindsOnDemand
 from service.core.protocol.step_params import StepParams
 from service.steps.context import StepKind
 
@@ -14,17 +14,27 @@ GROUP = "orthocapture.steps"  # entry points of plug-ins; each names a StepKind
 
 
 @cache
-def step_kinds() -> dict[str, StepKind[Any]]:
-    """All step kinds by name: every module of service/steps/kinds, and those of plug-ins.
+def step_kinds() -> Mapping[str, StepKind[Any]]:
+    """All step kinds by name: those of service/steps/kinds, and those of plug-ins.
 
     Raises:
-        ConfigurationError: two declare the same name, or an entry point names something that is not a StepKind.
+        ConfigurationError: two declare the same name, or an entry point names something that is not a StepKind; also
+            when they are listed.
     """
-    with loading():
-        kinds: dict[str, StepKind[Any]] = declared_kinds(f"{__name__}.kinds", GROUP, StepKind)
-    return dict(sorted(kinds.items()))
+    return KindsOnDemand[StepKind[Any]](f"{__name__}.kinds", GROUP, StepKind, lambda kind: kind.name)
 
 
-def params_models() -> dict[str, type[StepParams]]:
-    """The Params model of every step kind, for the protocol loader."""
-    return {name: kind.params for name, kind in step_kinds().items()}
+class _ParamsModels(Mapping[str, type[StepParams]]):
+    def __getitem__(self, name: str) -> type[StepParams]:
+        return step_kinds()[name].params
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(step_kinds())
+
+    def __len__(self) -> int:
+        return len(step_kinds())
+
+
+def params_models() -> Mapping[str, type[StepParams]]:
+    """The Params model of every step kind, for the protocol loader; raises what `step_kinds` does."""
+    return _ParamsModels()

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from simulators.geometry import Array, Array32, Bools, Bytes, Ints
+from simulators.rendering.kept import kept
 from simulators.rendering.lighting import Caster, blocked_rays, vertex_light
 from simulators.rendering.noise import Noise
 from simulators.rendering.textures import (
@@ -115,29 +116,24 @@ class Surfaces:
         self._caster = Caster(self._vertices, self._faces)
         self._parts = parts
         self._light: dict[bool, Array32] = {}
-        small = max(64, texture_size // 4)
-        self._textures = [
-            MipMap(texture)
-            for texture in (
-                specimen_texture(scene, texture_size),
-                board_texture(scene, texture_size),
-                post_texture(scene, small),
-                steel_texture(),
-                drape_texture(scene, texture_size),
-            )
-        ]
-        ripple = Noise(scene.seed, (512, 512), (0.02, 0.02))
-        slopes = np.stack([ripple.octaves(k, 0.004, 3) for k in (1, 2)], axis=-1)
-        self._ripple = np.ascontiguousarray(slopes * np.float32(0.16))
+        painted = (scene.seed, scene.specimen.anatomy, scene.specimen.grid_m, texture_size)
+        *texels, texel_m, self._ripple = kept("textures", painted, lambda: _painted(scene, texture_size))
+        self._textures = [MipMap(Texture(*texture)) for texture in zip(texels, texel_m.tolist(), strict=True)]
 
     def light(self, control: bool) -> Array32:
         """Light of lamp and room at the vertices (V, 2), with the shadows of the spheres that are present."""
         if control not in self._light:
-            blocked = self._shadow
-            if control:
-                blocked = blocked | self._blocked_by(_spheres(self.scene.control_m))
-            self._light[control] = vertex_light(blocked, self._vertices, self._normals, self.scene.lamp_m)
+            scene = self.scene
+            spheres = (scene.registration_m, scene.control_m if control else None)
+            lit = (self._vertices, self._normals, self._faces, *spheres, scene.lamp_m)
+            (self._light[control],) = kept("light", lit, lambda: [self._lit(control)])
         return self._light[control]
+
+    def _lit(self, control: bool) -> Array32:
+        blocked = self._shadow
+        if control:
+            blocked = blocked | self._blocked_by(_spheres(self.scene.control_m))
+        return vertex_light(blocked, self._vertices, self._normals, self.scene.lamp_m)
 
     @cached_property
     def _shadow(self) -> Bools:
@@ -231,6 +227,21 @@ class Surfaces:
         _normalise(half)
         s = np.clip(np.einsum("ij,ij->i", normal, half), 0.0, 1.0) ** 48 * gloss * np.minimum(lamp, 1.0)
         shaded[at] += np.float32(0.55) * s[:, None] * LAMP_COLOUR
+
+
+def _painted(scene: Scene, size: int) -> list[Array32]:
+    """The texels of all materials' textures, the sizes of their texels in metres, and the ripples of wet tissue."""
+    textures = (
+        specimen_texture(scene, size),
+        board_texture(scene, size),
+        post_texture(scene, max(64, size // 4)),
+        steel_texture(),
+        drape_texture(scene, size),
+    )
+    ripple = Noise(scene.seed, (512, 512), (0.02, 0.02))
+    slopes = np.stack([ripple.octaves(k, 0.004, 3) for k in (1, 2)], axis=-1)
+    texel_m = np.array([texture.texel_m for texture in textures])
+    return [*(texture.texels for texture in textures), texel_m, np.ascontiguousarray(slopes * np.float32(0.16))]
 
 
 def _interpolated(values: Array32, corners: Ints, weights: Weights) -> Array32:

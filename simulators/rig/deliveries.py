@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from simulators.scan_station.scanners import SCANNERS, chosen_format
+from simulators.scan_station.scanners import SCANNERS, USUAL_SPACING_MM, chosen_format
 from simulators.serve import SimulatorError
 
 _HAND = "hand"
@@ -18,6 +18,9 @@ def add_delivery_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ct-voxel-mm", type=float, default=0.4, help="edge of the CT's voxels")
     parser.add_argument(
         "--ct-sends-to", metavar="HOST:PORT", help="the CT suite sends its series there instead of writing files"
+    )
+    parser.add_argument(
+        "--scan-spacing-mm", type=float, default=USUAL_SPACING_MM, help="distance between the points of scans"
     )
     kinds = ", ".join(SCANNERS)
     parser.add_argument("--scanner", default=_HAND, metavar="NAME[/FORMAT]", help=f"of the device scanner: {kinds}")
@@ -51,6 +54,7 @@ def delivery_words(args: argparse.Namespace, device: str, folder: Path, *, spray
         raise LookupError(f"there is no scanner {device!r}; {', '.join(scanners)}")
     scanner, kind = _kind(scanners[device])
     words = ["scanner", "--folder", str(folder / _folder(device)), "--scanner", scanner, "--format", kind]
+    words += ["--spacing-mm", str(args.scan_spacing_mm)]
     return [*words, *(["--spray"] if spray else [])]
 
 

@@ -39,6 +39,7 @@ SCANNERS = {
     "photoneo": Scanner(("view",), pixels=(1032, 772), normals=True, views=3),
 }
 FORMATS = tuple(dict.fromkeys(name for scanner in SCANNERS.values() for name in scanner.formats))
+USUAL_SPACING_MM = 0.5  # of the vertices on spheres, where it exports a mesh
 VIEWS = ("view", "e57")  # formats that hold views, no mesh
 
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from simulators.faults import Fault, FaultPlan
 from simulators.geometry import Array, Ints, apply, inverse, transform
 from simulators.scan_station.formats import encode
-from simulators.scan_station.scanners import SCANNERS, VIEWS, add_scanner_arguments, chosen_format
+from simulators.scan_station.scanners import SCANNERS, USUAL_SPACING_MM, VIEWS, add_scanner_arguments, chosen_format
 from simulators.scan_station.view_formats import e57, view_ply
 from simulators.scan_station.views import sensor_pose, sensor_view
 from simulators.scene.parts import Part, sphere_mesh, vertex_normals
@@ -66,7 +66,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_scanner_arguments(parser)
     parser.add_argument("--unit", choices=UNITS, default="mm", help="of the file; E57 is in metres")
     parser.add_argument("--normals", action=argparse.BooleanOptionalAction, default=True, help="write vertex normals")
-    parser.add_argument("--spacing-mm", type=float, default=0.5, help="vertex spacing of the mesh on spheres")
+    parser.add_argument(
+        "--spacing-mm",
+        type=float,
+        default=USUAL_SPACING_MM,
+        help="vertex spacing of the mesh on spheres; where it is wider than usual, views have as many fewer pixels",
+    )
     parser.add_argument("--nth", type=int, help="number of the scan (default: exports in the folder, plus one)")
 
 
@@ -265,9 +270,10 @@ def _mesh(scene: Scene, args: argparse.Namespace, kind: str, nth: int) -> _Expor
 def _views(scene: Scene, args: argparse.Namespace, kind: str, nth: int) -> list[_Export]:
     """One E57 file with every view, or a PLY file for each view in the sensor's frame."""
     scanner = SCANNERS[args.scanner]
+    columns, rows = (round(pixels * min(1.0, USUAL_SPACING_MM / args.spacing_mm)) for pixels in scanner.pixels)
     views = [
         sensor_view(
-            scene, sensor_pose(index), *scanner.pixels,
+            scene, sensor_pose(index), columns, rows,
             spray=args.spray, control_spheres=args.control_spheres, nth=nth + index,
         )
         for index in range(args.views or scanner.views)

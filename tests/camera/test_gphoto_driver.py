@@ -141,7 +141,7 @@ def test_camera_killed_and_started_again(tmp_path: Path) -> None:
         camera.open()
         camera.capture(tmp_path)
         simulator.process.send_signal(signal.SIGKILL)
-        simulator.process.wait(10)
+        simulator.process.wait(90)
         try:
             with pytest.raises(DeviceError):
                 camera.capture(tmp_path)

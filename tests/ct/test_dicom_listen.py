@@ -44,7 +44,7 @@ def listening(folder: Path, *options: str) -> Generator[tuple[int, Iterator[str]
         ready = next(line for line in lines if "port" in line)
         yield ready["port"], (line["told"] for line in lines if "told" in line)
         process.terminate()
-        assert process.wait(30) == 0
+        assert process.wait(90) == 0
     finally:
         process.kill()
         process.wait()

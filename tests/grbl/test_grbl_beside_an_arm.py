@@ -122,6 +122,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Generator[Run]:
 
 
 @pytest.mark.slow
+@pytest.mark.whole
 @pytest.mark.timeout(1200)
 def test_both_take_every_view_of_one_run(run: Run) -> None:
     assert run.doctor["ok"]
@@ -135,6 +136,7 @@ def test_both_take_every_view_of_one_run(run: Run) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.whole
 @pytest.mark.timeout(1200)
 def test_the_images_of_both_are_registered_together(run: Run) -> None:
     measures = run.ended.summary.state.steps["registration"].measures

@@ -18,7 +18,7 @@ from tests.support.rig.patience import PATIENT_GRBL
 from tests.support.rig.rig import orthocapture, simulated_rig
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
-VIEWS = 5
+VIEWS = 3
 PROTOCOL: dict[str, Any] = {
     "id": "turntable",
     "version": "1.0.0",
@@ -81,7 +81,7 @@ def test_a_run_with_the_turntable_instead_of_the_arm(tmp_path: Path) -> None:
     folder.mkdir()
     protocol.write_text(yaml.safe_dump(PROTOCOL), encoding="utf-8")
     with (
-        simulated_rig(folder, "--scene", "3", "--image-width", "600", "--hand", "steady", host="127.0.0.58") as ready,
+        simulated_rig(folder, "--scene", "3", "--image-width", "320", "--hand", "steady", host="127.0.0.58") as ready,
         table(tmp_path, "--world", ready["world"]) as port,
     ):
         rig = folder / "with_table.yaml"

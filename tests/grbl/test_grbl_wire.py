@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 import serial
+from pydantic import ValidationError
 
 from drivers.grbl.wire import Alarm, Feedback, Ok, Refused, Setting, Status, Welcome, jog, parse
-from tests.support.arms.grbl_simulator import table
+from tests.support.arms.grbl_simulator import TURN, grbl_config, table
 
 _SESSION = Path(__file__).parents[1] / "data" / "grbl" / "session.txt"
 
@@ -94,3 +95,11 @@ def test_lines_and_what_they_say(line: bytes, message: object) -> None:
 def test_reasons_are_told_in_words() -> None:
     assert re.search("limit switch.*alarm 1", Alarm(1).words)
     assert re.search("feed.*error 22", Refused(22).words)
+
+
+def test_a_watchdog_leaves_time_to_brake() -> None:
+    usual = grbl_config(Path("table"), TURN)
+    assert usual.reaction_s == pytest.approx(0.3)
+    with pytest.raises(ValidationError, match=r"rest after 1\.2 s at the earliest: rest_within_s"):
+        grbl_config(Path("table"), TURN, watchdog_s=1.0)
+    assert grbl_config(Path("table"), TURN, watchdog_s=1.0, rest_within_s=1.2).reaction_s == pytest.approx(1.1)

@@ -14,7 +14,7 @@ from service.dataset.posed.of_run.view_covariances import view_covariances
 from tests.support.rig.rig import orthocapture
 from tests.support.runs.run_by_hand import run_by_hand, small_protocol
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.slow, pytest.mark.whole, pytest.mark.timeout(900)]
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import yaml
 from tests.support.rig.rig import orthocapture
 from tests.support.runs.run_by_hand import run_by_hand, small_protocol
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.slow, pytest.mark.whole, pytest.mark.timeout(900)]
 
 
 def without_ct(folder: Path) -> Path:

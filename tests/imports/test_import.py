@@ -241,6 +241,7 @@ def error_mm(data: Path, run: str, photographer: Photographer) -> float:
 
 
 @pytest.mark.slow
+@pytest.mark.whole
 @pytest.mark.timeout(900)
 def test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere(
     spine: tuple[Path, Photographer], short: Path, tmp_path: Path

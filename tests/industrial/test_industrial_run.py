@@ -43,7 +43,10 @@ def give_producer(rig: Path, producer: Path) -> None:
     rig.write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")
 
 
-@pytest.mark.parametrize("way", ["Aravis", "harvesters", "OpenCV"])
+@pytest.mark.parametrize(
+    "way",
+    [pytest.param("Aravis", marks=pytest.mark.whole), "harvesters", pytest.param("OpenCV", marks=pytest.mark.whole)],
+)
 def test_doctor_and_a_whole_small_run(way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(ADDRESS_VARIABLE, HOST)
     model, whole = "video" if way == "OpenCV" else "GigE Vision", way != "harvesters"

@@ -18,11 +18,12 @@ import yaml
 
 from service.core.records.events import JobEnqueued, ViewpointCaptured
 from service.jobs.calibration import calibrate
+from tests.support.protocols.small_demo import COARSE
 from tests.support.protocols.two_arms import FIRST, SECOND, for_two_arms, kuka_demo
 from tests.support.rig.rig import orthocapture, simulated_rig
 from tests.support.runs.ended_run import EndedRun, ended_run
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
+pytestmark = [pytest.mark.slow, pytest.mark.whole, pytest.mark.timeout(1200)]
 ARM = "LBR Med 14"
 SCANNER, PARTS = "zivid", 3  # views of it that are one scan
 
@@ -47,7 +48,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Generator[Run]:
     by_id["scanning"]["gates"].append({"measure": "part_residual_max_mm", "max": 0.1, "unit": "mm"})
     record = for_two_arms(record, images=12)
     protocol.write_text(yaml.safe_dump(record, sort_keys=False, allow_unicode=True), encoding="utf-8")
-    options = ("--scene", "7", "--image-width", "960", "--ct-voxel-mm", "1.0", "--speed-up", "10", "--arm", ARM)
+    options = ("--scene", "7", "--image-width", "960", *COARSE, "--speed-up", "10", "--arm", ARM)
     two = ("--arms", "2", "--further-scanner", SCANNER)
     with simulated_rig(folder, *options, *two, host="127.0.0.44") as rig:
         doctor = orthocapture("doctor", "--rig", rig["rig"], "--json")

@@ -21,14 +21,16 @@ from tests.support.arms.ur_simulator import address
 from tests.support.processes.waiting import until
 from tests.support.rig.patience import PATIENT_KUKA
 
+SILENCE_S = 2.0  # shorter than the motion of the transcript that is stopped because its client is silent
+
 
 @pytest.mark.parametrize("name", ["session.jsonl", "refusals.jsonl"])
 @pytest.mark.parametrize("controller", [simulated_kuka, pytest.param(sunrise_engine, marks=needs_jdk)])
 def test_simulator_and_application_answer_as_the_transcript(controller: Controller, name: str) -> None:
     host = address(70)
     with (
-        controller(host),
-        socket.create_connection((host, 30010), timeout=30) as connection,
+        controller(host, patience_s=SILENCE_S),
+        socket.create_connection((host, 30010), timeout=90) as connection,
         connection.makefile("rb") as lines,
     ):
         for row in transcript(name):
@@ -49,11 +51,11 @@ def test_a_client_that_stays_silent_gives_way_to_a_new_one(controller: Controlle
     said: list[str] = []
 
     def second_is_greeted() -> bool:
-        with socket.create_connection((host, 30010), timeout=30) as second, second.makefile("rb") as lines:
+        with socket.create_connection((host, 30010), timeout=90) as second, second.makefile("rb") as lines:
             said.append(json.loads(lines.readline()).get("code", "hello"))
         return said[-1] == "hello"
 
-    with controller(host), socket.create_connection((host, 30010), timeout=30):
+    with controller(host), socket.create_connection((host, 30010), timeout=90):
         until(second_is_greeted, "the first client stays")
     assert said[0] == "taken"
 

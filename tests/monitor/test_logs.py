@@ -257,7 +257,7 @@ def test_a_server_logs_no_password_pin_token_or_link(tmp_path: Path) -> None:
                 browser.post("/sign-out", data={"csrf": "of somebody else"})
         finally:
             server.terminate()
-        assert server.wait(timeout=30) == 0
+        assert server.wait(timeout=90) == 0
     said = lines(data)
     assert {line["process"] for line in said} == {"web"}
     assert ("POST", "/sign-in", 303) in {(line.get("method"), line.get("route"), line.get("status")) for line in said}

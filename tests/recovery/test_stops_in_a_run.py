@@ -214,9 +214,7 @@ def test_a_confirmation_from_before_the_stop_lets_nothing_move(tmp_path: Path, s
     with arm_at(82, "--speed-up", "3", "--faults", plan) as (host, arm):
         run = Run(store, tmp_path, host, arm)
         run.station.device("robot")  # it streams while the question is open
-        run.operator.on_prepare = lambda: stop_and_release(
-            host, arm
-        )  # the confirmation is recorded, no step has begun
+        run.operator.on_prepare = lambda: stop_and_release(host, arm)  # it is recorded, no step begun
         run.answers(looks_for(0.5, arm, "was in protective stop"))
         assert run.drive().status == "completed"
     assert run.failures() == ["SafetyStopError"]

@@ -25,6 +25,7 @@ from service.rig import load_rig
 from service.station import Station
 from service.store.store import Store
 from tests.support.processes.waiting import until
+from tests.support.rig.patience import PATIENT_UR
 from tests.support.rig.rig import REPOSITORY, RigLock, orthocapture, simulated_rig, without_calibration_and_ct
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
@@ -76,7 +77,7 @@ def rig_process(folder: Path) -> Generator[tuple[subprocess.Popen[str], dict[str
             yield process, json.loads(line), [root, *root.children(recursive=True)]
         finally:
             process.kill()
-            process.wait(timeout=30)
+            process.wait(timeout=90)
             process.stdout.close()
 
 
@@ -102,6 +103,7 @@ def test_files_world_and_hands(tmp_path: Path) -> None:
         assert rig.section.simulated
         assert rig.section.hands == ready["world"]
         assert set(rig.section.stations) == {"station_1", "station_2"}
+        assert PATIENT_UR.items() <= rig.section.devices["robot"].items()
 
         # The ground truth is only in its own file.
         truth = json.loads(Path(ready["truth"]).read_text())
@@ -204,7 +206,7 @@ def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:
         host, port = ready["world"].split(":")
         assert {(host, int(port)), (OWN_HOST, 30004)} <= addresses
         process.terminate()
-        assert process.wait(timeout=20) == 0
+        assert process.wait(timeout=90) == 0
         assert not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in processes)
         assert not [address for address in addresses if listens(*address)]
         assert not (tmp_path / "lightbox").exists()
@@ -215,7 +217,7 @@ def test_a_device_that_dies_ends_the_rig_with_a_reason(tmp_path: Path) -> None:
     with rig_process(tmp_path) as (process, _, processes):
         camera = next(p for p in processes if "camera" in p.cmdline())
         os.kill(camera.pid, signal.SIGKILL)
-        process.wait(timeout=20)
+        process.wait(timeout=90)
         until(lambda: not any(p.is_running() for p in processes), "all have ended")
         log = (tmp_path / "rig.log").read_text()
         assert "camera ended with status -9" in log
@@ -241,7 +243,7 @@ def test_sigterm_also_ends_a_ct_scan_that_is_under_way(tmp_path: Path) -> None:
         (scan,) = scans()
         scan.suspend()  # a scan that takes for ever
         process.terminate()
-        assert process.wait(timeout=30) == 0
+        assert process.wait(timeout=90) == 0
         assert not scan.is_running()
 
 

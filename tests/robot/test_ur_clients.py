@@ -201,7 +201,7 @@ def test_inputs_are_owned_and_written(controller: tuple[str, str], client: RtdeC
 
 
 def test_wrong_frames_end_only_their_own_connection(controller: tuple[str, str], client: RtdeClient) -> None:
-    bad = socket.create_connection((controller[0], 30004), timeout=30)
+    bad = socket.create_connection((controller[0], 30004), timeout=90)
     bad.sendall(b"\x00\x00\x00")
     assert bad.recv(10) == b""
     bad.close()
@@ -211,7 +211,7 @@ def test_wrong_frames_end_only_their_own_connection(controller: tuple[str, str],
 
 def test_dashboard_lines(controller: tuple[str, str]) -> None:
     host, version = controller
-    with socket.create_connection((host, 29999), timeout=30) as connection, connection.makefile("rw") as lines:
+    with socket.create_connection((host, 29999), timeout=90) as connection, connection.makefile("rw") as lines:
 
         def ask(line: str) -> str:
             lines.write(line + "\n")

@@ -116,7 +116,7 @@ def test_one_address_leaves_room_for_others(rig: Path) -> None:
 @pytest.mark.slow
 def test_a_client_that_is_slow_on_purpose_is_left(rig: Path) -> None:
     body = b"POST /sign-in HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/x-www-form-urlencoded\r\n"
-    with serving(rig, "--client-wait-s", "1") as server, ExitStack() as stack:
+    with serving(rig, "--client-wait-s", "3") as server, ExitStack() as stack:
         silent, half, idle, promised, stalled = (
             stack.enter_context(clients(server, 1, sent))[0]
             for sent in (b"", HALF + b"X: ", WHOLE, body + b"Content-Length: 99\r\n\r\naccount=a", b"")
@@ -146,7 +146,7 @@ def test_a_client_that_is_slow_on_purpose_is_left(rig: Path) -> None:
 def test_a_client_that_never_begins_tls_is_left(rig: Path) -> None:
     certificate, key = self_signed(rig.parent)
     files = ("--tls-certificate", str(certificate), "--tls-key", str(key))
-    with serving(rig, *files, "--client-wait-s", "1") as server, clients(server, 1, b"") as (silent,):
+    with serving(rig, *files, "--client-wait-s", "3") as server, clients(server, 1, b"") as (silent,):
         assert is_over(silent, within_s=WAIT_S)
         trust = ssl.create_default_context(cafile=str(certificate))
         assert httpx.get(f"{server.url}/sign-in", timeout=WAIT_S, verify=trust).status_code == 200

@@ -20,11 +20,12 @@ from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sqlalchemy import create_engine
+from sqlalchemy import create_engine, text
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import ActionRefused, JobEnqueued, StepNote
 from service.store.database import engine as database
+from service.store.database import new_schema
 from service.store.database.engine import database_path
 from service.store.database.tables import metadata
 from service.store.errors import StoreVersionError, UnknownRunError
@@ -33,6 +34,7 @@ from service.store.records import NewArtefact
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.record.new_schema import migrated_statements, module_text
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, capture, captured, put_image, rows, start_run, tamper
 
@@ -194,6 +196,19 @@ def test_migrations_make_the_tables_of_the_metadata(store: Store) -> None:
         options = {"include_name": lambda name, kind, _parent: kind != "table" or not name.startswith("event_words")}
         assert compare_metadata(MigrationContext.configure(connection, opts=options), metadata) == []
     engine.dispose()
+
+
+def test_a_new_database_is_what_the_migrations_make() -> None:
+    migrated = create_engine("sqlite://")
+    with migrated.begin() as connection:
+        database.migrate(connection)
+        assert database.read_schema(connection) == database.fresh_schema()
+        made_by = connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one()
+        assert made_by == database.REVISIONS[-1]
+    migrated.dispose()
+    statements = migrated_statements()
+    assert statements == new_schema.STATEMENTS
+    assert Path(new_schema.__file__).read_text("utf-8") == module_text(statements)
 
 
 def test_opening_prints_nothing_and_needs_no_ini(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

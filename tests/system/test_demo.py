@@ -24,21 +24,34 @@ from service.audit.record.run import read_run
 from service.audit.replay.copied import CopiedResults
 from service.cli.run.demo import free_address
 from service.core.jobs.references import jobs_of, references_in
-from tests.support.processes.package import installed_package
+from tests.support.processes.package import Package, installed_package
 from tests.support.processes.waiting import until
-from tests.support.rig.rig import RIG_LOCK, command, orthocapture
+from tests.support.rig.rig import RIG_LOCK, orthocapture
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.slow, pytest.mark.whole(always=True), pytest.mark.timeout(900)]
+MADE = "ORTHOCAPTURE_DEMO_RUN"  # the folder of the demonstration that `make demo` made
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Package:
+    return installed_package(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """One run of the demo as it is installed, from an empty folder; shared by the tests of this file."""
-    package = installed_package(tmp_path_factory)
+    """The result of the demonstration: the one that `make demo` made (as in .ci/run), or else one as installed."""
+    made = os.environ.get(MADE)
+    if made is not None:
+        (result,) = Path(made).glob("*/result.json")
+        return json.loads(result.read_text(encoding="utf-8"))
+    folder = tmp_path_factory.mktemp("demo")
     with RIG_LOCK:
-        answer = package.run("demo", "--json", cwd=tmp_path_factory.mktemp("demo"), timeout_s=840)
+        answer = installed_package(tmp_path_factory).run("demo", "--json", cwd=folder, timeout_s=840)
     assert answer.returncode == 0, answer.stdout + answer.stderr
-    return json.loads(answer.stdout.splitlines()[-1])
+    (result,) = folder.glob("demo-run/*/result.json")
+    told = json.loads(answer.stdout.splitlines()[-1])
+    assert json.loads(result.read_text(encoding="utf-8")) == told
+    return told
 
 
 def test_table_has_the_papers_rows_and_its_reason(demo: dict[str, Any]) -> None:
@@ -162,9 +175,9 @@ def test_truth_never_enters_the_run(demo: dict[str, Any]) -> None:
     assert "truth" not in re.sub("ground[ _]truth", "", text, flags=re.IGNORECASE)
 
 
-def test_sigterm_during_the_start_of_the_rig_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_sigterm_during_the_start_of_the_rig_leaves_nothing_behind(package: Package, tmp_path: Path) -> None:
     mark = f"of {tmp_path}"
-    environment = {**os.environ, "ORTHOCAPTURE_TEST": mark}
+    environment = {**package.environment(), "ORTHOCAPTURE_TEST": mark}
 
     def started() -> list[psutil.Process]:
         return [
@@ -175,7 +188,7 @@ def test_sigterm_during_the_start_of_the_rig_leaves_nothing_behind(tmp_path: Pat
         RIG_LOCK,
         (tmp_path / "words").open("w") as words,
         subprocess.Popen(
-            command("demo", "--out", str(tmp_path / "demo")), stdout=words, stderr=words, env=environment
+            [package.bin / "orthocapture", "demo"], cwd=tmp_path, stdout=words, stderr=words, env=environment
         ) as demo,
     ):
         until(lambda: len(started()) > 1 or demo.poll() is not None, "the demo starts no rig", 300)
@@ -191,7 +204,8 @@ def _environment(process: psutil.Process) -> dict[str, str]:
         return {}
 
 
-def test_a_taken_port_moves_the_demo_to_another_address(tmp_path: Path) -> None:
+def test_a_taken_port_moves_the_demo_to_another_address(package: Package, tmp_path: Path) -> None:
+    start = [package.bin / "orthocapture", "demo"]
     with RIG_LOCK, socket.socket() as taken:
         taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         first = free_address()
@@ -199,11 +213,11 @@ def test_a_taken_port_moves_the_demo_to_another_address(tmp_path: Path) -> None:
         taken.listen()
         with (
             (tmp_path / "words").open("w") as words,
-            subprocess.Popen(command("demo", "--out", str(tmp_path / "demo")), stdout=words, stderr=words) as demo,
+            subprocess.Popen(start, cwd=tmp_path, stdout=words, stderr=words, env=package.environment()) as demo,
         ):
             try:
                 deadline_s = time.monotonic() + 300
-                while not (found := list(tmp_path.glob("demo/*/rig/rig.yaml"))):
+                while not (found := list(tmp_path.glob("demo-run/*/rig/rig.yaml"))):
                     assert demo.poll() is None, (tmp_path / "words").read_text()
                     assert time.monotonic() < deadline_s
                     time.sleep(0.2)

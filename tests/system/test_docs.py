@@ -163,14 +163,25 @@ RUN_ELSEWHERE = {
     'python -m pip install ".[fuzz]"': (  # needs a package index, which tests have not
         "tests/system/test_docs.py::test_the_extras_that_documents_install_are_declared"
     ),
-    "make torture-crash": (
-        "tests/torture/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
+    **dict.fromkeys(
+        ("make test-drawn", "make test-whole", "make test-sweeps"),
+        "tests/house/test_suite_rules.py::"
+        "test_whole_runs_are_drawn_by_file_sweeps_by_row_and_what_was_drawn_is_printed",
     ),
+    **dict.fromkeys(
+        ("make marks", "make marks FILES=tests/core"),
+        "tests/house/test_suite_rules.py::test_the_list_is_written_from_records_and_then_the_check_is_content",
+    ),
+    "make torture-crash": ("tests/torture/test_crash_sweep.py::test_a_death_there_leaves_nothing_behind"),
     "python -m bench.torture.crash --sample 100 --random-runs 1": (
-        "tests/torture/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
+        "tests/torture/test_crash_sweep.py::test_a_death_there_leaves_nothing_behind"
+    ),
+    **dict.fromkeys(
+        ("python -m bench.suite.mutants --reach", "python -m bench.suite.mutants --seed 20261127 --count 60"),
+        "tests/torture/test_mutants.py::test_a_mutation_is_killed_by_a_test_that_fails_and_the_tree_is_as_before",
     ),
     "python -m bench.soak --only large --viewpoints 2000 --gigabytes 5": (
-        "tests/torture/test_soak.py::test_each_part_runs_small_and_its_figures_stand_beside_the_others"
+        "tests/torture/test_soak.py::test_a_large_run_is_read_at_four_sizes"
     ),
     **dict.fromkeys(
         (
@@ -184,6 +195,7 @@ RUN_ELSEWHERE = {
             "make torture-audit",
             "make torture-faults",
             "make torture-fuzz",
+            "make mutants",
             "make soak",
             "make clean",
         ),
@@ -204,7 +216,7 @@ RUN_ELSEWHERE = {
             "python -m bench.torture.faults --sample 40 --seed 7 --minutes 10",
             "python -m bench.torture.faults --record",
         ),
-        "tests/torture/test_torture_faults.py::test_a_few_cases_of_each_device_go_as_the_table_says",
+        "tests/torture/test_torture_faults.py::test_the_case_goes_as_the_table_says",
     ),
     **dict.fromkeys(
         (
@@ -249,7 +261,7 @@ RUN_ELSEWHERE = {
         "tests/grbl/test_grbl_run.py::test_a_run_with_the_turntable_instead_of_the_arm",
     ),
     "orthocapture dicom-listen --folder ct --from CTSUITE": (
-        "tests/ct/test_dicom_listen.py::test_dcmtk_sends_a_series_and_the_importer_reads_it"
+        "tests/ct/test_dicom_listen.py::test_another_program_sends_a_series_and_the_importer_reads_it"
     ),
     "orthocapture export latest --format mcap --out bag --data runs": (
         "tests/dataset/test_mcap.py::test_rosbags_opens_the_folder_as_a_recording_of_ros"

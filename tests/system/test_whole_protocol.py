@@ -13,7 +13,7 @@ from tests.support.protocols.shortened import shortened
 from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig
 from tests.support.runs.ended_run import EndedRun, ended_run
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
+pytestmark = [pytest.mark.slow, pytest.mark.whole, pytest.mark.timeout(1500)]
 WIDTH, SLICE_MM = "960", 1.0
 
 

@@ -95,17 +95,17 @@ def test_a_part_of_a_glb_that_claims_four_gigabytes_is_refused_before_memory_is_
 )
 def test_a_faulty_parser_is_found_out_and_its_input_kept(name: str, fault: str, tmp_path: Path) -> None:
     sweep = Sweep(PARSERS, "hypothesis", tmp_path, reducing_tries=0)
-    outcome = sweep.run({name: 3}, seconds=20.0)[name]
+    outcome = sweep.run({name: 3}, seconds=90.0)[name]
     assert outcome.findings
     assert all(re.match(fault, finding.fault) for finding in outcome.findings), outcome.findings
     assert all(finding.data != b"plain" * 4 for finding in outcome.findings)
 
 
 def test_an_error_with_place_and_remedy_is_no_finding(tmp_path: Path) -> None:
-    outcome = Sweep(PARSERS, "hypothesis", tmp_path).run({"_refuse": 50}, seconds=20.0)["_refuse"]
+    outcome = Sweep(PARSERS, "hypothesis", tmp_path).run({"_refuse": 50}, seconds=90.0)["_refuse"]
     assert (outcome.findings, outcome.refused > 0) == ([], True)
 
 
 def test_the_input_of_a_finding_is_made_small(tmp_path: Path) -> None:
-    outcome = Sweep(PARSERS, "hypothesis", tmp_path).run({"_leak": 50}, seconds=20.0)["_leak"]
+    outcome = Sweep(PARSERS, "hypothesis", tmp_path).run({"_leak": 50}, seconds=90.0)["_leak"]
     assert all(len(finding.data) <= 1 for finding in outcome.findings)

@@ -78,9 +78,10 @@ def demo_command(
         with progress_bar(quiet=json) as progress:
             summary, truth, result = _evaluated(folder, run_id, ready.truth, started_s, progress)
     rows = summary.table()
+    told = {**asdict(result), "table": [{**row.plain(), "true_error_mm": truth[row.poses]} for row in rows]}
+    (folder / "result.json").write_text(json_module.dumps(told, indent=1) + "\n", encoding="utf-8")
     if json:
-        table = [{**row.plain(), "true_error_mm": truth[row.poses]} for row in rows]
-        print_json({**asdict(result), "table": table})
+        print_json(told)
     else:
         _print(result, rows, truth)
     if not result.audit_ok:

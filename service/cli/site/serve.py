@@ -127,7 +127,7 @@ def serve_command(
             with http.capture_signals():
                 _announce(address, f"{address}/set-up/{link}" if link else "", json=json)
                 # The numerics behind steps and protocols take seconds to load, so load them in the background.
-                threading.Thread(target=params_models, daemon=True).start()
+                threading.Thread(target=lambda: list(params_models()), daemon=True).start()
                 http.run(sockets=[listener])
             _seal(store, data, rig_file)
 

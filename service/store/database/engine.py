@@ -17,6 +17,7 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from service.core.errors import StoreError
+from service.store.database import new_schema
 from service.store.durable_effects import Files
 from service.store.errors import StoreVersionError
 
@@ -231,20 +232,30 @@ def _refuse_old(present: str | None, path: Path) -> None:
 def _upgrade(connection: Connection, path: Path) -> None:
     present = _revision(connection)
     _refuse_unknown(present, path)
-    if present is None and inspect(connection).get_table_names():
+    if present is not None:
+        if present != REVISIONS[-1]:
+            migrate(connection)
+        return
+    if inspect(connection).get_table_names():
         raise StoreVersionError(
             "this is not a database of orthocapture", where=str(path), remedy="Choose another data folder"
         )
-    if present != REVISIONS[-1]:
-        # The import takes half a second and is needed only once in the life of a database.
-        from alembic import command  # noqa: PLC0415
-        from alembic.config import Config  # noqa: PLC0415
+    for statement in new_schema.STATEMENTS:
+        connection.exec_driver_sql(statement)
+    connection.execute(text("INSERT INTO alembic_version VALUES (:revision)"), {"revision": REVISIONS[-1]})
 
-        config = Config()
-        config.set_main_option("script_location", _MIGRATIONS)
-        config.set_main_option("path_separator", "os")
-        config.attributes["connection"] = connection
-        command.upgrade(config, "head")
+
+def migrate(connection: Connection) -> None:
+    """Upgrade a database of an earlier version, or an empty one, by the migrations."""
+    # The import takes half a second and is needed only where an earlier version wrote the database.
+    from alembic import command  # noqa: PLC0415
+    from alembic.config import Config  # noqa: PLC0415
+
+    config = Config()
+    config.set_main_option("script_location", _MIGRATIONS)
+    config.set_main_option("path_separator", "os")
+    config.attributes["connection"] = connection
+    command.upgrade(config, "head")
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from tests.support.pages.browser import PASSWORD, Screen, Served, add_people, sc
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, simulated_rig
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.slow, pytest.mark.whole, pytest.mark.timeout(600)]
 
 LONG_MS = 240_000
 STATED = REPOSITORY / "docs" / "screens" / "tasks.md"

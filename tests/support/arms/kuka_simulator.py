@@ -34,7 +34,7 @@ def simulated_kuka(host: str, *options: str, patience_s: float = PATIENCE_S) -> 
 
 def pendant(host: str, order: str) -> None:
     """Do what a person does at the smartPAD."""
-    with socket.create_connection((host, 30011), timeout=30) as connection, connection.makefile("rw") as lines:
+    with socket.create_connection((host, 30011), timeout=90) as connection, connection.makefile("rw") as lines:
         lines.write(order + "\n")
         lines.flush()
         assert lines.readline().strip() == "ok", order

@@ -65,8 +65,8 @@ class Program:
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.driver, signal.SIGCONT)
         self._process.kill()
-        self._process.wait(10)
-        self._reader.join(10)
+        self._process.wait(90)
+        self._reader.join(90)
         for pipe in (self._process.stdin, self._process.stdout):
             with contextlib.suppress(OSError):
                 if pipe is not None:

@@ -47,7 +47,7 @@ def faulty(number: int, *faults: dict[str, object]) -> contextlib.AbstractContex
 
 
 def dashboard(host: str, *orders: str) -> list[str]:
-    with socket.create_connection((host, 29999), timeout=30) as connection, connection.makefile("rw") as lines:
+    with socket.create_connection((host, 29999), timeout=90) as connection, connection.makefile("rw") as lines:
         lines.readline()
         answers: list[str] = []
         for order in orders:

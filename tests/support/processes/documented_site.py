@@ -6,7 +6,6 @@ import json
 import shlex
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from service.core.records.events import JobFailed
 from service.store.records import NewJob
 from service.store.store import Store
 from tests.support.processes.forked import Forked, run
+from tests.support.processes.waiting import until
 from tests.support.record.store import enqueue
 from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, render, scene
 
@@ -94,13 +94,16 @@ def serves_until_terminated(site: Site, command: str) -> None:
         job = NewJob("locate_spheres", "fixation", 1, "docs", {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10})
         enqueue(store, site.begun, job, actor="test")
         with Forked([SCRIPTS / words[0], *words[1:]], cwd=site.folder, stdout=subprocess.DEVNULL) as worker:
+
+            def refused() -> bool:
+                assert worker.poll() is None
+                return any(isinstance(event.payload, JobFailed) for event in store.events(site.begun))
+
             try:
-                while not any(isinstance(event.payload, JobFailed) for event in store.events(site.begun)):
-                    assert worker.poll() is None
-                    time.sleep(0.1)
+                until(refused, "the worker does not take the job")
             finally:
                 worker.terminate()
-            assert worker.wait(timeout=20) == 0
+            assert worker.wait(timeout=90) == 0
 
 
 def registers(site: Site, command: str) -> None:
@@ -132,11 +135,11 @@ def serves_pages(site: Site, command: str) -> None:
             assert server.stdout is not None
             ready = json.loads(server.stdout.readline())
             assert "/set-up/" in ready["set_up"]
-            with urlopen(ready["url"] + "/sign-in", timeout=20) as page:
+            with urlopen(ready["url"] + "/sign-in", timeout=90) as page:
                 assert b"Sign in" in page.read()
         finally:
             server.terminate()
-        assert server.wait(timeout=20) == 0
+        assert server.wait(timeout=90) == 0
 
 
 Check = Callable[[Site, str], None]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import statistics
 import threading
 import time
-from types import TracebackType
 
 _NAP_S = 0.005
 
@@ -22,9 +21,7 @@ class Lateness:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_exc: object) -> None:
         self._over.set()
         self._thread.join()
 

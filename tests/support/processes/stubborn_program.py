@@ -14,8 +14,8 @@ import time
 from typing import Any
 
 from drivers.errors import DeviceError, DeviceUnavailableError
-from drivers.host.__main__ import load_spec
 from drivers.host.hosted_device import HostedDevice, hosted
+from drivers.host.serving import load_spec
 from drivers.interfaces import RobotArm
 
 SPEED_RAD_S, ACCELERATION_RAD_S2 = 1.0, 1.5  # the fastest motion of protocols/demo.yaml

@@ -9,8 +9,11 @@ import yaml
 
 from tests.support.rig.rig import REPOSITORY
 
-SLICE_MM = 1.0  # of the CT, which a simulator makes in seconds
+SLICE_MM = 1.5  # of the CT, which a simulator makes in seconds
+COARSE = ("--ct-voxel-mm", str(SLICE_MM), "--scan-spacing-mm", "1.0")  # of a simulated rig: fewer voxels and faces
 VIEWS = 6  # at both stations
+_BOARD_IMAGES = (2, 4, 5)  # by arc
+_CONTROL_VIEWS = 2  # at each station
 _NEEDS_TIME = ("ground_truth", "specimen_release", "layout_check")
 _ARC = {"tilt_deg": 28, "azimuth_from_deg": -50, "azimuth_to_deg": 50, "count": VIEWS // 2, "distance_m": 0.66}
 
@@ -33,6 +36,12 @@ def small_demo(path: Path, *registration_gates: dict[str, Any], raw: bool = Fals
         if step["id"].startswith("viewpoint_capture"):
             step["params"]["viewpoints"][0]["arcs"] = [_ARC]
             step["gates"][0]["min"] = VIEWS // 2
+        if step["id"].startswith("control_capture"):
+            step["params"]["viewpoints"][0]["arcs"][0]["count"] = _CONTROL_VIEWS
+            step["gates"][0]["min"] = _CONTROL_VIEWS
+        if step["id"] == "camera_calibration":
+            for arc, count in zip(step["params"]["viewpoints"][0]["arcs"], _BOARD_IMAGES, strict=True):
+                arc["count"] = count
         if step["id"] == "registration":
             step["params"]["poses"] = ["robot", "robot_corrected"]
             step["gates"] += registration_gates

@@ -44,4 +44,4 @@ def camera_simulator(
             yield RunningCamera(process, ready["port"])
         finally:
             process.terminate()
-            process.wait(10)
+            process.wait(90)

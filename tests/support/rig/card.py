@@ -65,5 +65,5 @@ def half_copied(folder: Path, name: str, data: bytes, *, whole: bool = True) -> 
         if whole:
             process.stdin.write("go on\n")
         process.stdin.close()
-        assert process.wait(10) == 0
+        assert process.wait(90) == 0
     source.unlink()

@@ -40,7 +40,7 @@ RIG_LOCK = RigLock(_USUAL)
 def press_pedal(world: str) -> None:
     """Press the foot pedal of the rig whose world listens at `world`."""
     host, _, port = world.rpartition(":")
-    with socket.create_connection((host, int(port)), timeout=10) as link:
+    with socket.create_connection((host, int(port)), timeout=90) as link:
         link.sendall(b'{"op": "act", "action": "press_pedal"}\n')
         assert json.loads(link.makefile().readline())["ok"]
 
@@ -76,7 +76,7 @@ def simulated_rig(
             yield json.loads(line)
         finally:
             process.terminate()
-            process.wait(timeout=30)
+            process.wait(timeout=90)
             if process.stdout is not None:
                 process.stdout.close()
 

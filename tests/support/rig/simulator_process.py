@@ -38,7 +38,7 @@ def simulator(*words: str) -> Generator[Running]:
             yield Running(process, json.loads(line))
             if process.poll() is None:
                 process.terminate()
-            assert process.wait(20) == 0, process.stderr.read()
+            assert process.wait(90) == 0, process.stderr.read()
         finally:
             if process.poll() is None:
                 process.kill()

@@ -1,0 +1,57 @@
+"""What is mutated: the sources of twelve subjects, in which a fault would cost safety, evidence or accuracy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+# Glob patterns; `**` takes whole folders.
+SUBJECTS: dict[str, tuple[str, ...]] = {
+    "decide": ("service/core/run/**/*.py", "service/core/recovery/policy.py", "service/core/recovery/ways_on.py"),
+    "gates": ("service/core/gates/*.py", "service/core/protocol/rules.py"),
+    "leases": ("service/store/queue/*.py",),
+    "chain": ("service/store/events.py", "service/store/logged_events.py", "service/store/durable_effects.py"),
+    "signatures": ("service/store/signatures/*.py",),
+    "verifier": ("service/store/verification/*.py", "service/audit/verify/bundle_verifier.py"),
+    "cost": ("service/compute/registration/least_squares/*.py", "service/compute/registration/solve.py"),
+    "covariances": (
+        "service/compute/camera_covariance.py",
+        "service/compute/registration/camera_errors.py",
+        "service/compute/registration/joint_poses.py",
+        "service/compute/registration/result.py",
+        "service/compute/registration/further_cameras/*.py",
+        "service/compute/poses/hybrid/stated_covariance.py",
+        "service/compute/poses/files/pose_covariance.py",
+        "service/compute/calibration/intrinsics/uncertainty.py",
+        "service/dataset/posed/of_run/pose_errors.py",
+        "service/dataset/posed/of_run/view_covariances.py",
+        "service/core/geometry.py",
+    ),
+    "exporters": ("service/dataset/formats/**/*.py", "service/dataset/posed/exporter.py"),
+    "fusion": (
+        "service/compute/ground_truth/fusion/*.py",
+        "service/compute/ground_truth/align.py",
+        "service/compute/surfaces/constellations.py",
+    ),
+    "watchdogs": ("drivers/arm/*.py", "drivers/ur/watchdog.py", "drivers/ur/safety.py", "drivers/host/heartbeat.py"),
+    "authorisation": ("service/people/**/*.py",),
+}
+# Where the fast tests that reach these sources lie: only these are recorded (record.py).
+TESTS = (
+    *("tests/core", "tests/recovery", "tests/protocol", "tests/store", "tests/verify", "tests/people", "tests/run"),
+    *("tests/registration", "tests/dataset", "tests/evaluation", "tests/ground_truth", "tests/robot", "tests/poses"),
+    *("tests/calibration", "tests/further", "tests/scanner", "tests/server", "tests/audit", "tests/steps"),
+)
+
+
+def sources(tree: Path) -> dict[str, list[str]]:
+    """Return each subject's files, relative to the tree, in order."""
+    return {subject: sorted(_found(tree, patterns)) for subject, patterns in SUBJECTS.items()}
+
+
+def _found(tree: Path, patterns: tuple[str, ...]) -> Iterator[str]:
+    for pattern in patterns:
+        files = [path for path in tree.glob(pattern) if path.name != "__init__.py"]
+        if not files:
+            raise FileNotFoundError(f"nothing in {tree} is named {pattern}: correct bench/suite/mutants/subjects.py")
+        yield from (path.relative_to(tree).as_posix() for path in files)

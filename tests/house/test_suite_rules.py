@@ -1,0 +1,165 @@
+"""The suite's own rules: what is drawn, what runs again, what a test costs, and that marks follow from it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bench.suite.marks import costs_of, disagreements, remarked, settled
+from tests.plugins.cpu_record import cpu_s_of_tree
+from tests.plugins.draw import drawn
+
+ROOT = Path(__file__).parents[2]
+SETTINGS = "[pytest]\nmarkers =\n    slow\n    realtime\n    whole\n    sweep\n"
+
+
+def pytest_in(folder: Path, source: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run the tests of `source` in a process of their own, with this suite's settings and plug-ins."""
+    (folder / "pytest.ini").write_text(SETTINGS)
+    (folder / "conftest.py").write_text((ROOT / "tests/conftest.py").read_text())
+    (folder / "test_it.py").write_text(source)
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-rA", *words],
+        cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+def test_a_tenth_is_drawn_by_the_seed_and_every_unit_has_its_turn() -> None:
+    units = [f"tests/test_{number}.py" for number in range(25)]
+    assert len(drawn("a", units)) == 3
+    assert drawn("a", units) == drawn("a", reversed(units))
+    assert set.union(*(drawn(str(seed), units) for seed in range(100))) == set(units)
+    assert drawn("a", []) == set()
+
+
+def test_whole_runs_are_drawn_by_file_sweeps_by_row_and_what_was_drawn_is_printed(tmp_path: Path) -> None:
+    source = """
+import pytest
+@pytest.mark.whole(always=True)
+def test_always(): pass
+@pytest.mark.sweep
+@pytest.mark.parametrize("row", range(20))
+def test_row(row): pass
+def test_other(): pass
+"""
+    answer = pytest_in(tmp_path, source, "--draw", "seed")
+    assert "drawn by seed: 2 of 20 marked sweep" in answer.stdout
+    assert "4 passed, 18 deselected" in answer.stdout
+
+
+def test_only_the_body_of_a_test_that_meets_the_clock_runs_again(tmp_path: Path) -> None:
+    source = """
+import pytest
+calls = []
+def fails_once(name):
+    calls.append(name)
+    assert calls.count(name) > 1, f"first of {name}"
+@pytest.fixture(scope="module")
+def broken(): fails_once("set-up")
+@pytest.mark.realtime
+def test_late(): fails_once("late")
+def test_other(): fails_once("other")
+@pytest.mark.realtime
+def test_not_set_up(broken): pass
+"""
+    answer = pytest_in(tmp_path, source)
+    assert "1 failed, 1 passed, 1 error, 1 rerun" in answer.stdout
+    assert "1 realtime tests ran again" in answer.stdout
+    assert "first failure of test_it.py::test_late" in answer.stdout
+
+
+def test_the_cost_of_a_test_has_its_processes_and_its_share_of_fixtures(tmp_path: Path) -> None:
+    source = """
+import subprocess, sys, pytest
+WORK = "import time\\nwhile time.process_time() < 0.6: pass"
+@pytest.fixture(scope="module")
+def shared(): exec(WORK.replace("0.6", f"{__import__('time').process_time()} + 0.8"))
+def test_alone(): subprocess.run([sys.executable, "-c", WORK], check=True)
+def test_one(shared): pass
+@pytest.mark.parametrize("row", range(3))
+def test_rows(shared, row): pass
+"""
+    answer = pytest_in(tmp_path, source, "--cpu-record=cpu", "-n", "0")
+    assert answer.returncode == 0, answer.stdout
+    costs = costs_of(tmp_path / "cpu")["test_it.py"]
+    assert 0.5 < costs["test_alone"] < 1.5
+    assert costs["test_one"] == pytest.approx(0.2, abs=0.15)  # a fourth of 0.8
+    assert costs["test_rows"] == pytest.approx(0.2, abs=0.15)
+
+
+def test_the_tree_of_a_process_counts_children_that_still_run() -> None:
+    before_s = cpu_s_of_tree(os.getpid())
+    work = "import time\nwhile time.process_time() < 0.5: pass\nprint('done', flush=True)\ninput()"
+    with subprocess.Popen([sys.executable, "-c", work], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        assert cpu_s_of_tree(os.getpid()) - before_s > 0.4
+        child.communicate(b"\n")
+
+
+def test_marks_follow_from_the_costs_and_the_check_names_what_disagrees() -> None:
+    source = (
+        "import pytest\n\n\n@pytest.mark.slow\n@pytest.mark.timeout(9)\ndef test_cheap() -> None: ...\n\n\n"
+        "class TestClass:\n    def test_dear(self) -> None: ...\n"
+    )
+    costs = {"test_cheap": 0.1, "TestClass::test_dear": 3.0}
+    assert remarked(source, costs) == (
+        "import pytest\n\n\n@pytest.mark.timeout(9)\ndef test_cheap() -> None: ...\n\n\n"
+        "class TestClass:\n    @pytest.mark.slow\n    def test_dear(self) -> None: ...\n"
+    )
+    assert disagreements({"a": costs}, {"a": remarked(source, costs)}) == []
+    assert disagreements({"a": {"test_gone": 0.1}, "b": {}}, {"a": source}) == [
+        "a::TestClass::test_dear was not measured",
+        "a::test_cheap was not measured",
+        "a::test_gone is on the list and not in the file",
+        "b is on the list and does not exist",
+    ]
+    assert "a::test_cheap costs 0.1 CPU s and is marked slow" in disagreements({"a": costs}, {"a": source})
+    whole = "import pytest\n\npytestmark = [pytest.mark.slow]\n"
+    assert "marked for the whole file" in disagreements({}, {"a": whole})[0]
+
+
+@pytest.mark.parametrize(
+    ("before_s", "now_s", "listed_s"),
+    [
+        (None, 1.234, 1.2),
+        (1.0, 1.2, 1.0),
+        (1.0, 1.5, 1.5),
+        (1.9, 2.3, 1.9),
+        (1.9, 2.5, 2.5),
+        (2.2, 1.7, 2.2),
+        (9, 1, 1),
+    ],
+)
+def test_a_measurement_near_the_limit_changes_no_mark(before_s: float | None, now_s: float, listed_s: float) -> None:
+    assert settled(before_s, now_s) == listed_s
+
+
+def test_the_list_is_written_from_records_and_then_the_check_is_content(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests/test_it.py").write_text("from tests.support import x\n\n\ndef test_it() -> None: ...\n")
+    (tmp_path / "cpu").mkdir()
+    record = {"kind": "test", "test": "tests/test_it.py::test_it", "cpu_s": 5.0, "shared": []}
+    (tmp_path / "cpu/main.jsonl").write_text(json.dumps(record) + "\n")
+
+    def marks(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "bench.suite.marks", *words],
+            cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+
+    unmeasured = marks("--check")
+    assert (unmeasured.returncode, "test_it was not measured" in unmeasured.stderr) == (1, True)
+    assert marks("cpu").returncode == 0
+    assert marks("--check").returncode == 0
+    marked = (tmp_path / "tests/test_it.py").read_text()
+    assert marked.startswith("import pytest\n\nfrom tests")
+    assert "@pytest.mark.slow\ndef test_it" in marked
+    assert json.loads((tmp_path / "tests/cpu_seconds.json").read_text()) == {"tests/test_it.py": {"test_it": 5.0}}

@@ -1,0 +1,168 @@
+"""Mutations: what is changed and what is left out, how they are drawn, and that a test that fails kills one."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from bench.machine import REPOSITORY
+from bench.suite.mutants.places import Place, drawn, mutated, places
+from bench.suite.mutants.reach import RECORD, Reach, digest, files_of_tests
+from bench.suite.mutants.recorder import functions
+from bench.suite.mutants.subjects import SUBJECTS, TESTS
+from bench.suite.mutants.trial import Trial
+
+MODULE = '''"""Words."""
+
+from __future__ import annotations
+
+import logging
+
+__all__ = ["judge"]
+LIMIT: float = 5.0
+_LOG = logging.getLogger("a")
+
+
+def judge(value: float, *, anew: bool = False) -> bool:
+    """Say whether it is in limits."""
+    if value < 0:
+        raise ValueError("a value below nothing is none", value)
+    _LOG.info("judged %s times", 3)
+    note(value)
+    return value <= LIMIT and not anew
+
+
+def note(value: float) -> None:
+    words = "for people to read"
+    NOTES.append((value, words))
+
+
+NOTES: list[tuple[float, str]] = []
+'''
+
+
+def tree(folder: Path, module: str = MODULE) -> Path:
+    """A tree that has one file for each subject, and tests of one of them."""
+    for patterns in SUBJECTS.values():
+        for pattern in patterns:
+            path = folder / pattern.replace("**/", "").replace("*", "made_up")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text('"""Nothing."""\n\nA, B = 1, len("b")\n')
+    (folder / GATES).write_text(module)
+    (folder / "tests" / "core").mkdir(parents=True)
+    return folder
+
+
+GATES = "service/core/gates/made_up.py"
+
+
+def changes(folder: Path) -> dict[str, set[tuple[str, str]]]:
+    """What the lines of the module become, by kind."""
+    made = [mutated(folder, place) for place in places(folder, "gates", GATES)]
+    found: dict[str, set[tuple[str, str]]] = {}
+    for mutation in made:
+        assert mutation is not None
+        ast.parse(mutation.text)
+        found.setdefault(mutation.place.kind, set()).add((mutation.before, mutation.after))
+    return found
+
+
+def test_every_condition_number_comparison_operand_and_statement_has_its_changes(tmp_path: Path) -> None:
+    found = changes(tree(tmp_path))
+    assert found["float"] == {("LIMIT: float = 5.0", f"LIMIT: float = {x}") for x in ("50.0", "0.5")}
+    assert found["condition"] == {("if value < 0:", "if not (value < 0):")}
+    last = "return value <= LIMIT and not anew"
+    assert found["operand"] == {(last, "return value <= LIMIT"), (last, "return not anew")}
+    assert (last, "return value < LIMIT and not anew") in found["swap_op"]
+    assert (last, "return value <= LIMIT or not anew") in found["swap_op"]
+    assert found["remove_unary_ops"] == {(last, "return value <= LIMIT and anew")}
+    assert ("note(value)", "pass") in found["statement"]
+    assert ("if value < 0:", "if value < 1:") in found["number"]
+    assert any("anew: bool = True" in after for _, after in found["name"])
+
+
+def test_what_no_result_depends_on_is_left_alone(tmp_path: Path) -> None:
+    said = {text for of_kind in changes(tree(tmp_path)).values() for pair in of_kind for text in pair}
+    for untouched in ("Words", "import logging", "__all__", "getLogger", "Say whether", "below nothing", "judged"):
+        assert not any(untouched in text for text in said), untouched
+    assert not any("XXfor people" in text for text in said)
+
+
+def test_the_seed_alone_decides_and_no_subject_comes_short(tmp_path: Path) -> None:
+    folder = tree(tmp_path)
+    first, again, other = (drawn(folder, seed, 24) for seed in ("1", "1", "2"))
+    assert first == again
+    assert [m.name for m in first] != [m.name for m in other]
+    assert Counter(m.place.subject for m in first) == dict.fromkeys(SUBJECTS, 2)
+
+
+def recorded(folder: Path, text: str) -> Reach:
+    """Tests of the module, as they were recorded: one of its two functions is reached."""
+    file = folder / "tests" / "core" / "test_gate.py"
+    file.write_text(text)
+    record = {
+        "tests": {"tests/core/test_gate.py::test_limit": 0.1, "tests/core/test_gate.py::test_gone": 0.1},
+        "files": {"tests/core/test_gate.py": digest(text)},
+        "reached": {GATES: {"judge": [0, 1], "note": []}},
+    }
+    (folder / RECORD).parent.mkdir(parents=True, exist_ok=True)
+    (folder / RECORD).write_text(json.dumps(record))
+    return Reach(folder)
+
+
+TEST = "from service.core.gates.made_up import judge\n\ndef test_limit() -> None:\n    assert judge(5.0)\n"
+
+
+def test_the_tests_that_reach_a_line_are_chosen_and_changed_files_are_added_whole(tmp_path: Path) -> None:
+    reach = recorded(tree(tmp_path), TEST)
+    (limit,) = [line for line, text in enumerate(MODULE.splitlines(), 1) if "<= LIMIT" in text]
+    (noted,) = [line for line, text in enumerate(MODULE.splitlines(), 1) if "NOTES.append" in text]
+    assert [one.arguments for one in reach.selected(GATES, limit)] == [["tests/core/test_gate.py::test_limit"]]
+    assert reach.selected(GATES, noted) == []
+    (whole,) = reach.selected(GATES, 8)  # a constant: whatever reaches the file
+    assert whole.tests == ("test_limit",)
+    (tmp_path / "tests/core/test_new.py").write_text(TEST)
+    assert [one.arguments for one in Reach(tmp_path).selected(GATES, noted)] == [["tests/core/test_new.py"]]
+
+
+@pytest.mark.parametrize(("after", "outcome"), [("value < LIMIT", "killed"), ("value <= 2 * LIMIT", "survived")])
+def test_a_mutation_is_killed_by_a_test_that_fails_and_the_tree_is_as_before(
+    tmp_path: Path, after: str, outcome: str
+) -> None:
+    """The file is longer or not, and of the same second: byte code of either text is never taken for the other."""
+    folder = tree(tmp_path)
+    selected = recorded(folder, TEST).selected(GATES, 18)
+    (folder / "pyproject.toml").write_text("[tool.pytest.ini_options]\nmarkers = ['slow', 'realtime']\n")
+    place = Place("gates", GATES, 0, "test")
+    mutation = mutated(folder, place)
+    assert mutation is not None
+    changed = type(mutation)(place, 18, "", "", MODULE.replace("value <= LIMIT", after))
+    for _ in range(2):
+        trial = Trial(folder, changed, selected)
+        _, status, used = os.wait4(trial.pid, 0)
+        verdict = trial.ended(status, used)
+        assert verdict.outcome == outcome, verdict.by
+        assert verdict.by == ("tests/core/test_gate.py::test_limit" if outcome == "killed" else "")
+        assert (folder / GATES).read_text() == MODULE
+
+
+def test_the_record_is_of_tests_and_functions_that_exist() -> None:
+    """`python -m bench.suite.mutants --reach` renews it; a few that have gone since do no harm, many hide holes."""
+    record = json.loads((REPOSITORY / RECORD).read_text())
+    present = set(files_of_tests(REPOSITORY))
+    assert all(of.startswith("tests/") and (REPOSITORY / of).is_dir() for of in TESTS)
+    tests: list[str] = list(record["tests"])
+    assert sum(test.partition("::")[0] not in present for test in tests) < 0.1 * len(tests)
+    reached: dict[str, dict[str, list[int]]] = record["reached"]
+    there = {
+        file: {name for _, _, name in functions(REPOSITORY / file)} if (REPOSITORY / file).exists() else set[str]()
+        for file in reached
+    }
+    named = [(file, name) for file, of_file in reached.items() for name in of_file]
+    gone = [(file, name) for file, name in named if name not in there[file]]
+    assert len(gone) < 0.1 * len(named)
