@@ -16,21 +16,25 @@ _BEGAN_MONOTONIC_S = 1000.0
 class SteppedClock:
     """A clock that stands still unless a test sets `passed_s` or somebody sleeps; several threads may use it.
 
+    With `look_s` it goes on by that at each look at the date, so that no two records have the same one.
+
     A sleep returns at once, with the time gone on by as much. Threads that wait on a signal are woken when it is set,
     or when the time has come.
     """
 
-    def __init__(self, began: datetime = _BEGAN, began_monotonic_s: float = _BEGAN_MONOTONIC_S) -> None:
+    def __init__(
+        self, began: datetime = _BEGAN, began_monotonic_s: float = _BEGAN_MONOTONIC_S, look_s: float = 0.0
+    ) -> None:
         self.on_sleep: Callable[[float], None] = lambda _seconds: None  # called before time goes on
         self._began, self._began_monotonic_s = began, began_monotonic_s
-        self._passed_s = 0.0
+        self._passed_s, self._look_s = 0.0, look_s
         self.moved = threading.Condition()  # notified when time has passed, or a signal was set
 
     @classmethod
     def from_now(cls) -> Self:
         """One that begins at the host's present time, with which the times of files and certificates agree."""
         host = SystemClock()
-        return cls(host.utc_now(), host.monotonic_s())
+        return cls(host.utc_now(), host.monotonic_s(), look_s=1e-6)
 
     @property
     def passed_s(self) -> float:
@@ -44,7 +48,9 @@ class SteppedClock:
             self.moved.notify_all()
 
     def utc_now(self) -> datetime:
-        return self._began + timedelta(seconds=self._passed_s)
+        with self.moved:
+            self._passed_s += self._look_s
+            return self._began + timedelta(seconds=self._passed_s)
 
     def utc_s(self) -> float:
         """Seconds since the epoch."""
