@@ -15,7 +15,7 @@ from tests.plugins.draw import Draw
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is imported, here and in child processes
 
-# A scene's textures and light are computed once for all tests, and kept for the next ones (simulators/rendering/kept.py).
+# A scene's textures and light are computed once, and kept for the next tests (simulators/rendering/kept.py).
 os.environ.setdefault("ORTHOCAPTURE_RENDER_CACHE", str(Path(__file__).parents[1] / "build" / "rendered"))
 
 # Each commit of the store waits for the disk, which is half the time of its tests. What a disk loses is simulated

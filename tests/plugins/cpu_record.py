@@ -7,6 +7,7 @@ changes little.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from collections.abc import Generator
@@ -25,13 +26,13 @@ def cpu_s_of_tree(pid: int) -> float:
     """
     try:
         fields = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
-        children = [
-            int(child)
-            for task in Path(f"/proc/{pid}/task").iterdir()
-            for child in (task / "children").read_bytes().split()
-        ]
+        threads = list(Path(f"/proc/{pid}/task").iterdir())
     except (FileNotFoundError, ProcessLookupError):  # it ended meanwhile: its parent's next reading counts it
         return 0.0
+    children: list[int] = []
+    for thread in threads:
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread may end meanwhile
+            children += map(int, (thread / "children").read_bytes().split())
     return sum(map(int, fields[11:15])) / TICKS_PER_S + sum(map(cpu_s_of_tree, children))
 
 
