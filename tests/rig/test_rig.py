@@ -40,7 +40,7 @@ class Hands:
 
     def __init__(self, address: str) -> None:
         host, port = address.split(":")
-        self._socket = socket.create_connection((host, int(port)), timeout=60)
+        self._socket = socket.create_connection((host, int(port)), timeout=250)
         self._lines = self._socket.makefile("r")
 
     def __enter__(self) -> Hands:
@@ -230,7 +230,7 @@ def test_a_device_that_dies_ends_the_rig_with_a_reason(tmp_path: Path) -> None:
 def test_a_killed_rig_takes_its_devices_with_it(tmp_path: Path) -> None:
     with rig_process(tmp_path) as (process, _, processes):
         process.kill()
-        process.wait(timeout=60)
+        process.wait(timeout=90)
         until(lambda: not any(p.is_running() for p in processes[1:]), "its devices have ended")
 
 
@@ -257,7 +257,7 @@ def test_a_ct_scan_ends_with_a_rig_that_was_killed(tmp_path: Path) -> None:
         until(lambda: any("ct" in child.cmdline() for child in root.children()), "the CT does not scan")
         children = root.children()
         process.kill()  # before the scan's own process has begun to look whose child it is
-        process.wait(timeout=60)
+        process.wait(timeout=90)
         until(lambda: not any(child.is_running() for child in children), "its processes have not ended")
 
 
