@@ -218,6 +218,24 @@ def test_leaving_a_view_out_is_what_a_new_adjustment_without_it_gives() -> None:
     assert validation.five_fold_rms_px == pytest.approx(validation.leave_one_out_rms_px, rel=0.1)
 
 
+@pytest.mark.parametrize("distance_m", [0.4, 0.8, 1.6])
+def test_an_uncertainty_of_pixels_is_one_of_places_at_the_distance(distance_m: float) -> None:
+    stated = projection_uncertainty(
+        calibrate_intrinsics(_random_views(12, 0), BOARD, SIZE), distance_m, columns=7, rows=5
+    )
+    assert stated.distance_m == distance_m
+    assert (stated.pixels[0, 0].tolist(), stated.pixels[-1, -1].tolist()) == ([0, 0], [SIZE[0] - 1, SIZE[1] - 1])
+    assert stated.sigma_px.shape == stated.sigma_mm.shape == (5, 7)
+    # The focal length is so many pixels per radian; the middle of the image is one of the grid's places here.
+    assert stated.centre_mm == pytest.approx(stated.centre_px * 1e3 * distance_m / CAMERA.fx, rel=0.02)
+    assert stated.sigma_px[2, 3] == pytest.approx(stated.centre_px, rel=1e-9)
+    assert stated.sigma_mm[2, 3] == pytest.approx(stated.centre_mm, rel=1e-9)
+    assert stated.worst_px == stated.sigma_px.max() > stated.rms_px > stated.sigma_px.min()
+    assert stated.worst_mm == stated.sigma_mm.max() > stated.rms_mm > stated.sigma_mm.min()
+    ratio = stated.sigma_mm / stated.sigma_px * CAMERA.fx / (1e3 * distance_m)
+    assert ((ratio > 0.9) & (ratio < 1.3)).all()
+
+
 @pytest.mark.slow
 def test_projection_uncertainty_is_the_spread_of_projections_over_calibrations() -> None:
     """Each calibrated camera is moved to fit the boards, as happens when its pose is estimated."""

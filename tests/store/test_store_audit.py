@@ -132,6 +132,12 @@ def test_tampering_with_the_database_is_named(data: Path, name: str) -> None:
     assert said in fault.what
 
 
+def test_an_altered_row_is_named_with_the_file_that_it_is_about(data: Path) -> None:
+    tamper(data, "UPDATE artefacts SET device = 'phone' WHERE seq = 3")
+    (fault,) = [fault for fault in verify(data).faults if "row was altered" in fault.what]
+    assert (fault.seq, data / fault.file) == (3, image_path(data, "v2"))
+
+
 def test_event_rewritten_with_its_hash_breaks_the_next_link(data: Path) -> None:
     names = ("seq", "run_id", "at_utc", "monotonic_s", "previous_sha256", "payload")
     (row,) = rows(data, f"SELECT {', '.join(names)} FROM events WHERE seq = 7")

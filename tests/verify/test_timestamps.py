@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import socket
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -117,6 +119,24 @@ def test_an_authority_that_misbehaves_is_refused(
             timestamp(store, signed, ask(authority))
         assert store.timestamps(recorded[1]) == []
     assert verify(data, recorded[1]).ok
+
+
+def test_an_answer_that_is_no_http_is_told_at_once(data: Path, recorded: tuple[Path, str]) -> None:
+    """Otherwise the end of a run would wait until the time is up, and the reason would be lost."""
+    with socket.create_server(("127.0.0.1", 0)) as server, Store.open(data) as store:
+
+        def answer() -> None:
+            peer, _ = server.accept()
+            with peer:
+                peer.recv(65536)
+                peer.sendall(b"220 mail.example ESMTP\r\n")
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        asked = Authority(f"http://127.0.0.1:{server.getsockname()[1]}/", Path("unused.pem"), timeout_s=60)
+        with pytest.raises(TimestampError, match="its answer is not HTTP"):
+            timestamp(store, checkpoint(store, recorded[1]), asked)
+        thread.join()
 
 
 def test_a_run_ends_signed_whether_or_not_the_authority_answers(
