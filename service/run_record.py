@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Lock
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from service.core.errors import ComputeError, IntegrityError
 from service.core.jobs.keys import arguments_name, job_key
@@ -19,11 +19,13 @@ from service.core.run.state import JobState, RunState
 from service.jobs.words import term
 from service.steps import params_models
 from service.steps.context import JobRequest, JobResult
-from service.steps.poses.time_left import PendingResult, missing_results
 from service.store.database.engine import RESTORE
 from service.store.queue.leases import RunLease
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
+
+if TYPE_CHECKING:
+    from service.steps.poses.time_left import PendingResult
 
 
 def recorded_root(store: Store, run_id: str) -> RunStarted:
@@ -117,6 +119,8 @@ def read_log(store: Store, run_id: str, protocol: Protocol) -> RunRecord:
 
 def results_to_come(log: RunRecord) -> list[PendingResult]:
     """The planned registrations that have not arrived yet, with the time left; empty if all have."""
+    from service.steps.poses.time_left import missing_results  # noqa: PLC0415 - most job kinds
+
     started = log.store.jobs_started(log.run_id)
     cores = os.cpu_count() or 1
     left = missing_results(log.protocol, log.state, started, log.store.clock.utc_now().isoformat(), cores)

@@ -7,7 +7,7 @@ import os
 import socket
 from collections.abc import Callable, Mapping
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -28,6 +28,7 @@ from drivers.interfaces import (
     Transform,
 )
 from drivers.plugin import DriverConfig, DriverSpec
+from service.core.declared_kinds import plug_ins
 from service.core.errors import ConfigurationError
 from service.core.records.import_list import ImportList
 from service.core.text.checked_yaml import problem_of, refuse
@@ -52,7 +53,7 @@ D = TypeVar("D", bound=Device)
 
 @cache
 def _installed() -> dict[str, EntryPoint]:
-    return {point.name: point for point in entry_points(group=GROUP)}
+    return {point.name: point for point in plug_ins(GROUP)}
 
 
 class Station:

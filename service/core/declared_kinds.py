@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
 from collections.abc import Callable, Iterator, Mapping
-from importlib.metadata import entry_points
+from functools import lru_cache
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol, TypeVar
 
 from service.core.errors import ConfigurationError
@@ -37,7 +39,7 @@ def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
     """
     modules = [importlib.import_module(name) for name in _modules(package)]
     declared: list[object] = [module.KIND for module in modules if hasattr(module, "KIND")]
-    declared += [point.load() for point in entry_points(group=group)]
+    declared += [point.load() for point in plug_ins(group)]
     kinds: dict[str, K] = {}
     for one in declared:
         if not isinstance(one, kind):
@@ -46,6 +48,18 @@ def declared_kinds(package: str, group: str, kind: type[K]) -> dict[str, K]:
             raise ConfigurationError(f"two kinds are called {one.name!r}", where=f"entry points {group}")
         kinds[one.name] = one
     return kinds
+
+
+def plug_ins(group: str) -> tuple[EntryPoint, ...]:
+    """The entry points of one of our groups, by name; the installed packages are searched once for all groups."""
+    return _plug_ins(tuple(sys.path)).get(group, ())
+
+
+@lru_cache(maxsize=1)
+def _plug_ins(_path: tuple[str, ...]) -> Mapping[str, tuple[EntryPoint, ...]]:
+    found = entry_points()
+    ours = [group for group in found.groups if group.startswith("orthocapture.")]
+    return {group: tuple(sorted(found.select(group=group), key=lambda point: point.name)) for group in ours}
 
 
 def _modules(package: str) -> list[str]:
@@ -65,7 +79,7 @@ class KindsOnDemand(Mapping[str, K]):
         self._package, self._group, self._kind, self._order = package, group, kind, order
         self._modules = {name.rpartition(".")[2]: name for name in _modules(package)}
         self._all: dict[str, K] | None = None
-        if entry_points(group=group):
+        if plug_ins(group):
             self._whole()
 
     def __getitem__(self, name: str) -> K:

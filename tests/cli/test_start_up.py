@@ -1,10 +1,14 @@
-"""Commands that people type often start without the numerics that others need."""
+"""Processes that are started often start without the libraries that only others need."""
 
 from __future__ import annotations
 
+import gc
+import importlib
 import json
+import pkgutil
 import subprocess
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +16,19 @@ import pytest
 import typer
 
 from service.cli.main import app
+from service.core.loading import end_loading, loading
 from service.core.protocol.models import load_protocol
+from service.jobs import job_kinds
 from service.rig import load_rig
 from service.run_start import start_run
-from service.steps import params_models
+from service.steps import params_models, step_kinds
 from service.store.store import Store
+from tests.support.recorded.unpacked_run import unpack_recorded_run
 from tests.support.rig.rig import REPOSITORY
 
-NUMERICS = ("scipy", "cv2", "trimesh", "pycolmap", "plotly")
+NUMERICS = frozenset({"scipy", "cv2", "trimesh", "pycolmap", "plotly"})
+OF_THE_WEB = frozenset({"fastapi", "uvicorn", "jinja2", "prometheus_client"})
+OF_AN_OLD_STORE = frozenset({"alembic", "mako"})  # loaded to upgrade a database, not to make one
 LOADED = """
 import json, sys
 from service.cli.main import main
@@ -27,8 +36,29 @@ sys.argv = ["orthocapture", *sys.argv[1:]]
 try:
     main()
 except SystemExit as end:
-    print(json.dumps({"status": end.code or 0, "modules": sorted(name for name in sys.modules if "." not in name)}))
+    print(json.dumps({"status": end.code or 0, "modules": sorted(sys.modules)}))
 """
+AT_READY = """
+import json, sys
+from service.cli.main import main
+from service.cli.site import serve
+def ready(*_address, **_how):
+    raise SystemExit
+serve._announce = ready
+sys.argv = ["orthocapture", *sys.argv[1:]]
+try:
+    main()
+except SystemExit as end:
+    print(json.dumps({"status": end.code or 0, "modules": sorted(sys.modules)}))
+"""
+
+
+def said_by(program: str, *words: str) -> Any:
+    """What a Python program prints in its last line, as JSON."""
+    said = subprocess.run(
+        [sys.executable, "-c", program, *words], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    )
+    return json.loads(said.stdout.splitlines()[-1])
 
 
 @pytest.fixture(scope="module")
@@ -46,17 +76,77 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("words", ["--help", "--version", "status latest", "act pause", "resume --help"])
 def test_it_starts_without_numerics(words: str, data: Path) -> None:
     folder = () if "--" in words else ("--data", str(data))
-    said = subprocess.run(
-        [sys.executable, "-c", LOADED, *words.split(), *folder],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    outcome = json.loads(said.stdout.splitlines()[-1])
-    assert outcome["status"] == 0, said.stderr
+    outcome = said_by(LOADED, *words.split(), *folder)
+    assert outcome["status"] == 0
     assert "typer" in outcome["modules"]
-    assert not set(NUMERICS) & set(outcome["modules"])
+    assert not (NUMERICS | OF_THE_WEB | OF_AN_OLD_STORE) & set(outcome["modules"])
+
+
+def test_the_state_of_a_run_that_computes_is_told_without_numerics(tmp_path: Path) -> None:
+    outcome = said_by(LOADED, "status", "latest", "--json", "--data", str(unpack_recorded_run(tmp_path)))
+    assert outcome["status"] == 0
+    assert "service.steps.poses.time_left" in outcome["modules"]
+    assert not (NUMERICS | OF_THE_WEB | OF_AN_OLD_STORE | {"rich.progress"}) & set(outcome["modules"])
+    not_of_this_run = {"service.steps.kinds.captures.manual_capture", "service.steps.kinds.results.layout_check"}
+    assert not not_of_this_run & set(outcome["modules"])
+
+
+def test_a_server_is_ready_before_it_has_what_single_pages_need(data: Path, tmp_path: Path) -> None:
+    rig = data.parent / "rig.yaml"
+    outcome = said_by(AT_READY, "serve", "--rig", str(rig), "--data", str(tmp_path / "new"), "--port", "0", "--json")
+    assert outcome["status"] == 0
+    assert set(outcome["modules"]) >= OF_THE_WEB
+    of_single_pages = {"segno", "rfc3161_client", "service.steps.poses.time_left"}
+    assert not (NUMERICS | OF_AN_OLD_STORE | of_single_pages) & set(outcome["modules"])
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["drivers.host.serving", "simulators.kuka_controller", "simulators.ur_controller", "simulators.sony_camera"],
+)
+def test_drivers_processes_and_simulators_start_without_what_they_may_not_need(place: str) -> None:
+    modules = said_by(f"import json, sys, {place}; print(json.dumps(sorted(sys.modules)))")
+    needs = {"cv2"} if place == "simulators.sony_camera" else set[str]()  # a camera writes JPEG files
+    assert not (NUMERICS - needs | OF_THE_WEB | {"sqlalchemy", "typer", "yaml"}) & set(modules)
+
+
+@pytest.mark.parametrize(("package", "kinds"), [("service.jobs", job_kinds), ("service.steps.kinds", step_kinds)])
+def test_a_kind_is_alone_in_the_module_of_its_name(package: str, kinds: Callable[[], Mapping[str, Any]]) -> None:
+    path = importlib.import_module(package).__path__
+    places = [found.name for found in pkgutil.walk_packages(path, f"{package}.")]
+    for name, kind in kinds().items():
+        declared = [getattr(importlib.import_module(p), "KIND", None) for p in places if p.endswith(f".{name}")]
+        assert declared == [kind], f"{name} would not be found without importing all kinds"
+        assert kinds()[name] is kind
+
+
+def test_a_kind_is_found_without_the_others() -> None:
+    modules = said_by(
+        "import json, sys; from service.jobs import job_kinds; assert job_kinds()['match'].name == 'match'; "
+        "assert job_kinds().get('match') is job_kinds()['match']; print(json.dumps(sorted(sys.modules)))"
+    )
+    assert "service.jobs.poses.match" in modules
+    assert "service.jobs.surfaces.fuse" not in modules
+
+
+def test_the_collector_rests_only_while_modules_are_loaded() -> None:
+    assert gc.isenabled()
+    frozen = gc.get_freeze_count()
+    try:
+        with loading():
+            assert not gc.isenabled()
+            with loading():
+                pass
+            assert not gc.isenabled()
+        assert gc.isenabled()
+        assert gc.get_freeze_count() > frozen
+        with pytest.raises(ZeroDivisionError), loading():
+            raise ZeroDivisionError
+        assert gc.isenabled()
+        end_loading()
+        assert gc.isenabled()
+    finally:
+        gc.unfreeze()
 
 
 def test_the_list_of_commands_says_what_each_says_itself() -> None:
@@ -75,7 +165,6 @@ from importlib.metadata import entry_points
 kinds = {point.load().kind for point in entry_points(group="orthocapture.drivers")}
 print(json.dumps([sorted(kinds), sorted(name for name in sys.modules if "." not in name)]))
 """
-    said = subprocess.run([sys.executable, "-c", program], cwd=REPOSITORY, capture_output=True, text=True, check=True)
-    kinds, modules = json.loads(said.stdout)
+    kinds, modules = said_by(program)
     assert {"scanner", "ct"} <= set(kinds)
     assert not {"scipy", "trimesh", "pydicom"} & set(modules)

@@ -152,6 +152,24 @@ def test_the_parent_that_it_watches_is_the_one_that_it_has(tmp_path: Path) -> No
         assert process.wait(30) == 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_the_devices_of_a_forked_rig_are_forks_too_and_end_with_it(tmp_path: Path, how: signal.Signals) -> None:
+    words = ["rig", "--dir", str(tmp_path), "--scene", "3", "--image-width", "300", "--hand", "steady"]
+    with Forked([sys.executable, "-m", "simulators", *words], stdout=subprocess.PIPE, text=True, cwd=ROOT) as rig:
+        assert rig.is_fork
+        assert rig.stdout is not None
+        assert json.loads(rig.stdout.readline())["ready"] is True
+        below = psutil.Process(rig.pid).children(recursive=True)
+        assert len(below) == 3  # its zygote, camera and light box
+        assert {process.cmdline()[2] for process in below} == {"tests.support.processes.zygote"}
+        assert [process.ppid() for process in below[1:]] == [below[0].pid] * 2
+        rig.send_signal(how)
+        assert rig.wait(60) == (0 if how == signal.SIGTERM else -how)
+        until(lambda: not any(process.is_running() for process in below), "its processes have not ended")
+    assert not (tmp_path / "lightbox").is_symlink()  # the light box ended in order
+
+
 def test_forks_and_zygote_end_with_the_tests_however_these_end(tmp_path: Path) -> None:
     program = (
         "import os, sys\n"

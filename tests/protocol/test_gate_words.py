@@ -46,6 +46,8 @@ def verdict(value: float | None, lower: float | None = None, upper: float | None
         (verdict(0.34, 0.3, 0.38), BOUNDED, f"error_mm {BOUNDED}, allowed ≤ 0.35: not decided"),
         (verdict(0.2, 0.1999, 0.2001), "0.2000 mm, 0.1999 to 0.2001", ""),
         (verdict(0.2, 0.2, 0.2), "0.20 mm, 0.20 to 0.20", ""),
+        (verdict(0.34, upper=0.38), "0.34 mm", ""),  # a bound alone is not shown as if there were two
+        (verdict(0.34, lower=0.3), "0.34 mm", ""),
         (verdict(None), "not measured", "error_mm was not measured, allowed ≤ 0.35"),
     ],
 )

@@ -161,7 +161,10 @@ def test_files_world_and_hands(tmp_path: Path) -> None:
 
 def test_what_is_computed_ahead_is_written_when_asked_for_and_shows_the_scene_as_it_is_then(tmp_path: Path) -> None:
     options = (*SMALL, "--ahead", "--ct-voxel-mm", "3")
-    with simulated_rig(tmp_path, *options, host=OWN_HOST) as ready, Hands(ready["world"]) as hands:
+    with (
+        simulated_rig(tmp_path, *options, host=OWN_HOST, start=subprocess.Popen) as ready,
+        Hands(ready["world"]) as hands,
+    ):
 
         def ahead(simulator: str) -> list[int]:
             processes = psutil.Process().children(recursive=True)
@@ -326,7 +329,8 @@ def test_two_controllers_are_found_and_used(tmp_path: Path, arm: str) -> None:
 
 
 def test_a_device_that_dies_is_switched_on_again_at_its_address(tmp_path: Path) -> None:
-    with simulated_rig(tmp_path, *SMALL, "--revive-after-s", "0.2", host=OWN_HOST) as ready:
+    options = (*SMALL, "--revive-after-s", "0.2")
+    with simulated_rig(tmp_path, *options, host=OWN_HOST, start=subprocess.Popen) as ready:
         before = load_rig(Path(ready["rig"])).source
         port = int(load_rig(Path(ready["rig"])).section.devices["camera"]["port"].rpartition(":")[2])
         camera = next(

@@ -122,7 +122,6 @@ SQL_TAMPERING = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SQL_TAMPERING)
 def test_tampering_with_the_database_is_named(data: Path, name: str) -> None:
     seq, said, statements = SQL_TAMPERING[name]

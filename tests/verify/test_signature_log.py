@@ -133,7 +133,6 @@ ATTACKS = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("attack", ATTACKS, ids=lambda attack: attack.__name__)
 def test_every_attack_shows(data: Path, attack: Callable[[Path], None]) -> None:
     assert faults(data) == []

@@ -145,7 +145,6 @@ ALTERED = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ALTERED)
 def test_what_was_put_in_past_the_software_is_named(data: Path, name: str) -> None:
     statement, said = ALTERED[name]

@@ -134,6 +134,7 @@ def test_a_run_ends_signed_whether_or_not_the_authority_answers(
         trouble = store.events(run)[-1].payload
         assert isinstance(trouble, DeviceTrouble)
         assert (trouble.device, trouble.data_safe) == ("time-stamp authority", True)
+        assert "refused" in trouble.message, "it says why, and not that there was no answer in time"
         assert store.checkpoints(run)[-1].seq == len(store.events(run))
     assert verify(data, run).ok
 

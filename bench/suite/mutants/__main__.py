@@ -131,6 +131,7 @@ def arguments() -> argparse.Namespace:
     today = datetime.datetime.now(tz=datetime.UTC).date()
     parser.add_argument("--seed", default=f"{today:%Y%m%d}", help="decides what is drawn; the day if left out")
     parser.add_argument("--count", type=int, default=300, help="how many mutations are drawn")
+    parser.add_argument("--skip", type=int, default=0, help="leave out the first of those drawn: tried before")
     parser.add_argument("--jobs", type=int, default=2, help="how many are tried at a time")
     parser.add_argument("--at-least", type=float, default=0.0, metavar="SHARE", help="exit status 1 below this share")
     parser.add_argument("--tests-of", metavar="REVISION", help="the score of an older revision's tests")
@@ -152,7 +153,9 @@ def main() -> int:
             record_reach(folder / "recorded")
         trees = [copied_tree(folder / f"tree-{k}", options.tests_of) for k in range(options.jobs)]
         mutations = [
-            m for m in drawn(trees[0], options.seed, options.count) if not options.only or options.only in m.name
+            m
+            for m in drawn(trees[0], options.seed, options.count)[options.skip :]
+            if not options.only or options.only in m.name
         ]
 
         def tell(verdict: Verdict) -> None:

@@ -21,7 +21,7 @@ from bench.suite.mutants.subjects import TESTS
 
 RECORD = Path("bench/suite/mutants/reached.json")
 WHOLE_FILE_S = 3.0  # assumed of a test file whose tests were not recorded
-LIMIT_S = 40.0  # CPU seconds of the tests that a mutation may survive
+LIMIT_S = 15.0  # CPU seconds of the tests that a mutation may survive
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,9 +15,6 @@ _ROW = 62
 _MARGIN = 8
 _SWEEPS = 6  # of ordering the rows
 DRAWN = 70  # nodes; a larger graph is read in the list
-# Computations that only help during the capture: they lead to no result and would hide those that do.
-_ASIDE = frozenset(name for name, kind in job_kinds().items() if kind.aside)
-
 
 Edge = tuple[str, str]  # keys of two nodes
 
@@ -55,7 +52,9 @@ class GraphDrawing:
 def draw(graph: Graph) -> GraphDrawing:
     """Lay out a graph: columns by the longest path from a source, rows so that the arrows are short."""
     ordered = graph.ordered()
-    connected = {key for edge in graph.edges for key in edge if graph.nodes[key].kind not in _ASIDE}
+    # Computations that only help during the capture lead to no result and would hide those that do.
+    aside = {name for name, kind in job_kinds().items() if kind.aside}
+    connected = {key for edge in graph.edges for key in edge if graph.nodes[key].kind not in aside}
     shown = [node for node in ordered if node.key in connected][:DRAWN]
     names = {node.key for node in shown}
     edges = [(a, b) for a, b in graph.edges if a in names and b in names]

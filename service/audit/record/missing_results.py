@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from service.core.protocol.models import Protocol
 from service.core.records.events import Event
 from service.core.run.state import RunState
-from service.steps.poses.time_left import missing_results
 
 
 def not_in_yet(protocol: Protocol, state: RunState, events: Sequence[Event]) -> list[str]:
@@ -15,6 +14,8 @@ def not_in_yet(protocol: Protocol, state: RunState, events: Sequence[Event]) -> 
 
     The same events give the same lines, so the time that is left is not among them.
     """
+    from service.steps.poses.time_left import missing_results  # noqa: PLC0415 - as in service.run_record
+
     return [
         f"{left.what}: {f'there will be none, {left.failed}' if left.failed else 'was still being computed'}"
         for left in missing_results(protocol, state, {}, events[-1].at_utc, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import socket
 import threading
 from ipaddress import ip_address
@@ -126,10 +127,16 @@ def serve_command(
             http = server(create_app(site), listener, proxies, tls, log)
             with http.capture_signals():
                 _announce(address, f"{address}/set-up/{link}" if link else "", json=json)
-                # The numerics behind steps and protocols take seconds to load, so load them in the background.
-                threading.Thread(target=lambda: list(params_models()), daemon=True).start()
+                threading.Thread(target=_load_the_rest, daemon=True).start()
                 http.run(sockets=[listener])
             _seal(store, data, rig_file)
+
+
+def _load_the_rest() -> None:
+    """Load what pages need to be shown but not to be listed: a server is ready earlier, and no page waits for it."""
+    list(params_models())
+    for late in ("service.steps.poses.time_left", "service.store.signatures.timestamps"):
+        importlib.import_module(late)
 
 
 def _unprotected(host: str) -> ConfigurationError:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from difflib import get_close_matches
 from functools import cache
-from importlib.metadata import entry_points
 
 from service.core.arms.model import ArmModel
+from service.core.declared_kinds import plug_ins
 from service.core.errors import ConfigurationError
 
 GROUP = "orthocapture.arms"
@@ -16,7 +16,7 @@ GROUP = "orthocapture.arms"
 def known_arms() -> tuple[ArmModel, ...]:
     """All arms, ordered by name of their entry points."""
     found: list[ArmModel] = []
-    for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
+    for point in plug_ins(GROUP):
         arm: object = point.load()
         if not isinstance(arm, ArmModel):
             raise ConfigurationError(

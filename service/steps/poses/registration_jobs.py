@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.poses.sfm.front_end import pairs_of
 from service.compute.poses.sfm.options import SfmOptions
+from service.compute.poses.sfm.pairs import pairs_of
 from service.core.jobs.keys import arguments_name, newest_job
 from service.core.jobs.priorities import LATER, REDUCED, WAITED
 from service.core.jobs.references import Reference, jobs_of, resolve

@@ -21,7 +21,6 @@ from service.store.run_rows import read_runs
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import LogLine, log_findings, read_log
 from service.store.signatures.log_copy import copy_faults
-from service.store.signatures.timestamps import timestamp_findings
 from service.store.verification import chain_checks as checks
 from service.store.verification import derived_checks as derived
 from service.store.verification import signature_checks as signatures
@@ -218,6 +217,10 @@ class _SignatureCheck:
         """Faults and notes of one chain."""
         signed = self.evidence.checkpoints[run]
         rows = self.evidence.artefacts.get(run, [])
+        from service.store.signatures.timestamps import (  # noqa: PLC0415 - X.509, which only a verification needs
+            timestamp_findings,
+        )
+
         stamped, notes = timestamp_findings(signed, self.evidence.timestamps[run], self.certificates)
         faults = [
             *signatures.checkpoint_faults(run, signed, facts, self.site, self.keys, rows),

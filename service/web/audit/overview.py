@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.responses import HTMLResponse, Response
@@ -22,12 +23,14 @@ from service.audit.record.event_rows import EventRow
 from service.core.equipment.camera_bodies import CameraBodies
 from service.core.equipment.recorded_devices import RecordedIdentity
 from service.run_record import results_to_come
-from service.steps.poses.time_left import PendingResult
 from service.web.audit.frame import AuditState, CurrentAudit, audit_frame, close_audit, link
 from service.web.audit.gates import accuracy_of
 from service.web.audit.protocol_identity import protocol_identity
 from service.web.page.rendering import TEMPLATES, render
 from service.web.security.guards import requires
+
+if TYPE_CHECKING:
+    from service.steps.poses.time_left import PendingResult
 
 
 @asynccontextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Annotated
 
-import segno
 from fastapi import APIRouter, Depends, Form, Path, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from markupsafe import Markup
@@ -153,6 +152,8 @@ def _back(account: str) -> RedirectResponse:
 
 
 def _link(request: Request, whose: str, token: str) -> HTMLResponse:
+    import segno  # noqa: PLC0415 - for this page alone
+
     address = f"{request.url.scheme}://{request.url.netloc}/set-up/{token}"
     # A picture in the page itself: the link is a secret, and no other address may give it away.
     svg = segno.make_qr(address, error="m").svg_inline(

@@ -6,7 +6,7 @@ a real start, as are these where the environment differs in a variable that some
 
 What is about starting itself is a real start too, by `subprocess`: tests/cli/test_start_up.py, the installed command
 in tests/cli, the package in tests/system, the tree of a rig's processes in tests/rig/test_rig.py, `python -I`. So is
-what the program starts by itself: drivers, runners, workers, and the devices of a simulated rig.
+what the program starts by itself: drivers, runners and workers. The devices of a forked rig are forks too.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ class _Parent:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
+        self._pid = 0
 
     def start(self, request: dict[str, Any], standard: Sequence[int]) -> tuple[int, socket.socket]:
         """Fork a process; returns its id, and what will tell its exit status."""
@@ -65,25 +66,35 @@ class _Parent:
     def end(self) -> None:
         """End the zygote."""
         with self._lock:
-            if self._control is not None and self._process is not None:
+            if self._control is not None:
                 self._control.close()
+            if self._process is not None:
                 self._process.wait(timeout=30)
+            elif self._pid:
+                os.waitpid(self._pid, 0)
             self._control = self._process = None
+
+    def use(self, control: socket.socket, pid: int) -> None:
+        """Use a zygote that was forked from this process."""
+        self._control, self._pid = control, pid
+        atexit.register(self.end)
 
     def _begun(self) -> tuple[socket.socket, int]:
         """Its control socket and process id; starts it if it is not there yet."""
-        if self._control is None or self._process is None:
+        if self._control is None:
             self._control, theirs = socket.socketpair()
             with theirs:
                 self._process = subprocess.Popen(
                     [sys.executable, "-m", _ZYGOTE, str(theirs.fileno())], cwd=ROOT, env=_ENVIRONMENT,
                     stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, pass_fds=[theirs.fileno()],
                 )  # fmt: skip
+            self._pid = self._process.pid
             atexit.register(self.end)
-        return self._control, self._process.pid
+        return self._control, self._pid
 
 
 _PARENT_OF_ALL = _Parent()
+use = _PARENT_OF_ALL.use
 
 
 class Forked(subprocess.Popen[AnyStr]):

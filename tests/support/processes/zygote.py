@@ -19,9 +19,9 @@ import runpy
 import select
 import signal
 import socket
+import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, TextIO
 
@@ -29,11 +29,8 @@ COMMANDS, SIMULATORS = "service.cli.main", "simulators"
 OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe")
 _REQUEST_BYTES, _NUMBER_BYTES = 8, 8  # lengths of a request's size, and of a process id or an exit status
 _STANDARD = (0, 1, 2)
-# What these import only when they run; everything else is imported by the module of the command or the simulator.
-_LATE = {
-    "simulators camera": ("simulators.rendering.render",),
-    "simulators canon": ("simulators.rendering.render",),
-}
+_RIG = "rig"  # the simulator that starts others
+_LATE = ("simulators.rendering.render",)  # what simulators import only once they need it
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +45,11 @@ class _Request:
     session: bool  # whether it leads a session of its own
 
     @property
+    def is_rig(self) -> bool:
+        """Whether it starts simulators itself."""
+        return self.module == SIMULATORS and self.words[:1] == [_RIG]
+
+    @property
     def main(self) -> str:
         """The module that will run as `__main__`."""
         return f"{self.module}.__main__" if self.module == SIMULATORS else self.module
@@ -59,7 +61,7 @@ class _Zygote:
 
     control: int
     environment: dict[str, str]  # as it was when this process began
-    prepared: set[str] = field(default_factory=set[str])
+    prepared: set[tuple[str, ...]] = field(default_factory=set[tuple[str, ...]])  # kinds of processes
     children: dict[int, tuple[int, int]] = field(default_factory=dict[int, tuple[int, int]])  # pidfd: pid, to tell
 
     def serve(self) -> _Request | None:
@@ -101,13 +103,25 @@ class _Zygote:
 
     def _prepare(self, request: _Request) -> None:
         """Import what the process needs, unless it was done for one like it; no thread may begin by that."""
-        kind = " ".join([request.module, *request.words[:1]])
+        kind = (request.module, *request.words[:1])
         if kind in self.prepared:
             return
         self.prepared.add(kind)
-        for name in (*_needed(request), *_LATE.get(kind, ())):
+        main: Any = importlib.import_module(request.main)
+        word = request.words[0] if request.words else ""
+        if request.module == SIMULATORS:
+            known: dict[str, tuple[str, str]] = main.simulators()
+            names = known if request.is_rig else {word} & known.keys()
+            self.prepared.update((SIMULATORS, name) for name in names)
+            needed = [*(known[name][0] for name in names), *(_LATE if names else ())]
+        elif request.module == COMMANDS:  # it imports the module of a command on demand
+            place = vars(main)["_COMMANDS"].get(word)
+            needed = [place.place.partition(":")[0]] if place else []
+        else:
+            needed = []
+        for name in needed:
             importlib.import_module(name)
-        assert len(os.listdir("/proc/self/task")) == 1, f"importing for {kind!r} started a thread"
+        assert len(os.listdir("/proc/self/task")) == 1, f"importing for {kind} started a thread"
         gc.collect()
         gc.freeze()  # the children's collections leave alone, and so share, what is here
 
@@ -127,19 +141,6 @@ class _Zygote:
         """Terminate what still runs: the tests are no more."""
         for pidfd in self.children:
             signal.pidfd_send_signal(pidfd, signal.SIGTERM)
-
-
-def _needed(request: _Request) -> Sequence[str]:
-    """The modules of what the first word names; the command lines import them on demand."""
-    word = request.words[0] if request.words else ""
-    main: Any = importlib.import_module(request.main)
-    if request.module == SIMULATORS:
-        known: dict[str, tuple[str, str]] = main.simulators()
-        return [known[word][0]] if word in known else []
-    if request.module == COMMANDS:
-        place = vars(main)["_COMMANDS"].get(word)
-        return [place.place.partition(":")[0]] if place else []
-    return []
 
 
 def _changed(before: dict[str, str]) -> dict[str, str]:
@@ -202,9 +203,33 @@ def _write(descriptor: int, number: int) -> None:
     os.write(descriptor, number.to_bytes(_NUMBER_BYTES, "little", signed=True))
 
 
+def _below(zygote: _Zygote, rig: _Request) -> _Request | None:
+    """Let this process, a rig, fork its simulators from a zygote of its own, which is forked before any thread is.
+
+    Returns twice: the rig's own request, and in each fork of that zygote its request. None is that zygote's end.
+    """
+    ours, theirs = socket.socketpair()
+    pid = os.fork()
+    if pid == 0:
+        ours.close()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        with open(os.devnull, "r+b") as nowhere:  # not the rig's, whose end its reader waits for
+            for descriptor in _STANDARD[:2]:
+                os.dup2(nowhere.fileno(), descriptor)
+        return _Zygote(theirs.detach(), rig.env, zygote.prepared).serve()
+    theirs.close()
+    forked: Any = importlib.import_module("tests.support.processes.forked")
+    forked.use(ours, pid)
+    subprocess.Popen = forked.Forked  # pyright: ignore[reportAttributeAccessIssue]
+    return rig
+
+
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tests, and they end this
-    _asked = _Zygote(int(sys.argv[1]), dict(os.environ)).serve()
+    _of_tests = _Zygote(int(sys.argv[1]), dict(os.environ))
+    _asked = _of_tests.serve()
+    if _asked is not None and _asked.is_rig:
+        _asked = _below(_of_tests, _asked)
     if _asked is not None and _asked.script:
         runpy.run_path(_asked.script, run_name="__main__")
     elif _asked is not None:

@@ -57,15 +57,20 @@ def command(*words: str) -> list[str]:
 
 @contextmanager
 def simulated_rig(
-    folder: Path, *options: str, host: str = _USUAL, patience_s: float = PATIENCE_S
+    folder: Path,
+    *options: str,
+    host: str = _USUAL,
+    patience_s: float = PATIENCE_S,
+    start: type[subprocess.Popen[str]] = Forked,
 ) -> Generator[dict[str, Any]]:
     """Start a rig around one scene; yields its ready line. On another loopback address it waits for no other rig.
 
-    Its limits are patient, since a busy machine is no dead link; `patience_s=0` is for tests of the limits.
+    Its limits are patient, since a busy machine is no dead link; `patience_s=0` is for tests of the limits. With
+    `start=subprocess.Popen`, it and its devices are real starts, with command lines of their own.
     """
     words = ("--dir", str(folder), "--host", host, "--patience", str(patience_s))
     with RigLock(host), (folder / "rig.log").open("w") as log:
-        process = Forked(
+        process = start(
             [sys.executable, "-m", "simulators", "rig", *words, *options],
             cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
         )  # fmt: skip

@@ -47,12 +47,15 @@ def _fetch(camera: Any, path: Any) -> dict[str, Any]:
 
 
 def _events(camera: Any, seconds: float, files: int = 99, last: str = "") -> list[list[Any]]:
-    """What happens in so many seconds, until so many files have come, or until the last kind of event has."""
+    """What happens in so many seconds, or until so many files have come and an event with these words."""
     seen: list[list[Any]] = []
     end = time.monotonic() + seconds
-    while time.monotonic() < end and sum(kind == "file" for kind, _ in seen) < files:
-        if seen and seen[-1][0] == last:
-            break
+
+    def enough() -> bool:
+        told = not last or any(last in str(event) for event in seen)
+        return told and sum(kind == "file" for kind, _ in seen) >= files
+
+    while time.monotonic() < end and not enough():
         event, data = camera.wait_for_event(50)
         if event == gp.GP_EVENT_FILE_ADDED:
             seen.append(["file", _fetch(camera, data)])

@@ -19,9 +19,10 @@ from service.compute.camera_model import CameraModel
 from service.compute.poses.colmap.process import ColmapProcess
 from service.compute.poses.files.pose_covariance import blocks, similarity_covariance
 from service.compute.poses.sfm.features import ImageFeatures, PairMatches
-from service.compute.poses.sfm.front_end import FrontEnd, pairs_of
+from service.compute.poses.sfm.front_end import FrontEnd
 from service.compute.poses.sfm.kept import CachedFrontEnd
 from service.compute.poses.sfm.options import Mapper, Progress, SfmOptions
+from service.compute.poses.sfm.pairs import pairs_of
 from service.compute.poses.sfm.tracks import Tracks
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform

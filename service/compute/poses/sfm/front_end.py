@@ -14,9 +14,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.poses.colmap.process import ColmapProcess
 from service.compute.poses.sfm.features import ImageFeatures, PairMatches
 from service.compute.poses.sfm.options import Progress, SfmOptions
-from service.compute.poses.sfm.pairs import choose_pairs
 from service.core.errors import DataError
-from service.core.geometry import Transform
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
@@ -173,23 +171,6 @@ class FrontEnd:
             finally:
                 pool.shutdown(cancel_futures=True)
         return out
-
-
-def pairs_of(
-    names: Iterable[str],
-    T_world_camera_prior: Mapping[str, Transform] | None,
-    options: SfmOptions,
-    *,
-    stations: Mapping[str, str] | None = None,
-) -> list[tuple[str, str]]:
-    """Pairs of names worth matching (see `choose_pairs`): a function only of the set of images and their poses.
-
-    Before the images are taken, the planned poses give the pairs with which matching can begin; at the end, the pairs
-    of the images that were taken are the ones used.
-    """
-    order = sorted(names)
-    chosen = choose_pairs(order, T_world_camera_prior, options.neighbours, options.max_angle_deg, stations=stations)
-    return [(order[i], order[j]) for i, j in chosen]
 
 
 def missing_pairs(pairs: Iterable[tuple[str, str]], matches: Iterable[PairMatches]) -> list[tuple[str, str]]:

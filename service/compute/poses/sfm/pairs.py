@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from service.compute.poses.sfm.options import SfmOptions
 from service.core.geometry import Array, Transform
 
 _ROWS = 2000  # rows of angles in memory at a time
@@ -53,6 +54,23 @@ def choose_pairs(
                 if to_others[column] <= max_angle_deg:
                     chosen.add(_ordered(known[row], known[int(column)]))
     return sorted(chosen | _bridges(chosen, known, rays, n))
+
+
+def pairs_of(
+    names: Iterable[str],
+    T_world_camera_prior: Mapping[str, Transform] | None,
+    options: SfmOptions,
+    *,
+    stations: Mapping[str, str] | None = None,
+) -> list[tuple[str, str]]:
+    """Pairs of names worth matching (see `choose_pairs`): a function only of the set of images and their poses.
+
+    Before the images are taken, the planned poses give the pairs with which matching can begin; at the end, the pairs
+    of the images that were taken are the ones used.
+    """
+    order = sorted(names)
+    chosen = choose_pairs(order, T_world_camera_prior, options.neighbours, options.max_angle_deg, stations=stations)
+    return [(order[i], order[j]) for i, j in chosen]
 
 
 def _angles_deg(rays: Array, others: Array) -> Array:
