@@ -69,7 +69,6 @@ STILL = {
     "tests/kuka/test_kuka_driver.py",
     "tests/kuka/test_kuka_fri.py",
     "tests/kuka/test_kuka_wire.py",
-    "tests/monitor/test_health.py",
     "tests/robot/test_pose_stream.py",
     "tests/robot/test_ur_driver.py",
     "tests/robot/test_ur_driver_faults.py",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from collections.abc import Generator
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from service.core.records.events import DeviceOpened, DeviceTrouble
 from service.monitor.snapshot import Snapshot, write_snapshot
+from service.store.durable_effects import SystemClock
 from service.store.records import NewJob
 from tests.support.pages.web import HOST, Browser, WebSite, web_site
 from tests.support.processes.forked import Forked
@@ -62,7 +62,15 @@ def test_a_healthy_site_says_so_to_anybody_and_nothing_more(site: WebSite) -> No
     assert run_id not in answer.text
 
 
-def test_a_job_without_a_worker_is_not_healthy_until_one_lives(site: WebSite) -> None:
+@pytest.fixture
+def site_of_the_host(tmp_path: Path) -> Generator[WebSite]:
+    """A site that goes by the host's clock, as a worker beside it does."""
+    with web_site(tmp_path, clock=SystemClock()) as site:
+        yield site
+
+
+def test_a_job_without_a_worker_is_not_healthy_until_one_lives(site_of_the_host: WebSite) -> None:
+    site = site_of_the_host
     let_wait(site, site.begin_run())
     answer = site.browser().get("/health")
     assert (answer.status_code, answer.json()["worker"]["what"]) == (503, "a job waits, and no worker is running")
@@ -81,9 +89,9 @@ def test_a_job_without_a_worker_is_not_healthy_until_one_lives(site: WebSite) ->
 def test_a_silent_runner_is_not_healthy(site: WebSite) -> None:
     bench = site.begin_run()
     with site.store.lease(bench.run_id, "runner", 30.0):
-        write_snapshot(site.site.data, bench.run_id, Snapshot(at_utc_s=time.time(), pid=1, doing="working"))
+        write_snapshot(site.site.data, bench.run_id, Snapshot(at_utc_s=site.now_utc_s, pid=1, doing="working"))
         assert site.browser().get("/health").status_code == 200
-        write_snapshot(site.site.data, bench.run_id, Snapshot(at_utc_s=time.time() - 90, pid=1, doing="working"))
+        write_snapshot(site.site.data, bench.run_id, Snapshot(at_utc_s=site.now_utc_s - 90, pid=1, doing="working"))
         answer = site.browser().get("/health")
         assert (answer.status_code, answer.json()["runners"]["ok"]) == (503, False)
         silent = scrape(site)["orthocapture_runner_silent_seconds"]
@@ -125,7 +133,9 @@ def test_the_figures_are_those_of_the_record(site: WebSite) -> None:
 def test_a_run_that_is_driven_shows_its_pace_and_its_arm(site: WebSite) -> None:
     run_id = site.record_run()
     with site.store.lease(run_id, "runner", 30.0):
-        write_snapshot(site.site.data, run_id, Snapshot(at_utc_s=time.time(), pid=1, doing="working", robot="moving"))
+        write_snapshot(
+            site.site.data, run_id, Snapshot(at_utc_s=site.now_utc_s, pid=1, doing="working", robot="moving")
+        )
         found = scrape(site)
     assert found["orthocapture_driven_runs"] == {(): 1}
     assert found["orthocapture_robot_state"] == {(run_id, "moving"): 1}

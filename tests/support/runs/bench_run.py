@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TypeVar
 
 from service.core.protocol.models import parse_protocol
@@ -137,21 +134,8 @@ class HastyClock(SystemClock):
         super().sleep(min(seconds, 0.002))
 
 
-@cache
-def _empty() -> TemporaryDirectory[str]:
-    """A folder with data of nothing."""
-    folder = TemporaryDirectory(prefix="empty-")
-    Store.open(Path(folder.name) / "data").close()
-    return folder
-
-
 def bench_store(data: Path) -> Store:
-    """A data folder in which time passes only when a runner waits, a device works, or a test says so.
-
-    A new one is copied from one made once in a process: to make its tables takes as long as a small run.
-    """
-    if not data.exists():
-        shutil.copytree(Path(_empty().name) / "data", data)
+    """A data folder in which time passes only when a runner waits, a device works, or a test says so."""
     return Store.open(data, SteppedClock.from_now())
 
 
