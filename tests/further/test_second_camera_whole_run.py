@@ -129,6 +129,7 @@ def test_the_series_was_sent_and_the_scan_is_of_its_profile(ended: Ended) -> Non
     assert steps["ct_import"].measures["spheres_found"] == 13
     assert len(scans) == 2
     assert steps["scanning"].measures["sphere_change_max_mm"] < 0.1
+    assert steps["scanning"].measures["faces"] < 1e6, "it is as coarse as the rig was asked to make it"
 
 
 def test_it_comes_to_its_end_with_every_view(ended: Ended) -> None:
