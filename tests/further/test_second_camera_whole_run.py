@@ -67,7 +67,7 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
     """One run with both: they write other files, at other addresses, over other dialects of PTP."""
     folder = tmp_path_factory.mktemp("second")
     data, protocol = folder / "data", folder / "cameras.yaml"
-    options = ("--scene", "7", "--image-width", "720", *COARSE, "--speed-up", "10")
+    options = ("--scene", "7", "--image-width", "960", *COARSE, "--speed-up", "10")
     canon, sony = "Canon EOS R5", "Sony ILCE-7RM5"
     cameras = ("--camera", canon, "--second-camera", "fixed", "stereo", "--second-camera-model", sony, canon)
     with (
