@@ -241,7 +241,7 @@ def role_of(process: psutil.Process, runner: int) -> str:
         "simulators ur ": "simulated robot",
         "simulators camera ": "simulated camera",
         "simulators lightbox ": "simulated light box",
-        "simulate rig ": "simulated rig",
+        "simulators rig ": "simulated rig",
     }
     if "multiprocessing.spawn" in words:
         return CHILD

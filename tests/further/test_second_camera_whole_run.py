@@ -67,7 +67,7 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
     """One run with both: they write other files, at other addresses, over other dialects of PTP."""
     folder = tmp_path_factory.mktemp("second")
     data, protocol = folder / "data", folder / "cameras.yaml"
-    options = ("--scene", "7", "--image-width", "720", *COARSE, "--speed-up", "10")
+    options = ("--scene", "7", "--image-width", "960", *COARSE, "--speed-up", "10")
     canon, sony = "Canon EOS R5", "Sony ILCE-7RM5"
     cameras = ("--camera", canon, "--second-camera", "fixed", "stereo", "--second-camera-model", sony, canon)
     with (
@@ -129,6 +129,7 @@ def test_the_series_was_sent_and_the_scan_is_of_its_profile(ended: Ended) -> Non
     assert steps["ct_import"].measures["spheres_found"] == 13
     assert len(scans) == 2
     assert steps["scanning"].measures["sphere_change_max_mm"] < 0.1
+    assert steps["scanning"].measures["faces"] < 1e6, "it is as coarse as the rig was asked to make it"
 
 
 def test_it_comes_to_its_end_with_every_view(ended: Ended) -> None:

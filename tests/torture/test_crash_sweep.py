@@ -14,7 +14,11 @@ import pytest
 from tests.support.rig.rig import REPOSITORY
 from tests.support.runs.drawn_rows import rows_to_run
 
-pytestmark = [pytest.mark.slow, pytest.mark.sweep, pytest.mark.timeout(400)]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.sweep,
+    pytest.mark.timeout(1800),
+]  # the first of them waits for the others
 KINDS = [
     f"{process}/{effect}/{how}"
     for process, effects in (

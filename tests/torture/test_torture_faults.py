@@ -69,7 +69,7 @@ def tried(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 @pytest.mark.slow
 @pytest.mark.sweep
-@pytest.mark.timeout(400)
+@pytest.mark.timeout(1800)  # the first of them waits for the others
 @pytest.mark.parametrize("case", CHOSEN)
 def test_the_case_goes_as_the_table_says(tried: dict[str, dict[str, Any]], case: str) -> None:
     verdict = tried[case]
@@ -81,7 +81,7 @@ def test_the_case_goes_as_the_table_says(tried: dict[str, dict[str, Any]], case:
 
 @pytest.mark.slow
 @pytest.mark.sweep
-@pytest.mark.timeout(120)
+@pytest.mark.timeout(400)
 def test_a_store_that_does_not_say_what_to_do_shows(tmp_path: Path) -> None:
     status, _, (verdict,) = sweep(tmp_path, "--only", "store/disk_full/commit_02", code=SILENT)
     assert status == 1

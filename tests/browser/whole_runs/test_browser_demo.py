@@ -26,6 +26,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.whole(always=True), pytest.mark.time
 
 MOST_MENDS = 4  # per step, as of the automatic operator
 PRESSED_IN_VAIN = 3  # in the whole run
+ANSWER_MS = 60_000  # after which the page does not answer a press any more
 STEP_S = 400  # after which a step, of seconds on a quiet machine, does not end any more
 
 
@@ -73,7 +74,7 @@ def run(server: Served, browser: Browser) -> str:
         tablet.go("/")
         tablet.page.get_by_role("button", name="Start Demonstration on a simulated rig").click()
         tablet.page.get_by_role("button", name="Start the run").click()
-        expect(tablet.page.get_by_role("checkbox").first).to_be_visible(timeout=60_000)
+        expect(tablet.page.get_by_role("checkbox").first).to_be_visible(timeout=ANSWER_MS)
         name = tablet.page.url.rpartition("/")[2]
         technician = Technician(tablet)
         began_s, step, missed = time.monotonic(), "", "nothing"
@@ -110,7 +111,7 @@ class Technician:
         if unticked.count():
             before = unticked.count()
             unticked.first.click()
-            expect(unticked).to_have_count(before - 1)
+            expect(unticked).to_have_count(before - 1, timeout=ANSWER_MS)
             return
         actions = page.locator(".actions")
         sign = actions.get_by_role("button", name=re.compile("^Sign"))
@@ -143,7 +144,7 @@ class Technician:
         sign.click()
         self.page.get_by_label("Your password").fill(PASSWORD)
         self.page.get_by_role("button", name="Sign", exact=True).click()
-        expect(self.page.locator("dialog[open]")).to_have_count(0)
+        expect(self.page.locator("dialog[open]")).to_have_count(0, timeout=ANSWER_MS)
         self.signed += 1
         self._until_something_else_is_asked(asked, lambda: sign.count() == 0)
 
@@ -187,7 +188,7 @@ def test_the_technician_sees_the_accuracy_at_the_end(server: Served, browser: Br
         desk.sign_in("tina")
         desk.go(f"/runs/{run}")
         table = desk.page.get_by_role("table").first
-        expect(table.get_by_role("rowheader", name="robot corrected", exact=True)).to_be_visible()
+        expect(table.get_by_role("rowheader", name="robot corrected", exact=True)).to_be_visible(timeout=ANSWER_MS)
         errors_mm = {
             row.locator("th, td").nth(0).inner_text(): float(row.locator("th, td").nth(1).inner_text())
             for row in table.locator("tbody tr").all()
@@ -202,22 +203,22 @@ def test_the_auditor_reads_everything_and_changes_nothing(server: Served, browse
         desk.sign_in("otto")
         desk.go("/audit")
         page.get_by_role("main").get_by_role("link", name=run).click()
-        expect(page.get_by_role("heading", name="Deviations")).to_be_visible()
+        expect(page.get_by_role("heading", name="Deviations")).to_be_visible(timeout=ANSWER_MS)
         for name in ("Timeline", "Artefacts", "Provenance", "Corrections", "Signatures", "Devices and clocks"):
             page.get_by_role("navigation", name="Audit of this run").get_by_role("link", name=name).click()
-            expect(page.get_by_role("heading", level=1)).to_be_visible()
+            expect(page.get_by_role("heading", level=1)).to_be_visible(timeout=ANSWER_MS)
         desk.go(f"/audit/runs/{run}/signatures")
-        expect(page.get_by_text("Tina Example").or_(page.get_by_text("tina")).first).to_be_visible()
+        expect(page.get_by_text("Tina Example").or_(page.get_by_text("tina")).first).to_be_visible(timeout=ANSWER_MS)
         desk.go(f"/audit/runs/{run}/provenance")
-        expect(page.get_by_text(re.compile("registration", re.IGNORECASE)).first).to_be_visible()
+        expect(page.get_by_text(re.compile("registration", re.IGNORECASE)).first).to_be_visible(timeout=ANSWER_MS)
         desk.go(f"/audit/runs/{run}/verification")
         page.get_by_role("button", name="Verify now").click()
-        expect(page.get_by_role("heading", name="Verifies")).to_be_visible(timeout=60_000)
+        expect(page.get_by_role("heading", name="Verifies")).to_be_visible(timeout=ANSWER_MS)
         # Scene and calibration show figures beside the pictures.
         desk.go(f"/runs/{run}/scene")
-        expect(page.get_by_role("table").first).to_be_visible(timeout=60_000)
+        expect(page.get_by_role("table").first).to_be_visible(timeout=ANSWER_MS)
         desk.go(f"/runs/{run}/calibration")
-        expect(page.get_by_role("table").first).to_be_visible(timeout=60_000)
+        expect(page.get_by_role("table").first).to_be_visible(timeout=ANSWER_MS)
         assert refused(page, f"/runs/{run}/actions", {"verb": "redo", "reason": "no"}) == 403
         assert refused(page, f"/runs/{run}/exports", {"what": "bundle"}) == 403
 
