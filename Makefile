@@ -17,7 +17,7 @@ demo: $(READY)
 
 # Units, wires and one short run, in minutes; nothing of it needs more than Python and what pip installs.
 test: $(TOOLS)
-	$(BIN)/pytest -m "not (slow or realtime or packages)"
+	$(BIN)/pytest -m "not (slow or realtime or packages or whole or sweep)"
 
 # All tests: those that meet the clock run alone, after the others.
 test-all: $(TOOLS) $(NETWORKS)
@@ -29,7 +29,7 @@ test-all: $(TOOLS) $(NETWORKS)
 SEED = $(shell git rev-parse HEAD)
 test-drawn: $(TOOLS) $(NETWORKS)
 	.ci/packages
-	$(BIN)/pytest -m "(slow or packages) and not realtime" --draw $(SEED)
+	$(BIN)/pytest -m "(slow or packages or whole or sweep) and not realtime" --draw $(SEED)
 	$(BIN)/pytest -m realtime -n 0
 
 # Every whole run; every row of every systematic sweep.
@@ -41,7 +41,7 @@ test-whole test-sweeps: $(TOOLS) $(NETWORKS)
 marks: $(TOOLS) $(NETWORKS)
 	.ci/packages
 	rm -rf build/cpu
-	$(BIN)/pytest $(or $(FILES),tests) --cpu-record=build/cpu
+	$(BIN)/pytest $(or $(FILES),tests) -m "not whole" --cpu-record=build/cpu
 	$(BIN)/python -m bench.suite.marks build/cpu
 
 # Installs the locks under every supported Python of this machine and runs the fast tests there.

@@ -6,7 +6,8 @@ it with `--check`: the list and the marks must agree, and every test must be on 
 
 The cost of a test is its own, plus its share of each wider fixture that it uses: the fixture's cost over the number
 of tests that use it. Of a parametrised test the dearest row counts. A measurement within a fifth of the limit changes
-no mark, so that marks do not come and go with the machine's mood.
+no mark, so that marks do not come and go with the machine's mood. Tests marked `whole` are never fast, and are not
+measured.
 """
 
 from __future__ import annotations
@@ -75,18 +76,24 @@ def settled(before_s: float | None, now_s: float) -> float:
 
 
 def test_functions(source: str) -> Iterator[TestFunction]:
-    """Yield the tests of a file's source, those of classes included."""
+    """Yield the tests of a file's source, those of classes included, whole runs not."""
+
+    def is_whole(decorators: list[ast.expr]) -> bool:
+        return any(ast.unparse(decorator).startswith("pytest.mark.whole") for decorator in decorators)
 
     def within(body: list[ast.stmt], prefix: str) -> Iterator[TestFunction]:
         for node in body:
             if isinstance(node, ast.ClassDef) and node.name.startswith("Test"):
                 yield from within(node.body, f"{prefix}{node.name}::")
-            elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.name.startswith("test_"):
+            elif isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+                if is_whole(node.decorator_list):
+                    continue
                 first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
                 slow = any(ast.unparse(decorator) == MARK[1:] for decorator in node.decorator_list)
                 yield TestFunction(prefix + node.name, first, " " * node.col_offset, slow)
 
-    yield from within(ast.parse(source).body, "")
+    if not re.search(r"(?m)^pytestmark\b.*mark\.whole", source):
+        yield from within(ast.parse(source).body, "")
 
 
 def remarked(source: str, costs: Mapping[str, float]) -> str:
@@ -112,7 +119,7 @@ def disagreements(listed: Costs, files: Mapping[str, str]) -> list[str]:
     found: list[str] = []
     for file, source in files.items():
         costs, tests = listed.get(file, {}), {test.name: test for test in test_functions(source)}
-        if re.search(r"(?m)^pytestmark\b.*mark\.slow", source):
+        if re.search(r"(?m)^pytestmark\b(?!.*mark\.whole).*mark\.slow", source):
             found.append(f"{file}: `slow` is marked for the whole file; it is a mark of single tests")
         found += [f"{file}::{name} is on the list and not in the file" for name in costs.keys() - tests.keys()]
         for name, test in tests.items():
@@ -148,9 +155,9 @@ def main() -> int:
             kept[file] = {name: settled(before.get(name), now[name]) for name in names if name in now} | {
                 name: before[name] for name in names if name in before and name not in now
             }
-            whole = re.sub(r"(?m)^pytestmark = pytest\.mark\.slow( *#.*)?\n", "", source)
-            whole = re.sub(r"(?m)^(pytestmark = \[.*?)pytest\.mark\.slow(?:, )?", r"\1", whole)
-            files[file] = remarked(whole, kept[file])
+            single = re.sub(r"(?m)^pytestmark = pytest\.mark\.slow( *#.*)?\n", "", source)
+            single = re.sub(r"(?m)^(pytestmark = \[(?!.*mark\.whole).*?)pytest\.mark\.slow(?:, )?", r"\1", single)
+            files[file] = remarked(single, kept[file])
             if files[file] != source:
                 Path(file).write_text(files[file])
         LIST.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
