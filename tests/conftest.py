@@ -8,7 +8,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from tests.plugins.cpu_record import CpuRecord
 from tests.plugins.draw import Draw
@@ -25,7 +25,10 @@ if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM_BYTES:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 
 # The same examples every time, so that a failure is due to the change. `--hypothesis-profile=default` tries new ones.
-settings.register_profile("repeatable", derandomize=True, database=None)
+# They are not timed: a machine that is busy is no fault.
+settings.register_profile(
+    "repeatable", derandomize=True, database=None, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("repeatable")
 
 
