@@ -136,13 +136,13 @@ def test_the_stated_covariance_is_the_sandwich_of_all_components() -> None:
         **{name: others(name, count, 5) for name in ("spheres", "robot_position", "robot_rotation", "centres")},
     }
     found = stated_covariance(weighted, N)
-    H, M = clustered_information(weighted["tracks"], N)
+    information, spread = clustered_information(weighted["tracks"], N)
     for name in ("spheres", "robot_position", "robot_rotation", "centres"):
         slope, influence = ratios(name) if name in ROBUST else (1.0, 1.0)  # a prior is not robust
         JJ = weighted[name].frame.toarray()
-        H = H + slope * JJ.T @ JJ
-        M = M + influence * JJ.T @ JJ
-    expected = np.linalg.inv(H) @ M @ np.linalg.inv(H)
+        information = information + slope * JJ.T @ JJ
+        spread = spread + influence * JJ.T @ JJ
+    expected = np.linalg.inv(information) @ spread @ np.linalg.inv(information)
     assert np.allclose(found, expected, rtol=5e-3, atol=1e-3 * np.trace(expected))
 
 

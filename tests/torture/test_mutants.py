@@ -122,12 +122,14 @@ def test_the_tests_that_reach_a_line_are_chosen_and_changed_files_are_added_whol
     reach = recorded(tree(tmp_path), TEST)
     (limit,) = [line for line, text in enumerate(MODULE.splitlines(), 1) if "<= LIMIT" in text]
     (noted,) = [line for line, text in enumerate(MODULE.splitlines(), 1) if "NOTES.append" in text]
-    assert [one.arguments for one in reach.selected(GATES, limit)] == [["tests/core/test_gate.py::test_limit"]]
-    assert reach.selected(GATES, noted) == []
-    (whole,) = reach.selected(GATES, 8)  # a constant: whatever reaches the file
+    assert [one.arguments for one in reach.selected("gates", GATES, limit)] == [
+        ["tests/core/test_gate.py::test_limit"]
+    ]
+    assert reach.selected("gates", GATES, noted) == []
+    (whole,) = reach.selected("gates", GATES, 8)  # a constant: whatever reaches the file
     assert whole.tests == ("test_limit",)
     (tmp_path / "tests/core/test_new.py").write_text(TEST)
-    assert [one.arguments for one in Reach(tmp_path).selected(GATES, noted)] == [["tests/core/test_new.py"]]
+    assert [one.arguments for one in Reach(tmp_path).selected("gates", GATES, noted)] == [["tests/core/test_new.py"]]
 
 
 @pytest.mark.parametrize(("after", "outcome"), [("value < LIMIT", "killed"), ("value <= 2 * LIMIT", "survived")])
@@ -136,7 +138,7 @@ def test_a_mutation_is_killed_by_a_test_that_fails_and_the_tree_is_as_before(
 ) -> None:
     """The file is longer or not, and of the same second: byte code of either text is never taken for the other."""
     folder = tree(tmp_path)
-    selected = recorded(folder, TEST).selected(GATES, 18)
+    selected = recorded(folder, TEST).selected("gates", GATES, 18)
     (folder / "pyproject.toml").write_text("[tool.pytest.ini_options]\nmarkers = ['slow', 'realtime']\n")
     place = Place("gates", GATES, 0, "test")
     mutation = mutated(folder, place)

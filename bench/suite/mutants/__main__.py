@@ -2,8 +2,9 @@
 
 `python -m bench.suite.mutants --seed S --count N` (or `make mutants`). The seed alone decides what is drawn: each of
 twelve subjects (subjects.py) as often as the others, within it each kind of change (places.py). A mutation is made
-in a copy of the tree; the tests that reach it (reach.py) run, the cheapest first, until one fails: then it is killed.
-What no test notices is listed. Mutations that change no result are explained in equivalent.yaml and not counted.
+in a copy of the tree; the tests that reach it (reach.py) run, those of the subject first, until one fails: then it is
+killed. What no test notices is listed. Mutations that change no result are explained in equivalent.yaml and not
+counted.
 
 Exit status: 0, or 1 if the share that was killed is below `--at-least`, or a mutation could not be tried.
 """
@@ -60,7 +61,7 @@ def tried(trees: Sequence[Path], mutations: Sequence[Mutation], tell: Callable[[
     while waiting or running:
         while waiting and free:
             tree, mutation = free.pop(), waiting.pop(0)
-            selected = reach[tree].selected(mutation.place.file, mutation.line)
+            selected = reach[tree].selected(mutation.place.subject, mutation.place.file, mutation.line)
             trial = Trial(tree, mutation, selected)
             running[trial.pid] = (trial, tree)
         for pid, (trial, tree) in list(running.items()):

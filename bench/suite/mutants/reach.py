@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from bench.suite.mutants.recorder import functions
-from bench.suite.mutants.subjects import TESTS
+from bench.suite.mutants.subjects import OWN_TESTS, TESTS
 
 RECORD = Path("bench/suite/mutants/reached.json")
 WHOLE_FILE_S = 3.0  # assumed of a test file whose tests were not recorded
-LIMIT_S = 15.0  # CPU seconds of the tests that a mutation may survive
+LIMIT_S = 25.0  # CPU seconds of the tests that a mutation may survive
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +54,11 @@ class Reach:
         """Texts of the test files of the tree."""
         return {file: (self._tree / file).read_text() for file in files_of_tests(self._tree)}
 
-    def selected(self, file: str, line: int) -> list[Selected]:
-        """The files with tests that reach a line, the cheapest first, as far as they cost no more than the limit."""
+    def selected(self, subject: str, file: str, line: int) -> list[Selected]:
+        """The files with tests that reach a line, as far as they cost no more than the limit.
+
+        Those of the subject come first, the cheapest before the others.
+        """
         name = next((name for first, last, name in functions(self._tree / file) if first <= line <= last), "")
         recorded = self._reached.get(file, {})
         numbers: Iterable[int] = recorded[name] if name in recorded else {n for of in recorded.values() for n in of}
@@ -77,7 +80,8 @@ class Reach:
             if self._files.get(of) != digest(text) and imports.search(text):
                 found = [one for one in found if one.file != of]
                 found.append(Selected(of, (), WHOLE_FILE_S))
-        return _within(sorted(found, key=lambda one: (one.cost_s, one.file)))
+        own = tuple(f"{folder}/" for folder in OWN_TESTS[subject])
+        return _within(sorted(found, key=lambda one: (not one.file.startswith(own), one.cost_s, one.file)))
 
 
 def _within(found: Sequence[Selected]) -> list[Selected]:

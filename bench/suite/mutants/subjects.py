@@ -36,12 +36,23 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
     "watchdogs": ("drivers/arm/*.py", "drivers/ur/watchdog.py", "drivers/ur/safety.py", "drivers/host/heartbeat.py"),
     "authorisation": ("service/people/**/*.py",),
 }
-# Where the fast tests that reach these sources lie: only these are recorded (record.py).
-TESTS = (
-    *("tests/core", "tests/recovery", "tests/protocol", "tests/store", "tests/verify", "tests/people", "tests/run"),
-    *("tests/registration", "tests/dataset", "tests/evaluation", "tests/ground_truth", "tests/robot", "tests/poses"),
-    *("tests/calibration", "tests/further", "tests/scanner", "tests/server", "tests/audit", "tests/steps"),
-)
+# Where the tests of each subject lie: of all that reach a place, these come first.
+OWN_TESTS: dict[str, tuple[str, ...]] = {
+    "decide": ("tests/core", "tests/recovery", "tests/run"),
+    "gates": ("tests/core", "tests/protocol"),
+    "leases": ("tests/store", "tests/run"),
+    "chain": ("tests/store",),
+    "signatures": ("tests/verify",),
+    "verifier": ("tests/store", "tests/verify"),
+    "cost": ("tests/registration",),
+    "covariances": ("tests/registration", "tests/poses", "tests/calibration", "tests/further", "tests/core"),
+    "exporters": ("tests/dataset",),
+    "fusion": ("tests/ground_truth", "tests/scanner"),
+    "watchdogs": ("tests/robot", "tests/steps"),
+    "authorisation": ("tests/people", "tests/server"),
+}
+# Where else fast tests reach them: only these folders are recorded (record.py).
+TESTS = sorted({folder for own in OWN_TESTS.values() for folder in own} | {"tests/evaluation", "tests/audit"})
 
 
 def sources(tree: Path) -> dict[str, list[str]]:
