@@ -96,6 +96,20 @@ def test_the_decisions_of_a_run_in_order(log: Log) -> None:
     refused(log, "the run is completed", action="redo", reason="x")
 
 
+def test_a_release_binds_the_required_step_that_passed_last() -> None:
+    """Signing the earlier one would leave open what was done after it."""
+    log = Log(toy_protocol(TOY.replace("requires: [capture]", "requires: [fix_it, capture]")))
+    log.do()
+    of_the_first = log.events[-1].sha256
+    log.do(**GOOD)
+    assert log.question.for_ == "sign"
+    assert log.question.sign_sha256 == log.events[-1].sha256 != of_the_first
+    log = Log(toy_protocol(TOY.replace("requires: [capture]", "requires: [capture, fix_it]")))
+    log.do()
+    log.do(**GOOD)
+    assert log.question.sign_sha256 == log.events[-1].sha256
+
+
 def test_the_fold_is_the_reduction_by_advance() -> None:
     log = at_scan()
     assert fold(log.protocol, log.events) == log.state

@@ -17,6 +17,7 @@ from service.core.records.events import (
     ViewpointFailed,
 )
 from service.core.recovery.policy import NEEDS_A_PERSON, PASSING, recovery_policy
+from service.core.recovery.ways_on import ways_on
 from service.core.run.decide import (
     AbortRun,
     Halt,
@@ -97,6 +98,15 @@ def test_failed_gates_ask_and_can_be_overridden_only_with_leave_and_reason() -> 
     assert log.state.deviations[-1].kind == "gate_overridden"
     assert log.state.steps["capture"].skipped
     assert log.state.current == "spray"
+
+
+def test_a_signature_takes_a_minute_and_to_leave_a_step_out_takes_none() -> None:
+    """The person at the table chooses by what each way takes."""
+    log = at_capture()
+    log.begin()
+    log.measure(views=2.0, sharp=0.5)
+    takes = {way.verb: way.minutes for way in ways_on(log.protocol, log.state)}
+    assert (takes["accept"], takes["skip"], takes["abort"]) == (1.0, 0.0, 0.0)
 
 
 def test_verdicts_that_do_not_follow_from_the_measures_are_no_evidence() -> None:

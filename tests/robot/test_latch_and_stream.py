@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections import deque
 from collections.abc import Callable, Generator
 from multiprocessing import Pipe
@@ -212,6 +213,11 @@ def test_an_arm_that_stands_for_most_of_the_window_has_settled() -> None:
     assert np.allclose(found.T_base_flange[:3, 3], [0.4, 0.0, 0.2])
     assert np.allclose(found.joints_rad, 0.0)
     assert not judge(window(0.39), CRITERIA).settled, "less than 0.8 of the window"
+
+
+def test_what_is_stated_of_the_joints_is_the_mean_of_each() -> None:
+    samples = [dataclasses.replace(one, joints_rad=0.1 * np.arange(6) + 0.001 * k) for k, one in enumerate(window())]
+    assert np.allclose(judge(samples, CRITERIA).joints_rad, 0.1 * np.arange(6) + 0.0125)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ import shutil
 import sys
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -77,53 +76,55 @@ def tried(trees: Sequence[Path], mutations: Sequence[Mutation], tell: Callable[[
     return [verdicts[mutation] for mutation in mutations]
 
 
-def killed(verdict: Verdict) -> bool:
-    """Whether the tests noticed."""
-    return verdict.outcome in ("killed", "hung")
+KILLED = ("killed", "hung")
 
 
-def report(verdicts: Sequence[Verdict], options: argparse.Namespace, cpu_s: float) -> tuple[str, dict[str, Any]]:
-    """The results as a page and as data."""
-    counted = [v for v in verdicts if killed(v) or not explained(v.mutation)]
-    number = sum(map(killed, counted))
-    alike = len(verdicts) - len(counted)
-    by_subject = {subject: [v for v in counted if v.mutation.place.subject == subject] for subject in SUBJECTS}
-    share = number / max(1, len(counted))
-    tests_of = f", with the tests of {options.tests_of}" if options.tests_of else ""
-    lines = [
-        f"# Mutations of {options.day}",
-        "",
-        f"`python -m bench.suite.mutants --seed {options.seed} --count {options.count}` at {commit()}{tests_of}: "
-        f"**{number} of {len(counted)} killed ({share:.1%})**; {alike} more change no result "
-        "(bench/suite/mutants/equivalent.yaml). "
-        f"{cpu_s:.0f} CPU seconds in all, {sum(v.cpu_s for v in verdicts) / max(1, len(verdicts)):.1f} a mutation.",
-        "",
-        "| subject | killed | drawn |",
-        "|---|---|---|",
-        *(f"| {subject} | {sum(map(killed, of))} | {len(of)} |" for subject, of in by_subject.items() if of),
-        "",
-    ]
-    survivors = [v for v in verdicts if not killed(v)]
-    if survivors:
-        lines += ["## Survivors", ""]
-    for v in survivors:
-        m, why = v.mutation, explained(v.mutation)
-        ran = f"{v.outcome}; tests: {', '.join(v.tests) or 'none reaches it'}"
-        lines += [f"- `{m.name}` ({m.place.subject}, {m.place.kind}): {why or ran}", "", "  ```diff"]
-        lines += [f"  - {m.before}", f"  + {m.after}", "  ```", ""]
+def recorded(verdicts: Sequence[Verdict], options: argparse.Namespace, cpu_s: float) -> dict[str, Any]:
+    """The results as data."""
     rows = [
         {
             "subject": v.mutation.place.subject, "kind": v.mutation.place.kind, "at": v.mutation.name,
             "before": v.mutation.before, "after": v.mutation.after, "outcome": v.outcome, "by": v.by,
-            "cpu_s": round(v.cpu_s, 2), "explained": explained(v.mutation),
+            "cpu_s": round(v.cpu_s, 2), "explained": explained(v.mutation), "tests": list(v.tests),
         }
         for v in verdicts
     ]  # fmt: skip
-    data = {
-        "seed": options.seed, "count": options.count, "tests_of": options.tests_of, "commit": commit(),
-        "machine": machine(), "killed": number, "counted": len(counted), "cpu_s": round(cpu_s, 1), "mutations": rows,
+    counted = [row for row in rows if row["outcome"] in KILLED or not row["explained"]]
+    return {
+        "day": options.day, "seed": options.seed, "count": len(rows), "tests_of": options.tests_of or "",
+        "commit": commit(), "machine": machine(), "killed": sum(row["outcome"] in KILLED for row in rows),
+        "counted": len(counted), "cpu_s": round(cpu_s, 1), "mutations": rows,
     }  # fmt: skip
-    return "\n".join(lines).rstrip() + "\n", data
+
+
+def page(data: dict[str, Any]) -> str:
+    """The results as a page."""
+    rows: list[dict[str, Any]] = data["mutations"]
+    counted = [row for row in rows if row["outcome"] in KILLED or not row["explained"]]
+    of = {subject: [row["outcome"] in KILLED for row in counted if row["subject"] == subject] for subject in SUBJECTS}
+    tests_of = f", with the tests of {data['tests_of']}" if data["tests_of"] else ""
+    mean_s = sum(row["cpu_s"] for row in rows) / max(1, len(rows))
+    lines = [
+        f"# Mutations of {data['day']}",
+        "",
+        f"`python -m bench.suite.mutants --seed {data['seed']} --count {data['count']}` "
+        f"at {data['commit']}{tests_of}: "
+        f"**{data['killed']} of {data['counted']} killed ({data['killed'] / max(1, data['counted']):.1%})**; "
+        f"{len(rows) - len(counted)} more change no result (bench/suite/mutants/equivalent.yaml). "
+        f"{data['cpu_s']:.0f} CPU seconds in all, {mean_s:.1f} a mutation.",
+        "",
+        "| subject | killed | counted |",
+        "|---|---|---|",
+        *(f"| {subject} | {sum(found)} | {len(found)} |" for subject, found in of.items() if found),
+        "",
+    ]
+    survivors = [row for row in rows if row["outcome"] not in KILLED]
+    lines += ["## Survivors", ""] if survivors else []
+    for row in survivors:
+        ran = f"{row['outcome']}; tests: {', '.join(row['tests']) or 'none reaches it'}"
+        lines += [f"- `{row['at']}` ({row['subject']}, {row['kind']}): {row['explained'] or ran}", "", "  ```diff"]
+        lines += [f"  - {row['before']}", f"  + {row['after']}", "  ```", ""]
+    return "\n".join(lines).rstrip() + "\n"
 
 
 def arguments() -> argparse.Namespace:
@@ -166,14 +167,14 @@ def main() -> int:
         verdicts = tried(trees, mutations, tell)
     times = os.times()
     cpu_s = times.user + times.system + times.children_user + times.children_system
-    page, data = report(verdicts, options, cpu_s)
-    print(f"\n{page}")
+    data = recorded(verdicts, options, cpu_s)
+    print(f"\n{page(data)}")
     if options.record:
         name = f"mutants{'-before' if options.tests_of else ''}-{options.day}"
-        (RESULTS / f"{name}.md").write_text(page, encoding="utf-8")
+        (RESULTS / f"{name}.md").write_text(page(data), encoding="utf-8")
         (RESULTS / f"{name}.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-    broken = Counter(v.outcome for v in verdicts)["broken"]
-    return int(broken > 0 or data["killed"] < options.at_least * data["counted"])
+    broken = any(verdict.outcome == "broken" for verdict in verdicts)
+    return int(broken or data["killed"] < options.at_least * data["counted"])
 
 
 if __name__ == "__main__":

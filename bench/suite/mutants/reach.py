@@ -54,6 +54,11 @@ class Reach:
         """Texts of the test files of the tree."""
         return {file: (self._tree / file).read_text() for file in files_of_tests(self._tree)}
 
+    def _in_order(self, file: str, tests: Iterable[str]) -> tuple[str, ...]:
+        """Tests in the order of their file, since some share a fixture that an earlier one leaves changed."""
+        text = self._present[file]
+        return tuple(sorted(tests, key=lambda test: text.index(f"def {test.rpartition('::')[2]}(")))
+
     def selected(self, subject: str, file: str, line: int) -> list[Selected]:
         """The files with tests that reach a line, as far as they cost no more than the limit.
 
@@ -68,7 +73,7 @@ class Reach:
             if re.search(rf"def {re.escape(function.rpartition('::')[2])}\(", self._present.get(of, "")):
                 by_file.setdefault(of, []).append(function)
         found = [
-            Selected(of, tuple(sorted(tests)), sum(self._costs[f"{of}::{test}"] for test in tests))
+            Selected(of, self._in_order(of, tests), sum(self._costs[f"{of}::{test}"] for test in tests))
             for of, tests in by_file.items()
         ]
         module = re.escape(file.removesuffix(".py").replace("/", "."))
