@@ -53,10 +53,7 @@ def test_pieces_made_as_images_arrive_give_the_same_model_as_pieces_made_afterwa
     features = {image["viewpoint"]: ref.sha256 for image, ref in zip(jobs.images, together, strict=True)}
     assert features == one_by_one
     prior = {name: T.tolist() for name, T in jobs.poses.items()}
-    pairs = [
-        list(pair)
-        for pair in pairs_of(features, jobs.poses, SfmOptions(**EFFORT))
-    ]
+    pairs = [list(pair) for pair in pairs_of(features, jobs.poses, SfmOptions(**EFFORT))]
     every = [[a, b] for a in features for b in features if a < b]
     extra = [pair for pair in every if pair not in pairs]
     assert len(pairs) > 3, "a part is left when the first three are taken away"
