@@ -238,6 +238,7 @@ def screen(
     complaints: list[str] = []
     page = context.new_page()
     page.set_default_timeout(15_000)
+    page.set_default_navigation_timeout(60_000)  # a page with a scene is made when it is first asked for
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on(
         "console", lambda message: complaints.append(message.text) if "Content Security" in message.text else None
