@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from service.compute.pixels.masks import WorldSphere
+from service.core.errors import DataError
 from service.core.geometry import Array, inverse
 from service.dataset.posed.pixels import undistorted_data_set
 from service.dataset.posed.records import DataSet
@@ -61,6 +64,13 @@ def test_instant_ngp_sees_the_solid_in_its_cube_and_its_meshes_come_back(dataset
     assert np.abs(saved[:, box["mesh_axes"]] + box["centre_m"] - corners()).max() < 1e-6
     # The solid has no symmetry: another order of the axes does not fit.
     assert np.abs(saved + box["centre_m"] - corners()).max() > 0.02
+
+
+@pytest.mark.parametrize("term", ["k3", "k4", "k5", "k6"])
+def test_instant_ngp_is_not_given_a_lens_that_it_does_not_know(dataset: DataSet, tmp_path: Path, term: str) -> None:
+    views = tuple(replace(v, camera=replace(v.camera, **{term: 0.01})) for v in dataset.views)
+    with pytest.raises(DataError, match="knows only k1, k2, p1, p2"):
+        written(replace(dataset, views=views), "instant-ngp", tmp_path)
 
 
 def test_neus2_sees_the_solid_in_its_cube_and_its_meshes_come_back(dataset: DataSet, tmp_path: Path) -> None:

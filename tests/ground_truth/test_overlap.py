@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.ground_truth.fusion.overlap import OverlapLimits, overlap
+from service.compute.ground_truth.fusion.overlap import Mask, OverlapLimits, WoundLimits, overlap, propose_wound
 from service.compute.ground_truth.surface import Surface
 from service.core.geometry import transform
 
@@ -69,3 +71,48 @@ def test_a_strip_along_the_scans_rim_is_not_used(rim_m: float) -> None:
     assert not found[from_rim_m < rim_m - 1e-6].any()
     default = overlap(CT, sheet(13)).covered
     assert np.array_equal(default, overlap(CT, sheet(13), OverlapLimits(rim_m=0.001)).covered)
+
+
+# --- wounds ----------------------------------------------------------------------------------------------
+
+RADIUS_M, DEPTH_M = 0.012, 0.008
+
+
+def bowl(sign: int = 1) -> tuple[Surface, Mask]:
+    """A sheet with a hollow (or a hill) of 12 mm radius in its middle, which the scan lacks."""
+    flat = sheet(41)
+    across_m = np.linalg.norm(flat.vertices_m[:, :2], axis=1)
+    height = -sign * DEPTH_M * np.maximum(1 - (across_m / RADIUS_M) ** 2, 0.0)
+    return Surface(flat.vertices_m + height[:, None] * [0, 0, 1], flat.faces), across_m >= RADIUS_M
+
+
+def proposed(limits: WoundLimits, sign: int = 1, up: tuple[float, float, float] = (0, 0, 2)) -> bool:
+    surface, covered = bowl(sign)
+    wound = propose_wound(surface, covered, np.array(up), limits)
+    assert not wound.any() or np.array_equal(wound, ~covered)
+    return bool(wound.any())
+
+
+def test_a_hollow_that_the_scan_lacks_is_a_wound_from_its_least_area_and_depth_on() -> None:
+    surface, covered = bowl()
+    area_m2 = sum(
+        float(np.linalg.norm(surface.area_vectors_m2[face])) / 3
+        for face, corners in enumerate(surface.faces)
+        for corner in corners
+        if not covered[corner]
+    )
+    assert 1.2 * np.pi * RADIUS_M**2 < area_m2 < 2.5 * np.pi * RADIUS_M**2
+    alike = WoundLimits(closing_m=1e-4, least_depth_m=0.001, least_facing=0.2)
+    assert proposed(dataclasses.replace(alike, least_area_m2=0.95 * area_m2))
+    assert not proposed(dataclasses.replace(alike, least_area_m2=1.05 * area_m2))
+    small = dataclasses.replace(alike, least_area_m2=1e-5)
+    # The mean depth of a paraboloid is half of that of its middle, and less from a rim that lies below the sheet.
+    assert proposed(dataclasses.replace(small, least_depth_m=0.25 * DEPTH_M))
+    assert not proposed(dataclasses.replace(small, least_depth_m=0.55 * DEPTH_M))
+    assert not proposed(small, sign=-1), "a hill"
+    assert not proposed(small, up=(0, 0, -1)), "seen from below it is a hill too"
+
+
+def test_nothing_is_proposed_where_nothing_lacks() -> None:
+    surface, covered = bowl()
+    assert not propose_wound(surface, np.ones_like(covered), np.array([0.0, 0.0, 1.0])).any()

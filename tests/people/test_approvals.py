@@ -115,3 +115,7 @@ def first_page(web: WebSite, run_id: str) -> str:
 
 def test_lines_are_numbered_on_either_side() -> None:
     assert difference("a\nb\nc\n", "a\nB\nc\nd\n") == ["− 2: b", "+ 2: B", "+ 4: d"]
+
+
+def test_each_of_several_lines_has_its_own_number() -> None:
+    assert difference("a\nb\nc\nd", "a\nx\ny\nz\nd") == ["− 2: b", "− 3: c", "+ 2: x", "+ 3: y", "+ 4: z"]

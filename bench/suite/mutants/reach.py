@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +21,7 @@ from bench.suite.mutants.subjects import OWN_TESTS, TESTS
 
 RECORD = Path("bench/suite/mutants/reached.json")
 WHOLE_FILE_S = 3.0  # assumed of a test file whose tests were not recorded
-LIMIT_S = 25.0  # CPU seconds of the tests that a mutation may survive
+LIMIT_S = 25.0  # CPU seconds; from here on only the subject's own tests run
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +60,9 @@ class Reach:
         return tuple(sorted(tests, key=lambda test: text.index(f"def {test.rpartition('::')[2]}(")))
 
     def selected(self, subject: str, file: str, line: int) -> list[Selected]:
-        """The files with tests that reach a line, as far as they cost no more than the limit.
+        """The files with tests that reach a line: all of the subject's own, then others, as far as the limit allows.
 
-        Those of the subject come first, the cheapest before the others.
+        The cheapest come first.
         """
         name = next((name for first, last, name in functions(self._tree / file) if first <= line <= last), "")
         recorded = self._reached.get(file, {})
@@ -86,16 +86,12 @@ class Reach:
                 found = [one for one in found if one.file != of]
                 found.append(Selected(of, (), WHOLE_FILE_S))
         own = tuple(f"{folder}/" for folder in OWN_TESTS[subject])
-        return _within(sorted(found, key=lambda one: (not one.file.startswith(own), one.cost_s, one.file)))
-
-
-def _within(found: Sequence[Selected]) -> list[Selected]:
-    kept: list[Selected] = []
-    for one in found:
-        if kept and sum(other.cost_s for other in kept) + one.cost_s > LIMIT_S:
-            break
-        kept.append(one)
-    return kept
+        found.sort(key=lambda one: (one.cost_s, one.file))
+        kept = [one for one in found if one.file.startswith(own)]
+        for one in found:
+            if one not in kept and sum(other.cost_s for other in kept) + one.cost_s <= LIMIT_S:
+                kept.append(one)
+        return kept
 
 
 def files_of_tests(tree: Path) -> list[str]:
