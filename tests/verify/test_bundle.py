@@ -74,12 +74,14 @@ def test_the_verifier_needs_nothing_of_this_project_and_no_new_python() -> None:
 
 def test_the_export_is_recorded_and_the_bundle_ends_before_it(site: Site) -> None:
     with Store.open(site.data) as store:
-        *before, last = store.events(site.run_id)
+        events = store.events(site.run_id)  # other tests of this file export it again
+        first = next(n for n, event in enumerate(events) if isinstance(event.payload, EvidenceExported))
+        before, last = events[:first], events[first]
         assert isinstance(last.payload, EvidenceExported)
         assert (last.actor, last.payload.what, last.payload.file_name) == ("ada", "bundle", site.bundle.name)
         assert (last.payload.sha256, last.payload.size_bytes) == hash_file(site.bundle)
         assert last.payload.head_sha256 == before[-1].sha256
-        assert store.checkpoints(site.run_id)[-1].seq == last.seq
+        assert last.seq in {signed.seq for signed in store.checkpoints(site.run_id)}
     manifest = json.loads((site.folder / "manifest.json").read_text())
     assert manifest["head"] == {"seq": before[-1].seq, "sha256": before[-1].sha256}
     assert verify(site.data, site.run_id).ok

@@ -70,7 +70,8 @@ def estimate(
         start: current values.
 
     Source: Patterson and Thompson, "Recovery of inter-block information when block sizes are unequal",
-    Biometrika 58(3), 1971. A wide prior on each logarithm limits the influence of few residuals.
+    Biometrika 58(3), 1971. A wide prior on the logarithm of the outlines' factor limits the influence of few
+    residuals.
 
     The pose noise grows at most fivefold at a time. If residuals are far larger than stated, the minimiser's first
     step would otherwise make the poses carry no information, from which neither it nor the solution recovers.
