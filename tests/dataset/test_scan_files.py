@@ -17,8 +17,8 @@ from service.dataset.posed.exporter import exporter, write_data_set
 from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.summary import summarise
 from service.steps import params_models
-from service.store.store import Store
 from tests.support.ct.fused_scene import CENTRES_M, scan_mesh, with_spheres
+from tests.support.runs.bench_run import bench_store
 from tests.support.runs.computing_run import OneScanner, begin_computing_run
 from tests.support.scenes.posed import posed_data_set
 
@@ -61,7 +61,7 @@ def test_a_textured_scan_leaves_as_it_came(tmp_path: Path) -> None:
     write_textured(tmp_path / "scans")
     rig = OneScanner()
     rig.folder = tmp_path / "scans"
-    with Store.open(tmp_path / "data") as store:
+    with bench_store(tmp_path / "data") as store:
         bench = begin_computing_run(store, PROTOCOL, tmp_path, rig)
         state = bench.run()
         assert state.status == "completed", state

@@ -75,7 +75,7 @@ class Bench:
     operator: ScriptedOperator = field(default_factory=ScriptedOperator)
     authority: Authority | None = None
     signature_copy: Path | None = None
-    on_wait: Callable[[float], None] = lambda _seconds: None
+    on_wait: Callable[[float], None] | None = None  # called when the runner waits, in a store of `bench_store`
 
     @property
     def clock(self) -> SteppedClock:
@@ -87,7 +87,7 @@ class Bench:
     def run(self) -> RunState:
         """Run one runner process to its end."""
         self.rig.keep_time(self.store.clock)
-        if isinstance(self.store.clock, SteppedClock):
+        if self.on_wait is not None:
             self.clock.on_sleep = self.on_wait
         protocol, _ = recorded_run(self.store, self.run_id)
         return Runner(
