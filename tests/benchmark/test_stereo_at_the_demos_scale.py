@@ -16,6 +16,7 @@ SCENE, WIDTH_PX, VIEWS = 7, 1280, 16
 
 
 @pytest.mark.slow
+@pytest.mark.whole
 @pytest.mark.timeout(1500)
 def test_the_stereo_method_reconstructs_the_specimen_at_the_demos_scale(tmp_path: Path) -> None:
     dataset = simulated_data_set(render_scene(SCENE, WIDTH_PX, VIEWS, cache=tmp_path))
