@@ -16,8 +16,6 @@ from service.store.verification.verify import show
 from service.web.capture.view import views_of
 from tests.support.record.counting import lines_of
 
-pytestmark = pytest.mark.slow
-
 SMALL, LARGE = 100, 200
 MOST = 2.3  # limit of the ratio for twice as many viewpoints
 

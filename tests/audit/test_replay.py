@@ -105,7 +105,6 @@ def referring(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("recorded", ["folder", "referring"])
 def test_end_to_end_carries_the_change_to_the_registration(
     recorded: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
@@ -206,7 +205,6 @@ def test_command_says_equal_with_status_0(folder: Path, tmp_path: Path) -> None:
     assert kept.read_bytes() == files.artefact_path(recorded.ref.sha256).read_bytes()
 
 
-@pytest.mark.slow
 def test_command_says_where_and_by_how_much_with_status_1(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hand(monkeypatch, "locate_spheres", moved_spheres)
     answer = invoke(folder, "--jobs", "locate_spheres")

@@ -18,8 +18,6 @@ from service.core.geometry import Array, transform
 from service.dataset.posed.exporter import exporter, write_data_set
 from tests.support.scenes.slab_data_set import SLABS, slab_data_set, slab_mesh
 
-pytestmark = pytest.mark.slow
-
 
 def write_map(path: Path, values: Array) -> None:
     """Write an array (H, W, C) as COLMAP writes depth and normal maps."""
@@ -62,6 +60,7 @@ def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "dense"
 
 
+@pytest.mark.slow
 def test_the_depth_maps_are_fused_and_meshed_in_the_frame_of_the_poses(
     dense: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -76,6 +75,7 @@ def test_the_depth_maps_are_fused_and_meshed_in_the_frame_of_the_poses(
         assert np.median(np.abs(vertices[:, 2:] - heights).min(axis=1)) < most_m
 
 
+@pytest.mark.slow
 def test_depth_maps_without_depth_end_with_words(
     dense: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -121,7 +121,6 @@ def test_a_steep_place_is_most_alike_where_it_is(views: list[StereoView]) -> Non
     assert np.median(alike.max(axis=1)) > 0.7
 
 
-@pytest.mark.slow
 def test_what_is_plain_is_no_evidence() -> None:
     known = RayMesh(together(*FLOORS).vertices_m, together(*FLOORS).faces)
     photographs = [photograph(seen_from(T, plain=True), known) for T in poses()]
@@ -142,7 +141,6 @@ def test_a_place_behind_the_known_surface_is_seen_by_no_view_and_one_before_it_i
     assert seen_through(photographs, np.concatenate([on, below, above])).tolist() == [0, 0, len(views)]
 
 
-@pytest.mark.slow
 def test_the_views_of_many_places_take_no_more_memory_than_those_of_a_few(views: list[StereoView]) -> None:
     known = RayMesh(together(*FLOORS).vertices_m, together(*FLOORS).faces)
     photographs = [photograph(view, known) for view in views] * 3

@@ -21,7 +21,7 @@ from tests.support.pages.browser import (
 )
 from tests.support.recorded.unpacked_run import unpack_recorded_run
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 
 CHECKS = (Path(__file__).parents[1] / "support" / "pages" / "page_checks.js").read_text()
 
@@ -48,6 +48,7 @@ def opacity(page: Page) -> float:
     return float(page.locator("#depth-over").evaluate("e => getComputedStyle(e).opacity"))
 
 
+@pytest.mark.slow
 def test_the_whole_page_is_accessible_and_its_targets_are_large(tablet: Screen) -> None:
     page = tablet.page
     page.evaluate(CHECKS)
@@ -62,6 +63,7 @@ def test_the_whole_page_is_accessible_and_its_targets_are_large(tablet: Screen) 
     page.set_viewport_size({"width": TABLET[0], "height": TABLET[1]})
 
 
+@pytest.mark.slow
 def test_the_slider_is_moved_by_a_finger_and_by_keys(tablet: Screen) -> None:
     page = tablet.page
     slider = page.get_by_label("From photograph to depth")
@@ -82,6 +84,7 @@ def test_the_slider_is_moved_by_a_finger_and_by_keys(tablet: Screen) -> None:
     assert opacity(page) == pytest.approx(0.7)
 
 
+@pytest.mark.slow
 def test_photograph_and_depth_cover_each_other(tablet: Screen) -> None:
     boxes = [image.bounding_box() for image in tablet.page.locator(".depth-stack img").all()]
     assert len(boxes) == 2
@@ -90,6 +93,7 @@ def test_photograph_and_depth_cover_each_other(tablet: Screen) -> None:
     assert tablet.page.locator(".depth-stack img").evaluate_all(loaded)
 
 
+@pytest.mark.slow
 def test_another_view_and_another_split_are_chosen(tablet: Screen) -> None:
     page = tablet.page
     page.locator(".splits").get_by_role("link", name="Sparse").click()

@@ -25,7 +25,7 @@ from tests.support.recorded.calibrated_run import RIG
 from tests.support.runs.attended import attended
 from tests.support.runs.bench_run import PROTOCOL
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 BADGE = "0004711815"
 DENSE = PROTOCOL.replace("count: 4", "count: 54")  # as many viewpoints as a station of the paper's protocol
 # A badge reader's keys: far faster than the test could press them; the letters end in the focused field.
@@ -98,6 +98,7 @@ def at_the_plan(server: Served, browser: Browser) -> Generator[tuple[Screen, str
         yield tablet, run_id
 
 
+@pytest.mark.slow
 def test_viewpoints_closer_than_a_fingertip_are_chosen_from_a_list(server: Served, browser: Browser) -> None:
     with at_the_plan(server, browser) as (tablet, _run_id):
         page = tablet.page
@@ -114,6 +115,7 @@ def test_viewpoints_closer_than_a_fingertip_are_chosen_from_a_list(server: Serve
         expect(page.get_by_role("heading", name="v028")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_the_plan_is_made_larger_until_a_finger_is_enough(server: Served, browser: Browser) -> None:
     with at_the_plan(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -185,6 +187,7 @@ def signed_by(server: Served, run_id: str) -> list[str]:
     return [action.identified for action in actions if action.action == "sign"]
 
 
+@pytest.mark.slow
 def test_a_badge_held_to_the_reader_signs_and_leaves_nothing_in_the_fields(server: Served, browser: Browser) -> None:
     with at_the_signature(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -207,6 +210,7 @@ def test_a_badge_held_to_the_reader_signs_and_leaves_nothing_in_the_fields(serve
         assert signed_by(server, run_id) == ["badge"]
 
 
+@pytest.mark.slow
 def test_a_pin_is_typed_on_the_screen(server: Served, browser: Browser) -> None:
     with at_the_signature(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -223,6 +227,7 @@ def test_a_pin_is_typed_on_the_screen(server: Served, browser: Browser) -> None:
         assert signed_by(server, run_id) == ["pin"]
 
 
+@pytest.mark.slow
 def test_a_reason_is_chosen_or_written(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (tablet, run_id):
         page = tablet.page

@@ -16,9 +16,10 @@ from service.store.verification.verify import verify
 from tests.support.pages.browser import add_people, chromium, screen, served
 from tests.support.runs.bench_run import PROTOCOL
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 
 
+@pytest.mark.slow
 def test_a_run_is_started_noted_on_and_found(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text("name: bench\nsimulated: true\ndevices: {}\n")
     protocols = tmp_path / "protocols"

@@ -31,7 +31,7 @@ from tests.support.pages.shown_site import ShownSite, shown_site
 from tests.support.pages.web import PIN, password_of, web_site
 from tests.support.runs.attended import attended
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 
 CHECKS = (Path(__file__).parents[1] / "support" / "pages" / "page_checks.js").read_text()
 WIDTHS = (768, 1024, 1920, 3840)
@@ -213,6 +213,7 @@ def test_no_page_is_forgotten(tmp_path: Path) -> None:
     assert routes == set(PAGES) | NO_PAGES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("role", "path"), VIEWS, ids=[f"{role}:{path}" for role, path in VIEWS])
 def test_page(desk: Desk, role: Role | None, path: str) -> None:
     """One load: axe, sizes, horizontal scrolling, keys, and the page's requests and complaints."""
@@ -287,6 +288,7 @@ def test_a_dialog_holds_the_focus_and_gives_it_back(desk: Desk, run: str, opener
         expect(button).to_be_focused()
 
 
+@pytest.mark.slow
 def test_a_locked_screen_is_unlocked_by_keys_and_cannot_be_escaped(desk: Desk) -> None:
     shown = desk.screen("technician")
     page = shown.page
@@ -315,6 +317,7 @@ def test_nothing_moves_on_the_page_for_who_wants_no_motion(desk: Desk) -> None:
         shown.page.emulate_media(reduced_motion="no-preference")
 
 
+@pytest.mark.slow
 def test_a_motion_is_confirmed_with_a_held_key_only(desk: Desk) -> None:
     shown = desk.screen("technician")
     page = shown.page
@@ -332,6 +335,7 @@ def test_a_motion_is_confirmed_with_a_held_key_only(desk: Desk) -> None:
         assert actions(desk, desk.site.moving).count("confirm") == 1
 
 
+@pytest.mark.slow
 def test_a_checklist_is_worked_through_without_script(desk: Desk) -> None:
     with plain_page(desk.browser, desk.server.url) as page, desk.attending("/runs/{listing}") as address:
         page.goto("/sign-in")

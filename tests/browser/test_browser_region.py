@@ -21,7 +21,7 @@ from tests.support.pages.web import password_of, web_site
 from tests.support.runs.attended import attended
 from tests.support.runs.recorded_run import FUSION, PROTOCOL, record_run
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 
 EYE_M = np.array([0.0, -0.002, 1.7])  # of the view `Top`, which looks at the origin
 HALF_ANGLE_RAD = np.pi / 8  # of plotly's lens, between the middle and the upper edge
@@ -52,6 +52,7 @@ def seen_from_the_top(page: Page, points_m: Array) -> list[tuple[float, float]]:
     return [(float(a), float(b)) for a, b in zip(u, v, strict=True)]
 
 
+@pytest.mark.slow
 def test_the_corners_that_a_finger_touches_are_recorded(tmp_path: Path, browser: Browser) -> None:
     run_id = record_run(tmp_path, complete=False, protocol=PROTOCOL + FUSION)
     with web_site(tmp_path):  # creates its people

@@ -31,7 +31,7 @@ from tests.support.processes.waiting import until
 from tests.support.protocols.short_protocol import short_protocol
 from tests.support.rig.rig import press_pedal, simulated_rig
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.timeout(400)]
 
 LONG_MS = 60_000
 
@@ -134,6 +134,7 @@ def images(page: Page, run: str) -> int:
     )
 
 
+@pytest.mark.slow
 def test_a_technician_is_led_through_a_run_and_a_second_person_releases_it(
     server: Served, browser: Browser, people: None
 ) -> None:
@@ -240,6 +241,7 @@ def sign(page: Page, password: str) -> None:
     page.get_by_role("button", name="Sign", exact=True).click()
 
 
+@pytest.mark.slow
 def test_two_tablets_a_lost_connection_and_a_killed_web_process_do_not_disturb_a_capture(
     server: Served, browser: Browser, rig: dict[str, Any], people: None
 ) -> None:

@@ -22,7 +22,7 @@ from tests.support.pages.web import WebSite, password_of, web_site
 from tests.support.recorded.calibrated_run import RIG, begin_calibrated_run
 from tests.support.runs.bench_run import PROTOCOL
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 AT_THE_LENS = PROTOCOL.replace("id: fixation", "id: camera_set_up\n    drawing: camera")
 
 
@@ -51,6 +51,7 @@ def scrolled(page: Page) -> float:
     return page.evaluate("scrollY")
 
 
+@pytest.mark.slow
 def test_the_banner_stays_and_a_new_step_begins_at_its_head(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -75,6 +76,7 @@ def test_the_banner_stays_and_a_new_step_begins_at_its_head(server: Served, brow
         assert scrolled(page) == 0
 
 
+@pytest.mark.slow
 def test_a_page_that_is_no_runs_keeps_the_robots_in_sight(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (tablet, _run_id):
         tablet.go("/account")
@@ -103,6 +105,7 @@ HEARD = """() => {
 }"""
 
 
+@pytest.mark.slow
 def test_sound_and_notification_are_by_choice(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -160,6 +163,7 @@ def camera(data: Path, run_id: str, name: str = "") -> Generator[list[cv2.typing
         sender.join()
 
 
+@pytest.mark.slow
 def test_the_lens_is_focused_by_the_live_view_of_its_step(server: Served, browser: Browser) -> None:
     noise = np.random.default_rng(1).integers(40, 200, (85, 128), np.uint8)
     sharp = cv2.resize(noise, (1024, 680), interpolation=cv2.INTER_NEAREST)
@@ -240,6 +244,7 @@ def run_with_three_cameras(web: WebSite) -> str:
     return begin_calibrated_run(web, rig_text=rig)
 
 
+@pytest.mark.slow
 def test_the_live_view_changes_to_the_camera_that_is_pressed(server: Served, browser: Browser) -> None:
     with web_site(server.data.parent) as web:
         run_id = run_with_three_cameras(web)

@@ -15,7 +15,7 @@ from tests.support.pages.browser import Served, screen, served
 from tests.support.pages.shown_site import skip
 from tests.support.pages.web import password_of, web_site
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +33,7 @@ def box(page: Page, selector: str) -> FloatRect:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "least_px"), [((1024, 768), 430), ((1280, 800), 460)])
 def test_the_step_has_most_of_a_small_screen(
     server: Served, browser: Browser, size: tuple[int, int], least_px: int
@@ -48,6 +49,7 @@ def test_the_step_has_most_of_a_small_screen(
         assert box(page, "#robot-banner .robot-banner")["height"] >= 48
 
 
+@pytest.mark.slow
 def test_end_run_stays_where_it_is(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -79,6 +81,7 @@ def test_end_run_stays_where_it_is(server: Served, browser: Browser) -> None:
 # --- a link, a checklist -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_invitation_is_scanned_or_copied(server: Served, browser: Browser) -> None:
     with screen(browser, server.url) as desk:
         desk.context.grant_permissions(["clipboard-read", "clipboard-write"])

@@ -44,7 +44,6 @@ def test_poses_that_fit_give_the_mount(photographs: BoardFolder, tmp_path: Path)
     assert np.allclose(record["T_flange_camera"], T_FLANGE_CAMERA, atol=1e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words", "remedy"),
     [

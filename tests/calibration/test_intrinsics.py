@@ -236,7 +236,6 @@ def test_an_uncertainty_of_pixels_is_one_of_places_at_the_distance(distance_m: f
     assert ((ratio > 0.9) & (ratio < 1.3)).all()
 
 
-@pytest.mark.slow
 def test_projection_uncertainty_is_the_spread_of_projections_over_calibrations() -> None:
     """Each calibrated camera is moved to fit the boards, as happens when its pose is estimated."""
     projected: list[Array] = []

@@ -19,8 +19,6 @@ from tests.support.processes.waiting import until
 from tests.support.rig.camera_simulator import camera_simulator
 from tests.support.rig.gphoto_rig import PAPER, driver
 
-pytestmark = pytest.mark.slow
-
 
 @contextmanager
 def _world() -> Generator[tuple[World, str]]:

@@ -61,7 +61,6 @@ def test_settings_are_set_and_survive_a_session(camera: RunningCamera, widget: s
     assert vendor_session(camera.gphoto_port, ["value", widget]) == [value]
 
 
-@pytest.mark.slow
 def test_the_focal_position_is_read_and_moved_by_hand_in_manual_focus_only(camera: RunningCamera) -> None:
     """Read-only, 0 to 100; `manualfocus` moves it by steps on the client's own scale."""
     before, refused, *_ = vendor_session(
@@ -95,7 +94,6 @@ def test_an_empty_value_is_refused_and_the_link_goes_on(camera: RunningCamera) -
     assert isinstance(seconds, float)
 
 
-@pytest.mark.slow
 def test_a_value_that_is_not_offered_is_refused_and_nothing_changes(camera: RunningCamera) -> None:
     # The client caches a setting for two seconds.
     words = (["set", "iso", "100"], ["set", "iso", "123"], ["sleep", 2.2], ["value", "iso"])
@@ -136,7 +134,6 @@ def test_capture_raw_and_jpeg_share_a_stem_and_the_log_has_the_bytes_that_were_s
     assert lines[0]["size"] == single["size"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("announce", "complete"), [("event", False), ("property", True)])
 def test_end_of_capture_by_event_or_by_property(announce: str, complete: bool) -> None:
     with camera_simulator((), "--announce", announce) as camera:
@@ -157,7 +154,6 @@ def test_live_view(camera: RunningCamera) -> None:
     assert frame["size"] > 5000
 
 
-@pytest.mark.slow
 def test_autofocus_and_exposure_time_are_waited_for(camera: RunningCamera) -> None:
     answers = vendor_session(
         camera.gphoto_port,
@@ -191,7 +187,6 @@ def test_refused_setting() -> None:
     assert again == "400"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "codes"), [("drop", {-1, -7}), ("reset", {-1, -7}), ("stall", {-10})])
 def test_link_lost_in_mid_download_and_a_new_session_works(kind: str, codes: set[int]) -> None:
     with camera_simulator([{"on": "get_object", "kind": kind}]) as camera:
@@ -240,7 +235,6 @@ def world_socket(answer: dict[str, Any]) -> Generator[str]:
             thread.join()
 
 
-@pytest.mark.slow
 def test_pictures_of_the_world_and_their_true_pose(tmp_path: Path) -> None:
     log = tmp_path / "truth.jsonl"
     pose = look_at(np.array([0.0, -0.3, 0.6]), np.zeros(3), np.array([0.0, 0.0, 1.0]))

@@ -99,7 +99,6 @@ def test_stale_image_then_a_new_one(tmp_path: Path) -> None:
     assert hashlib.sha256(first.jpeg.path.read_bytes()).hexdigest() == first.jpeg.sha256
 
 
-@pytest.mark.slow
 def test_shutter_refused_by_a_camera_that_answers(tmp_path: Path) -> None:
     with rig([{"on": "shutter", "kind": "reject"}]) as (camera, _):
         with pytest.raises(
@@ -122,7 +121,6 @@ def test_a_release_that_is_not_confirmed_is_known_by_its_photograph(answer: int,
     assert [image.jpeg.sha256 for image in images] == truth
 
 
-@pytest.mark.slow
 def test_setting_refused_for_good_and_for_a_moment() -> None:
     # The first set comes from the library itself when it connects (priority mode).
     with rig([{"on": "set", "kind": "reject", "nth": 2, "times": 1}]) as (camera, _):
@@ -134,7 +132,6 @@ def test_setting_refused_for_good_and_for_a_moment() -> None:
         camera.apply(CameraSettings(22.0, 1 / 15, 100, "Automatic"))
 
 
-@pytest.mark.slow
 def test_camera_killed_and_started_again(tmp_path: Path) -> None:
     with camera_simulator() as simulator:
         camera = driver(simulator.gphoto_port)

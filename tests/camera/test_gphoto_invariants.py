@@ -36,7 +36,6 @@ def test_stale_image_is_known_by_its_bytes_in_another_folder(tmp_path: Path, bod
     assert hashlib.sha256(first.jpeg.path.read_bytes()).hexdigest() == first.jpeg.sha256
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("on", ["image", "get_object"])
 def test_truncated_jpeg_is_named_and_earlier_files_are_untouched(tmp_path: Path, body: str, on: str) -> None:
     with rig(body, [{"on": on, "kind": "truncate", "nth": 2}]) as (camera, _):
@@ -49,13 +48,11 @@ def test_truncated_jpeg_is_named_and_earlier_files_are_untouched(tmp_path: Path,
     assert third.counter == 3
 
 
-@pytest.mark.slow
 def test_busy_camera_is_asked_again(tmp_path: Path, body: str) -> None:
     with rig(body, [{"on": "shutter", "kind": "busy", "times": 2}]) as (camera, _):
         assert camera.capture(tmp_path).counter == 1
 
 
-@pytest.mark.slow
 def test_camera_that_stays_busy(tmp_path: Path, body: str) -> None:
     with rig(body, [{"on": "shutter", "kind": "busy", "times": 50}]) as (camera, _), pytest.raises(DeviceBusyError):
         camera.capture(tmp_path)
@@ -68,7 +65,6 @@ def test_full_store(tmp_path: Path, body: str) -> None:
         assert any("free" in problem for problem in camera.report().problems)
 
 
-@pytest.mark.slow
 def test_shutter_without_an_image(tmp_path: Path, body: str) -> None:
     with rig(body, [{"on": "image", "kind": "no_image"}], capture_timeout_s=4.0) as (camera, _):
         with pytest.raises(DeviceTimeoutError, match="none"):
@@ -76,7 +72,6 @@ def test_shutter_without_an_image(tmp_path: Path, body: str) -> None:
         assert camera.capture(tmp_path).counter == 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["drop", "reset"])
 def test_link_lost_in_mid_download_then_open_again(tmp_path: Path, body: str, kind: str) -> None:
     with rig(body, [{"on": "get_object", "kind": kind, "nth": 2}]) as (camera, _):

@@ -103,7 +103,6 @@ def test_a_sphere_covers_exactly_what_its_outline_encloses(scene: Scene) -> None
         assert [(cover * u).sum() / cover.sum(), (cover * v).sum() / cover.sum()] == pytest.approx(middle, abs=0.005)
 
 
-@pytest.mark.slow
 def test_sphere_outlines_in_the_picture_lie_on_the_analytic_cone(plain: Picture, scene: Scene) -> None:
     camera = CameraModel(**dataclasses.asdict(scene.camera_intrinsics(WIDTH)))
     found = detect_spheres(np.ascontiguousarray(plain[..., ::-1]), camera)
@@ -123,7 +122,6 @@ def test_sphere_outlines_in_the_picture_lie_on_the_analytic_cone(plain: Picture,
     assert abs(centre_and_size_px[2]) < 0.03
 
 
-@pytest.mark.slow
 def test_checkerboard_corners_lie_where_the_lens_projects_them(renderer: Renderer, scene: Scene) -> None:
     T_world_board = scene.board_placement(1)
     lens = scene.camera_intrinsics(WIDTH)
@@ -222,7 +220,6 @@ def test_control_spheres_and_spray_change_only_what_they_touch(
         assert np.abs(sprayed[patch].astype(float) - plain[patch]).mean() < 3
 
 
-@pytest.mark.slow
 def test_the_preview_is_small_and_shows_the_same(scene: Scene, plain: Picture) -> None:
     wide = Renderer(780)
     assert WIDTH < PREVIEW_WIDTH < wide.image_width

@@ -42,7 +42,6 @@ def test_identity_and_report(camera: Camera) -> None:
     assert report.problems == ()
 
 
-@pytest.mark.slow
 def test_a_connection_that_breaks_while_it_begins_is_unavailable_and_no_refused_setting(tmp_path: Path) -> None:
     """libgphoto2 takes the camera for open, and says "Bad parameters" when a setting is read."""
     plan = [{"device": "camera", "on": "set_event_mode", "kind": "drop"}]
@@ -71,7 +70,6 @@ def test_a_setting_that_the_camera_lacks_is_refused_with_its_neighbours(camera: 
     assert "aperture 23.7" in refused.value.what
 
 
-@pytest.mark.slow
 def test_files_are_those_on_the_card_and_advance(tmp_path: Path) -> None:
     log = tmp_path / "truth.jsonl"
     with rig([], "--exposures-log", str(log)) as (camera, _):
@@ -114,13 +112,11 @@ def test_the_client_answers_with_what_was_sent() -> None:
         assert vendor_session(simulator.gphoto_port, ["value", "iso"]) == ["400"]
 
 
-@pytest.mark.slow
 def test_a_setting_refused_in_silence_once_is_noticed_and_sent_again() -> None:
     with rig([{"on": "set", "kind": "ignore", "nth": 2}]) as (camera, _):
         assert camera.apply(PAPER) == PAPER
 
 
-@pytest.mark.slow
 def test_a_setting_refused_in_silence_is_an_error_and_not_what_was_sent() -> None:
     with rig([{"on": "set", "kind": "ignore", "nth": 2, "times": 500}]) as (camera, _):
         with pytest.raises(DeviceRefusedError, match="keeps shutterspeed at 1/60 instead of 1/15"):
@@ -129,13 +125,11 @@ def test_a_setting_refused_in_silence_is_an_error_and_not_what_was_sent() -> Non
     assert (kept.aperture_f, kept.exposure_s, kept.iso) == (22.0, pytest.approx(1 / 60), 400)
 
 
-@pytest.mark.slow
 def test_a_setting_refused_for_a_moment_is_sent_again() -> None:
     with rig([{"on": "set", "kind": "reject", "nth": 2, "times": 2}]) as (camera, _):
         assert camera.apply(PAPER) == PAPER
 
 
-@pytest.mark.slow
 def test_a_floating_white_balance_becomes_daylight() -> None:
     with camera_simulator((), name="canon") as simulator:
         vendor_session(simulator.gphoto_port, ["set", "whitebalance", "Auto"])
@@ -196,7 +190,6 @@ def test_a_body_without_a_profile_is_told_which_there_are() -> None:
     assert all(name in refused.value.remedy for name in ("sony_ilce", "canon_eos", "nikon_z"))
 
 
-@pytest.mark.slow
 def test_what_rig_yaml_names_must_exist() -> None:
     with camera_simulator((), name="canon") as simulator:
         for config, what in (({"profile": "leica"}, "no profile leica"), ({"capture_target": "both"}, "canon_eos")):

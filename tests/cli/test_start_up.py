@@ -72,7 +72,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "data"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("words", ["--help", "--version", "status latest", "act pause", "resume --help"])
 def test_it_starts_without_numerics(words: str, data: Path) -> None:
     folder = () if "--" in words else ("--data", str(data))

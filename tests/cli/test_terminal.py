@@ -108,7 +108,6 @@ def test_a_run_by_hand(terminal: Terminal) -> None:
     assert "fixation was inspected" in json.dumps(actions)
 
 
-@pytest.mark.slow
 def test_another_terminal_answers_and_aborts(terminal: Terminal) -> None:
     terminal.wait_for("Two wires hold each piece")
     data = str(terminal.data)

@@ -124,7 +124,6 @@ def test_simulators_explain_themselves_as_every_command_does() -> None:
         assert re.search(rf"│ {name} +[AT]", everything.stdout)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("typed", "told"),
     [

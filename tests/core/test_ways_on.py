@@ -129,7 +129,6 @@ def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Callable
 # --- the walk ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("error", "leave_by"),
     [
@@ -165,7 +164,6 @@ def walker_exits(walker: Walker, verb: str) -> Iterator[str]:
     return (here for here, taken, _ in walker.taken if taken == verb)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("step", ["hands", "views", "judge"])
 def test_ending_early_seals_what_is_there(begin: Callable[[Fakes, Walker], Bench], step: str) -> None:
     bench = begin(Fakes(), Walker("skip", ends_at=step))

@@ -31,7 +31,6 @@ from tests.support.rig.bench_rig import BenchRig
 from tests.support.runs.bench_run import Bench, bench_store, say
 from tests.support.runs.computing_run import begin_computing_run
 
-pytestmark = pytest.mark.slow
 VOXEL_M = 0.8e-3
 FIRST_M = np.array([-0.08, -0.08, 0.0])  # voxel (0, 0, 0) in the world
 SHAPE = (80, 200, 200)  # K, J, I
@@ -98,6 +97,7 @@ def imported(bench: Bench, spheres: tuple[Path, NDArray[np.uint8]], labels: NDAr
     return bench.run()
 
 
+@pytest.mark.slow
 def test_the_surface_is_that_of_the_segment_and_the_record_names_nobody(
     bench: Bench, spheres: tuple[Path, NDArray[np.uint8]]
 ) -> None:
@@ -129,6 +129,7 @@ def test_the_surface_is_that_of_the_segment_and_the_record_names_nobody(
     assert "NIfTI descrip" in html
 
 
+@pytest.mark.slow
 def test_a_mirrored_segmentation_is_told_from_a_true_one(
     bench: Bench, spheres: tuple[Path, NDArray[np.uint8]]
 ) -> None:

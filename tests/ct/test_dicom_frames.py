@@ -135,7 +135,6 @@ def test_an_enhanced_file_in_rle_reads_frame_by_frame(tmp_path: Path) -> None:
     np.testing.assert_array_equal(source(tmp_path / "enhanced").read(series).hounsfield, 2 * pixels() - 1000)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "install"),
     [("JPEG Lossless", "pip install python-gdcm"), ("JPEG-LS", "pip install python-gdcm, or pyjpegls")],

@@ -44,6 +44,7 @@ def stated(run: RecordedRun, job: JobState, folder: Path) -> tuple[JobAnswer, Ru
     return answer, dataclasses.replace(run.summary(), state=state, store=ScratchStore(run.files, folder))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ARM)
 def test_the_arm_is_in_the_covariance_of_each_of_its_poses(run: RecordedRun, name: str, tmp_path: Path) -> None:
     answer, summary = stated(run, arm_jobs(run)[name], tmp_path)

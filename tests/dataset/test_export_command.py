@@ -44,7 +44,6 @@ def export(data: Path, *arguments: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
-@pytest.mark.slow
 def test_a_run_is_exported_recorded_and_still_verifies(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "colmap"
     status, printed = export(recorded, "--format", "colmap", "--out", str(out), "--operator", "Erika", "--json")

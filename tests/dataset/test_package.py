@@ -72,7 +72,6 @@ def listed(folder: Path) -> dict[str, str]:
     return {name: sha256 for sha256, name in (line.split("  ", 1) for line in lines)}
 
 
-@pytest.mark.slow
 def test_croissant_is_valid_and_its_record_sets_load(exported: Path, dataset: DataSet) -> None:
     loaded = mlcroissant.Dataset(jsonld=exported / "croissant.json")  # raises where it is not valid
     issues = loaded.metadata.ctx.issues

@@ -18,7 +18,6 @@ from tests.support.arms.grbl_simulator import TURN, Tap, grbl_config, table
 from tests.support.processes.waiting import until
 from tests.support.rig.patience import PATIENT_GRBL
 
-pytestmark = pytest.mark.slow  # it homes a machine
 WATCHDOG_S = 5.0
 
 

@@ -17,7 +17,7 @@ from tests.support.arms.grbl_simulator import CENTRE_M, TURN, mount, table
 from tests.support.rig.patience import PATIENT_GRBL
 from tests.support.rig.rig import orthocapture, simulated_rig
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.timeout(400)]
 VIEWS = 3
 PROTOCOL: dict[str, Any] = {
     "id": "turntable",
@@ -76,6 +76,7 @@ def rig_with_table(simulated: str, port: Path) -> dict[str, Any]:
     return rig
 
 
+@pytest.mark.slow
 def test_a_run_with_the_turntable_instead_of_the_arm(tmp_path: Path) -> None:
     folder, data, protocol = tmp_path / "rig", tmp_path / "data", tmp_path / "turntable.yaml"
     folder.mkdir()

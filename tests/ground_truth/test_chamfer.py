@@ -126,7 +126,6 @@ def test_the_score_is_that_of_brute_force_over_the_same_samples() -> None:
     assert score.f_scores[1] == pytest.approx(2 * p * r / (p + r))
 
 
-@pytest.mark.slow
 @given(seed=st.integers(0, 1000), n=st.integers(1, 60), spread=st.floats(0.001, 0.1))
 @settings(max_examples=25, deadline=None)
 def test_the_distance_to_the_faces_is_exact(seed: int, n: int, spread: float) -> None:
@@ -225,7 +224,6 @@ def test_the_command_prints_the_scores_of_meshes_of_any_format(tmp_path: Path, s
     assert (record["excluded"], record["n_pred"], record["n_gt"]) == (0, 9_600, 9_600)
 
 
-@pytest.mark.slow
 def test_the_command_writes_heat_maps_in_the_unit_of_the_surface(tmp_path: Path) -> None:
     tilted = plane().moved(transform(Rotation.from_rotvec([0, 0.12, 0]), np.zeros(3)))
     pred, gt = written(tmp_path / "pred.ply", tilted), written(tmp_path / "gt.ply", plane())

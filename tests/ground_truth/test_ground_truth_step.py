@@ -127,7 +127,6 @@ def fused(bench: Bench) -> tuple[RunState, dict[str, Any], np.ndarray[Any, Any]]
     return state, dict(columns), points
 
 
-@pytest.mark.slow
 def test_a_run_with_a_ct_and_a_scan_makes_the_ground_truth(bench: Bench) -> None:
     state, columns, points = fused(bench)
     measures = state.steps["ground_truth"].measures
@@ -200,7 +199,6 @@ def unpacked(packed: dict[str, str]) -> np.ndarray[Any, Any]:
     return np.frombuffer(base64.b64decode(packed["bdata"]), dtype=packed["dtype"])
 
 
-@pytest.mark.slow
 def test_a_region_that_a_person_drew_is_used_with_the_name(bench: Bench) -> None:
     corners = ((-0.022, 0.012, 0.03), (-0.016, 0.012, 0.03), (-0.016, 0.018, 0.03), (-0.022, 0.018, 0.03))
     drawn = RegionDrawn(step="ground_truth", source="ct", corners_m=corners, seen_along=(0.0, 0.0, 1.0))
@@ -218,7 +216,6 @@ def test_a_region_that_a_person_drew_is_used_with_the_name(bench: Bench) -> None
     assert np.all(columns["source"][within] == 0)
 
 
-@pytest.mark.slow
 def test_a_sphere_that_was_taken_away_before_the_scan_is_not_in_the_ground_truth(bench: Bench) -> None:
     state, _, points = fused(bench)
     (number,) = state.steps["ground_truth"].result["details"]["taken_away"]

@@ -72,7 +72,6 @@ def measured(bench: Bench) -> StepMeasured:
     return next(p for p in bench.payloads(StepMeasured) if p.step == "capture")
 
 
-@pytest.mark.slow
 def test_photographs_of_a_card_become_views_as_those_of_a_cable_do(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -91,7 +90,6 @@ def test_photographs_of_a_card_become_views_as_those_of_a_cable_do(
     bench.must_verify()
 
 
-@pytest.mark.slow
 def test_after_a_restart_nothing_is_taken_twice_and_nothing_is_lost(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -115,7 +113,6 @@ def test_after_a_restart_nothing_is_taken_twice_and_nothing_is_lost(
     assert found == [f"DSC{n:05d}.JPG" for n in range(1, person.presses + 1)]
 
 
-@pytest.mark.slow
 def test_a_screen_that_asks_for_a_release_is_told_whose_button_counts(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

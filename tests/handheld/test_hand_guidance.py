@@ -135,7 +135,6 @@ def test_a_view_next_to_another_is_the_same() -> None:
     assert not same_view(here.T_world_camera(), far.T_world_camera(), 0.02, 0.05)
 
 
-@pytest.mark.slow
 def test_a_clumsy_hand_makes_every_mistake_and_a_steady_one_none() -> None:
     cases: list[tuple[Kind, set[str]]] = [("clumsy", set(MISHAPS)), ("steady", set())]
     for kind, expected in cases:

@@ -24,7 +24,6 @@ def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
         yield lambda text: begin_run(opened, text, tmp_path)
 
 
-@pytest.mark.slow
 def test_the_screen_releases_a_video_source(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

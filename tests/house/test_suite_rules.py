@@ -73,6 +73,7 @@ def test_not_set_up(broken): pass
     assert "first failure of test_it.py::test_late" in answer.stdout
 
 
+@pytest.mark.slow
 def test_the_cost_of_a_test_has_its_processes_and_its_share_of_fixtures(tmp_path: Path) -> None:
     source = """
 import subprocess, sys, pytest

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 
+import pytest
+
 from tests.support.rig.rig import REPOSITORY
 
 _POWERS = {1e-6, 1e-3, 1e3, 1e6, 1e9}
@@ -16,6 +18,7 @@ _ALLOWED = {
 }
 
 
+@pytest.mark.slow
 def test_units_are_converted_in_one_place_only() -> None:
     found = {
         (path.relative_to(REPOSITORY).as_posix(), expression)

@@ -76,7 +76,6 @@ def refusal(*words: str) -> str:
     return f"{error['what']} {error['where']} {error['remedy']}"
 
 
-@pytest.mark.slow
 def test_odd_files_are_left_out_by_name_with_the_reason(folder: Path) -> None:
     images = folder / "images"
     first, second = sorted(images.glob("*.JPG"))
@@ -124,7 +123,6 @@ def test_what_the_protocol_needs_must_be_there(folder: Path) -> None:
     assert "there is no such place for ct" in refusal(str(folder), "--ct", "nowhere", "--dry-run")
 
 
-@pytest.mark.slow
 def test_nobody_imports_in_the_name_of_an_account_without_its_password(folder: Path, tmp_path: Path) -> None:
     with web_site(tmp_path):
         pass

@@ -110,7 +110,6 @@ def test_without_aravis_the_message_says_what_to_install(monkeypatch: pytest.Mon
 
 
 @needs_aravis
-@pytest.mark.slow
 def test_a_lost_camera_is_an_error_and_it_can_be_opened_again(tmp_path: Path) -> None:
     with fake_camera("127.0.0.1") as process, opened("127.0.0.1", frame_timeout_s=3.0) as camera:
         camera.capture(tmp_path)

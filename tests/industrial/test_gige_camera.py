@@ -74,7 +74,6 @@ def pixels(path: Path) -> NDArray[np.uint8]:
     return np.asarray(read, dtype=np.uint8)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("camera_on")
 def test_settings_and_exposures(way: dict[str, str], tmp_path: Path) -> None:
     with opened(way, gain=6.04) as camera:
@@ -113,7 +112,6 @@ def test_the_picture_is_what_the_camera_saw(name: str, way: dict[str, str], tmp_
     assert apart.max() <= 4.0 if name != "BayerRG8" else apart.mean() < 2.0  # the edges of a mosaic are guessed
 
 
-@pytest.mark.slow
 def test_faults_of_the_link_and_of_the_camera(way: dict[str, str], tmp_path: Path) -> None:
     faults = [
         {"kind": kind, "nth": number} for number, kind in ((2, "lost_packets"), (3, "truncate"), (4, "no_image"))
@@ -132,7 +130,6 @@ def test_faults_of_the_link_and_of_the_camera(way: dict[str, str], tmp_path: Pat
             camera.capture(tmp_path)
 
 
-@pytest.mark.slow
 def test_a_camera_that_dies_and_one_that_comes_back(producer: Path, tmp_path: Path) -> None:
     """With harvesters; with Aravis, tests/industrial/test_genicam_driver.py does so."""
     with ExitStack() as until_the_end:

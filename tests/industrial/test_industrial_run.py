@@ -23,7 +23,7 @@ from tests.support.protocols.one_side import VIEWS, one_side
 from tests.support.rig.gentl_producer import ADDRESS_VARIABLE, compiled_producer
 from tests.support.rig.rig import orthocapture, simulated_rig
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1000)]
+pytestmark = [pytest.mark.timeout(1000)]
 HOST = "127.0.0.64"
 
 
@@ -43,6 +43,7 @@ def give_producer(rig: Path, producer: Path) -> None:
     rig.write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "way",
     [pytest.param("Aravis", marks=pytest.mark.whole), "harvesters", pytest.param("OpenCV", marks=pytest.mark.whole)],

@@ -141,7 +141,6 @@ def test_a_stop_latches_until_a_person_confirms_and_nothing_clears_it_by_itself(
         travel(arm, turned(arm, 0.1))
 
 
-@pytest.mark.slow
 @pytest.mark.realtime
 @both
 def test_a_moving_arm_that_nobody_looks_at_is_stopped(controller: Controller) -> None:
@@ -159,7 +158,6 @@ def test_a_moving_arm_that_nobody_looks_at_is_stopped(controller: Controller) ->
         travel(arm, turned(arm, 0.1))
 
 
-@pytest.mark.slow
 @pytest.mark.realtime
 @both
 def test_a_driver_that_stands_still_sends_no_heartbeat_and_the_arm_stops(controller: Controller) -> None:
@@ -184,7 +182,6 @@ def test_a_driver_that_stands_still_sends_no_heartbeat_and_the_arm_stops(control
         travel(arm, turned(arm, 0.1))
 
 
-@pytest.mark.slow
 def test_an_arm_whose_brakes_closed_moves_once_they_are_released() -> None:
     host = address(78)
     with simulated_kuka(host, "--speed-up", "4"), opened(host) as arm:
@@ -203,7 +200,6 @@ def test_an_arm_whose_brakes_closed_moves_once_they_are_released() -> None:
         assert left[0].monotonic_s - begin > 0.12, "the brakes take 0.6 s, here 0.15 s"
 
 
-@pytest.mark.slow
 def test_a_wrong_load_is_felt_as_a_collision() -> None:
     host = address(74)
     with simulated_kuka(host, "--true-load-kg", "1.6"), opened(host) as arm:
@@ -216,7 +212,6 @@ def test_a_wrong_load_is_felt_as_a_collision() -> None:
         travel(arm, turned(arm, 0.2))
 
 
-@pytest.mark.slow
 def test_t1_keeps_the_flange_below_250_mm_per_second() -> None:
     host = address(75)
     with simulated_kuka(host, "--mode", "T1"), opened(host) as arm:
@@ -227,7 +222,6 @@ def test_t1_keeps_the_flange_below_250_mm_per_second() -> None:
         assert 0.2 < fastest < 0.26
 
 
-@pytest.mark.slow
 def test_a_lost_link_is_unavailable_and_opens_again() -> None:
     host = address(76)
     plan = json.dumps([{"device": "robot", "on": "move", "kind": "drop"}])

@@ -169,7 +169,6 @@ def last_second(arm: RobotArm) -> tuple[RobotSample, ...]:
     return arm.samples(now_s - 1.0, now_s)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("version", ["1", "2.5", "2.7"])
 def test_its_samples_are_the_pose_stream(version: str) -> None:
     host = address(91)
@@ -200,7 +199,6 @@ def test_its_samples_are_the_pose_stream(version: str) -> None:
         assert "MONITORING_READY" in report.details["FRI"], "it has commanded nothing"
 
 
-@pytest.mark.slow
 def test_lost_messages_are_told_and_an_interruption_falls_back_to_the_application() -> None:
     host = address(92)
     faults = [
@@ -219,7 +217,6 @@ def test_lost_messages_are_told_and_an_interruption_falls_back_to_the_applicatio
         until(lambda: arm.settle(SettleCriteria()).samples > 10, "no samples of the application")
 
 
-@pytest.mark.slow
 def test_a_stop_shows_in_its_samples() -> None:
     host = address(93)
     with simulated_kuka(host), opened(host) as arm:
@@ -228,7 +225,6 @@ def test_a_stop_shows_in_its_samples() -> None:
         until(lambda: not last_second(arm)[-1].safety.may_move, "the stop does not show")
 
 
-@pytest.mark.slow
 def test_an_application_without_fri_and_a_port_in_use_are_refused() -> None:
     host = address(94)
     with (
@@ -246,7 +242,6 @@ def test_an_application_without_fri_and_a_port_in_use_are_refused() -> None:
             pass
 
 
-@pytest.mark.slow
 def test_doctor_says_how_fri_fares(tmp_path: Path) -> None:
     host = address(96)
     rig = tmp_path / "rig.yaml"
@@ -261,7 +256,6 @@ def test_doctor_says_how_fri_fares(tmp_path: Path) -> None:
     assert "every 10 ms" in told["details"]["FRI"]
 
 
-@pytest.mark.slow
 def test_its_process_ends_with_the_driver() -> None:
     host = address(95)
     with simulated_kuka(host), opened(host):

@@ -44,7 +44,6 @@ def test_simulator_and_application_answer_as_the_transcript(controller: Controll
             assert agrees(line, row["line"]), (line, row["line"])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("controller", [simulated_kuka, pytest.param(sunrise_engine, marks=needs_jdk)])
 def test_a_client_that_stays_silent_gives_way_to_a_new_one(controller: Controller) -> None:
     host = address(70)

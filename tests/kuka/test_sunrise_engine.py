@@ -88,7 +88,6 @@ def connected(host: str) -> Generator[Client]:
         client.close()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stubs", "folders"),
     [
@@ -111,7 +110,6 @@ def test_only_the_layer_of_a_version_names_the_maker_s_classes() -> None:
         assert "com.kuka" not in path.read_text(encoding="utf-8"), path
 
 
-@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_silent_client_has_its_arm_stopped_after_0_3_s_and_must_permit_again() -> None:
     host = address(81)

@@ -186,7 +186,6 @@ def test_an_outline_of_a_known_sphere_is_not_read_as_one_more() -> None:
     assert outcome.photographs == 2
 
 
-@pytest.mark.slow
 def test_bounds_hold_the_truth_as_often_as_they_say() -> None:
     centres = np.concatenate([Scene.generate(34).registration_m, Scene.generate(34).control_m])
     truth = check_layout(centres).margin_m

@@ -130,7 +130,6 @@ def test_other_weights_are_refused(tiny: Weights, tmp_path: Path, how: str) -> N
     assert told.value.where == str(tmp_path / "sam2")
 
 
-@pytest.mark.slow
 def test_boxes_masks_and_edges_give_the_outlines() -> None:
     made = scene(1, width=1200, seed=2)
     image = render(made.camera, made.centres_camera(0, EVERY))

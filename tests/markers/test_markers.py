@@ -212,7 +212,6 @@ CONDITIONS = [
 LEAST_FOUND = [3, 3, 3, 3, 2, 3]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("look", "least"), list(zip(CONDITIONS, LEAST_FOUND, strict=True)), ids=lambda value: getattr(value, "colour", "")
 )

@@ -22,8 +22,6 @@ from service.core.geometry import Array
 from service.dataset.posed.exporter import exporter, write_data_set
 from tests.support.scenes.posed import posed_data_set
 
-pytestmark = pytest.mark.slow
-
 CAMERA = CameraModel(480, 360, 700.0, 702.0, 238.0, 181.0, -0.05, 0.01, 3e-4, -2e-4)
 _GRID_M, _FROM_M = (0.0025, 0.006), -0.15
 

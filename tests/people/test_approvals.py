@@ -89,7 +89,6 @@ def test_the_command_line_refuses_a_changed_content_without_a_reason(web: WebSit
     assert len(approved(web)) == 2
 
 
-@pytest.mark.slow
 def test_the_auditor_sees_which_limits_and_what_differs(web: WebSite) -> None:
     approve(web.store, loaded(PROTOCOL), "emmy")
     strict = web.record_run()

@@ -80,7 +80,6 @@ def signatures(bench: Bench) -> list[tuple[str, str]]:
     ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("signing", "known_by", "secret"),
     [("{}", "password", password_of("grace")), ("{pin: true}", "pin", PIN), ("{badge: true}", "badge", BADGE)],
@@ -103,7 +102,6 @@ def test_a_step_is_signed_by_what_the_site_allows_and_the_record_says_how(
     until(lambda: said in auditor.get(f"/audit/runs/{bench.run_id}/signatures").text, "the signatures are computed")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("known_by", "secret"), [("pin", PIN), ("badge", BADGE)])
 def test_where_the_site_does_not_allow_it_the_right_one_signs_nothing(
     web: WebSite, known_by: str, secret: str
@@ -117,7 +115,6 @@ def test_where_the_site_does_not_allow_it_the_right_one_signs_nothing(
     assert accepting.state().steps["capture"].accepted is None
 
 
-@pytest.mark.slow
 def test_a_supervisor_accepts_by_badge_on_the_technicians_screen(web: WebSite) -> None:
     allow(web, "{badge: true}")
     assert enrol(web, "emmy", EMMYS_BADGE, by="administrator") == 303

@@ -61,7 +61,6 @@ def test_nothing_is_recorded_in_the_name_of_an_account_without_its_password(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
 def test_with_the_password_it_is_recorded_and_a_strangers_name_needs_none(data: Path, tmp_path: Path) -> None:
     words = ["audit", "export", "latest", str(tmp_path / "b.zip"), "--hashes-only"]
     status, said = called(data, "Grace", *words, typed=password_of("grace"))

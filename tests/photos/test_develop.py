@@ -120,7 +120,6 @@ def warped(jpeg: Path, change: str) -> NDArray[np.uint8]:
     return leaves(seed=4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("change", "words"), [
     ("distortion corrected", r"up to 0\.\d+ px.*distortion compensation"), ("half a pixel", r"up to 0\.[67]\d px"),
     ("smaller", "240 × 160.*full size"), ("another picture", "do not show the same picture"),
@@ -144,7 +143,6 @@ def test_without_rawpy_the_message_names_the_extra(pair: tuple[Path, Path], monk
         develop(pair[0], None)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("shift_px", [(0.25, -0.4), (3.0, -2.0), (-11.3, 7.6)])
 def test_shifts_are_found_to_hundredths_of_a_pixel(shift_px: tuple[float, float]) -> None:
     grey = np.asarray(cv2.cvtColor(leaves(), cv2.COLOR_RGB2GRAY), dtype=np.uint8)

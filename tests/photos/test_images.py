@@ -62,7 +62,6 @@ def jpeg(*, progressive: bool) -> bytes:
     return data.tobytes()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("progressive", [False, True])
 def test_every_reader_of_a_jpeg_judges_it_alike(tmp_path: Path, progressive: bool) -> None:
     """The driver that fetches it and what computes with it or shows it: cut anywhere, or damaged, none takes it."""

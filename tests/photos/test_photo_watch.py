@@ -94,7 +94,6 @@ def test_a_file_that_stays_cut_off_is_told_once_and_holds_nothing_up(card: Path,
     assert names(camera, tmp_path, 5.0) == ["DSC00001.JPG"]
 
 
-@pytest.mark.slow
 def test_what_was_taken_before_is_left_out(card: Path, tmp_path: Path) -> None:
     put(card, "DSC00001.JPG", photograph(1, after(-9000)))
     camera = watching(card)

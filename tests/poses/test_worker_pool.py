@@ -115,7 +115,6 @@ def test_a_worker_computes_side_by_side_and_ends_when_nothing_is_left(store: Sto
     assert [end.error for end in ends] == ["IntegrityError"] * 3
 
 
-@pytest.mark.slow
 def test_a_child_that_is_killed_is_replaced_and_its_job_done_again(store: Store, tmp_path: Path) -> None:
     run = start_run(store)
     with Pool(store, tmp_path / "data", 1) as pool:
@@ -154,7 +153,6 @@ def test_a_worker_that_is_told_to_stop_puts_its_jobs_back_untried(store: Store, 
     assert isinstance(store.events(run)[-1].payload, JobFinished)
 
 
-@pytest.mark.slow
 def test_a_worker_whose_runner_died_before_it_looked_ends(tmp_path: Path) -> None:
     with Store.open(tmp_path / "data"):
         pass

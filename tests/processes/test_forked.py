@@ -152,7 +152,6 @@ def test_the_parent_that_it_watches_is_the_one_that_it_has(tmp_path: Path) -> No
         assert process.wait(30) == 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_the_devices_of_a_forked_rig_are_forks_too_and_end_with_it(tmp_path: Path, how: signal.Signals) -> None:
     words = ["rig", "--dir", str(tmp_path), "--scene", "3", "--image-width", "300", "--hand", "steady"]

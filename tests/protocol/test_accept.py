@@ -240,7 +240,6 @@ def test_a_supervisor_accepts_on_the_technicians_screen(web: WebSite) -> None:
     bench.must_verify()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("account", "password"), [("grace", None), ("emmy", "guessed"), ("", ""), ("nobody", "x")])
 def test_a_technician_a_wrong_password_and_a_stranger_are_refused(
     web: WebSite, account: str, password: str | None

@@ -53,7 +53,6 @@ def test_nobody_takes_control_of_it_any_more(web: WebSite) -> None:
     assert web.store.head(run_id) == head
 
 
-@pytest.mark.slow
 def test_in_the_terminal(web: WebSite) -> None:
     run_id = web.record_run()
     head = web.store.head(run_id)

@@ -80,7 +80,6 @@ def test_a_failed_job_shows_the_workers_reason_and_a_repeated_step_enqueues_it_a
     bench.must_verify()
 
 
-@pytest.mark.slow
 def test_that_nobody_computes_is_told_and_again_when_the_worker_has_gone(begin: Callable[[str], Bench]) -> None:
     bench = begin(PROTOCOL + CALIBRATION)
     sign = SignOfLife(bench.data, bench.clock)
@@ -152,7 +151,6 @@ def _die_before_recording(bench: Bench, monkeypatch: pytest.MonkeyPatch, nth: in
     monkeypatch.setattr(bench.store, "record", dying)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("nth", [1, 3, 4])
 def test_killed_between_exposure_and_record_leaves_an_orphan_and_no_viewpoint_is_lost_or_doubled(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, nth: int

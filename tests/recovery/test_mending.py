@@ -123,7 +123,6 @@ def test_the_simulated_technician_does_what_a_step_advises_and_confirms(
     bench.must_verify()
 
 
-@pytest.mark.slow
 def test_he_gives_up_after_a_few_mends_that_did_not_help(
     bench: Bench, world: _World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,7 +153,6 @@ def test_hands_that_cannot_do_it_say_so(bench: Bench, world: _World, monkeypatch
         automatic_run(bench, world)
 
 
-@pytest.mark.slow
 def test_the_newest_advice_counts_with_its_words_and_its_hands(bench: Bench, world: _World) -> None:
     bench.rig.shutter.exif = other_settings
 

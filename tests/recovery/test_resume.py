@@ -21,7 +21,7 @@ from tests.support.processes.started import started
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig, without_calibration_and_ct
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.timeout(400)]
 HOST = "127.0.0.31"
 T = TypeVar("T")
 
@@ -41,6 +41,7 @@ def short_protocol(folder: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> None:
     data = tmp_path / "data"
     with simulated_rig(tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3", host=HOST) as ready:

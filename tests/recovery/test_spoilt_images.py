@@ -19,7 +19,7 @@ from service.run_start import recorded_run
 from service.store.store import Store
 from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.timeout(600)]
 BOARDS, VIEWS = 9, 5
 T = TypeVar("T")
 
@@ -78,6 +78,7 @@ def run(folder: Path, faults: Sequence[Mapping[str, Any]], *wanted: str, host: s
     return ran
 
 
+@pytest.mark.slow
 def test_a_covered_board_a_blurred_and_a_black_image_are_taken_again_at_once(tmp_path: Path) -> None:
     first_view = BOARDS + 1 + 1  # one additional board image is taken
     faults = (
@@ -106,6 +107,7 @@ def test_a_covered_board_a_blurred_and_a_black_image_are_taken_again_at_once(tmp
     assert f"{views[3]}: the image is black" in ran.told
 
 
+@pytest.mark.slow
 def test_a_smeared_lens_is_cleaned_and_exactly_the_blurred_images_are_taken_again(tmp_path: Path) -> None:
     smeared_at = 7
     ran = run(

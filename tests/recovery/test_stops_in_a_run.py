@@ -33,7 +33,7 @@ from tests.support.rig.bench_rig import BenchCamera, ScriptedOperator, answer, n
 from tests.support.rig.patience import PATIENT_UR
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 
 RIG = """\
 name: one arm
@@ -179,6 +179,7 @@ def unlock(host: str) -> bool:
     return dashboard(host, "unlock protective stop")[0].startswith("Protective stop rel")
 
 
+@pytest.mark.slow
 def test_a_stop_during_an_exposure_is_asked_about_though_it_was_released(tmp_path: Path, store: Store) -> None:
     plan = '[{"device": "robot", "on": "rtde_P", "kind": "protective_stop"}]'
     with arm_at(80, "--speed-up", "3", "--faults", plan) as (host, arm):
@@ -190,6 +191,7 @@ def test_a_stop_during_an_exposure_is_asked_about_though_it_was_released(tmp_pat
     assert run.captured() == VIEWS, "what was taken is kept"
 
 
+@pytest.mark.slow
 def test_a_driver_killed_in_mid_motion_is_asked_about_before_the_arm_moves_on(tmp_path: Path, store: Store) -> None:
     with arm_at(81) as (host, arm):
         run = Run(store, tmp_path, host, arm)
@@ -208,6 +210,7 @@ def test_a_driver_killed_in_mid_motion_is_asked_about_before_the_arm_moves_on(tm
     assert run.captured() == VIEWS
 
 
+@pytest.mark.slow
 def test_a_confirmation_from_before_the_stop_lets_nothing_move(tmp_path: Path, store: Store) -> None:
     """The stop comes after the person has confirmed and before the arm was told."""
     plan = '[{"device": "robot", "on": "rtde_P", "kind": "protective_stop"}]'
@@ -221,6 +224,7 @@ def test_a_confirmation_from_before_the_stop_lets_nothing_move(tmp_path: Path, s
     assert run.captured() == VIEWS
 
 
+@pytest.mark.slow
 def test_a_key_turned_to_remote_while_a_person_is_asked_is_seen(tmp_path: Path, store: Store) -> None:
     """The controller was in local control when it was connected."""
     host = address(83)

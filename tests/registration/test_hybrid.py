@@ -155,7 +155,6 @@ def test_a_wrong_principal_point_is_found_with_the_calibration_as_prior() -> Non
     assert np.sqrt(np.mean(better[:, 3:] ** 2)) < 0.5 * np.sqrt(np.mean(worse[:, 3:] ** 2))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("robot", [True, False])
 def test_what_is_not_known_of_the_camera_is_in_the_uncertainty(robot: bool) -> None:
     """Cameras with errors of their calibration's covariance: without it the stated sigma is far too small."""

@@ -20,8 +20,6 @@ from service.core.errors import DataError
 from service.core.geometry import inverse
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, Scene, render, scene
 
-pytestmark = pytest.mark.slow
-
 Captured = tuple[Scene, list[Path], tuple[tuple[SphereOutline, ...], ...]]
 
 
@@ -84,6 +82,7 @@ def test_overlay_draws_on_a_copy(captured: Captured) -> None:
     assert 0.001 < changed.mean() < 0.2
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_outlines(captured: Captured) -> None:
     made, paths, outlines = captured
     again = detect_all(paths[:2], made.camera, workers=2)

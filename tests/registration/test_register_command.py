@@ -29,8 +29,6 @@ from tests.support.grounded_weights import tiny_weights
 from tests.support.scenes.colmap_model import write_colmap_text
 from tests.support.scenes.scene_photographs import photograph, pose_above
 
-pytestmark = pytest.mark.slow  # photographs are rendered and registered
-
 Array = NDArray[np.float64]
 
 WIDTH, N_IMAGES, SEED = 720, 6, 7
@@ -175,6 +173,7 @@ def test_detections_lie_on_the_spheres_they_are_said_to_be(capture: Capture, rec
     assert seen > 5 * N_IMAGES
 
 
+@pytest.mark.slow
 def test_mesh_and_control_indices(capture: Capture, tmp_path: Path) -> None:
     out = tmp_path / "result.json"
     mesh: dict[str, object] = {
@@ -199,6 +198,7 @@ def test_mesh_and_control_indices(capture: Capture, tmp_path: Path) -> None:
     assert record["mean_radial_error_mm"] < 0.2
 
 
+@pytest.mark.slow
 def test_transforms_json_and_colmap_say_the_same(capture: Capture, few: Path, tmp_path: Path) -> None:
     write_transforms_json(tmp_path / "transforms.json", capture.camera, capture.T_world_camera)
     write_colmap_text(tmp_path / "colmap", capture.camera, capture.T_world_camera)
@@ -211,6 +211,7 @@ def test_transforms_json_and_colmap_say_the_same(capture: Capture, few: Path, tm
     assert np.allclose(*found, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_scale_of_poses_that_are_not_metric(capture: Capture, few: Path, tmp_path: Path) -> None:
     factor = 7.3
     scaled = {name: pose.copy() for name, pose in capture.T_world_camera.items()}
@@ -238,6 +239,7 @@ def refused(result: Result, out: Path, *words: str) -> None:
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_an_image_without_a_pose(capture: Capture, tmp_path: Path) -> None:
     lines = (capture.folder / "poses.csv").read_text().splitlines(keepends=True)
     (tmp_path / "poses.csv").write_text("".join(line for line in lines if not line.startswith("DSC00003.JPG")))
@@ -324,6 +326,7 @@ def test_the_papers_detector_takes_the_boxes_of_another(capture: Capture, few: P
     assert "mauve" in register(capture, tmp_path / "out.json", images=few, sphere_colour="mauve").output
 
 
+@pytest.mark.slow
 def test_grounded_and_vote_record_the_hashes_of_their_weights(
     capture: Capture, few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -28,7 +28,7 @@ from tests.support.processes.waiting import until
 from tests.support.rig.patience import PATIENT_UR
 from tests.support.rig.rig import REPOSITORY, RigLock, orthocapture, simulated_rig, without_calibration_and_ct
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
+pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
 
 SMALL = ("--scene", "3", "--image-width", "480", "--speed-up", "10")
 # These rigs use an address of their own, so that they do not wait for those of other tests.
@@ -89,6 +89,7 @@ def listens(host: str, port: int) -> bool:
 # --- one rig ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_files_world_and_hands(tmp_path: Path) -> None:
     with simulated_rig(tmp_path, *SMALL, host=OWN_HOST) as ready, Hands(ready["world"]) as hands:
         # Everything in the ready line exists, and the service can read it.
@@ -159,6 +160,7 @@ def test_files_world_and_hands(tmp_path: Path) -> None:
             station.close()
 
 
+@pytest.mark.slow
 def test_what_is_computed_ahead_is_written_when_asked_for_and_shows_the_scene_as_it_is_then(tmp_path: Path) -> None:
     options = (*SMALL, "--ahead", "--ct-voxel-mm", "3")
     with (
@@ -291,6 +293,7 @@ def two_station_protocol(folder: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", ["UR10e", "LBR Med 14"])
 def test_two_controllers_are_found_and_used(tmp_path: Path, arm: str) -> None:
     """An arm at each station, both running at once."""
@@ -328,6 +331,7 @@ def test_two_controllers_are_found_and_used(tmp_path: Path, arm: str) -> None:
             assert (error_m < 0.005) == (station == event.station), (event.viewpoint, station, error_m)
 
 
+@pytest.mark.slow
 def test_a_device_that_dies_is_switched_on_again_at_its_address(tmp_path: Path) -> None:
     options = (*SMALL, "--revive-after-s", "0.2")
     with simulated_rig(tmp_path, *options, host=OWN_HOST, start=subprocess.Popen) as ready:

@@ -132,7 +132,6 @@ def test_a_user_of_the_machine_is_told_that_another_user_drives_the_arm() -> Non
         holder.kill()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("device", "other"),
     [

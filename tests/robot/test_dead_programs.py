@@ -20,7 +20,7 @@ from tests.support.processes.lateness import Lateness
 from tests.support.processes.waiting import until
 from tests.support.rig.world_watch import WorldWatch, watched_world
 
-pytestmark = [pytest.mark.slow, pytest.mark.realtime]
+pytestmark = [pytest.mark.realtime]
 AT_REST_WITHIN_S = 0.5
 LATE_TIMES = 5  # program, driver, its threads and the controller wake one after the other
 FULL_SPEED_AFTER_S = 0.9  # at 1.5 rad/s² to 1 rad/s

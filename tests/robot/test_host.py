@@ -125,7 +125,6 @@ def test_the_child_is_told_that_its_parent_lives_during_long_calls_too(fake: Fak
     assert np.min(gaps_s) < 2 * heartbeat.BEAT_S
 
 
-@pytest.mark.slow
 @pytest.mark.realtime
 def test_no_beat_while_the_parent_stands_still() -> None:
     program = (
@@ -159,7 +158,6 @@ def test_no_beat_while_the_parent_stands_still() -> None:
         assert float(parent.stdout.readline()) >= 1.0
 
 
-@pytest.mark.slow
 def test_a_child_that_does_not_read_holds_its_parent_up_for_no_beat(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(heartbeat, "BEAT_S", 0.001)
     device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=20.0, name="stopped")
@@ -225,7 +223,6 @@ def test_child_that_dies_while_opening() -> None:
         device.open()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("busy", [False, True])
 def test_child_exits_when_its_parent_is_killed(tmp_path: Path, busy: bool) -> None:
     trace, hangs = tmp_path / "trace", tmp_path / "hangs"

@@ -238,7 +238,6 @@ def test_dashboard_lines(controller: tuple[str, str]) -> None:
 # --- ur_rtde ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_unmodified_ur_rtde(controller: tuple[str, str]) -> None:
     host, version = controller
     command = [sys.executable, "-m", "tests.support.vendor.ur_vendor_session", host, version]
@@ -286,7 +285,6 @@ def rare_calls() -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.slow
 def test_a_package_longer_than_its_recipe_leaves_the_link_alive(rare_calls: dict[str, Any]) -> None:
     said = rare_calls["forward_kinematics"]
     assert said["long"] == [6, 6]

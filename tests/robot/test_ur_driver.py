@@ -147,7 +147,6 @@ def test_refused_payload_leaves_a_usable_arm(robot: RobotArm) -> None:
     robot.configure(PAYLOAD, T_FLANGE_TCP)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("version", ["3.15", "5.25"])
 def test_other_versions(version: str) -> None:
     model = "UR10" if version == "3.15" else "UR5e"

@@ -34,7 +34,6 @@ from tests.support.vendor.ur_rtde_protocol import RtdeClient
 STALE_S = 4.0  # of a stream that a test lets end, and far more than a busy machine holds one up
 
 
-@pytest.mark.slow
 def test_protective_stop_is_surfaced_and_cleared_by_a_person_only() -> None:
     host = address(51)
     with faulty(51, {"on": "move", "nth": 2, "kind": "protective_stop", "value": 0.1}), opened(host) as arm:
@@ -68,7 +67,6 @@ def test_protective_stop_is_surfaced_and_cleared_by_a_person_only() -> None:
         travel(arm, turned(arm, 0.1))
 
 
-@pytest.mark.slow
 def test_a_stop_that_came_and_was_released_between_two_motions_is_not_forgotten() -> None:
     host = address(62)
     # The plan causes the stop at a message that only this test sends: nobody queries the arm meanwhile.
@@ -101,7 +99,6 @@ def test_a_stop_that_came_and_was_released_between_two_motions_is_not_forgotten(
         assert watch.moved_for_s(since) > 0.0
 
 
-@pytest.mark.slow
 def test_a_motion_ended_at_the_controller_did_not_arrive_and_waits_for_a_person() -> None:
     host = address(63)
     with simulated_ur(host), opened(host) as arm, watched_arm(host) as watch:
@@ -118,7 +115,6 @@ def test_a_motion_ended_at_the_controller_did_not_arrive_and_waits_for_a_person(
         travel(arm, turned(arm, 0.1))
 
 
-@pytest.mark.slow
 def test_what_was_connected_anew_is_let_move_anew() -> None:
     with simulated_ur(address(64), "--speed-up", SPEED_UP), opened(address(64)) as arm:
         travel(arm, turned(arm, 0.1))
@@ -155,7 +151,6 @@ def switched_on(arm: RobotArm, host: str) -> bool:
     return arm.state().robot_mode == "IDLE"
 
 
-@pytest.mark.slow
 def test_refused_motion_is_an_error_and_the_next_one_works() -> None:
     with faulty(53, {"on": "move", "kind": "reject"}), opened(address(53)) as arm:
         with pytest.raises(DeviceRefusedError, match="did not start the joint motion"):
@@ -182,7 +177,6 @@ def test_reconnect_after_the_controller_restarted() -> None:
             arm.close()
 
 
-@pytest.mark.slow
 def test_dropped_link_ends_in_an_error_and_a_reconnect() -> None:
     host = address(60)
     with faulty(60, {"on": "move", "kind": "drop"}), opened(host, stale_after_s=STALE_S) as arm:
@@ -193,7 +187,6 @@ def test_dropped_link_ends_in_an_error_and_a_reconnect() -> None:
         travel(arm, turned(arm, 0.1))
 
 
-@pytest.mark.slow
 def test_motion_that_ended_on_a_dead_stream_is_not_taken_for_an_arm_at_rest() -> None:
     drop: dict[str, object] = {"on": "move", "kind": "drop", "value": "receivers"}  # no samples; commands still pass
     with faulty(61, drop), opened(address(61), stale_after_s=STALE_S) as arm:
@@ -204,7 +197,6 @@ def test_motion_that_ended_on_a_dead_stream_is_not_taken_for_an_arm_at_rest() ->
         travel(arm, turned(arm, 0.1))
 
 
-@pytest.mark.slow
 def test_stalled_stream_is_not_taken_for_a_still_arm() -> None:
     with faulty(55, {"on": "move", "kind": "stall"}), opened(address(55), stale_after_s=STALE_S) as arm:
         with pytest.raises(DeviceUnavailableError, match="no new sample"):

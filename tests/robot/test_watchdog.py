@@ -16,7 +16,7 @@ from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.processes.lateness import Lateness
 from tests.support.processes.waiting import until
 
-pytestmark = [pytest.mark.slow, pytest.mark.realtime]
+pytestmark = [pytest.mark.realtime]
 AT_REST_WITHIN_S = 0.5
 LATE_TIMES = 5  # program, driver, its threads and the controller wake one after the other
 STAYS_S = 1.0  # a program that is refused tries ten times

@@ -256,7 +256,6 @@ def test_a_note_does_not_make_the_page_out_of_date(web: WebSite) -> None:
     assert answer.status_code == 303, answer.text
 
 
-@pytest.mark.slow
 def test_runs_are_found_by_what_people_said_of_them(web: WebSite) -> None:
     browser = web.browser("technician")
     spine = start(browser)

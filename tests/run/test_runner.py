@@ -82,7 +82,6 @@ def test_one_run_has_one_runner(bench: Bench) -> None:
     assert not bench.payloads(SessionStarted)
 
 
-@pytest.mark.slow
 def test_a_database_that_is_moved_away_in_the_capture_ends_the_run_loudly(tmp_path: Path) -> None:
     data = tmp_path / "data"
 

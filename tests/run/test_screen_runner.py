@@ -25,7 +25,7 @@ from tests.support.processes.waiting import until
 from tests.support.protocols.short_protocol import short_protocol
 from tests.support.rig.rig import press_pedal, simulated_rig
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 
 
 class Watched:
@@ -61,6 +61,7 @@ class Watched:
         return (state.current, state.phase) == (step, phase)
 
 
+@pytest.mark.slow
 def test_a_run_driven_from_screens_and_pedal_survives_its_starter(tmp_path: Path) -> None:
     data = tmp_path / "data"
     with (

@@ -25,7 +25,7 @@ from simulators.faults import FaultPlan
 from simulators.scene.world import Scene
 from tests.support.rig.simulator_process import simulator
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.timeout(400)]
 COMPUTED_S = 300.0  # longer than a scan takes to compute on a machine with much other work
 
 SEED = 7
@@ -86,6 +86,7 @@ def glossy(tmp_path_factory: pytest.TempPathFactory) -> Scanned:
     return scanned(tmp_path_factory.mktemp("glossy"), "--control-spheres", "--no-normals")
 
 
+@pytest.mark.slow
 def test_scanned_spheres_are_where_they_are(sprayed: Scanned, glossy: Scanned) -> None:
     for scan, centres in (
         (sprayed, SCENE.registration_m),
@@ -99,6 +100,7 @@ def test_scanned_spheres_are_where_they_are(sprayed: Scanned, glossy: Scanned) -
             assert 0.035e-3 < fit.rms_m < 0.08e-3
 
 
+@pytest.mark.slow
 def test_the_scan_is_in_a_frame_of_its_own_and_in_millimetres(sprayed: Scanned, glossy: Scanned) -> None:
     assert sprayed.mesh.unit == "mm"
     assert np.linalg.det(sprayed.T_world_scan[:3, :3]) == pytest.approx(1.0)
@@ -114,6 +116,7 @@ def test_the_underside_and_what_lies_deep_are_missing(sprayed: Scanned) -> None:
     assert sprayed.mesh.findings["holes"] > 5
 
 
+@pytest.mark.slow
 def test_without_spray_more_is_missing(sprayed: Scanned, glossy: Scanned) -> None:
     assert glossy.mesh.findings["holes"] > 3 * sprayed.mesh.findings["holes"]
     assert glossy.tissue_area_m2() < 1.1 * sprayed.tissue_area_m2()
@@ -125,6 +128,7 @@ def test_normals_face_outwards(sprayed: Scanned) -> None:
     assert np.median(normals[board, 2]) > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["obj", "stl"])
 def test_other_formats_hold_the_same_scan(tmp_path: Path, form: str) -> None:
     scan = scanned(tmp_path, "--format", form, "--spacing-mm", "1.2", "--spray")
@@ -134,6 +138,7 @@ def test_other_formats_hold_the_same_scan(tmp_path: Path, form: str) -> None:
     assert names == ({"scan_01.obj", "scan_01.MTL", "scan_01_0.PNG"} if form == "obj" else {"scan_01.stl"})
 
 
+@pytest.mark.slow
 def test_a_scan_appears_gradually_and_is_not_taken_before_it_is_whole(tmp_path: Path) -> None:
     scanner = ScanFolder(ScanFolderConfig(folder=tmp_path, unit="mm", stable_s=0.0))
     seen: list[str] = []
@@ -158,6 +163,7 @@ def test_a_scan_appears_gradually_and_is_not_taken_before_it_is_whole(tmp_path: 
     assert any("cut short" in text for text in seen)
 
 
+@pytest.mark.slow
 def test_a_truncated_scan_is_recognised(tmp_path: Path) -> None:
     plan = json.dumps([{"device": "scanner", "on": "export", "kind": "truncate", "value": 0.7}])
     with pytest.raises(IncompleteExportError, match="cut short"):
@@ -186,6 +192,7 @@ def ct(tmp_path_factory: pytest.TempPathFactory) -> Ct:
     return Ct(source.read(series), truth)
 
 
+@pytest.mark.slow
 def test_ct_spheres_are_where_they_are_to_a_tenth_of_a_voxel(ct: Ct) -> None:
     vertices, _ = surface(ct.volume.hounsfield, ct.volume.T_ct_voxel, -425)
     world = apply(ct.T_world_ct, vertices)
@@ -195,6 +202,7 @@ def test_ct_spheres_are_where_they_are_to_a_tenth_of_a_voxel(ct: Ct) -> None:
         assert abs(fit.radius_m - RADIUS_M) < 0.1e-3
 
 
+@pytest.mark.slow
 def test_ct_surface_lies_on_the_specimen(ct: Ct) -> None:
     vertices, _ = surface(ct.volume.hounsfield, ct.volume.T_ct_voxel, -475)
     world = apply(ct.T_world_ct, vertices)
@@ -266,6 +274,7 @@ def test_ct_faults_are_found(tmp_path: Path, fault: dict[str, object], words: st
     assert words in " ".join(series.problems)
 
 
+@pytest.mark.slow
 def test_a_ct_fault_plan_reaches_the_simulator(tmp_path: Path) -> None:
     plan = json.dumps([{"device": "ct", "on": "slice", "nth": 20, "kind": "drop", "times": 2}])
     words = ("ct", "--scene", str(SEED), "--folder", str(tmp_path), "--once", "--voxel-mm", "4", "--faults", plan)

@@ -88,7 +88,6 @@ def test_a_part_that_shares_too_little_or_is_mirrored_is_named() -> None:
         merge_parts(mirrored)
 
 
-@pytest.mark.slow
 def test_a_run_waits_for_all_parts_and_makes_one_mesh(tmp_path: Path) -> None:
     T_world_part = poses(3)
     rig = OneScanner()

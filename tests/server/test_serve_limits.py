@@ -100,7 +100,6 @@ def test_1100_half_open_requests_shut_nobody_out_and_are_told_in_a_few_lines(rig
     assert "more messages like this were left out" in server.log.read_text()
 
 
-@pytest.mark.slow
 def test_one_address_leaves_room_for_others(rig: Path) -> None:
     with (
         serving(rig, "--connections", "12", "--address-connections", "8", "--client-wait-s", "300") as server,
@@ -113,7 +112,6 @@ def test_one_address_leaves_room_for_others(rig: Path) -> None:
         assert httpx.get(f"{server.url}/sign-in", timeout=WAIT_S).status_code == 200
 
 
-@pytest.mark.slow
 def test_a_client_that_is_slow_on_purpose_is_left(rig: Path) -> None:
     body = b"POST /sign-in HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/x-www-form-urlencoded\r\n"
     with serving(rig, "--client-wait-s", "3") as server, ExitStack() as stack:
@@ -142,7 +140,6 @@ def test_a_client_that_is_slow_on_purpose_is_left(rig: Path) -> None:
         assert httpx.get(f"{server.url}/sign-in", timeout=WAIT_S).status_code == 200
 
 
-@pytest.mark.slow
 def test_a_client_that_never_begins_tls_is_left(rig: Path) -> None:
     certificate, key = self_signed(rig.parent)
     files = ("--tls-certificate", str(certificate), "--tls-key", str(key))
@@ -152,7 +149,6 @@ def test_a_client_that_never_begins_tls_is_left(rig: Path) -> None:
         assert httpx.get(f"{server.url}/sign-in", timeout=WAIT_S, verify=trust).status_code == 200
 
 
-@pytest.mark.slow
 @pytest.mark.realtime
 def test_when_no_more_files_can_be_opened_it_neither_spins_nor_floods_the_log(rig: Path) -> None:
     with serving(rig) as server:
@@ -178,7 +174,6 @@ def cpu_s(process: psutil.Process) -> float:
     return sum(process.cpu_times()[:2])
 
 
-@pytest.mark.slow
 def test_what_is_no_http_is_told_once_and_counted(rig: Path) -> None:
     with serving(rig) as server:
         for _ in range(50):
@@ -273,14 +268,12 @@ def test_of_a_trusted_proxys_words_the_last_stranger_counts(rig: Path) -> None:
     assert recorded_addresses(rig) == ["198.51.100.7", "198.51.100.8", "127.0.0.1", "198.51.100.9", "127.0.0.1"]
 
 
-@pytest.mark.slow
 def test_a_proxy_is_an_address(rig: Path) -> None:
     refused = orthocapture("serve", "--rig", str(rig), "--data", str(rig.parent / "data"), "--trusted-proxy", "proxy")
     assert refused.returncode == 1
     assert "'proxy' is not an address" in refused.stderr
 
 
-@pytest.mark.slow
 def test_the_list_of_addresses_is_not_public(rig: Path) -> None:
     with serving(rig) as server:
         for address in ("/openapi.json", "/docs", "/redoc"):

@@ -124,7 +124,6 @@ def test_nobody_gets_in_without_signing_in(site: WebSite, run_id: str) -> None:
     assert events_of(site, run_id) == before
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("role", ROLES)
 def test_each_role_may_what_the_table_says_and_nothing_else(site: WebSite, run_id: str, role: Role) -> None:
     browser = site.browser(role)
@@ -142,7 +141,6 @@ def test_each_role_may_what_the_table_says_and_nothing_else(site: WebSite, run_i
             assert events_of(site, run_id) == before, way
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("role", ROLES)
 def test_a_form_of_an_allowed_role_gets_past_the_guard(site: WebSite, run_id: str, role: Role) -> None:
     """On a run that has ended, with an empty form: only the handler itself can refuse it."""
@@ -195,7 +193,6 @@ def test_a_form_from_another_site_is_refused_whatever_it_carries(
     assert events_of(site, run_id) == before
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("role", ROLES)
 def test_a_locked_screen_looks_on(site: WebSite, run_id: str, role: Role) -> None:
     browser = site.browser(role)

@@ -132,7 +132,6 @@ def test_names_and_addresses_that_it_has(site: WebSite, host: str) -> None:
 # --- hostile input -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("hostile", HOSTILE)
 def test_hostile_names_in_addresses(site: WebSite, run_id: str, hostile: str) -> None:
     browser = site.browser("supervisor")
@@ -152,7 +151,6 @@ def test_hostile_names_in_addresses(site: WebSite, run_id: str, hostile: str) ->
             assert "set-cookie" not in answer.headers, address
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("hostile", HOSTILE)
 def test_hostile_words_in_forms_and_queries(site: WebSite, run_id: str, hostile: str) -> None:
     browser = site.browser("administrator")

@@ -121,7 +121,6 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 pytestmark = pytest.mark.timeout(330)
 
 
-@pytest.mark.slow
 def test_a_run_computes_with_it(seen: dict[str, Any]) -> None:
     assert seen["status"] == "completed"
     assert seen["measures"] == {"weight_g": 501.0}

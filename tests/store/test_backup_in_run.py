@@ -15,7 +15,7 @@ from tests.support.processes.waiting import until
 from tests.support.protocols.short_protocol import short_protocol
 from tests.support.rig.rig import orthocapture, simulated_rig
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.timeout(400)]
 VIEWS = 16
 
 
@@ -37,6 +37,7 @@ def wait_for_captures(data: Path, count: int, runner: subprocess.Popen[bytes], l
     until(there, log.read_text, 120)
 
 
+@pytest.mark.slow
 def test_a_run_is_backed_up_in_its_capture_and_finished_where_it_was_restored(tmp_path: Path) -> None:
     data, restored = tmp_path / "data", tmp_path / "restored"
     with simulated_rig(

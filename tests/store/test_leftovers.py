@@ -9,8 +9,6 @@ import sys
 from datetime import datetime
 from pathlib import Path
 
-import pytest
-
 from service.core.records.events import ArtefactRef, LeftoversRemoved
 from service.store.files.leftovers import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.records import SITE, NewArtefact, NewJob
@@ -141,7 +139,6 @@ def must_record(store: Store, run: str, ref: ArtefactRef) -> None:
     assert verify(store.database_path.parent).ok
 
 
-@pytest.mark.slow
 def test_the_command_lists_first_and_removes_when_asked(tmp_path: Path) -> None:
     with Store.open(tmp_path) as store:
         run = start_run(store)

@@ -76,7 +76,6 @@ def sweep(data: Path, crash_at: int | None) -> tuple[CrashingFiles, bool]:
     return files, True
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("power_lost", [False, True])
 def test_crash_at_every_point_of_a_record(before: Path, tmp_path: Path, *, power_lost: bool) -> None:
     shutil.copytree(before, tmp_path / "whole")
@@ -167,7 +166,6 @@ with Store.open(Path(sys.argv[1])) as store:
 """
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("lines", [5, 8, 13])
 def test_killed_writer_loses_nothing_that_it_reported(tmp_path: Path, lines: int) -> None:
     with Store.open(tmp_path) as store:

@@ -16,7 +16,7 @@ import trimesh
 
 from tests.support.rig.rig import REPOSITORY, command
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 _RIG = "name: OR 3\ndevices:\n  scanner: {driver: zipped_scans, folder: arriving, path: unpacked, unit: mm}\n"
 NOTHING: Mapping[str, str] = {}
 _READ = """
@@ -32,6 +32,7 @@ print(json.dumps([[one.source.name, float(one.mesh.vertices_m.max())] for one in
 """
 
 
+@pytest.mark.slow
 def test_the_example_is_installed_opened_and_read(tmp_path: Path) -> None:
     source, site = tmp_path / "source", tmp_path / "site"
     shutil.copytree(REPOSITORY / "docs" / "howto" / "new_driver", source)

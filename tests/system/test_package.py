@@ -17,7 +17,7 @@ from service.store.store import Store
 from tests.support.processes.package import PACKAGES, Package, installed_package
 from tests.support.rig.rig import REPOSITORY
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +51,7 @@ def test_the_code_of_the_wheel_is_what_runs(package: Package, tmp_path: Path) ->
     assert package.run("--version", cwd=tmp_path).stdout == "orthocapture 0.1.0\n"
 
 
+@pytest.mark.slow
 def test_the_shell_completes_commands_and_options(package: Package, tmp_path: Path) -> None:
     for typed, offered in (("orthocapture dem", ["demo"]), ("orthocapture store gc --rem", ["--remove"])):
         answer = package.run(
@@ -59,6 +60,7 @@ def test_the_shell_completes_commands_and_options(package: Package, tmp_path: Pa
         assert answer.stdout.split() == offered, typed
 
 
+@pytest.mark.slow
 def test_its_pages_are_served_with_their_styles_and_protocols(package: Package, tmp_path: Path) -> None:
     (tmp_path / "scans").mkdir()
     rig = "name: a small site\ndevices:\n  scanner: {driver: scan_folder, folder: scans}\n"

@@ -18,7 +18,6 @@ from tests.support.rig.rig import REPOSITORY
 from tests.support.runs.bench_run import record_runs
 
 
-@pytest.mark.slow
 def test_seconds_of_a_run_come_from_its_record(tmp_path: Path) -> None:
     run_id, _ = record_runs(tmp_path)
     with Store.open(tmp_path / "data", create=False) as store:

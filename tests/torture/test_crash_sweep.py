@@ -65,6 +65,7 @@ def test_a_death_there_leaves_nothing_behind(swept: dict[str, Any], kind: str) -
     assert [fault for fault in swept["faults"] if fault["kind"] == kind] == []
 
 
+@pytest.mark.slow
 def test_a_store_that_does_not_sync_its_files_shows(tmp_path: Path) -> None:
     status, shown = sweep(tmp_path, "--ways", "power", "--sample", "60", "--first-fault", code=FORGETFUL)
     assert status == 1, "sixty losses of power, and nothing was missed"

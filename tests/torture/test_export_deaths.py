@@ -16,7 +16,7 @@ from service.dataset.posed.folder import check_folder
 from service.dataset.posed.records import DataSet
 from tests.support.scenes.posed import posed_data_set
 
-pytestmark = [pytest.mark.slow, pytest.mark.sweep, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.sweep, pytest.mark.timeout(300)]
 ROUNDS = 7  # the last two die at the last operations
 
 #: Exports into a folder and kills itself at the n-th operation on its files; says how many there were if it lives.
@@ -93,6 +93,7 @@ def undisturbed(
     return Undisturbed(photographs, whole, operations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("round_", range(ROUNDS))
 def test_a_death_at_a_random_point_leaves_nothing_that_looks_whole(
     dataset: DataSet, undisturbed: Undisturbed, tmp_path: Path, name: str, round_: int

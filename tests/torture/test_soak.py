@@ -22,7 +22,7 @@ from bench.soak.fit import Duration, exponent, growth
 from bench.soak.large import judge as judge_large
 from service.store.store import Store
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.timeout(600)]
 SMALL = (
     "--minutes", "0.15", "--sample-s", "0.4", "--planned", "40", "--uncalibrated",
     "--viewpoints", "64", "--gigabytes", "0.02", "--together-minutes", "0.05",
@@ -53,6 +53,7 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> Parts:
     return Parts(tmp_path_factory.mktemp("soak"))
 
 
+@pytest.mark.slow
 @pytest.mark.sweep
 def test_captures_go_on_until_there_are_figures_of_each_program(
     parts: Parts, monkeypatch: pytest.MonkeyPatch
@@ -69,6 +70,7 @@ def test_captures_go_on_until_there_are_figures_of_each_program(
     assert figures <= {row["what"] for row in found["rows"]}
 
 
+@pytest.mark.slow
 @pytest.mark.sweep
 def test_many_programs_at_one_file_do_not_fail(parts: Parts) -> None:
     found = parts.measured("together")
@@ -79,6 +81,7 @@ def test_many_programs_at_one_file_do_not_fail(parts: Parts) -> None:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.sweep
 def test_a_large_run_is_read_at_four_sizes(parts: Parts) -> None:
     found = parts.measured("large")

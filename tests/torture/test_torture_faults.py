@@ -67,7 +67,6 @@ def tried(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return {one["name"]: one for one in sweep(folder, "--only", *rows_to_run(request, "case"))[2]}
 
 
-@pytest.mark.slow
 @pytest.mark.sweep
 @pytest.mark.timeout(1800)  # the first of them waits for the others
 @pytest.mark.parametrize("case", CHOSEN)
@@ -79,7 +78,6 @@ def test_the_case_goes_as_the_table_says(tried: dict[str, dict[str, Any]], case:
     assert differences([as_tried], read_table(DOCUMENT)) == []
 
 
-@pytest.mark.slow
 @pytest.mark.sweep
 @pytest.mark.timeout(400)
 def test_a_store_that_does_not_say_what_to_do_shows(tmp_path: Path) -> None:
@@ -88,7 +86,6 @@ def test_a_store_that_does_not_say_what_to_do_shows(tmp_path: Path) -> None:
     assert any(fault.startswith("no place or no remedy") for fault in verdict["broken"]), verdict
 
 
-@pytest.mark.slow
 def test_a_motion_that_nobody_confirmed_shows(tmp_path: Path) -> None:
     early, late, stopped = Motions(), Motions(), Motions()
     early.began()

@@ -35,7 +35,6 @@ def test_every_parser_refuses_bad_input_as_people_can_understand(group: str, tmp
     assert all(outcome.inputs > 0 for outcome in outcomes.values())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(FOUND.glob("*/*")), ids=lambda path: f"{path.parent.name}-{path.name}")
 def test_what_was_found_once_stays_mended(path: Path, tmp_path: Path) -> None:
     (target,) = [one for group in GROUPS for one in targets_of(group) if one.name == path.parent.name]

@@ -42,7 +42,6 @@ def unpacked(site: Site, tmp_path: Path) -> Path:
 # --- an untouched bundle ---------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_the_verifier_in_the_bundle_finds_it_whole(site: Site, unpacked: Path, tmp_path: Path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()

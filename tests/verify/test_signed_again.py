@@ -69,7 +69,6 @@ def forge(data: Path, run: str) -> list[int]:
     return passed[:-1]  # the last of them is the run's end
 
 
-@pytest.mark.slow
 def test_what_was_signed_at_once_and_is_signed_only_later_stays_told(data: Path, tmp_path: Path) -> None:
     run = completed(data)
     assert (verify(data).faults, verify(data).notes) == ((), ())

@@ -46,7 +46,6 @@ def flip(path: Path) -> None:
     path.write_bytes(content)
 
 
-@pytest.mark.slow
 def test_every_changed_file_is_named(unpacked: Path) -> None:
     names = [path for path in sorted(unpacked.rglob("*")) if path.is_file() and path.stat().st_size]
     assert len(names) > 15
@@ -174,7 +173,6 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
             yield from places(item, (*path, key))
 
 
-@pytest.mark.slow
 def test_any_value_of_any_kind_in_any_place_is_named_and_breaks_nothing(unpacked: Path) -> None:
     chance = random.Random(4)
     other = [None, True, -1, 1.5, "", "x", "\0", [], {}, [1], {"a": 1}, "0" * 64]

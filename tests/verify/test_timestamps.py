@@ -54,7 +54,6 @@ def ask(authority: TimeStampAuthority) -> Authority:
     return Authority(authority.url, authority.certificates, timeout_s=30)
 
 
-@pytest.mark.slow
 def test_a_checkpoint_is_stamped_once_and_verified_with_and_without_certificates(
     data: Path, recorded: tuple[Path, str], authority: TimeStampAuthority, tmp_path: Path
 ) -> None:
@@ -159,7 +158,6 @@ def test_a_run_ends_signed_whether_or_not_the_authority_answers(
     assert verify(data, run).ok
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("end", ["completed", "aborted"])
 def test_the_runner_has_the_end_of_a_run_stamped(tmp_path: Path, authority: TimeStampAuthority, end: str) -> None:
     with bench_store(tmp_path / "data") as store:
@@ -177,7 +175,6 @@ def test_the_runner_has_the_end_of_a_run_stamped(tmp_path: Path, authority: Time
     assert (report.faults, report.timestamps) == ((), 1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("behaviour", ["asleep", "dripping"])
 def test_an_authority_that_is_slow_delays_the_end_no_longer_than_allowed(
     tmp_path: Path, authority: TimeStampAuthority, behaviour: str

@@ -180,7 +180,6 @@ def test_before_a_registration_the_3d_view_shows_what_is_planned(shown: BrowsedR
     assert "of the robot base at station_1" in page
 
 
-@pytest.mark.slow
 def test_a_registered_scene_is_drawn_in_a_frame_without_rights(tmp_path: Path) -> None:
     run = record_run(tmp_path)
     with web_site(tmp_path) as site:

@@ -52,7 +52,6 @@ def test_the_page_says_where_to_go_and_what_became_of_the_images(
     assert "way-arrow" in answer.text
 
 
-@pytest.mark.slow
 def test_the_buttons_ask_the_step(shown: tuple[WebSite, Browser, Bench]) -> None:
     _, browser, bench = shown
     for what in ("release", "finish"):
@@ -98,7 +97,6 @@ def test_parts_of_the_page_come_alone(shown: tuple[WebSite, Browser, Bench]) -> 
     assert answer.text.count("<template") == 4
 
 
-@pytest.mark.slow
 def test_an_image_that_could_not_be_looked_at_says_why_and_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -88,7 +88,6 @@ def test_the_wound_that_the_last_fusion_used_is_outlined(shown: tuple[WebSite, B
     assert drawn_mm == pytest.approx(1e3 * apply(viewing_frame(scene), np.array([*corners, corners[0]])), abs=1e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -121,7 +120,6 @@ def test_only_who_controls_the_run_draws(shown: tuple[WebSite, Browser, str]) ->
     assert not drawn(site, run)
 
 
-@pytest.mark.slow
 def test_without_a_fusion_to_come_there_is_nothing_to_draw(tmp_path: Path) -> None:
     run = record_run(tmp_path)
     with web_site(tmp_path) as site:

@@ -90,7 +90,6 @@ def test_nothing_is_told_to_whoever_is_not_signed_in(web: WebSite) -> None:
 # --- the first page ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_runs_under_way_come_first_of_all_runs(web: WebSite) -> None:
     browser = web.browser("technician")
     forgotten, aborted, driven = (web.begin_run().run_id for _ in range(3))

@@ -51,7 +51,6 @@ def settle(web: WebSite, address: str) -> str:
     return page
 
 
-@pytest.mark.slow
 def test_every_page_can_be_read_by_every_role_and_by_nobody_else(web: WebSite, run: str) -> None:
     assert all(may(role, "read") for role in ("technician", "supervisor", "auditor", "administrator"))
     for address in addresses(web, run):

@@ -76,7 +76,6 @@ def picture(browser: Browser, run: str, name: str) -> np.ndarray[tuple[int, ...]
     return np.asarray(found, dtype=np.uint8)
 
 
-@pytest.mark.slow
 def test_the_page_shows_every_view_with_its_splits_and_pictures(web: WebSite, run: str, auditor: Browser) -> None:
     dataset = data_set_of(read_run(web.site.data, run).summary())
     page = auditor.get(f"/runs/{run}/dataset").text

@@ -157,7 +157,6 @@ def test_a_report_leaves_in_both_forms(web: WebSite, supervisor: Browser) -> Non
         assert fetched.content[:14].lower().startswith(begins)
 
 
-@pytest.mark.slow
 def test_a_data_set_without_registration_says_why_not(web: WebSite, supervisor: Browser) -> None:
     run = web.record_run()
     page = ended(web, supervisor, run, "dataset")
@@ -219,7 +218,6 @@ def _refuse(*_arguments: object, **_more: object) -> None:
     raise StoreError("no space")
 
 
-@pytest.mark.slow
 def test_export_is_blocked_when_the_evidence_fails(web: WebSite, supervisor: Browser) -> None:
     run = web.record_run()
     image = next(item for item in web.store.artefacts(run) if item.ref.kind == "image")

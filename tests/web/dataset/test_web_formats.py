@@ -66,14 +66,12 @@ def fetch(browser: Browser, run: str, name: str) -> dict[str, bytes]:
         return {entry.removeprefix(f"{name}/"): archive.read(entry) for entry in archive.namelist()}
 
 
-@pytest.mark.slow
 def test_every_registered_format_is_offered(web: WebSite, run: str, supervisor: Browser) -> None:
     page = html.unescape(page_of(web, supervisor, run))
     for name, how in exporters().items():
         assert f'<option value="{name}">{name}: {how.words}</option>' in page
 
 
-@pytest.mark.slow
 def test_a_format_is_exported_recorded_and_fetched(web: WebSite, run: str, supervisor: Browser) -> None:
     page_of(web, supervisor, run)
     assert ask(supervisor, run, "colmap", anonymous="true") == 303
@@ -95,7 +93,6 @@ def test_a_format_is_exported_recorded_and_fetched(web: WebSite, run: str, super
     assert not web.app.state.exports.unfinished(run)
 
 
-@pytest.mark.slow
 def test_what_the_form_states_is_in_the_card_and_the_metadata(web: WebSite, run: str, supervisor: Browser) -> None:
     """What is left empty is the protocol's, or said to be missing."""
     page_of(web, supervisor, run)
@@ -120,7 +117,6 @@ def test_what_the_form_states_is_in_the_card_and_the_metadata(web: WebSite, run:
     assert "Version 2.1.0" in card
 
 
-@pytest.mark.slow
 def test_crops_that_do_not_fit_say_so_and_leave_nothing(web: WebSite, run: str, supervisor: Browser) -> None:
     assert ask(supervisor, run, "dtu", crop="9000x9000") == 303
     page = page_of(web, supervisor, run)
@@ -196,7 +192,6 @@ def interrupted(web: WebSite, run: str, name: str, form: str = "colmap") -> Path
     return folder / name
 
 
-@pytest.mark.slow
 def test_an_interrupted_export_goes_on(web: WebSite, run: str, supervisor: Browser) -> None:
     target = interrupted(web, run, f"{run}-exported-cut-SIMULATED")
     kept = {path.name: path.stat().st_mtime_ns for path in target.with_name(f".{target.name}.part").rglob("*.jpg")}
