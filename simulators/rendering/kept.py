@@ -15,6 +15,7 @@ import zipfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
+from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -104,7 +105,7 @@ def _hash(*inputs: object) -> str:
 def _of_the_program() -> bytes:
     """The hash of the simulators' source, and of the libraries and the machine that compute with it."""
     digest = hashlib.sha256()
-    root = Path(__file__).parents[1]
+    root = Path(str(resources.files("simulators")))
     for path in (*sorted(root.glob("*.py")), *sorted(root.glob("rendering/*.py")), *sorted(root.glob("scene/*.py"))):
         digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     machine = (platform.machine(), platform.python_version(), *map(version, _LIBRARIES))

@@ -172,6 +172,9 @@ RUN_ELSEWHERE = {
         ("make marks", "make marks FILES=tests/core"),
         "tests/house/test_suite_rules.py::test_the_list_is_written_from_records_and_then_the_check_is_content",
     ),
+    "python -m tests.support.record.new_schema": (
+        "tests/store/test_store_chain.py::test_a_new_database_is_what_the_migrations_make"
+    ),
     "make torture-crash": ("tests/torture/test_crash_sweep.py::test_a_death_there_leaves_nothing_behind"),
     "python -m bench.torture.crash --sample 100 --random-runs 1": (
         "tests/torture/test_crash_sweep.py::test_a_death_there_leaves_nothing_behind"

@@ -75,10 +75,15 @@ def test_what_the_readme_says_of_a_corrected_arm_is_what_was_measured() -> None:
 def test_make_targets_do_what_the_documents_say() -> None:
     """The last line of each target; tests/system/test_demo.py runs the command of `make demo`."""
     for target, last in (
-        ("test", '.venv/bin/pytest -m "not slow"'),
-        ("test-all", ".venv/bin/pytest"),
+        ("test", '.venv/bin/pytest -m "not (slow or realtime or packages or whole or sweep)"'),
+        ("test-all", ".venv/bin/pytest -m realtime -n 0"),
+        ("test-drawn", ".venv/bin/pytest -m realtime -n 0"),
+        ("test-whole", ".venv/bin/pytest -m whole"),
+        ("test-sweeps", ".venv/bin/pytest -m sweep"),
+        ("marks", ".venv/bin/python -m bench.suite.marks build/cpu"),
+        ("mutants SEED=1", ".venv/bin/python -m bench.suite.mutants --seed 1 --count 300 --at-least 0"),
         ("demo", ".venv/bin/orthocapture demo"),
-        ("lint", ".venv/bin/lint-imports"),
+        ("lint", ".venv/bin/python -m bench.suite.marks --check"),
         ("lock", "sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' constraints-dev.txt"),
         ("docs", ".venv/bin/sphinx-build --quiet --fail-on-warning --keep-going docs build/docs"),
         ("reference", ".venv/bin/python -m docs.generate"),
@@ -91,7 +96,7 @@ def test_make_targets_do_what_the_documents_say() -> None:
         ("clean", "rm -rf .venv build *.egg-info"),
     ):
         done = subprocess.run(
-            ["make", "--dry-run", "--no-print-directory", target],
+            ["make", "--dry-run", "--no-print-directory", *target.split()],
             cwd=ROOT, capture_output=True, text=True, timeout=30, check=False,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr

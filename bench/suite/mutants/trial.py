@@ -73,6 +73,9 @@ def import_libraries() -> None:
             importlib.import_module(name)
 
 
+_OURS = ("bench", "drivers", "service", "simulators", "tests")  # packages that are read anew, from the tree
+
+
 class Trial:
     """A mutation that is being tried in a child process."""
 
@@ -158,7 +161,7 @@ def _try(tree: Path, selected: Sequence[Selected], told: Path) -> None:
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     sys.dont_write_bytecode = False
     sys.path[:] = [str(tree), *(path for path in sys.path if Path(path or ".").resolve() != REPOSITORY)]
-    for name in [name for name in sys.modules if name.partition(".")[0] == "bench"]:
+    for name in [name for name in sys.modules if name.partition(".")[0] in _OURS]:
         del sys.modules[name]
     judge, rest = _Judge(), list(selected)
     for size in (*BATCHES, len(rest)):
