@@ -56,7 +56,6 @@ def write_textured(folder: Path) -> None:
     (folder / "tex" / "SKIN.PNG").write_bytes(parts[picture_name])
 
 
-@pytest.mark.slow
 def test_a_textured_scan_leaves_as_it_came(tmp_path: Path) -> None:
     write_textured(tmp_path / "scans")
     rig = OneScanner()

@@ -150,6 +150,7 @@ def test_a_stop_of_the_safety_controller_latches_and_cancels_the_motion() -> Non
         assert client.ask(**MOVE)["code"] == "locked"
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_call_to_the_controller_that_hangs_does_not_keep_the_arm_moving() -> None:
     host = address(83)

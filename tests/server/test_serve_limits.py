@@ -149,6 +149,7 @@ def test_a_client_that_never_begins_tls_is_left(rig: Path) -> None:
         assert httpx.get(f"{server.url}/sign-in", timeout=WAIT_S, verify=trust).status_code == 200
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_when_no_more_files_can_be_opened_it_neither_spins_nor_floods_the_log(rig: Path) -> None:
     with serving(rig) as server:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from docs.generate.pages import REFERENCE, pages
 from docs.generate.steps import measures_of_kind
+import pytest
+
 from service.steps import step_kinds
 
 ROOT = Path(__file__).parents[2]
