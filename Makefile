@@ -43,6 +43,8 @@ marks: $(TOOLS) $(NETWORKS)
 	rm -rf build/cpu
 	$(BIN)/pytest $(or $(FILES),tests) -m "not whole" --cpu-record=build/cpu
 	$(BIN)/python -m bench.suite.marks build/cpu
+	$(BIN)/ruff check --fix --quiet tests
+	$(BIN)/ruff format --quiet tests
 
 # Installs the locks under every supported Python of this machine and runs the fast tests there.
 test-versions:

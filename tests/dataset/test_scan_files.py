@@ -8,7 +8,6 @@ from typing import Any, cast
 
 import cv2
 import numpy as np
-import pytest
 import trimesh
 from PIL import Image
 

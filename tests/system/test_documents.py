@@ -9,8 +9,6 @@ from pathlib import Path
 
 from docs.generate.pages import REFERENCE, pages
 from docs.generate.steps import measures_of_kind
-import pytest
-
 from service.steps import step_kinds
 
 ROOT = Path(__file__).parents[2]
@@ -82,7 +80,7 @@ def test_make_targets_do_what_the_documents_say() -> None:
         ("test-drawn", ".venv/bin/pytest -m realtime -n 0"),
         ("test-whole", ".venv/bin/pytest -m whole"),
         ("test-sweeps", ".venv/bin/pytest -m sweep"),
-        ("marks", ".venv/bin/python -m bench.suite.marks build/cpu"),
+        ("marks", ".venv/bin/ruff format --quiet tests"),
         ("mutants SEED=1", ".venv/bin/python -m bench.suite.mutants --seed 1 --count 300 --at-least 0"),
         ("demo", ".venv/bin/orthocapture demo"),
         ("lint", ".venv/bin/python -m bench.suite.marks --check"),
