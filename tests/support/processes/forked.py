@@ -31,8 +31,8 @@ _ZYGOTE = "tests.support.processes.zygote"
 _MODULES = (COMMANDS, SIMULATORS, *OF_TESTS)
 # Variables that begin so decide nothing while a process starts, or are set by it: by libraries when they are imported
 # (cv2, gdcm, gphoto2, torch), and by drivers that tests use in their own process.
-_SET_BY_IMPORTS = ("LD_LIBRARY_PATH", "GDCM_RESOURCES_PATH", "CAMLIBS", "IOLIBS", "TORCHINDUCTOR_CACHE_DIR")
-_READ_LATER = ("ORTHOCAPTURE_", "PYTEST_", "GENTL_CAMERA", "OPENCV_FFMPEG_", "XDG_CONFIG_HOME", *_SET_BY_IMPORTS)
+SET_BY_IMPORTS = ("LD_LIBRARY_PATH", "GDCM_RESOURCES_PATH", "CAMLIBS", "IOLIBS", "TORCHINDUCTOR_CACHE_DIR")
+_READ_LATER = ("ORTHOCAPTURE_", "PYTEST_", "GENTL_CAMERA", "OPENCV_FFMPEG_", "XDG_CONFIG_HOME", *SET_BY_IMPORTS)
 _ENVIRONMENT = dict(os.environ)  # before any test has changed it
 _NUMBER_BYTES = 8
 _PARENT = "--parent"
