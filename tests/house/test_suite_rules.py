@@ -67,6 +67,8 @@ def test_other(): fails_once("other")
 @pytest.mark.realtime
 def test_not_set_up(broken): pass
 """
+    once = pytest_in(tmp_path, source, "--force-reruns", "0")  # as bench.suite.realtime runs them
+    assert "2 failed, 1 error" in once.stdout
     answer = pytest_in(tmp_path, source)
     assert "1 failed, 1 passed, 1 error, 1 rerun" in answer.stdout
     assert "1 realtime tests ran again" in answer.stdout
