@@ -18,6 +18,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is imported, 
 # A scene's textures and light are computed once, and kept for the next tests (simulators/rendering/kept.py).
 os.environ.setdefault("ORTHOCAPTURE_RENDER_CACHE", str(Path(__file__).parents[1] / "build" / "rendered"))
 
+MOST_WORKERS = 12  # each takes up to half a GiB
+
 # Each commit of the store waits for the disk, which is half the time of its tests. What a disk loses is simulated
 # (bench.torture.crash), so a file system in memory proves as much, where there is room for the files of whole runs.
 MEMORY, ROOM_BYTES = Path("/dev/shm"), 12 * 2**30
@@ -51,6 +53,12 @@ def pytest_configure(config: pytest.Config) -> None:
     seed: str | None = config.getoption("--draw")
     if seed is not None:
         config.pluginmanager.register(Draw(seed))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Return two workers a processor: tests of devices and servers wait for half of their time."""
+    return min(2 * (os.cpu_count() or 1), MOST_WORKERS)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

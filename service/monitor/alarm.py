@@ -73,7 +73,7 @@ class Alarm:
         if standing not in self._section.on or now == self._told or lasted_s < due_s:
             return
         self._told = now
-        self._queue.put(Alert(standing, self._run_id, self._rig, words, self._clock.utc_now().timestamp()))
+        self._queue.put(Alert(standing, self._run_id, self._rig, words, self._clock.utc_s()))
 
     def close(self) -> None:
         """Send pending alerts, for some seconds at most."""

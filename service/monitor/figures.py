@@ -66,7 +66,7 @@ class Figures:
 
 def read_figures(store: Store, data: Path, driven: Sequence[str]) -> Figures:
     """Read all figures; `driven` are the runs driven now. Raises StoreError; OSError if the disk fails."""
-    now_utc_s = store.clock.utc_now().timestamp()
+    now_utc_s = store.clock.utc_s()
     with store.database.reading() as connection:
         latest = select(runs.c.run_id).where(runs.c.run_id != SITE).order_by(runs.c.created_utc.desc()).limit(1)
         shown = list(driven) or list(connection.execute(latest).scalars())

@@ -49,7 +49,7 @@ def read_health(store: Store, data: Path, driven: Sequence[str]) -> Health:
         database,
         _data_folder(data),
         _worker(data, queued, store.clock),
-        _runners(data, driven, store.clock.utc_now().timestamp()),
+        _runners(data, driven, store.clock.utc_s()),
     )
 
 

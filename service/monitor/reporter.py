@@ -99,7 +99,7 @@ class Reporter:
 
     def begin(self) -> None:
         """Write twice a second from now on, until `end`."""
-        self._newest = self._newest.model_copy(update={"attended_utc_s": self._utc_s()})
+        self._newest = self._newest.model_copy(update={"attended_utc_s": self.clock.utc_s()})
         self.busy("starting")
         self._heartbeat.begin()
 
@@ -109,7 +109,7 @@ class Reporter:
 
     def busy(self, what: str) -> None:
         """Announce a call of the main loop that may take long."""
-        self._activity = (what, self._utc_s())
+        self._activity = (what, self.clock.utc_s())
 
     def tell(self, message: str) -> None:
         """Add one message."""
@@ -151,7 +151,7 @@ class Reporter:
         for camera in devices.cameras.values():
             if self._due("camera", _CAMERA_S):
                 self._camera = read_camera(camera)
-        now_s = self._utc_s()
+        now_s = self.clock.utc_s()
         return Snapshot(
             at_utc_s=now_s,
             attended_utc_s=now_s,
@@ -181,7 +181,7 @@ class Reporter:
             if newest.doing == "ended":
                 return
             told: dict[str, object] = {
-                "at_utc_s": self._utc_s(), "pid": getpid(), "what": what, "done": done, "total": total,
+                "at_utc_s": self.clock.utc_s(), "pid": getpid(), "what": what, "done": done, "total": total,
                 "messages": self._news, "activity": activity, "activity_utc_s": since_s,
             }  # fmt: skip
             if watched_s > newest.robot_utc_s:
@@ -192,9 +192,9 @@ class Reporter:
     def watch(self) -> None:
         """Read the robot's pose stream while the main loop is in a long call. May block on the robot."""
         newest = self._newest
-        if self._utc_s() - newest.attended_utc_s < _QUIET_S or newest.doing == "ended":
+        if self.clock.utc_s() - newest.attended_utc_s < _QUIET_S or newest.doing == "ended":
             return
-        asked_s = self._utc_s()
+        asked_s = self.clock.utc_s()
         self._watched = (asked_s, watch_robot(self.devices(), self.clock.monotonic_s()))
 
     def _elsewhere(self) -> str:
@@ -210,7 +210,7 @@ class Reporter:
         self._tower(self.devices(), "ended")
         with self._writing:
             self._newest = Snapshot(
-                at_utc_s=self._utc_s(),
+                at_utc_s=self.clock.utc_s(),
                 pid=getpid(),
                 doing="ended",
                 step=last.step,
@@ -239,7 +239,7 @@ class Reporter:
 
     def _frame(self) -> None:
         """Write a frame of the live view while somebody looks; only when the camera is idle."""
-        wanted = frames_wanted(self.data, self.run_id, self._utc_s())
+        wanted = frames_wanted(self.data, self.run_id, self.clock.utc_s())
         if wanted is None or not self._due("frame", _FRAME_S):
             return
         try:
@@ -249,9 +249,6 @@ class Reporter:
             self._due_s["frame"] = self.clock.monotonic_s() + _CAMERA_S
             return
         self._write(lambda: write_frame(self.data, self.run_id, jpeg, wanted))
-
-    def _utc_s(self) -> float:
-        return self.clock.utc_now().timestamp()
 
     def _due(self, what: str, every_s: float) -> bool:
         now_s = self.clock.monotonic_s()

@@ -48,7 +48,7 @@ class SignOfLife:
         if now_s < self._due_s:
             return
         self._due_s = now_s + _EVERY_S
-        now_utc_s = self._clock.utc_now().timestamp()
+        now_utc_s = self._clock.utc_s()
         sign = WorkerSign(host=socket.gethostname(), pid=os.getpid(), at_utc_s=now_utc_s, jobs_done=jobs_done)
         part = self._path.with_suffix(".part")
         try:
@@ -66,7 +66,7 @@ class SignOfLife:
 
 def living_workers(data: Path, clock: Clock) -> list[WorkerSign]:
     """The workers of a data folder that are alive, as far as is known; removes the files of dead ones."""
-    now_utc_s = clock.utc_now().timestamp()
+    now_utc_s = clock.utc_s()
     found: list[WorkerSign] = []
     for path in sorted(_folder(data).glob("*.json")):
         try:

@@ -38,9 +38,6 @@ class Accounts:
         self._store = store
         self._passwords = passwords
 
-    def _now_s(self) -> float:
-        return self._store.clock.utc_now().timestamp()
-
     def all(self) -> list[Account]:
         """Every account, sorted by name."""
         with self._store.database.reading() as connection:
@@ -261,7 +258,7 @@ class Accounts:
             select(invitations).where(
                 invitations.c.token_sha256 == token_sha256(token),
                 invitations.c.used == 0,
-                invitations.c.expires_utc_s > self._now_s(),
+                invitations.c.expires_utc_s > self._store.clock.utc_s(),
             )
         ).one_or_none()
         if row is None:

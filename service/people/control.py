@@ -37,9 +37,6 @@ class Control:
     def __init__(self, store: Store) -> None:
         self._store = store
 
-    def _now_s(self) -> float:
-        return self._store.clock.utc_now().timestamp()
-
     def holder(self, run_id: str) -> Holder:
         """Who has control of the run now. Raises UnknownRunError."""
         with self._store.database.reading() as connection:
@@ -67,7 +64,7 @@ class Control:
             unanswered = (
                 holder.locked
                 and holder.asked_by_screen == person.screen
-                and self._now_s() - holder.asked_utc_s >= UNANSWERED_S
+                and self._store.clock.utc_s() - holder.asked_utc_s >= UNANSWERED_S
             )
             if not holder.screen:
                 self._give(connection, run_id, person, holder, "free", "")
@@ -105,7 +102,7 @@ class Control:
             holder = self._holder(connection, run_id)
             if not holder.screen or holder.screen == person.screen:
                 raise ControlError("there is nobody to ask", where=run_id, remedy="Take control; it is free")
-            recent = self._now_s() - holder.asked_utc_s < UNANSWERED_S
+            recent = self._store.clock.utc_s() - holder.asked_utc_s < UNANSWERED_S
             if holder.asked_by_screen not in ("", person.screen) and recent:
                 raise ControlError(
                     f"{holder.asked_by_account} has just asked", where=run_id, remedy="Wait for the answer"
@@ -116,7 +113,9 @@ class Control:
                 asked_by_screen=person.screen,
                 asked_by_account=person.account,
                 # Asking again does not restart the waiting time.
-                asked_utc_s=holder.asked_utc_s if holder.asked_by_screen == person.screen else self._now_s(),
+                asked_utc_s=holder.asked_utc_s
+                if holder.asked_by_screen == person.screen
+                else self._store.clock.utc_s(),
             )
 
     def answer(self, run_id: str, person: Person, *, grant: bool) -> None:
@@ -127,7 +126,7 @@ class Control:
                 raise ControlError("this screen does not have control", where=run_id, remedy="Read the page again")
             if not holder.asked_by_screen:
                 raise ControlError("nobody asks for control any more", where=run_id, remedy="Nothing has to be done")
-            asker = connection.execute(_valid(holder.asked_by_screen, self._now_s())).one_or_none()
+            asker = connection.execute(_valid(holder.asked_by_screen, self._store.clock.utc_s())).one_or_none()
             if grant and asker is not None:
                 reason = f"asked for; granted by {person.account}"
                 self._record(connection, run_id, asker.account, holder.asked_by_screen, holder, "handed_over", reason)
@@ -154,7 +153,7 @@ class Control:
         row = connection.execute(select(control).where(control.c.run_id == run_id)).one_or_none()
         if row is None or not row.screen:
             return Holder()
-        session = connection.execute(_valid(row.screen, self._now_s())).one_or_none()
+        session = connection.execute(_valid(row.screen, self._store.clock.utc_s())).one_or_none()
         if session is None:
             return Holder()
         return Holder(

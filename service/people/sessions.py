@@ -62,9 +62,6 @@ class People:
         self.accounts = Accounts(store, self._passwords)
         self.badges = Badges(store, self._passwords, self.check_password)
 
-    def _now_s(self) -> float:
-        return self._store.clock.utc_now().timestamp()
-
     def first_link(self) -> str | None:
         """A new one-time token for the page /set-up/TOKEN, voiding earlier ones; None if an administrator exists."""
         return self.accounts.first_link()
@@ -79,7 +76,7 @@ class People:
         with self._one_guess:
             row = self._checked(account, password, address)
             token = new_token()
-            now = self._now_s()
+            now = self._store.clock.utc_s()
             with self._store.database.writing() as connection:
                 self._require_unchanged(connection, row)
                 self._end(connection, replaces)
@@ -128,7 +125,7 @@ class People:
         name = plain_name(typed)
         with self._store.database.reading() as connection:
             row = find_account(connection, name)
-        waits = row is not None and row.locked_until_utc_s > self._now_s()
+        waits = row is not None and row.locked_until_utc_s > self._store.clock.utc_s()
         usable = row is not None and row.state == "active" and not waits
         hashes = {} if row is None else {"password": row.password_hash, "pin": row.pin_hash, "badge": row.badge_hash}
         stored = str(hashes[known_by]) if usable else ""
@@ -142,7 +139,9 @@ class People:
                 connection.execute(
                     update(accounts)
                     .where(accounts.c.account == name)
-                    .values(failures=failures, locked_until_utc_s=self._now_s() + wait_s if wait_s else 0.0)
+                    .values(
+                        failures=failures, locked_until_utc_s=self._store.clock.utc_s() + wait_s if wait_s else 0.0
+                    )
                 )
                 waits = wait_s > 0
             # An unknown name is not recorded, because it may be a password typed into the wrong field.
@@ -187,7 +186,7 @@ class People:
             idle_lock_s: the site's limit for idle time.
             deliberate: whether a person acted, rather than the page by itself; only that keeps a screen unlocked.
         """
-        now = self._now_s()
+        now = self._store.clock.utc_s()
         with self._store.database.reading() as connection:
             row = self._session(connection, token)
         if row is None:
@@ -243,7 +242,7 @@ class People:
                 if ended:
                     connection.execute(delete(sessions).where(here))
                 elif matches:
-                    opened = {"locked": 0, "pin_failures": 0, "seen_utc_s": self._now_s()}
+                    opened = {"locked": 0, "pin_failures": 0, "seen_utc_s": self._store.clock.utc_s()}
                     connection.execute(update(sessions).where(here).values(**opened))
                 else:
                     connection.execute(update(sessions).where(here).values(pin_failures=failures))
@@ -264,7 +263,9 @@ class People:
         with self._store.database.reading() as connection:
             rows = connection.execute(
                 select(sessions)
-                .where(sessions.c.account == account, sessions.c.created_utc_s > self._now_s() - SESSION_S)
+                .where(
+                    sessions.c.account == account, sessions.c.created_utc_s > self._store.clock.utc_s() - SESSION_S
+                )
                 .order_by(sessions.c.created_utc_s.desc())
             ).all()
         return [Screen(r.screen, r.account, r.created_utc_s, r.seen_utc_s, bool(r.locked)) for r in rows]

@@ -135,6 +135,10 @@ class Clock(Protocol):
         """The present time in UTC, timezone-aware."""
         ...
 
+    def utc_s(self) -> float:
+        """The same in seconds since the epoch."""
+        ...
+
     def monotonic_s(self) -> float:
         """Monotonic time of the host in seconds; all processes of one boot share its origin."""
         ...
@@ -154,6 +158,10 @@ class SystemClock:
     def utc_now(self) -> datetime:
         """The host's time in UTC, timezone-aware."""
         return datetime.now(UTC)
+
+    def utc_s(self) -> float:
+        """The host's time in seconds since the epoch."""
+        return self.utc_now().timestamp()
 
     def monotonic_s(self) -> float:
         """Seconds of the host's monotonic clock."""

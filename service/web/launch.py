@@ -62,7 +62,7 @@ class Launcher:
             ) from error
         with self._lock:
             self._children[run_id] = child
-        now_s = self.store.clock.utc_now().timestamp()
+        now_s = self.store.clock.utc_s()
         first = Snapshot(at_utc_s=now_s, pid=child.pid, doing="starting", activity="starting", activity_utc_s=now_s)
         with contextlib.suppress(OSError):  # the runner will report by itself soon
             write_snapshot(self.data, run_id, first)

@@ -91,7 +91,7 @@ def test_wrong_passwords_lock_out_with_growing_waits(office: Office) -> None:
         refused(lambda: office.people.sign_in("grace", "wrong"))
     for _ in range(7):
         refused(lambda: office.people.sign_in("grace", "wrong"))
-        now = office.clock.utc_now().timestamp()
+        now = office.clock.utc_s()
         until = office.people.accounts.get("grace").locked_until_utc_s
         waits.append(round(until - now, 3))
         refused(lambda: office.people.sign_in("grace", password_of("grace")))  # even with the right one

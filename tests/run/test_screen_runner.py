@@ -54,7 +54,7 @@ class Watched:
     @property
     def told(self) -> Snapshot:
         """What the runner told last."""
-        return read_snapshot(self.data, self.run_id, self.store.clock.utc_now().timestamp())
+        return read_snapshot(self.data, self.run_id, self.store.clock.utc_s())
 
     def at(self, step: str, phase: str) -> bool:
         state = self.state()

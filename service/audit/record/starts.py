@@ -94,7 +94,7 @@ def _same_boot(before: ServiceStarted | None, boot: str) -> bool:
 
 def _clock_jump_s(clock: Clock, last: Event) -> float:
     """Seconds by which UTC advanced more than the monotonic clock since the last start: how far it was set."""
-    utc_s = clock.utc_now().timestamp() - datetime.fromisoformat(last.at_utc).timestamp()
+    utc_s = clock.utc_s() - datetime.fromisoformat(last.at_utc).timestamp()
     return round(utc_s - (clock.monotonic_s() - last.monotonic_s), 6)
 
 

@@ -57,7 +57,7 @@ def leftovers(store: Store, *, min_age_s: float = USUAL_AGE_S) -> list[Leftover]
     try:
         found = list(_candidates(store.artefact_folder))
         with store.database.reading() as connection:
-            return _judged(connection, found, min_age_s, store.clock.utc_now().timestamp())
+            return _judged(connection, found, min_age_s, store.clock.utc_s())
     except OSError as error:
         raise _refused(error) from error
 

@@ -140,7 +140,7 @@ def claim(
 
 def _take_over(connection: Connection, clock: Clock, row: Row[Any]) -> bool:
     """Whether another worker may have this running job. Records the loss of its worker, and fails it at its limit."""
-    if clock.utc_now().timestamp() < row.until_utc_s and identity_of(row).life() != "dead":
+    if clock.utc_s() < row.until_utc_s and identity_of(row).life() != "dead":
         return False
     _note(connection, clock, row, actor=ACTOR, note="job_lease_lost", data={"worker": row.worker})
     if row.tries < row.try_limit:
@@ -159,7 +159,7 @@ def _of_lane(lane: Lane | None) -> ColumnElement[bool]:
 def renew(connection: Connection, clock: Clock, job: Job, lease_s: float) -> Job:
     """Extend the lease on a job to `lease_s` seconds from now. Raises LeaseLostError."""
     held_row(connection, job)
-    until = clock.utc_now().timestamp() + lease_s
+    until = clock.utc_s() + lease_s
     connection.execute(update(jobs).where(jobs.c.job_id == job.job_id).values(until_utc_s=until))
     return to_job(connection.execute(select(jobs).where(jobs.c.job_id == job.job_id)).one())
 

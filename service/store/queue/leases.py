@@ -103,7 +103,7 @@ class RunLease:
         """Extend the lease by its duration from now. Raises LeaseLostError if another process has taken over."""
         with self._database.writing() as connection:
             check_lease(connection, self)
-            until = self._clock.utc_now().timestamp() + self._seconds
+            until = self._clock.utc_s() + self._seconds
             connection.execute(update(leases).where(leases.c.token == self.token).values(until_utc_s=until))
 
     def release(self) -> None:
@@ -135,12 +135,12 @@ class RunLease:
 def is_held(connection: Connection, clock: Clock, run_id: str) -> bool:
     """Whether a process that may still be alive holds the lease of a run."""
     row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
-    return row is not None and is_live(row, clock.utc_now().timestamp())
+    return row is not None and is_live(row, clock.utc_s())
 
 
 def held_runs(connection: Connection, clock: Clock) -> list[str]:
     """Names, sorted, of the runs whose lease is held by a process that may still be alive."""
-    now_utc_s = clock.utc_now().timestamp()
+    now_utc_s = clock.utc_s()
     rows = connection.execute(select(leases).order_by(leases.c.run_id)).all()
     return [row.run_id for row in rows if is_live(row, now_utc_s)]
 
@@ -155,7 +155,7 @@ def acquire(database: Database, clock: Clock, ids: IdSource, *, run_id: str, hol
     """Take the lease of a run. Raises LeaseHeldError, naming the holder, while another process has it."""
     token = ids.new_token()
     with database.writing() as connection:
-        now = clock.utc_now().timestamp()
+        now = clock.utc_s()
         row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
         if row is not None:
             if is_live(row, now):

@@ -175,7 +175,7 @@ def live_view(site: CurrentSite, run_id: RunId, camera: Annotated[str, Query(max
     path = frame_path(site.data, run_id, camera)
     headers = {"Cache-Control": "no-store"}
     try:
-        age_s = site.store.clock.utc_now().timestamp() - path.stat().st_mtime
+        age_s = site.store.clock.utc_s() - path.stat().st_mtime
         content = path.read_bytes()  # now: it may be replaced while a response is sent piece by piece
     except OSError:
         return Response(status_code=204, headers=headers)

@@ -165,7 +165,7 @@ def _line(site: Site, row: RunRow) -> RunLine:
 
     robot, standing, why = "", ("", ""), ""
     if not state.terminal:
-        now_utc_s = site.store.clock.utc_now().timestamp()
+        now_utc_s = site.store.clock.utc_s()
         snapshot, driven = read_snapshot(site.data, row.run_id, now_utc_s), site.launcher.driven(row.run_id)
         robot = robot_banner(state, snapshot, now_utc_s, driven=driven).title
         standing, why = _standing(log.protocol, state, driven=driven)

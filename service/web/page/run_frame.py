@@ -74,7 +74,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # checked when the run was read
     here = f"/runs/{run_id}"
-    now_utc_s = site.store.clock.utc_now().timestamp()
+    now_utc_s = site.store.clock.utc_s()
     driven, snapshot = site.launcher.driven(run_id), read_snapshot(site.data, run_id, now_utc_s)
     return RunFrame(
         run_id=run_id,

@@ -184,7 +184,7 @@ def _list(
         "people/accounts.html.j2",
         status=status_of(problem) if problem else 200,
         accounts=site.people.accounts.all(),
-        now_s=site.store.clock.utc_now().timestamp(),
+        now_s=site.store.clock.utc_s(),
         roles=ROLES,
         problem=problem,
         typed=typed or {"account": "", "full_name": "", "role": "technician"},
@@ -193,7 +193,7 @@ def _list(
 
 def _one(request: Request, site: Site, account: str, *, problem: OrthocaptureError | None = None) -> HTMLResponse:
     shown = site.people.accounts.get(account)
-    waits = shown.locked_until_utc_s > site.store.clock.utc_now().timestamp()
+    waits = shown.locked_until_utc_s > site.store.clock.utc_s()
     return render(
         request,
         "people/account_administration.html.j2",

@@ -74,7 +74,7 @@ def _signed_in(site: Site, token: str) -> Person | None:
 
 def _newest(site: Site, run_id: str) -> tuple[int, int]:
     """The last event, and a number that changes with what the runner reports, or when it falls silent."""
-    now_utc_s = site.store.clock.utc_now().timestamp()
+    now_utc_s = site.store.clock.utc_s()
     snapshot = read_snapshot(site.data, run_id, now_utc_s)
     silent = snapshot.age_s(now_utc_s) // STALE_S if snapshot.stale(now_utc_s) else 0
     return site.store.head(run_id), hash((silent, *snapshot.shown()))

@@ -107,7 +107,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
     log = site.run(run_id)
     view = run_view(
         log,
-        read_snapshot(site.data, run_id, site.store.clock.utc_now().timestamp()),
+        read_snapshot(site.data, run_id, site.store.clock.utc_s()),
         _viewer(site, person, run_id),
         driven=site.launcher.driven(run_id),
         show=step,

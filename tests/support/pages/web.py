@@ -111,7 +111,7 @@ class WebSite:
     @property
     def now_utc_s(self) -> float:
         """The site's time, in seconds since the epoch."""
-        return self.store.clock.utc_now().timestamp()
+        return self.store.clock.utc_s()
 
     @property
     def people(self) -> People:

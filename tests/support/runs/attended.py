@@ -21,7 +21,7 @@ def attended(data: Path, runs: Mapping[str, Mapping[str, Any]]) -> Generator[Non
     over = threading.Event()
 
     def tell() -> None:
-        now_utc_s = store.clock.utc_now().timestamp()
+        now_utc_s = store.clock.utc_s()
         for run_id, fields in runs.items():
             write_snapshot(data, run_id, Snapshot.model_validate({"at_utc_s": now_utc_s, **fields}))
 
