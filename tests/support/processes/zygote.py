@@ -26,6 +26,18 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TextIO
 
 COMMANDS, SIMULATORS = "service.cli.main", "simulators"
+# What the pages start: modules of the program, each with those that it imports only once it needs them.
+OF_PAGES = {
+    "service.audit.export.formats": ("service.audit.export.posed",),
+    "service.audit.export.process": (
+        "service.audit.export.posed",
+        "service.audit.report.content",
+        "service.audit.report.output.html",
+        "service.audit.report.output.pdf",
+    ),
+    "service.audit.verify.process": (),
+    "service.web.dataset.process": ("service.audit.record.run", "service.dataset.preview.making"),
+}
 OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe")
 _REQUEST_BYTES, _NUMBER_BYTES = 8, 8  # lengths of a request's size, and of a process id or an exit status
 _STANDARD = (0, 1, 2)
@@ -118,7 +130,7 @@ class _Zygote:
             place = vars(main)["_COMMANDS"].get(word)
             needed = [place.place.partition(":")[0]] if place else []
         else:
-            needed = []
+            needed = OF_PAGES.get(request.module, ())
         for name in needed:
             importlib.import_module(name)
         assert len(os.listdir("/proc/self/task")) == 1, f"importing for {kind} started a thread"
