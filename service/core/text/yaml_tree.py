@@ -6,11 +6,12 @@ import re
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import yaml
 from yaml.composer import Composer
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from yaml.parser import Parser
 
 from service.core.errors import ProtocolError
 
@@ -20,8 +21,8 @@ Plain = None | bool | int | float | str | list["Plain"] | dict[str, "Plain"]
 MOST_DEEP = 50
 MOST_VALUES = 200_000
 _LONGEST_INTEGER = 18  # characters; a longer integer is read as a float
-# Text that libyaml and PyYAML's own parser read alike: no tabs, directives, byte order marks or unusual ends of lines, no
-# tags, no "?", which begins a key or is part of a word, and no comment that touches the sign of a block.
+# Text that libyaml and PyYAML itself read alike: no tabs, directives, byte order marks or unusual ends of lines,
+# no tags, no "?", which begins a key or is part of a word, and no comment that touches the sign of a block.
 _READ_ALIKE = re.compile(
     r"(?!%)(?:[ \"-=@-{}~\xa0-\u2027\u202a-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff]++"
     r"|[|>](?![-+0-9]*#)|\n(?!%))*+"
@@ -145,7 +146,7 @@ class _ShallowComposer(Composer):
     def _one_deeper(self) -> Generator[None]:
         self._depth += 1
         if self._depth > MOST_DEEP:
-            start = self.peek_event().start_mark
+            start = cast("Parser", self).peek_event().start_mark
             raise ProtocolError(
                 f"nested more than {MOST_DEEP} deep",
                 where=f"{self._file}:{start.line + 1 if start else 1}",
@@ -166,11 +167,11 @@ class _Loader(_ShallowComposer, yaml.SafeLoader):
 _library_loader: Callable[[str, str], Composer] | None = None
 if yaml.__with_libyaml__:
 
-    class _LibraryLoader(_ShallowComposer, yaml.cyaml.CParser):
+    class _LibraryLoader(_ShallowComposer, yaml.CBaseLoader):
         """Scans and parses in C, ten times as fast."""
 
         def __init__(self, text: str, name: str) -> None:
-            yaml.cyaml.CParser.__init__(self, text)
+            yaml.CBaseLoader.__init__(self, text)
             Composer.__init__(self)
             self._file = name
 

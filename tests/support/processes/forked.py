@@ -1,13 +1,13 @@
 """Starts processes of the program for tests without importing everything again: by forks of a zygote.
 
 `Forked` and `run` stand for `subprocess.Popen` and `subprocess.run`. What is forked: `orthocapture …`,
-`python -m service.cli.main …`, `python -m simulators …`, what pages start for exports, previews and verifications
-(OF_PAGES) and some programs of the tests (OF_TESTS). Everything else is a real start, as are these where the environment differs in a variable that something may read while it starts.
+`python -m service.cli.main …`, `python -m simulators …`, some programs of the tests (OF_TESTS), and what the pages of
+a site in this process start for exports, previews and verifications (OF_PAGES, by `pages_fork`). Everything else is a
+real start, as are these where the environment differs in a variable that something may read while it starts.
 
 What is about starting itself is a real start too, by `subprocess`: tests/cli/test_start_up.py, the installed command
 in tests/cli, the package in tests/system, the tree of a rig's processes in tests/rig/test_rig.py, `python -I`. So is
-what the program starts by itself: drivers, runners and workers. The devices of a forked rig are forks too, and what the
-pages of a site in this process start (`pages_fork`).
+what the program starts by itself: drivers, runners and workers. The devices of a forked rig are forks too.
 """
 
 from __future__ import annotations
