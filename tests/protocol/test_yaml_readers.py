@@ -1,4 +1,4 @@
-"""YAML is read by libyaml where PyYAML's own parser reads the same, and that one has the last word on what is wrong."""
+"""YAML is read by libyaml where PyYAML's own parser reads the same; that one has the last word on what is wrong."""
 
 from __future__ import annotations
 
