@@ -42,6 +42,7 @@ OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes
 _REQUEST_BYTES, _NUMBER_BYTES = 8, 8  # lengths of a request's size, and of a process id or an exit status
 _STANDARD = (0, 1, 2)
 _RIG = "rig"  # the simulator that starts others
+_DESCRIBE = "--describe"  # asks for the options of the simulator that is named next
 _LATE = ("simulators.rendering.render",)  # what simulators import only once they need it
 
 
@@ -115,12 +116,13 @@ class _Zygote:
 
     def _prepare(self, request: _Request) -> None:
         """Import what the process needs, unless it was done for one like it; no thread may begin by that."""
-        kind = (request.module, *request.words[:1])
+        described = request.words[:1] == [_DESCRIBE]
+        kind = (request.module, *request.words[: 2 if described else 1])
         if kind in self.prepared:
             return
         self.prepared.add(kind)
         main: Any = importlib.import_module(request.main)
-        word = request.words[0] if request.words else ""
+        word = kind[-1] if request.words else ""
         if request.module == SIMULATORS:
             known: dict[str, tuple[str, str]] = main.simulators()
             names = known if request.is_rig else {word} & known.keys()
