@@ -13,8 +13,11 @@ from typing import Any
 from urllib.parse import quote
 
 from sqlalchemy import Connection, Engine, RootTransaction, create_engine, event, inspect, text
+from sqlalchemy.dialects import registry
+from sqlalchemy.dialects.sqlite.pysqlite import SQLiteDialect_pysqlite
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.pool import ConnectionPoolEntry
+from sqlalchemy.util import LRUCache
 
 from service.core.errors import StoreError
 from service.store.database import new_schema
@@ -52,6 +55,22 @@ def fresh_schema() -> Mapping[tuple[str, str], tuple[str, str | None]]:
             return read_schema(connection)
     finally:
         engine.dispose()
+
+
+class _SharedDialect(SQLiteDialect_pysqlite):
+    """The dialect of SQLite, equal for all databases: a statement that was compiled for one serves them all."""
+
+    supports_statement_cache = True
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self)
+
+    def __hash__(self) -> int:
+        return hash(type(self))
+
+
+registry.register("sqlite.shared", __name__, _SharedDialect.__name__)
+_COMPILED: LRUCache[Any, Any] = LRUCache(500)
 
 
 class Database:
@@ -179,7 +198,11 @@ def _checked_read_only(engine: Engine, path: Path, files: Files) -> Database:
 
 
 def _engine(address: str, *, writable: bool) -> Engine:
-    engine = create_engine(f"sqlite:///{address}", connect_args={"timeout": BUSY_TIMEOUT_S})
+    engine = create_engine(
+        f"sqlite+shared:///{address}",
+        connect_args={"timeout": BUSY_TIMEOUT_S},
+        execution_options={"compiled_cache": _COMPILED},
+    )
 
     def on_connect(connection: sqlite3.Connection, _record: ConnectionPoolEntry) -> None:
         # The driver's own BEGIN comes too late and is never IMMEDIATE, so on_begin below sends it.
