@@ -184,7 +184,7 @@ def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence
             "payload": parse_canonical(text),
             "previous_sha256": previous,
         }
-        previous = event_sha256(fields)
+        previous = event_sha256_of_text(fields, text)
         connection.execute(_INSERT, fields | {"kind": payload.kind, "payload": text, "sha256": previous})
         appended.append(Event.model_validate(fields | {"sha256": previous}))
     if appended:
