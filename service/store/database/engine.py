@@ -13,8 +13,6 @@ from typing import Any
 from urllib.parse import quote
 
 from sqlalchemy import Connection, Engine, RootTransaction, create_engine, event, inspect, text
-from sqlalchemy.dialects import registry
-from sqlalchemy.dialects.sqlite.pysqlite import SQLiteDialect_pysqlite
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.pool import ConnectionPoolEntry
 from sqlalchemy.util import LRUCache
@@ -57,20 +55,19 @@ def fresh_schema() -> Mapping[tuple[str, str], tuple[str, str | None]]:
         engine.dispose()
 
 
-class _SharedDialect(SQLiteDialect_pysqlite):
-    """The dialect of SQLite, equal for all databases: a statement that was compiled for one serves them all."""
+class _Compiled(LRUCache[Any, Any]):
+    """Statements as they were compiled for SQLite, for all databases: SQLAlchemy keeps them for each alone."""
 
-    supports_statement_cache = True
+    def get(self, key: Any, default: Any = None) -> Any:
+        _dialect, *statement = key
+        return super().get(tuple(statement), default)
 
-    def __eq__(self, other: object) -> bool:
-        return type(other) is type(self)
-
-    def __hash__(self) -> int:
-        return hash(type(self))
+    def __setitem__(self, key: Any, value: Any) -> None:
+        _dialect, *statement = key
+        super().__setitem__(tuple(statement), value)
 
 
-registry.register("sqlite.shared", __name__, _SharedDialect.__name__)
-_COMPILED: LRUCache[Any, Any] = LRUCache(500)
+_COMPILED = _Compiled(500)
 
 
 class Database:
@@ -199,7 +196,7 @@ def _checked_read_only(engine: Engine, path: Path, files: Files) -> Database:
 
 def _engine(address: str, *, writable: bool) -> Engine:
     engine = create_engine(
-        f"sqlite+shared:///{address}",
+        f"sqlite:///{address}",
         connect_args={"timeout": BUSY_TIMEOUT_S},
         execution_options={"compiled_cache": _COMPILED},
     )
