@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import rfc8785
 from pydantic_core import PydanticSerializationError, ValidationError
-from sqlalchemy import Connection, Row, insert, select, update
+from sqlalchemy import Connection, Row, bindparam, insert, select, update
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import PAYLOAD, ArtefactRef, Event, Payload
@@ -25,6 +25,22 @@ _SAFE = 2**53 - 1
 _MAY_DIFFER = re.compile("\\.0(?![0-9])|[0-9]e[+-]|[\ud800-\U0010ffff]")
 _PLAIN = json.JSONEncoder(ensure_ascii=False, allow_nan=False, sort_keys=True, separators=(",", ":"))
 _REF_FIELDS: set[str] = set(ArtefactRef.model_fields)
+
+# Statements of every append are put together once, which takes SQLAlchemy longer than SQLite takes to execute them.
+_INSERT = insert(events)
+_MOVE_HEAD = update(heads).where(heads.c.run_id == bindparam("run"))
+_HEAD = select(heads.c.seq, heads.c.sha256).where(heads.c.run_id == bindparam("run"))
+_LAST = (
+    select(events.c.seq, events.c.sha256)
+    .where(events.c.run_id == bindparam("run"))
+    .order_by(events.c.seq.desc())
+    .limit(1)
+)
+_AFTER = (
+    select(events)
+    .where(events.c.run_id == bindparam("run"), events.c.seq > bindparam("after_seq"))
+    .order_by(events.c.seq)
+)
 
 
 def canonical(value: object) -> str:
@@ -168,13 +184,11 @@ def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence
             "payload": parse_canonical(text),
             "previous_sha256": previous,
         }
-        previous = event_sha256(fields)
-        connection.execute(
-            insert(events).values(**fields | {"kind": payload.kind, "payload": text, "sha256": previous})
-        )
+        previous = event_sha256_of_text(fields, text)
+        connection.execute(_INSERT, fields | {"kind": payload.kind, "payload": text, "sha256": previous})
         appended.append(Event.model_validate(fields | {"sha256": previous}))
     if appended:
-        connection.execute(update(heads).where(heads.c.run_id == run_id).values(seq=seq, sha256=previous))
+        connection.execute(_MOVE_HEAD, {"run": run_id, "seq": seq, "sha256": previous})
     return appended
 
 
@@ -183,10 +197,8 @@ def read_head(connection: Connection, run_id: str) -> tuple[int, str]:
 
     Raises IntegrityError if the chain does not end where the last append left it.
     """
-    head = connection.execute(select(heads.c.seq, heads.c.sha256).where(heads.c.run_id == run_id)).one_or_none()
-    last = connection.execute(
-        select(events.c.seq, events.c.sha256).where(events.c.run_id == run_id).order_by(events.c.seq.desc()).limit(1)
-    ).one_or_none()
+    head = connection.execute(_HEAD, {"run": run_id}).one_or_none()
+    last = connection.execute(_LAST, {"run": run_id}).one_or_none()
     expected = (0, ROOT) if last is None else (last.seq, last.sha256)
     if head is None or (head.seq, head.sha256) != expected:
         raise IntegrityError(
@@ -199,10 +211,7 @@ def read_head(connection: Connection, run_id: str) -> tuple[int, str]:
 
 def read_events(connection: Connection, run_id: str, after_seq: int) -> list[Event]:
     """The events after a sequence number, in order. Raises IntegrityError for a row that is not a valid event."""
-    rows = connection.execute(
-        select(events).where(events.c.run_id == run_id, events.c.seq > after_seq).order_by(events.c.seq)
-    )
-    return [to_event(row) for row in rows]
+    return [to_event(row) for row in connection.execute(_AFTER, {"run": run_id, "after_seq": after_seq})]
 
 
 def to_event(row: Row[Any]) -> Event:

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, bindparam, select
 
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.jobs.priorities import Lane
@@ -27,6 +27,8 @@ from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, 
 from service.store.run_rows import begin_chain, read_open_runs, read_runs, resolve_run
 from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
 
+_HEAD = select(heads.c.seq).where(heads.c.run_id == bindparam("run"))  # put together once, for they are asked often
+_RUN = select(runs.c.run_id).where(runs.c.run_id == bindparam("run"))
 _OWN_KINDS = frozenset({"run_started", "site_opened", "job_enqueued", "job_finished", "job_failed"})
 
 
@@ -242,7 +244,7 @@ class Store:
     def head(self, run_id: str) -> int:
         """Sequence number of a run's last event. Raises UnknownRunError."""
         with self._database.reading() as connection:
-            seq: int | None = connection.execute(select(heads.c.seq).where(heads.c.run_id == run_id)).scalar()
+            seq: int | None = connection.execute(_HEAD, {"run": run_id}).scalar()
         if seq is None:
             raise UnknownRunError(f"there is no run {run_id!r}", where=str(self.database_path))
         return seq
@@ -286,7 +288,7 @@ class Store:
             return held_runs(connection, self._clock)
 
     def _require_run(self, connection: Connection, run_id: str) -> None:
-        if connection.execute(select(runs.c.run_id).where(runs.c.run_id == run_id)).first() is None:
+        if connection.execute(_RUN, {"run": run_id}).first() is None:
             raise UnknownRunError(f"there is no run {run_id!r}", where=str(self.database_path))
 
     # --- jobs ---

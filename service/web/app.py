@@ -58,6 +58,10 @@ _ROUTERS: tuple[APIRouter, ...] = (
     exports.router,
     service.web.monitoring.pages.router,
 )
+# Put together once: FastAPI works out what a route depends on anew for every application that includes its router.
+_PAGES = APIRouter(dependencies=[Depends(sealed, scope="function")])
+for _router in _ROUTERS:
+    _PAGES.include_router(_router)
 _WITH_STATIC_FILES = ("audit", "calibration", "capture", "dataset", "handheld", "home", "people", "run", "scene")
 
 
@@ -68,15 +72,13 @@ def create_app(site: Site) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         openapi_url=None,  # the pages are for people; a list of all addresses would only help attackers
-        dependencies=[Depends(sealed, scope="function")],
+        routes=[*_PAGES.routes],
     )
     app.state.site = site
     app.state.limiter = Limiter(site.store.clock, failed_tries(site.store, TRIES_WINDOW_S))
     app.add_middleware(Shield, hosts=site.hosts)
     install_errors(app)
     install_metrics(app)
-    for router in _ROUTERS:
-        app.include_router(router)
     for folder in _WITH_STATIC_FILES:
         files = StaticFiles(packages=[(f"service.web.{folder}", "static")])
         app.mount(f"/static/{folder}", files, name=f"static_{folder}")

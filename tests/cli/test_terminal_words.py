@@ -31,6 +31,7 @@ from service.dataset.posed.exporter import exporters
 from service.jobs.words import term
 from service.steps import params_models
 from service.steps.capture.live_numbers import seen_words
+from tests.support.processes.forked import Forked
 
 ROOT = Path(__file__).parents[2]
 COMMAND = Path(sys.executable).with_name("orthocapture")
@@ -41,11 +42,18 @@ def _output(*words: str) -> tuple[int, str]:
     return done.exit_code, done.output
 
 
-def _run(*words: str, **more: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [COMMAND, *words], env={**os.environ, "COLUMNS": "80", **more}, capture_output=True, text=True, timeout=100,
-        check=False,
-    )  # fmt: skip
+def _completed(words: str, at: int) -> list[str]:
+    """What the command offers a shell that asks how the word at a place goes on."""
+    asked = {"_ORTHOCAPTURE_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(at)}
+    done = subprocess.run(
+        [COMMAND],
+        env={**os.environ, "COLUMNS": "80", **asked},
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=True,
+    )
+    return done.stdout.split()
 
 
 def _plain(shown: str) -> str:
@@ -106,22 +114,21 @@ def test_every_command_is_named_in_the_help_and_the_version_is_told() -> None:
 
 
 def test_the_shell_completes_commands() -> None:
-    done = _run(_ORTHOCAPTURE_COMPLETE="complete_bash", COMP_WORDS="orthocapture re", COMP_CWORD="1")
-    assert done.stdout.split() == ["resume", "register", "replay"]
-    done = _run(_ORTHOCAPTURE_COMPLETE="complete_bash", COMP_WORDS="orthocapture calibrate ", COMP_CWORD="2")
-    assert done.stdout.split() == ["intrinsics", "hand-eye"]
+    assert _completed("orthocapture re", 1) == ["resume", "register", "replay"]
+    assert _completed("orthocapture calibrate ", 2) == ["intrinsics", "hand-eye"]
 
 
-def test_simulators_explain_themselves_as_every_command_does() -> None:
-    done = _run("simulate", "rig", "--help")
-    assert done.returncode == 0, done.stderr
-    assert "Usage: orthocapture simulate rig [OPTIONS]" in done.stdout
-    assert "╭─ Options" in done.stdout
+def test_simulators_explain_themselves_as_every_command_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subprocess, "Popen", Forked)
+    status, shown = _output("simulate", "rig", "--help")
+    assert status == 0
+    assert "Usage: orthocapture simulate rig [OPTIONS]" in shown
+    assert "╭─ Options" in shown
     for words in ("--scene", "--image-width", "--speed-up", "seed of the scene"):
-        assert words.lower() in done.stdout.lower()
-    everything = _run("simulate", "--help")
+        assert words.lower() in shown.lower()
+    _, everything = _output("simulate", "--help")
     for name in ("ur", "camera", "scanner", "ct", "lightbox", "rig"):
-        assert re.search(rf"│ {name} +[AT]", everything.stdout)
+        assert re.search(rf"│ {name} +[AT]", everything)
 
 
 @pytest.mark.parametrize(
@@ -136,11 +143,14 @@ def test_simulators_explain_themselves_as_every_command_does() -> None:
         (["--bogus"], "Which one? There are ur, kuka, camera, canon, gige, video, scanner, ct, lightbox, rig, grbl"),
     ],
 )
-def test_a_simulator_refuses_wrong_usage_as_every_command_does(typed: list[str], told: str) -> None:
-    done = _run("simulate", *typed)
-    assert done.returncode == 2
-    assert "╭─ Error" in done.stderr
-    assert told in _plain(done.stderr)
+def test_a_simulator_refuses_wrong_usage_as_every_command_does(
+    typed: list[str], told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(subprocess, "Popen", Forked)  # the command asks a process of its own for the options
+    status, shown = _output("simulate", *typed)
+    assert status == 2
+    assert "╭─ Error" in shown
+    assert told in _plain(shown)
 
 
 def test_a_missing_rig_file_says_what_to_do(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,28 @@ from tests.support.runs.bench_run import Bench
 from tests.support.runs.held_run import left_held_run
 
 
-@pytest.fixture
-def shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[tuple[WebSite, Browser, Bench]]:
-    """A run with four images, the second one blurred."""
-    with web_site(tmp_path) as site:
-        bench = left_held_run(site.begin_run, monkeypatch, tmp_path)
+@contextmanager
+def held_site(folder: Path) -> Generator[tuple[WebSite, Browser, Bench]]:
+    """A run with four images, the second one blurred, and the technician who controls it."""
+    with web_site(folder) as site, pytest.MonkeyPatch.context() as patch:
+        bench = left_held_run(site.begin_run, patch, folder)
         browser = site.browser("technician")
         site.take_control(bench.run_id, browser)
         yield site, browser, bench
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Generator[tuple[WebSite, Browser, Bench]]:
+    """A site for tests that leave its run as it is."""
+    with held_site(tmp_path_factory.mktemp("held")) as held:
+        yield held
+
+
+@pytest.fixture
+def acted_on(tmp_path: Path) -> Generator[tuple[WebSite, Browser, Bench]]:
+    """A site for a test that adds to its run."""
+    with held_site(tmp_path) as held:
+        yield held
 
 
 def last_answer(bench: Bench) -> Mapping[str, Any]:
@@ -52,8 +67,8 @@ def test_the_page_says_where_to_go_and_what_became_of_the_images(
     assert "way-arrow" in answer.text
 
 
-def test_the_buttons_ask_the_step(shown: tuple[WebSite, Browser, Bench]) -> None:
-    _, browser, bench = shown
+def test_the_buttons_ask_the_step(acted_on: tuple[WebSite, Browser, Bench]) -> None:
+    _, browser, bench = acted_on
     for what in ("release", "finish"):
         answer = browser.send_form(f"/runs/{bench.run_id}/held", step="capture", attempt=1, what=what)
         assert answer.status_code == 303
@@ -108,9 +123,9 @@ def test_an_image_that_could_not_be_looked_at_says_why_and_what_to_do(
 
 
 def test_a_camera_without_a_cable_has_no_release_and_no_live_view_on_the_page(
-    shown: tuple[WebSite, Browser, Bench],
+    acted_on: tuple[WebSite, Browser, Bench],
 ) -> None:
-    _, browser, bench = shown
+    _, browser, bench = acted_on
     page = f"/runs/{bench.run_id}/held"
     assert "Start live view" in browser.get(page).text
     watch = PhotoWatch(PhotoWatchConfig(folder=bench.data / "card"))

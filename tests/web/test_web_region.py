@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,14 +29,28 @@ CORNERS = [[0.01, 0.0, 0.02], [0.03, 0.0, 0.02], [0.02, 0.02, 0.025]]
 FORM = {"source": "ct", "corners": json.dumps(CORNERS), "along": "[0, 0, 1]"}
 
 
-@pytest.fixture
-def shown(tmp_path: Path) -> Iterator[tuple[WebSite, Browser, str]]:
+@contextmanager
+def fusing_site(folder: Path) -> Generator[tuple[WebSite, Browser, str]]:
     """A run that has been registered and is to be fused, and a technician who controls it."""
-    run = record_run(tmp_path, complete=False, protocol=PROTOCOL + FUSION)
-    with web_site(tmp_path) as site:
+    run = record_run(folder, complete=False, protocol=PROTOCOL + FUSION)
+    with web_site(folder) as site:
         browser = site.browser("technician")
         site.take_control(run, browser)
         yield site, browser, run
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Generator[tuple[WebSite, Browser, str]]:
+    """A site for tests that draw nothing, or try to in vain."""
+    with fusing_site(tmp_path_factory.mktemp("fusing")) as fusing:
+        yield fusing
+
+
+@pytest.fixture
+def drawn_on(tmp_path: Path) -> Generator[tuple[WebSite, Browser, str]]:
+    """A site for a test that draws."""
+    with fusing_site(tmp_path) as fusing:
+        yield fusing
 
 
 def drawn(site: WebSite, run: str) -> list[tuple[str, RegionDrawn]]:
@@ -44,8 +59,8 @@ def drawn(site: WebSite, run: str) -> list[tuple[str, RegionDrawn]]:
     return [(e.actor, e.payload) for e in events if isinstance(e.payload, RegionDrawn)]
 
 
-def test_a_region_is_recorded_with_the_name_of_who_drew_it(shown: tuple[WebSite, Browser, str]) -> None:
-    site, browser, run = shown
+def test_a_region_is_recorded_with_the_name_of_who_drew_it(drawn_on: tuple[WebSite, Browser, str]) -> None:
+    site, browser, run = drawn_on
     page = browser.get(f"/runs/{run}/scene").text
     assert 'action="/runs/' + run + '/scene/region"' in page
     frame = browser.get(f"/runs/{run}/scene/frame").text

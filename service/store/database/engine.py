@@ -15,6 +15,7 @@ from urllib.parse import quote
 from sqlalchemy import Connection, Engine, RootTransaction, create_engine, event, inspect, text
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.pool import ConnectionPoolEntry
+from sqlalchemy.util import LRUCache
 
 from service.core.errors import StoreError
 from service.store.database import new_schema
@@ -52,6 +53,21 @@ def fresh_schema() -> Mapping[tuple[str, str], tuple[str, str | None]]:
             return read_schema(connection)
     finally:
         engine.dispose()
+
+
+class _Compiled(LRUCache[Any, Any]):
+    """Statements as they were compiled for SQLite, for all databases: SQLAlchemy keeps them for each alone."""
+
+    def get(self, key: Any, default: Any = None) -> Any:
+        _dialect, *statement = key
+        return super().get(tuple(statement), default)
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        _dialect, *statement = key
+        super().__setitem__(tuple(statement), value)
+
+
+_COMPILED = _Compiled(500)
 
 
 class Database:
@@ -179,7 +195,11 @@ def _checked_read_only(engine: Engine, path: Path, files: Files) -> Database:
 
 
 def _engine(address: str, *, writable: bool) -> Engine:
-    engine = create_engine(f"sqlite:///{address}", connect_args={"timeout": BUSY_TIMEOUT_S})
+    engine = create_engine(
+        f"sqlite:///{address}",
+        connect_args={"timeout": BUSY_TIMEOUT_S},
+        execution_options={"compiled_cache": _COMPILED},
+    )
 
     def on_connect(connection: sqlite3.Connection, _record: ConnectionPoolEntry) -> None:
         # The driver's own BEGIN comes too late and is never IMMEDIATE, so on_begin below sends it.

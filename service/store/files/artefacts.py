@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Row, insert, select
+from sqlalchemy import Connection, Row, bindparam, insert, select
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import ArtefactRef, Event
@@ -24,6 +24,16 @@ from service.store.records import Artefact, NewArtefact
 CHUNK_BYTES = 1 << 20
 TEMPORARY = "tmp"  # beside the shards on the same file system, so that a rename is atomic
 _SHA256 = re.compile(r"[0-9a-f]{64}")
+_INSERT = insert(artefacts)  # like the next, put together once for all images
+_RECORDED = (
+    select(artefacts.c.seq)
+    .where(
+        artefacts.c.sha256 == bindparam("hash"),
+        artefacts.c.run_id == bindparam("run"),
+        artefacts.c.size_bytes == bindparam("size"),
+    )
+    .limit(1)
+)
 
 
 def relative_path(sha256: str) -> Path:
@@ -250,20 +260,12 @@ def _insert(
         "monotonic_s": float(event.monotonic_s if artefact.monotonic_s is None else artefact.monotonic_s),
     }
     digest = record_sha256(event.sha256, fields)
-    connection.execute(insert(artefacts).values(**fields, record_sha256=digest))
+    connection.execute(_INSERT, fields | {"record_sha256": digest})
 
 
 def _require_row(connection: Connection, event: Event, ref: ArtefactRef) -> None:
-    statement = (
-        select(artefacts.c.seq)
-        .where(
-            artefacts.c.sha256 == ref.sha256,
-            artefacts.c.run_id == event.run_id,
-            artefacts.c.size_bytes == ref.size_bytes,
-        )
-        .limit(1)
-    )
-    if connection.execute(statement).first() is None:
+    wanted = {"run": event.run_id, "hash": ref.sha256, "size": ref.size_bytes}
+    if connection.execute(_RECORDED, wanted).first() is None:
         raise StoreError(
             f"{event.payload.kind} refers to an artefact that this run has not recorded: {ref.original_name}",
             where=ref.sha256,

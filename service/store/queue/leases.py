@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 import psutil
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
 
 from service.core.errors import StoreError
 from service.store.database.engine import Database
@@ -25,6 +25,7 @@ from service.store.errors import LeaseHeldError, LeaseLostError
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _SAME_START_S = 1.5  # the boot time is known to one second
+_HELD = select(leases.c.run_id).where(leases.c.token == bindparam("held"))  # put together once: every record asks it
 _log = logging.getLogger(__name__)
 
 
@@ -178,7 +179,7 @@ def acquire(database: Database, clock: Clock, ids: IdSource, *, run_id: str, hol
 
 def check_lease(connection: Connection, lease: RunLease) -> None:
     """Raise LeaseLostError unless the database still holds this lease."""
-    if connection.execute(select(leases.c.run_id).where(leases.c.token == lease.token)).first() is None:
+    if connection.execute(_HELD, {"held": lease.token}).first() is None:
         raise LeaseLostError(
             "another process has taken over this run",
             where=lease.run_id,

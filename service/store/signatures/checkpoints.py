@@ -68,7 +68,7 @@ def artefacts_digest(connection: Connection, run_id: str) -> str:
 
 def insert_checkpoint(connection: Connection, checkpoint: Checkpoint) -> None:
     """Insert a checkpoint's row in the caller's transaction."""
-    connection.execute(insert(checkpoints).values(**asdict(checkpoint)))
+    connection.execute(insert(checkpoints), asdict(checkpoint))
 
 
 def last_checkpoint(connection: Connection, run_id: str) -> Checkpoint | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from typing import Any, cast
 
 from pypdf import PdfReader
@@ -24,9 +25,10 @@ def fonts_of(pdf: bytes) -> set[str]:
     return {str(font.get_object()["/BaseFont"]) for page in pages for font in page["/Resources"]["/Font"].values()}
 
 
-def pages_of(pdf: bytes) -> list[str]:
-    """The text of each page, in order, with white space normalised."""
-    return [" ".join(page.extract_text().split()) for page in reader_of(pdf).pages]
+@lru_cache(maxsize=2)
+def pages_of(pdf: bytes) -> tuple[str, ...]:
+    """The text of each page, in order, with white space normalised; half a second of work, so the last are kept."""
+    return tuple(" ".join(page.extract_text().split()) for page in reader_of(pdf).pages)
 
 
 def tags_of(pdf: bytes) -> list[tuple[str, str]]:

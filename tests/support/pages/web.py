@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import httpx
+from anyio.from_thread import BlockingPortal, start_blocking_portal
 from argon2 import PasswordHasher
 from fastapi import FastAPI
 
@@ -28,6 +29,7 @@ from service.web.app import create_app
 from service.web.launch import Launcher
 from service.web.security.guards import cookie_name
 from service.web.site import Site
+from tests.support.processes.forked import pages_fork
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
 
@@ -102,6 +104,7 @@ class WebSite:
     site: Site
     app: FastAPI
     folder: Path
+    portal: BlockingPortal  # the event loop in which the application serves all screens
     browsers: list[Browser] = field(default_factory=list[Browser])
 
     @property
@@ -121,6 +124,7 @@ class WebSite:
         """A new screen; with a role, signed in as its person. Server errors become pages."""
         browser = Browser(self.app, base_url=HOST, raise_server_exceptions=False)
         browser.site = self.site
+        browser.portal = self.portal  # without it every request would start a loop and a thread of its own
         self.browsers.append(browser)
         if role is not None:
             account = _ACCOUNTS[role]
@@ -162,7 +166,8 @@ def web_site(folder: Path, *, clock: Clock | None = None, idle_lock_s: float = 6
     data = folder / "data"
     if clock is None and not data.exists():
         shutil.copytree(Path(_with_people().name) / "data", data)
-    with Store.open(data, clock or SteppedClock.from_now()) as store:
+    clock = clock or SteppedClock.from_now()
+    with Store.open(data, clock) as store, start_blocking_portal() as portal, pages_fork():
         people = People(store, QUICK_HASHES)
         populate(people)
         site = Site(
@@ -176,7 +181,7 @@ def web_site(folder: Path, *, clock: Clock | None = None, idle_lock_s: float = 6
             idle_lock_s=idle_lock_s,
             hosts=("testserver",),
         )
-        whole = WebSite(site, create_app(site), folder)
+        whole = WebSite(site, create_app(site), folder, portal)
         try:
             yield whole
         finally:

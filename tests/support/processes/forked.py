@@ -1,8 +1,9 @@
 """Starts processes of the program for tests without importing everything again: by forks of a zygote.
 
 `Forked` and `run` stand for `subprocess.Popen` and `subprocess.run`. What is forked: `orthocapture …`,
-`python -m service.cli.main …`, `python -m simulators …` and some programs of the tests (OF_TESTS). Everything else is
-a real start, as are these where the environment differs in a variable that something may read while it starts.
+`python -m service.cli.main …`, `python -m simulators …`, some programs of the tests (OF_TESTS), and what the pages of
+a site in this process start for exports, previews and verifications (OF_PAGES, by `pages_fork`). Everything else is a
+real start, as are these where the environment differs in a variable that something may read while it starts.
 
 What is about starting itself is a real start too, by `subprocess`: tests/cli/test_start_up.py, the installed command
 in tests/cli, the package in tests/system, the tree of a rig's processes in tests/rig/test_rig.py, `python -I`. So is
@@ -19,16 +20,20 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, AnyStr, cast
+from unittest.mock import patch
 
-from tests.support.processes.zygote import COMMANDS, OF_TESTS, SIMULATORS
+from service.audit.background import child_process
+from tests.support.processes.zygote import COMMANDS, OF_PAGES, OF_TESTS, SIMULATORS
 
 ROOT = Path(__file__).resolve().parents[3]
 INSTALLED = Path(sys.executable).with_name("orthocapture")
 _ZYGOTE = "tests.support.processes.zygote"
-_MODULES = (COMMANDS, SIMULATORS, *OF_TESTS)
+_MODULES = (COMMANDS, SIMULATORS, *OF_PAGES, *OF_TESTS)
 # Variables that begin so decide nothing while a process starts, or are set by it: by libraries when they are imported
 # (cv2, gdcm, gphoto2, torch), and by drivers that tests use in their own process.
 SET_BY_IMPORTS = ("LD_LIBRARY_PATH", "GDCM_RESOURCES_PATH", "CAMLIBS", "IOLIBS", "TORCHINDUCTOR_CACHE_DIR")
@@ -196,6 +201,13 @@ def run(
             process.kill()
             raise
     return subprocess.CompletedProcess(process.args, process.returncode, stdout, stderr)
+
+
+@contextmanager
+def pages_fork() -> Generator[None]:
+    """Let what the pages of a site in this process start be forks, while the block lasts."""
+    with patch.object(child_process, "subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": Forked})):
+        yield
 
 
 def _of_the_program(words: object) -> dict[str, Any] | None:

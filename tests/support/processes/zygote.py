@@ -26,10 +26,23 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TextIO
 
 COMMANDS, SIMULATORS = "service.cli.main", "simulators"
+# What the pages start: modules of the program, each with those that it imports only once it needs them.
+OF_PAGES = {
+    "service.audit.export.formats": ("service.audit.export.posed",),
+    "service.audit.export.process": (
+        "service.audit.export.posed",
+        "service.audit.report.content",
+        "service.audit.report.output.html",
+        "service.audit.report.output.pdf",
+    ),
+    "service.audit.verify.process": (),
+    "service.web.dataset.process": ("service.audit.record.run", "service.dataset.preview.making"),
+}
 OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe")
 _REQUEST_BYTES, _NUMBER_BYTES = 8, 8  # lengths of a request's size, and of a process id or an exit status
 _STANDARD = (0, 1, 2)
 _RIG = "rig"  # the simulator that starts others
+_DESCRIBE = "--describe"  # asks for the options of the simulator that is named next
 _LATE = ("simulators.rendering.render",)  # what simulators import only once they need it
 
 
@@ -103,12 +116,13 @@ class _Zygote:
 
     def _prepare(self, request: _Request) -> None:
         """Import what the process needs, unless it was done for one like it; no thread may begin by that."""
-        kind = (request.module, *request.words[:1])
+        described = request.words[:1] == [_DESCRIBE]
+        kind = (request.module, *request.words[: 2 if described else 1])
         if kind in self.prepared:
             return
         self.prepared.add(kind)
         main: Any = importlib.import_module(request.main)
-        word = request.words[0] if request.words else ""
+        word = kind[-1] if request.words else ""
         if request.module == SIMULATORS:
             known: dict[str, tuple[str, str]] = main.simulators()
             names = known if request.is_rig else {word} & known.keys()
@@ -118,7 +132,7 @@ class _Zygote:
             place = vars(main)["_COMMANDS"].get(word)
             needed = [place.place.partition(":")[0]] if place else []
         else:
-            needed = []
+            needed = OF_PAGES.get(request.module, ())
         for name in needed:
             importlib.import_module(name)
         assert len(os.listdir("/proc/self/task")) == 1, f"importing for {kind} started a thread"

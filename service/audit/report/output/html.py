@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import base64
+from functools import cache
 from html import escape
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template, select_autoescape
 from markupsafe import Markup
 
 from service.audit.report.blocks import Drawing, Picture, Report, TableCell
@@ -22,6 +23,12 @@ def write_html(report: Report, path: Path) -> None:
 
 def render_html(report: Report) -> str:
     """The report as HTML."""
+    return _template().render(report=report)
+
+
+@cache
+def _template() -> Template:
+    """The template, which takes longer to compile than to fill in."""
     environment = Environment(
         loader=PackageLoader("service.audit.report.output"),
         autoescape=select_autoescape(["html", "j2"]),
@@ -30,7 +37,7 @@ def render_html(report: Report) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"cell": _cell, "data_url": _data_url, "svg": _svg, "moment": moment}
-    return environment.get_template("report.html.j2").render(report=report)
+    return environment.get_template("report.html.j2")
 
 
 def _cell(value: TableCell | str) -> Markup:
