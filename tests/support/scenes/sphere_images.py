@@ -227,7 +227,7 @@ def render(
         a, b = rng.uniform([0, 0], [cam.width, cam.height], (2, 2)).astype(int)
         cv2.line(image, a.tolist(), b.tolist(), (0.3, 0.3, 0.3), max(2, cam.width // 250))
     image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px), dtype=np.float32)
-    image += rng.standard_normal(image.shape, dtype=np.float32) * np.float32(noise) * np.sqrt(np.float32(0.2) + image)
+    image += rng.normal(size=image.shape).astype(np.float32) * np.float32(noise) * np.sqrt(np.float32(0.2) + image)
     np.clip(image, 0, 1, out=image)
     ok, data = cv2.imencode(".jpg", coded_8bit(image), [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])
     assert ok

@@ -43,8 +43,8 @@ def compress(J: Array, A: Array, r: Array, image: NDArray[np.int64], n_images: i
             out[i] = rows.T @ rows
     counted = np.bincount(image, weights=3.0 * np.minimum(weights, 1.0), minlength=n_images)
     return Blocks(
-        out[:, :n, :n].sum(axis=0), out[:, :n, n:-1], out[:, n:-1, n:-1], out[:, :n, -1], out[:, n:-1, -1], out[:, -1, -1],
-        counted.astype(np.float64),
+        out[:, :n, :n].sum(axis=0), out[:, :n, n:-1], out[:, n:-1, n:-1],
+        out[:, :n, -1], out[:, n:-1, -1], out[:, -1, -1], counted.astype(np.float64),
     )  # fmt: skip
 
 
