@@ -215,7 +215,7 @@ def render(
         if box is None:
             continue
         patch = image[box[1] : box[3] + 1, box[0] : box[2] + 1]
-        for pixels, rays in sampled_pixels(cam, c, box, oversample):
+        for pixels, rays in sampled_pixels(cam, c, box, oversample, inside=oversample):
             hit, normal = met(rays, c)
             shade = 0.18 + 0.82 * np.maximum(normal @ lamp, 0)
             half = lamp - rays
