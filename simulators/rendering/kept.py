@@ -27,6 +27,7 @@ VARIABLE = "ORTHOCAPTURE_RENDER_CACHE"
 MOST_BYTES = 2**30
 MOST_ENTRY_BYTES = MOST_BYTES // 4
 _LIBRARIES = ("embreex", "numpy", "opencv-python-headless", "scipy")
+_SOURCE = ("", "rendering/", "scan_station/", "scene/")  # of all that is kept
 _SUFFIX = ".npz"
 Arrays = Sequence[NDArray[Any]]
 
@@ -106,7 +107,7 @@ def _of_the_program() -> bytes:
     """The hash of the simulators' source, and of the libraries and the machine that compute with it."""
     digest = hashlib.sha256()
     root = Path(str(resources.files("simulators")))
-    for path in (*sorted(root.glob("*.py")), *sorted(root.glob("rendering/*.py")), *sorted(root.glob("scene/*.py"))):
+    for path in (path for folder in _SOURCE for path in sorted(root.glob(f"{folder}*.py"))):
         digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     machine = (platform.machine(), platform.python_version(), *map(version, _LIBRARIES))
     digest.update(repr(machine).encode())

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from simulators.faults import Fault, FaultPlan
 from simulators.geometry import Array, Ints, apply, inverse, transform
+from simulators.rendering.kept import kept
 from simulators.scan_station.formats import encode
 from simulators.scan_station.scanners import SCANNERS, USUAL_SPACING_MM, VIEWS, add_scanner_arguments, chosen_format
 from simulators.scan_station.view_formats import e57, view_ply
@@ -118,25 +119,33 @@ def _seen_counts(parts: list[Part]) -> list[tuple[Array, Array]]:
     vertices = np.concatenate([part.vertices_m for part in parts])
     faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets[:-1], strict=True)])
     normals = np.concatenate([vertex_normals(part.vertices_m, part.faces) for part in parts])
+    count, best = kept("seen", [vertices, faces, normals], lambda: _seen(vertices, faces, normals))
+    return [(count[a:b], best[a:b]) for a, b in pairwise(offsets)]
+
+
+def _seen(vertices: Array, faces: Ints, normals: Array) -> list[Array]:
+    """For each vertex (V, 3): the number (V,) of scanner poses that see it, and the best cosine (V,) of incidence."""
     scene = EmbreeScene()
     mesh = TriangleMesh(scene, vertices[faces].astype(np.float32))
-    origins = vertices + 0.3e-3 * normals
+    origins, outward = (np.ascontiguousarray(rows.T) for rows in (vertices + 0.3e-3 * normals, normals))
     count, best = np.zeros(len(vertices)), np.zeros(len(vertices))
     for centre, across in _sweep():
-        free = np.ones(len(vertices), dtype=np.bool_)
-        cosine = np.ones(len(vertices))
+        free, cosine = np.arange(len(vertices)), np.ones(len(vertices))
         for eye in (centre - 0.5 * BASELINE_M * across, centre + 0.5 * BASELINE_M * across):
-            ray = eye - origins
-            ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-            cosine = np.minimum(cosine, np.sum(ray * normals, axis=1))
-            free &= cosine > 0.3
-            index = np.flatnonzero(free)
-            hit = scene.run(origins[index].astype(np.float32), ray[index].astype(np.float32), query="OCCLUDED")
-            free[index[np.asarray(hit) == 0]] = False
-        count += free
-        best = np.where(free, np.maximum(best, cosine), best)
+            ray = eye[:, None] - origins[:, free]
+            ray /= np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
+            towards = ray * outward[:, free]
+            cosine = np.minimum(cosine, towards[0] + towards[1] + towards[2])
+            facing = np.flatnonzero(cosine > 0.3)
+            free, cosine = free[facing], cosine[facing]
+            from_m = origins[:, free].T.astype(np.float32, order="C")
+            hit = scene.run(from_m, ray[:, facing].T.astype(np.float32, order="C"), query="OCCLUDED")
+            unhidden = np.asarray(hit) != 0
+            free, cosine = free[unhidden], cosine[unhidden]
+        count[free] += 1
+        best[free] = np.maximum(best[free], cosine)
     del mesh
-    return [(count[a:b], best[a:b]) for a, b in pairwise(offsets)]
+    return [count, best]
 
 
 def _sweep() -> Iterator[tuple[Array, Array]]:

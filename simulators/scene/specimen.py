@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from simulators.geometry import Array, Ints, smoothstep
+from simulators.rendering.kept import kept
 from simulators.scene.parts import Part, grid_faces, joined
 
 HALF_LENGTH_M = 0.160
@@ -19,17 +20,66 @@ INCISION_DEPTH_M = 0.040
 LEVEL_SPACING_M = 0.034
 
 
-def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cells: float) -> Array:
-    """Return band-limited noise of unit variance with about `cells` features along the first axis."""
-    sigma = shape[0] / cells / 2.5
-    coarse = max(1, int(sigma / 2))
-    small = tuple(n // coarse + 4 for n in shape)
-    field = gaussian_filter(rng.standard_normal(small), sigma / coarse, mode="reflect")
-    field /= field.std()
-    if coarse == 1:
-        return field[: shape[0], : shape[1]]
-    at = np.meshgrid(*(np.arange(n) / coarse + 1 for n in shape), indexing="ij")
-    return map_coordinates(field, at, order=3, mode="nearest")
+@dataclass(frozen=True, slots=True)
+class SmoothNoise:
+    """Band-limited noise of unit variance, `shape` wide, with about `cells` features along the first axis.
+
+    What is random is drawn at once, and the field is computed when it is needed.
+    """
+
+    shape: tuple[int, int]
+    cells: float
+    drawn: Array
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, shape: tuple[int, int], cells: float) -> SmoothNoise:
+        """Draw one; coarse noise is drawn on a coarse grid."""
+        coarse = _coarse(shape, cells)
+        return cls(shape, cells, rng.standard_normal(tuple(n // coarse + 4 for n in shape)))
+
+    def field(self) -> Array:
+        """Return the noise, of this shape."""
+        coarse = _coarse(self.shape, self.cells)
+        field = gaussian_filter(self.drawn, _sigma(self.shape, self.cells) / coarse, mode="reflect")
+        field /= field.std()
+        if coarse == 1:
+            return field[: self.shape[0], : self.shape[1]]
+        at = np.meshgrid(*(np.arange(n) / coarse + 1 for n in self.shape), indexing="ij")
+        return map_coordinates(field, at, order=3, mode="nearest")
+
+
+def _sigma(shape: tuple[int, int], cells: float) -> float:
+    return shape[0] / cells / 2.5
+
+
+def _coarse(shape: tuple[int, int], cells: float) -> int:
+    """Spacing of the grid that the noise is drawn on."""
+    return max(1, int(_sigma(shape, cells) / 2))
+
+
+@dataclass(frozen=True, slots=True)
+class Relief:
+    """The noise of the fine relief: lumps, the course and size of muscle bundles, the deep surface, and folds."""
+
+    lumps: SmoothNoise
+    small_lumps: SmoothNoise
+    course: SmoothNoise
+    bundles: SmoothNoise
+    deep: SmoothNoise
+    folds: SmoothNoise
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, shape: tuple[int, int]) -> Relief:
+        """Draw all of it, for a grid of this shape."""
+        lumps, small_lumps, course, bundles, deep, folds = (
+            SmoothNoise.draw(rng, shape, cells) for cells in (7, 22, 9, 45, 70, 14)
+        )
+        return cls(lumps, small_lumps, course, bundles, deep, folds)
+
+    def drawn(self) -> list[Array]:
+        """Return the random numbers, which all of it depends on."""
+        each = (self.lumps, self.small_lumps, self.course, self.bundles, self.deep, self.folds)
+        return [noise.drawn for noise in each]
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,17 +148,13 @@ class Specimen:
             bend_m=float(rng.uniform(-0.006, 0.006)),
             lean=float(rng.uniform(-0.02, 0.02)),
         )
-        x = np.linspace(-HALF_LENGTH_M, HALF_LENGTH_M, n_x)
-        fine = np.linspace(-1.0, 1.0, 8 * n_y)
-        grid = np.empty((n_x, n_y, 3))
-        for i, xi in enumerate(x):
-            # Vertices at equal arc length of the cross-section, so that steep walls are meshed as finely as the top.
-            y = fine * anatomy.half_width(np.full(1, xi))
-            z = anatomy.height(np.full_like(y, xi), y)
-            arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(y), np.diff(z)))])
-            yi = np.interp(np.linspace(0.0, arc[-1], n_y), arc, y)
-            grid[i] = np.stack([np.full(n_y, xi), yi, anatomy.height(np.full(n_y, xi), yi)], axis=1)
-        return cls(anatomy, _with_relief(rng, anatomy, grid))
+        relief = Relief.draw(rng, (n_x, n_y))
+        (grid,) = kept(
+            "specimen",
+            [anatomy, n_x, n_y, *relief.drawn()],
+            lambda: [_with_relief(relief, anatomy, _smooth(anatomy, n_x, n_y))],
+        )
+        return cls(anatomy, grid)
 
     def part(self) -> Part:
         """Return the closed solid, with its top mapped to uv (0…1 along x, 0…1 along the arc)."""
@@ -137,20 +183,34 @@ class Specimen:
         return Part("end", "specimen", vertices.reshape(-1, 3), grid_faces(len(fractions), len(p)), uv.reshape(-1, 2))
 
 
-def _with_relief(rng: np.random.Generator, anatomy: Anatomy, grid: Array) -> Array:
+def _smooth(anatomy: Anatomy, n_x: int, n_y: int) -> Array:
+    """The grid (n_x, n_y, 3) without the fine relief."""
+    x = np.linspace(-HALF_LENGTH_M, HALF_LENGTH_M, n_x)
+    fine = np.linspace(-1.0, 1.0, 8 * n_y)
+    grid = np.empty((n_x, n_y, 3))
+    for i, xi in enumerate(x):
+        # Vertices at equal arc length of the cross-section, so that steep walls are meshed as finely as the top.
+        y = fine * anatomy.half_width(np.full(1, xi))
+        z = anatomy.height(np.full_like(y, xi), y)
+        arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(y), np.diff(z)))])
+        yi = np.interp(np.linspace(0.0, arc[-1], n_y), arc, y)
+        grid[i] = np.stack([np.full(n_y, xi), yi, anatomy.height(np.full(n_y, xi), yi)], axis=1)
+    return grid
+
+
+def _with_relief(relief: Relief, anatomy: Anatomy, grid: Array) -> Array:
     """Displace the grid along z, and the incision's walls sideways, by lumps, muscle bundles and skin folds."""
-    shape = (grid.shape[0], grid.shape[1])
     x, y, z = (grid[..., k] for k in range(3))
     t = anatomy.incision(x, y)
     rim = np.clip(z / 0.02, 0.0, 1.0)  # zero where the specimen touches the board
     ends = smoothstep(0.0, 0.02, HALF_LENGTH_M - np.abs(x)) * 0.8 + 0.2
-    lumps = 0.0022 * smooth_noise(rng, shape, 7) + 0.0007 * smooth_noise(rng, shape, 22)
+    lumps = 0.0022 * relief.lumps.field() + 0.0007 * relief.small_lumps.field()
     wall = smoothstep(1.15, 0.95, t) * smoothstep(0.45, 0.62, t)
     # Muscle bundles run along the wall, slightly oblique.
-    phase = 900.0 * z + 60.0 * x + 2.0 * smooth_noise(rng, shape, 9)
-    bundles = smooth_noise(rng, shape, 45) * 0.0008 + 0.0010 * np.sin(phase)
+    phase = 900.0 * z + 60.0 * x + 2.0 * relief.course.field()
+    bundles = relief.bundles.field() * 0.0008 + 0.0010 * np.sin(phase)
     deep = smoothstep(0.7, 0.5, t)
-    z = z + rim * ends * (lumps * (1.0 - 0.6 * deep) + 0.0006 * deep * smooth_noise(rng, shape, 70))
+    z = z + rim * ends * (lumps * (1.0 - 0.6 * deep) + 0.0006 * deep * relief.deep.field())
     side = np.sign(y - anatomy.midline(x))
-    y = y - side * wall * ends * (bundles + 0.0025 * smooth_noise(rng, shape, 14))
+    y = y - side * wall * ends * (bundles + 0.0025 * relief.folds.field())
     return np.stack([x, y, np.maximum(z, 0.0)], axis=-1)

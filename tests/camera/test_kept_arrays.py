@@ -55,7 +55,7 @@ def test_pictures_and_previews_are_the_same_to_the_last_bit_whether_kept_or_comp
 
     computed = pictures()
     entries = {path: path.stat().st_ino for path in folder.iterdir()}
-    assert sorted(path.name.partition("-")[0] for path in entries) == ["light", "light", "textures"]
+    assert sorted(path.name.partition("-")[0] for path in entries) == ["light", "light", "specimen", "textures"]
     assert same(pictures(), computed)
     assert {path: path.stat().st_ino for path in folder.iterdir()} == entries
 

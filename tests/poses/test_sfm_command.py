@@ -25,10 +25,10 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, T
     folder = tmp_path_factory.mktemp("capture")
     camera = camera_of_width(480)
     (folder / "images").mkdir()
-    poses: dict[str, Transform] = {}
+    scene, poses = slabs(), dict[str, Transform]()
     for k, T in enumerate(ring_of_poses(6)):
         name = f"v{k}.png"
-        assert cv2.imwrite(str(folder / "images" / name), render(slabs(), camera, T, k))
+        assert cv2.imwrite(str(folder / "images" / name), render(scene, camera, T, k))
         poses[name] = T
     write_camera_json(folder / "camera.json", camera)
     return folder, poses

@@ -82,7 +82,7 @@ def test_noise_is_estimated_and_covariances_are_honest() -> None:
     scan: list[float] = []
     alone: list[float] = []
     robot: list[tuple[float, float]] = []
-    for seed in range(8):
+    for seed in range(6):
         made = noisy(seed)
         answer = adjust(made)
         error = pose_errors(answer.T_scan_camera, made.T_scan_camera)
@@ -165,7 +165,7 @@ def test_what_is_not_known_of_the_camera_is_in_the_uncertainty(robot: bool) -> N
     rng = np.random.default_rng(11)
     stated: list[Array] = []
     without: list[Array] = []
-    for seed in range(8):
+    for seed in range(5):
         off = dict(zip(names, rng.multivariate_normal(np.zeros(5), matrix), strict=True))
         made = tracked_scene(
             seed, track_px=0.3, outline_px=0.1, robot_m=5e-4, robot_rad=1e-3,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import trimesh
@@ -48,6 +50,7 @@ def _terrain(n: int) -> tuple[Array, IntArray]:
     return np.stack([X.ravel(), Y.ravel(), Z.ravel()], 1), faces
 
 
+@cache
 def _scan(noise_m: float, seed: int = 0) -> tuple[Array, IntArray]:
     rng = np.random.default_rng(seed)
     parts: list[tuple[Array, IntArray]] = [_terrain(350)]

@@ -28,23 +28,27 @@ class Photography:
     bright: float = 0.75
 
 
-Shade = Callable[[Array, float], Array]  # reflectance at board points (N, 2), averaged over a footprint (m)
+Shade = Callable[
+    [NDArray[np.floating], float], NDArray[np.floating]
+]  # reflectance at board points (N, 2), averaged over a footprint (m)
 
 
 def checkerboard(columns: int, rows: int, square_m: float, border: float = 1.0) -> Shade:
     """Ink 0, paper 1; the first square between the first corners of the first two rows is dark."""
 
-    def shade(xy: Array, footprint_m: float) -> Array:
-        cell = xy / square_m
+    def shade(xy: NDArray[np.floating], footprint_m: float) -> NDArray[np.floating]:
+        cell = xy.T / square_m
         # A square wave whose steps are as wide as a sample: point samples would round every edge to their grid.
-        beyond = cell - np.round(cell)
-        wave = np.clip(2 * beyond * square_m / footprint_m, -1, 1) * np.where(
-            np.round(cell).astype(int) % 2, -1.0, 1.0
-        )
-        light = 0.5 - 0.5 * wave[:, 0] * wave[:, 1]
-        inside = ((cell >= -1) & (cell <= [columns, rows])).all(axis=1)
-        paper = ((cell >= -1 - border) & (cell <= np.array([columns, rows]) + border)).all(axis=1)
-        return np.where(inside, light, np.where(paper, 1.0, 0.45))
+        whole = np.round(cell)
+        wave = (cell - whole) * (2 * square_m / footprint_m)
+        np.clip(wave, -1, 1, out=wave)
+        odd = (whole[0] + whole[1]) % 2
+        light = 0.5 - 0.5 * wave[0] * wave[1] * (1 - 2 * odd)
+        x, y = cell
+        margin = 1 + border
+        inside = (x >= -1) & (y >= -1) & (x <= columns) & (y <= rows)
+        paper = (x >= -margin) & (y >= -margin) & (x <= columns + border) & (y <= rows + border)
+        return np.where(inside, light, np.where(paper, np.float32(1.0), np.float32(0.45)))
 
     return shade
 
@@ -52,11 +56,14 @@ def checkerboard(columns: int, rows: int, square_m: float, border: float = 1.0) 
 def printed(image: NDArray[np.uint8], pixel_m: float, origin_m: Array) -> Shade:
     """Reflectance of a drawn board whose image's corner lies at `origin_m` in the board frame."""
 
-    def shade(xy: Array, footprint_m: float) -> Array:
-        index = np.floor((xy - origin_m) / pixel_m).astype(np.int64)
-        inside = ((index >= 0) & (index < np.array(image.shape[::-1]))).all(axis=1)
-        index = np.clip(index, 0, np.array(image.shape[::-1]) - 1)
-        return np.where(inside, image[index[:, 1], index[:, 0]] / 255.0, 0.45)
+    def shade(xy: NDArray[np.floating], footprint_m: float) -> NDArray[np.floating]:
+        column, row = (
+            np.floor((at - origin) / pixel_m).astype(np.int64) for at, origin in zip(xy.T, origin_m, strict=True)
+        )
+        height, width = image.shape
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        column, row = np.clip(column, 0, width - 1), np.clip(row, 0, height - 1)
+        return np.where(inside, image[row, column] / np.float32(255), np.float32(0.45))
 
     return shade
 
@@ -128,9 +135,10 @@ def _tile(
     board = np.column_stack([rays, np.ones(len(rays))]) @ H.T
     values = (board[:, :2] / board[:, 2:]).reshape(_NODES, _NODES, 2)
     wx, wy = _lagrange(nx, x), _lagrange(ny, y)
-    xy = np.einsum("ya,abk,xb->yxk", wy, values, wx, optimize=True)
+    # x and y are each contiguous and of single precision (a ten-thousandth of a pixel), which takes half the time.
+    xy = np.moveaxis(np.stack([wy @ values[:, :, k] @ wx.T for k in range(2)]).astype(np.float32), 0, -1)
     footprint_m = float(np.sqrt(np.abs(np.linalg.det([xy[1, 0] - xy[0, 0], xy[0, 1] - xy[0, 0]]))))
-    grey = shade(xy.reshape(-1, 2), footprint_m).reshape(height, samples, width, samples)
+    grey = shade(np.moveaxis(xy, -1, 0).reshape(2, -1).T, footprint_m).reshape(height, samples, width, samples)
     return grey.mean(axis=(1, 3)).astype(np.float32)
 
 

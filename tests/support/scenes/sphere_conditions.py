@@ -5,6 +5,7 @@ Outlines are exact: every pixel near a sphere is the mean of rays through the di
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone
 from service.core.geometry import Array
-from tests.support.scenes.sphere_images import RADIUS_M
+from tests.support.scenes.sphere_images import RADIUS_M, box_around, met, sampled_pixels
 
 COLOURS_BGR = {
     "white": (0.78, 0.80, 0.82), "green": (0.085, 0.74, 0.50), "dark green": (0.10, 0.32, 0.06),
@@ -173,47 +174,44 @@ def _draw_sphere(
     look: Look,
     rng: np.random.Generator,
 ) -> None:
-    n = 5
-    u, v = cam.project(c[None])[0]
-    reach = 1.2 * RADIUS_M / c[2] * cam.fx + 3
-    x0, y0 = (int(max(0, np.floor(q - reach))) for q in (u, v))
-    x1, y1 = int(min(cam.width - 1, u + reach)), int(min(cam.height - 1, v + reach))
-    if x1 <= x0 or y1 <= y0:
+    box = box_around(cam, c, 1.25)
+    if box is None:
         return
-    sub = (np.arange(n) + 0.5) / n - 0.5
-    xs = (np.arange(x0, x1 + 1)[:, None] + sub).ravel()
-    ys = (np.arange(y0, y1 + 1)[:, None] + sub).ravel()
-    grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
-    rays = np.column_stack([cam.normalise(grid), np.ones(len(grid))])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    along = rays @ c
-    gap = along**2 - (float(c @ c) - RADIUS_M**2)
-    hit = gap > 0
-    r, along = rays[hit], along[hit]
-    normal = (r * (along - np.sqrt(gap[hit]))[:, None] - c) / RADIUS_M
+    patch, shown = (whole[box[1] : box[3] + 1, box[0] : box[2] + 1] for whole in (image, owner))
+    spots = [_spot(rng) for _ in range(look.stains)]
+    for pixels, rays in sampled_pixels(cam, c, box, 5, inside=5):
+        hit, normal = met(rays, c)
+        cover = hit.mean(axis=1)
+        colour = np.zeros(rays.shape)
+        colour[hit] = _light(rays[hit], normal[hit], look, spots)
+        shown[pixels] = np.where(cover > 0.5, index, shown[pixels])
+        patch[pixels] = patch[pixels] * (1 - cover)[:, None] + colour.mean(axis=1)
+
+
+def _spot(rng: np.random.Generator) -> Array:
+    """The direction (3,) of a stain's middle, on the side of the camera."""
+    spot = rng.normal(size=3)
+    spot[2] = -abs(spot[2])
+    return spot / np.linalg.norm(spot)
+
+
+def _light(rays: Array, normal: Array, look: Look, spots: Sequence[Array]) -> Array:
+    """Light (N, 3) BGR that a sphere sends along rays (N, 3) that meet it, at places with these normals (N, 3)."""
     sky = np.array([0.2, -0.9, -0.4]) / np.linalg.norm([0.2, -0.9, -0.4])
     shade = look.ambient * (1 + 0.5 * (normal @ sky))
-    shine = np.zeros(len(r))
+    shine = np.zeros(len(rays))
     for direction, strength in look.lamps:
         lamp = np.array(direction) / np.linalg.norm(direction)
         shade = shade + strength * np.maximum(normal @ lamp, 0)
-        half = lamp - r
+        half = lamp - rays
         half /= np.linalg.norm(half, axis=1, keepdims=True)
         facing = normal @ lamp > 0
         shine += look.gloss * strength * facing * np.maximum(np.sum(normal * half, axis=1), 0) ** look.shininess
-    albedo = np.tile(np.array(COLOURS_BGR[look.colour]), (len(r), 1))
-    for _ in range(look.stains):
-        spot = rng.normal(size=3)
-        spot[2] = -abs(spot[2])
-        albedo[normal @ (spot / np.linalg.norm(spot)) > 0.96] = [0.02, 0.02, 0.2]
-    colour = np.zeros((len(hit), 3))
-    colour[hit] = albedo * shade[:, None] + shine[:, None]
+    albedo = np.tile(np.array(COLOURS_BGR[look.colour]), (len(rays), 1))
+    for spot in spots:
+        albedo[normal @ spot > 0.96] = [0.02, 0.02, 0.2]
+    colour = albedo * shade[:, None] + shine[:, None]
     if look.mirror:
-        share, light = _reflection(r, normal, look)
-        colour[hit] = (1 - share) * colour[hit] + share * light
-    box = (y1 - y0 + 1, n, x1 - x0 + 1, n)
-    cover = hit.reshape(box).mean(axis=(1, 3))[..., None]
-    patch = image[y0 : y1 + 1, x0 : x1 + 1]
-    owner[y0 : y1 + 1, x0 : x1 + 1][cover[..., 0] > 0.5] = index
-    patch *= 1 - cover
-    patch += colour.reshape(*box, 3).mean(axis=(1, 3))
+        share, light = _reflection(rays, normal, look)
+        colour = (1 - share) * colour + share * light
+    return colour

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -23,6 +24,7 @@ REGISTRATION_M = np.array(
     ]
 )  # fmt: skip
 REGISTRATION = ScanSpheres(REGISTRATION_M, RADIUS_M)
+_AT_OUTLINE_PX = 1.5  # a pixel's corner is 0.71 px from its middle; the rest is for the lens
 CONTROL_M = np.array([[-0.09, 0.02, 0.09], [0.01, -0.02, 0.06], [0.10, 0.03, 0.085]])
 
 
@@ -109,15 +111,85 @@ def false_outlines(cam: CameraModel, n: int, seed: int = 0) -> tuple[SphereOutli
     return tuple(out)
 
 
-def _background(shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float64]:
+def _background(shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float32]:
     """Linear BGR in 0…1: blotches over several octaves, like tissue and cloth."""
     h, w = shape
-    out = np.zeros((h, w, 3))
+    out = np.zeros((h, w, 3), dtype=np.float32)
     for octave in (4, 12, 40, 160):
         grid = rng.uniform(0, 1, (octave * h // w + 2, octave + 2, 3)).astype(np.float32)
-        out += cv2.resize(grid, (w, h), interpolation=cv2.INTER_CUBIC) / (octave**0.3)
+        grid /= np.float32(octave**0.3)
+        out += cv2.resize(grid, (w, h), interpolation=cv2.INTER_CUBIC)
     out -= out.min()
-    return out / out.max() * np.array([0.14, 0.16, 0.32]) + 0.01
+    out *= np.array([0.14, 0.16, 0.32], dtype=np.float32) / out.max()
+    out += np.float32(0.01)
+    return out
+
+
+Box = tuple[int, int, int, int]  # first column, first row, last column, last row
+
+
+def box_around(cam: CameraModel, centre_camera_m: Array, radii: float) -> Box | None:
+    """The pixels within so many radii of a sphere's centre; None if these are outside the image."""
+    u, v = cam.project(centre_camera_m[None])[0]
+    reach = radii * RADIUS_M / centre_camera_m[2] * cam.fx + 3
+    x0, y0 = (int(max(0, np.floor(q - reach))) for q in (u, v))
+    x1, y1 = int(min(cam.width - 1, u + reach)), int(min(cam.height - 1, v + reach))
+    return None if x1 <= x0 or y1 <= y0 else (x0, y0, x1, y1)
+
+
+def sampled_pixels(
+    cam: CameraModel, centre_camera_m: Array, box: Box, oversample: int, inside: int = 1
+) -> Iterator[tuple[NDArray[np.bool_], Array]]:
+    """The pixels of a box that show a sphere, and the rays through the distorted lens that they average.
+
+    Those at the outline have `oversample`² rays each, so that it is exact. Those within change little from ray to
+    ray, and have `inside`² rays.
+
+    Yields:
+        pixels (H, W) of the box, N in number, and unit rays (N, K, 3).
+    """
+    x0, y0, x1, y1 = box
+    middles = np.stack(np.meshgrid(np.arange(x0, x1 + 1.0), np.arange(y0, y1 + 1.0)), axis=-1)
+    distance_m = np.linalg.norm(centre_camera_m)
+    rays = _rays(cam, middles)
+    angle = np.arccos(np.clip(rays @ centre_camera_m / distance_m, -1, 1))
+    beyond_px = (angle - np.arcsin(RADIUS_M / distance_m)) * cam.fx / rays[..., 2]
+    within = beyond_px < -_AT_OUTLINE_PX
+    for pixels, n in ((within, inside), (~within & (beyond_px < _AT_OUTLINE_PX), oversample)):
+        if not pixels.any():
+            continue
+        sub = (np.arange(n) + 0.5) / n - 0.5
+        grid = middles[pixels][:, None, None] + np.stack(np.meshgrid(sub, sub), axis=-1)
+        yield pixels, _rays(cam, grid.reshape(-1, n * n, 2))
+
+
+def _rays(cam: CameraModel, pixels: Array) -> Array:
+    """Unit rays (..., 3) through pixels (..., 2)."""
+    plane = cam.normalise(pixels.reshape(-1, 2))
+    rays = np.column_stack([plane, np.ones(len(plane))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return rays.reshape(*pixels.shape[:-1], 3)
+
+
+def met(rays: Array, centre_camera_m: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Which unit rays (..., 3) meet a sphere, and its unit normals there; of others, the normals mean nothing."""
+    along = rays @ centre_camera_m
+    gap = along**2 - (centre_camera_m @ centre_camera_m - RADIUS_M**2)
+    return gap > 0, (rays * (along - np.sqrt(np.maximum(gap, 0)))[..., None] - centre_camera_m) / RADIUS_M
+
+
+def coded_8bit(image: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Light (0…1) as 8 bits of sRGB."""
+    return _CODES[np.rint(image * (len(_CODES) - 1)).astype(np.uint16)]
+
+
+def _codes() -> NDArray[np.uint8]:
+    light = np.linspace(0, 1, 2**16)
+    coded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.round(coded * 255).astype(np.uint8)
+
+
+_CODES = _codes()  # of 65536 steps of light; one step is at most a twentieth of a code
 
 
 def render(
@@ -137,46 +209,27 @@ def render(
     image = _background((cam.height, cam.width), rng)
     lamp = np.array([0.35, -0.5, -0.8]) + rng.uniform(-0.2, 0.2, 3)
     lamp /= np.linalg.norm(lamp)
-    tones = np.array(colour)
     order = np.argsort(-np.linalg.norm(centres_camera_m, axis=1))
     for c in centres_camera_m[order]:
-        centre = cam.project(c[None])[0]
-        reach = 1.25 * RADIUS_M / c[2] * cam.fx + 3
-        x0, y0 = np.maximum(np.floor(centre - reach).astype(int), 0)
-        x1 = min(int(centre[0] + reach), cam.width - 1)
-        y1 = min(int(centre[1] + reach), cam.height - 1)
-        if x1 <= x0 or y1 <= y0:
+        box = box_around(cam, c, 1.25)
+        if box is None:
             continue
-        step = 1.0 / oversample
-        xs = np.arange((x1 - x0 + 1) * oversample) * step + x0 - 0.5 + step / 2
-        ys = np.arange((y1 - y0 + 1) * oversample) * step + y0 - 0.5 + step / 2
-        grid = np.stack(np.meshgrid(xs, ys), axis=-1)
-        rays = np.concatenate([cam.normalise(grid.reshape(-1, 2)), np.ones((grid.size // 2, 1))], axis=1)
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        along = rays @ c
-        gap = along**2 - (c @ c - RADIUS_M**2)
-        hit = gap > 0
-        normal = (rays * (along - np.sqrt(np.maximum(gap, 0)))[:, None] - c) / RADIUS_M
-        shade = 0.18 + 0.82 * np.maximum(normal @ lamp, 0)
-        half = lamp - rays
-        half /= np.linalg.norm(half, axis=1, keepdims=True)
-        gloss = 0.12 * np.maximum(np.einsum("ij,ij->i", normal, half), 0) ** 40
-        values = (shade[:, None] * tones + gloss[:, None]) * hit[:, None]
-        ny, nx = y1 - y0 + 1, x1 - x0 + 1
-        box = (ny, oversample, nx, oversample)
-        cover = hit.astype(float).reshape(box).mean(axis=(1, 3))
-        light = values.reshape(*box, 3).mean(axis=(1, 3))
-        patch = image[y0 : y1 + 1, x0 : x1 + 1]
-        patch *= 1 - cover[..., None]
-        patch += light
+        patch = image[box[1] : box[3] + 1, box[0] : box[2] + 1]
+        for pixels, rays in sampled_pixels(cam, c, box, oversample, inside=oversample):
+            hit, normal = met(rays, c)
+            shade = 0.18 + 0.82 * np.maximum(normal @ lamp, 0)
+            half = lamp - rays
+            half /= np.linalg.norm(half, axis=-1, keepdims=True)
+            gloss = 0.12 * np.maximum(np.sum(normal * half, axis=-1), 0) ** 40
+            values = (shade[..., None] * colour + gloss[..., None]) * hit[..., None]
+            patch[pixels] = patch[pixels] * (1 - hit.mean(axis=1))[:, None] + values.mean(axis=1)
     for _ in range(occluders):
         a, b = rng.uniform([0, 0], [cam.width, cam.height], (2, 2)).astype(int)
         cv2.line(image, a.tolist(), b.tolist(), (0.3, 0.3, 0.3), max(2, cam.width // 250))
-    image = cv2.GaussianBlur(image, (0, 0), blur_px)
-    image += rng.normal(size=image.shape) * noise * np.sqrt(0.2 + image)
-    image = np.clip(image, 0, 1)
-    coded = np.where(image <= 0.0031308, 12.92 * image, 1.055 * image ** (1 / 2.4) - 0.055)
-    ok, data = cv2.imencode(".jpg", np.round(coded * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])
+    image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px), dtype=np.float32)
+    image += rng.normal(size=image.shape).astype(np.float32) * np.float32(noise) * np.sqrt(np.float32(0.2) + image)
+    np.clip(image, 0, 1, out=image)
+    ok, data = cv2.imencode(".jpg", coded_8bit(image), [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])
     assert ok
     decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
     assert decoded is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -222,11 +223,22 @@ def _markers(image: Grey, dictionary: str) -> int:
 
 def _best_dictionary(image: Grey) -> tuple[str, int]:
     """The dictionary with the most markers in the image (the smallest one in a tie), and their number."""
+    # Quadrilaterals are searched for once, and compared with all dictionaries.
+    _, identifiers, _, dictionary = _detector_of_all().detectMarkersMultiDict(image)
     best = ("", 0)
-    for name in _DICTIONARIES:
-        if (count := _markers(image, name)) > best[1]:
+    if identifiers is None:  # pyright: ignore[reportUnnecessaryComparison]
+        return best
+    for k, name in enumerate(_DICTIONARIES):
+        if (count := len(np.unique(np.asarray(identifiers)[np.asarray(dictionary) == k]))) > best[1]:
             best = (name, count)
     return best
+
+
+@cache
+def _detector_of_all() -> cv2.aruco.ArucoDetector:
+    """A detector that knows all dictionaries, in their order."""
+    known = [cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)) for name in _DICTIONARIES]
+    return cv2.aruco.ArucoDetector(known, cv2.aruco.DetectorParameters(), cv2.aruco.RefineParameters())
 
 
 # --- circles ----------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from service.core.geometry import Array
 class Blocks:
     """Products of the whitened rows for each of N images; n common unknowns."""
 
-    JJ: Array  # (N, n, n)
+    JJ: Array  # (n, n), summed over the images
     JA: Array  # (N, n, 6)
     AA: Array  # (N, 6, 6)
     Jr: Array  # (N, n)
@@ -43,8 +43,8 @@ def compress(J: Array, A: Array, r: Array, image: NDArray[np.int64], n_images: i
             out[i] = rows.T @ rows
     counted = np.bincount(image, weights=3.0 * np.minimum(weights, 1.0), minlength=n_images)
     return Blocks(
-        out[:, :n, :n], out[:, :n, n:-1], out[:, n:-1, n:-1], out[:, :n, -1], out[:, n:-1, -1], out[:, -1, -1],
-        counted.astype(np.float64),
+        out[:, :n, :n].sum(axis=0), out[:, :n, n:-1], out[:, n:-1, n:-1],
+        out[:, :n, -1], out[:, n:-1, -1], out[:, -1, -1], counted.astype(np.float64),
     )  # fmt: skip
 
 
@@ -64,9 +64,9 @@ def marginalise(blocks: Blocks, root: Array, factor: float) -> Marginal:
     inner = np.eye(6) + np.einsum("nji,njk,nkl->nil", root, blocks.AA, root) / factor
     Q = np.einsum("nij,njk,nlk->nil", root, np.linalg.inv(inner), root)
     JQ = blocks.JA @ Q
-    n = blocks.JJ.shape[1]
+    n = len(blocks.JJ)
     left = JQ.transpose(1, 0, 2).reshape(n, -1)
-    H = blocks.JJ.sum(axis=0) / factor - left @ blocks.JA.transpose(1, 0, 2).reshape(n, -1).T / factor**2
+    H = blocks.JJ / factor - left @ blocks.JA.transpose(1, 0, 2).reshape(n, -1).T / factor**2
     g = blocks.Jr.sum(axis=0) / factor - left @ blocks.Ar.ravel() / factor**2
     quadratic = float(blocks.rr.sum() / factor - np.einsum("ni,nij,nj->", blocks.Ar, Q, blocks.Ar) / factor**2)
     log_determinant = float(np.linalg.slogdet(inner)[1].sum() + blocks.rows.sum() * np.log(factor))

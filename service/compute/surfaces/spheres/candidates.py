@@ -41,17 +41,19 @@ def vote_peaks(patches: Surfels, radius: float) -> Array:
     mass, moment = sums[:, 0], sums[:, 1:]
     total, centre = mass.copy(), moment.copy()
     steps = (-1, 0, 1)
-    for offset in (int((i * size[1] + j) * size[2] + k) for i in steps for j in steps for k in steps):
-        if offset == 0:
-            continue
-        at = np.searchsorted(cells, cells + offset)
-        at[at == len(cells)] = 0
-        hit = cells[at] == cells + offset
-        total[hit] += mass[at[hit]]
-        centre[hit] += moment[at[hit]]
+    for row in (int((i * size[1] + j) * size[2]) for i in steps for j in steps):
+        # The keys of a row's three cells follow one another, so that one search finds all of them.
+        at = np.searchsorted(cells, cells + (row - 1))
+        for offset in (row - 1, row, row + 1):
+            hit = np.flatnonzero(cells[np.minimum(at, len(cells) - 1)] == cells + offset)
+            if offset != 0:
+                total[hit] += mass[at[hit]]
+                centre[hit] += moment[at[hit]]
+            at[hit] += 1
     strong = np.flatnonzero(total > _MIN_VOTE * 4 * np.pi * radius**2)
     strong = strong[np.argsort(-total[strong], kind="stable")]
     peaks = centre[strong] / total[strong, None]
+    around = cKDTree(peaks)
     picked: list[Array] = []
     free = np.ones(len(peaks), dtype=bool)
     for k, peak in enumerate(peaks):
@@ -60,5 +62,6 @@ def vote_peaks(patches: Surfels, radius: float) -> Array:
         picked.append(peak)
         if len(picked) == _MAX_CANDIDATES:
             break
-        free[k:] &= np.linalg.norm(peaks[k:] - peak, axis=1) > _APART * radius
+        near = np.array(around.query_ball_point(peak, 1.001 * _APART * radius))
+        free[near] &= np.linalg.norm(peaks[near] - peak, axis=1) > _APART * radius
     return np.array(picked).reshape(-1, 3)
