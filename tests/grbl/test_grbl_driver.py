@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +22,7 @@ from drivers.errors import (
     UnreachablePoseError,
 )
 from drivers.grbl.wire import JOG_CANCEL
+from drivers.host.hosted_device import HostedDevice
 from drivers.interfaces import Array, RobotArm, SafetyState, SettleCriteria
 from service.core.geometry import Transform, rotation_angle_rad, transform
 from tests.support.arms.grbl_simulator import CENTRE_M, LIFT, TURN, Tap, fault, mount, opened, table
@@ -190,12 +193,9 @@ def test_without_its_host_the_machine_soon_stands(tmp_path: Path) -> None:
 
 
 def kill(arm: RobotArm) -> None:
-    import psutil  # noqa: PLC0415
-
-    for child in psutil.Process().children():
-        if "drivers.host" in child.cmdline():
-            child.kill()
-            child.wait()
+    device: HostedDevice = vars(arm)["hosted_device"]
+    assert device.pid is not None
+    os.kill(device.pid, signal.SIGKILL)
     with pytest.raises(DeviceUnavailableError):
         arm.state()
 

@@ -29,6 +29,11 @@ from tests.support.rig.host_fake_driver import Fake, FakeConfig
 SPEC = "tests.support.rig.host_fake_driver:DRIVER"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def forked_hosts() -> None:
+    """Start processes for real: this is about their start and end."""
+
+
 @pytest.fixture
 def fake(tmp_path: Path) -> Iterator[Fake]:
     device = hosted(Fake, SPEC, FakeConfig(trace=tmp_path / "trace"), call_timeout_s=20.0, name="fake one")
