@@ -22,10 +22,10 @@ from drivers.errors import (
     UnreachablePoseError,
 )
 from drivers.grbl.wire import JOG_CANCEL
-from drivers.host.hosted_device import HostedDevice
 from drivers.interfaces import Array, RobotArm, SafetyState, SettleCriteria
 from service.core.geometry import Transform, rotation_angle_rad, transform
 from tests.support.arms.grbl_simulator import CENTRE_M, LIFT, TURN, Tap, fault, mount, opened, table
+from tests.support.processes.hosts import driver_pid
 from tests.support.processes.waiting import until
 
 ANSWER_S = 3.0  # where answers are lost, which is known only then
@@ -193,9 +193,7 @@ def test_without_its_host_the_machine_soon_stands(tmp_path: Path) -> None:
 
 
 def kill(arm: RobotArm) -> None:
-    device: HostedDevice = vars(arm)["hosted_device"]
-    assert device.pid is not None
-    os.kill(device.pid, signal.SIGKILL)
+    os.kill(driver_pid(arm), signal.SIGKILL)
     with pytest.raises(DeviceUnavailableError):
         arm.state()
 

@@ -7,6 +7,7 @@ from collections.abc import Generator
 import pytest
 
 from drivers.host import hosted_device
+from drivers.host.hosted_device import HostedDevice
 from tests.support.processes.forked import Forked
 
 
@@ -16,3 +17,10 @@ def forked_hosts() -> Generator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(hosted_device, "Popen", Forked)
         yield
+
+
+def driver_pid(device: object) -> int:
+    """The process id of the driver behind this proxy, which is open."""
+    hosted: HostedDevice = vars(device)["hosted_device"]
+    assert hosted.pid is not None
+    return hosted.pid

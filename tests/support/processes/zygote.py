@@ -10,6 +10,7 @@ of one zygote share the seed of `hash()`.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import fcntl
 import gc
@@ -28,10 +29,13 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TextIO
 
 COMMANDS, SIMULATORS, HOST = "service.cli.main", "simulators", "drivers.host"
-VENDOR = "tests.support.vendor.camera_vendor_session"
-OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe", VENDOR)
+VENDORS = tuple(f"tests.support.vendor.{name}" for name in (
+    "camera_vendor_session", "ur_vendor_session", "ur_vendor_calls",
+))  # fmt: skip
+OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe", *VENDORS)
 _REQUEST_BYTES, _NUMBER_BYTES = 8, 8  # lengths of a request's size, and of a process id or an exit status
 _STANDARD = (0, 1, 2)
+_statuses: list[int] = []  # of this process, if it is a fork that has come to its end
 MOST_PASSED = 4  # descriptors that a process may get besides those
 _RIG = "rig"  # the simulator that starts others
 _LATE = ("simulators.rendering.render",)  # what simulators import only once they need it
@@ -112,7 +116,7 @@ class _Zygote:
 
     def _prepare(self, request: _Request) -> None:
         """Import what the process needs, unless it was done for one like it; no thread may begin by that."""
-        kind = (request.module, *([] if request.module in (HOST, VENDOR) else request.words[:1]))
+        kind = (request.module, *([] if request.module in (HOST, *VENDORS) else request.words[:1]))
         if kind in self.prepared:
             return
         self.prepared.add(kind)
@@ -248,13 +252,32 @@ def _below(zygote: _Zygote, rig: _Request) -> _Request | None:
     return rig
 
 
+def _leave_at_once() -> None:
+    """End this fork once all is done, unless it failed: to take the modules apart would copy all of their memory."""
+    if _statuses:
+        try:
+            sys.stdout.flush()
+            sys.stderr.flush()
+        except (OSError, ValueError):  # the interpreter has a status of its own for this
+            return
+        os._exit(_statuses[-1])
+
+
 if __name__ == "__main__":
+    atexit.register(_leave_at_once)  # before all others, so that it is called after them
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tests, and they end this
     _of_tests = _Zygote(int(sys.argv[1]), dict(os.environ))
     _asked = _of_tests.serve()
     if _asked is not None and _asked.is_rig:
         _asked = _below(_of_tests, _asked)
-    if _asked is not None and _asked.script:
-        runpy.run_path(_asked.script, run_name="__main__")
-    elif _asked is not None:
-        runpy.run_module(_asked.module, run_name="__main__", alter_sys=True)
+    try:
+        if _asked is not None and _asked.script:
+            runpy.run_path(_asked.script, run_name="__main__")
+        elif _asked is not None:
+            runpy.run_module(_asked.module, run_name="__main__", alter_sys=True)
+    except SystemExit as _ended:
+        if _ended.code is None or isinstance(_ended.code, int):
+            _statuses.append((_ended.code or 0) & 0xFF)
+        raise
+    else:
+        _statuses.append(0)
