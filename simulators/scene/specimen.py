@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from simulators.geometry import Array, Ints, smoothstep
+from simulators.rendering.kept import kept
 from simulators.scene.parts import Part, grid_faces, joined
 
 HALF_LENGTH_M = 0.160
@@ -98,17 +102,14 @@ class Specimen:
             bend_m=float(rng.uniform(-0.006, 0.006)),
             lean=float(rng.uniform(-0.02, 0.02)),
         )
-        x = np.linspace(-HALF_LENGTH_M, HALF_LENGTH_M, n_x)
-        fine = np.linspace(-1.0, 1.0, 8 * n_y)
-        grid = np.empty((n_x, n_y, 3))
-        for i, xi in enumerate(x):
-            # Vertices at equal arc length of the cross-section, so that steep walls are meshed as finely as the top.
-            y = fine * anatomy.half_width(np.full(1, xi))
-            z = anatomy.height(np.full_like(y, xi), y)
-            arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(y), np.diff(z)))])
-            yi = np.interp(np.linspace(0.0, arc[-1], n_y), arc, y)
-            grid[i] = np.stack([np.full(n_y, xi), yi, anatomy.height(np.full(n_y, xi), yi)], axis=1)
-        return cls(anatomy, _with_relief(rng, anatomy, grid))
+
+        def computed() -> list[NDArray[Any]]:
+            grid = _with_relief(rng, anatomy, _smooth_grid(anatomy, n_x, n_y))
+            return [grid, np.frombuffer(json.dumps(rng.bit_generator.state).encode(), np.uint8)]
+
+        grid, state = kept("specimen", (anatomy, n_x, n_y, rng.bit_generator.state), computed)
+        rng.bit_generator.state = json.loads(state.tobytes())  # also where nothing was drawn
+        return cls(anatomy, grid)
 
     def part(self) -> Part:
         """Return the closed solid, with its top mapped to uv (0…1 along x, 0…1 along the arc)."""
@@ -135,6 +136,20 @@ class Specimen:
             np.broadcast_arrays(np.abs(u - 0.09 * fractions)[:, None], np.linspace(0.02, 0.98, len(p))[None]), axis=-1
         )
         return Part("end", "specimen", vertices.reshape(-1, 3), grid_faces(len(fractions), len(p)), uv.reshape(-1, 2))
+
+
+def _smooth_grid(anatomy: Anatomy, n_x: int, n_y: int) -> Array:
+    """The surface without the fine relief, as a grid (n_x, n_y, 3)."""
+    fine = np.linspace(-1.0, 1.0, 8 * n_y)
+    grid = np.empty((n_x, n_y, 3))
+    for i, xi in enumerate(np.linspace(-HALF_LENGTH_M, HALF_LENGTH_M, n_x)):
+        # Vertices at equal arc length of the cross-section, so that steep walls are meshed as finely as the top.
+        y = fine * anatomy.half_width(np.full(1, xi))
+        z = anatomy.height(np.full_like(y, xi), y)
+        arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(y), np.diff(z)))])
+        yi = np.interp(np.linspace(0.0, arc[-1], n_y), arc, y)
+        grid[i] = np.stack([np.full(n_y, xi), yi, anatomy.height(np.full(n_y, xi), yi)], axis=1)
+    return grid
 
 
 def _with_relief(rng: np.random.Generator, anatomy: Anatomy, grid: Array) -> Array:
