@@ -61,9 +61,15 @@ class PhotoWatch:
     returned, so that the photographs of a card come in the order in which they were taken.
     """
 
-    def __init__(self, config: PhotoWatchConfig, monotonic: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        config: PhotoWatchConfig,
+        monotonic: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
         self._config = config
         self._monotonic = monotonic
+        self._sleep = sleep
         self._seen: dict[Path, _Seen] = {}
         self._raws: dict[Path, list[Path]] = {}  # of each JPEG
         self._alone: list[Path] = []  # raw files without one
@@ -142,7 +148,7 @@ class PhotoWatch:
             left_s = deadline_s - self._monotonic()
             if left_s <= 0:
                 return ()
-            time.sleep(min(_LOOK_S, left_s))
+            self._sleep(min(_LOOK_S, left_s))
 
     def _observe(self) -> None:
         """Poll the folder: update which files it holds and since when they are unchanged."""

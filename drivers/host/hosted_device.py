@@ -9,13 +9,13 @@ import logging
 import os
 import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from subprocess import DEVNULL, PIPE, STDOUT, Popen, TimeoutExpired
 from typing import Any, TypeVar, cast
 
 from pydantic import BaseModel
@@ -89,7 +89,7 @@ def _forwarder(method: str, function: Callable[..., Any]) -> Callable[..., Any]:
 class _Child:
     """A running child process, with the parent's end of its connection and of its log."""
 
-    process: subprocess.Popen[str]
+    process: Popen[str]
     line: Line
     log_reader: threading.Thread
 
@@ -220,11 +220,11 @@ class HostedDevice:
     def _start(self) -> None:
         ours, theirs = socket.socketpair()
         path = os.pathsep.join(p for p in sys.path if p)
-        process = subprocess.Popen(
+        process = Popen(
             [sys.executable, "-m", "drivers.host", str(theirs.fileno())],
-            stdin=subprocess.DEVNULL,  # libgphoto2 closes descriptor 0
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
+            stdin=DEVNULL,  # libgphoto2 closes descriptor 0
+            stdout=PIPE,
+            stderr=STDOUT,
             pass_fds=[theirs.fileno()],
             env={**os.environ, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"},
             start_new_session=True,  # Ctrl-C must reach only the parent, which then closes the device properly
@@ -254,7 +254,7 @@ class HostedDevice:
         child.line.close()  # the child exits when its connection closes
         try:
             status = child.process.wait(CLOSE_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
+        except TimeoutExpired:
             child.process.kill()
             status = child.process.wait()
         child.log_reader.join(CLOSE_TIMEOUT_S)
@@ -280,7 +280,7 @@ class HostedDevice:
                 self._lock.release()
 
 
-def _log_output(process: subprocess.Popen[str], name: str) -> None:
+def _log_output(process: Popen[str], name: str) -> None:
     log = logging.getLogger(f"{_LOG.name}.{name}")
     assert process.stdout is not None
     for line in process.stdout:

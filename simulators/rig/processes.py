@@ -217,7 +217,7 @@ class _Rig:
 
     def _watch(self) -> None:
         """End the rig when a device has died, since it is of no use then, and report it on stderr."""
-        while not self.termination.wait(1.0):
+        while not self.termination.wait(0.2):
             for name, process in self.children.items():
                 if process.poll() is not None and not self.termination.is_set():
                     sys.stderr.write(f"{name} ended with status {process.returncode}: see {self.folder}/logs\n")

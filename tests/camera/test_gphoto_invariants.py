@@ -66,7 +66,7 @@ def test_full_store(tmp_path: Path, body: str) -> None:
 
 
 def test_shutter_without_an_image(tmp_path: Path, body: str) -> None:
-    with rig(body, [{"on": "image", "kind": "no_image"}], capture_timeout_s=4.0) as (camera, _):
+    with rig(body, [{"on": "image", "kind": "no_image"}], capture_timeout_s=2.0) as (camera, _):
         with pytest.raises(DeviceTimeoutError, match="none"):
             camera.capture(tmp_path)
         assert camera.capture(tmp_path).counter == 2

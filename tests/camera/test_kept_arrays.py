@@ -14,6 +14,7 @@ from simulators.rendering import kept as module
 from simulators.rendering.kept import VARIABLE, kept
 from simulators.rendering.render import Renderer
 from simulators.rig.world_server import World
+from simulators.scene.specimen import Specimen
 from simulators.scene.world import Scene
 
 WIDTH = 90
@@ -58,6 +59,16 @@ def test_pictures_and_previews_are_the_same_to_the_last_bit_whether_kept_or_comp
     assert sorted(path.name.partition("-")[0] for path in entries) == ["light", "light", "specimen", "textures"]
     assert same(pictures(), computed)
     assert {path: path.stat().st_ino for path in folder.iterdir()} == entries
+
+
+def test_a_specimen_and_what_is_drawn_after_it_are_the_same_whether_kept_or_computed(folder: Path) -> None:
+    one, other = (np.random.default_rng(5) for _ in range(2))
+    computed = Specimen.generate(one, 48, 32).grid_m
+    (entry,) = folder.iterdir()
+    before = entry.stat().st_ino
+    assert same([Specimen.generate(other, 48, 32).grid_m], [computed])
+    assert [path.stat().st_ino for path in folder.iterdir()] == [before]
+    assert one.random() == other.random()
 
 
 def test_nothing_is_kept_unless_the_environment_says_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +25,7 @@ from drivers.grbl.wire import JOG_CANCEL
 from drivers.interfaces import Array, RobotArm, SafetyState, SettleCriteria
 from service.core.geometry import Transform, rotation_angle_rad, transform
 from tests.support.arms.grbl_simulator import CENTRE_M, LIFT, TURN, Tap, fault, mount, opened, table
+from tests.support.processes.hosts import driver_pid
 from tests.support.processes.waiting import until
 
 ANSWER_S = 3.0  # where answers are lost, which is known only then
@@ -190,12 +193,7 @@ def test_without_its_host_the_machine_soon_stands(tmp_path: Path) -> None:
 
 
 def kill(arm: RobotArm) -> None:
-    import psutil  # noqa: PLC0415
-
-    for child in psutil.Process().children():
-        if "drivers.host" in child.cmdline():
-            child.kill()
-            child.wait()
+    os.kill(driver_pid(arm), signal.SIGKILL)
     with pytest.raises(DeviceUnavailableError):
         arm.state()
 

@@ -61,11 +61,24 @@ def card_run(
     card.mkdir()
 
     def person(rig: BenchRig, mishaps: dict[int, str]) -> CardPerson:
-        watch = PhotoWatch(PhotoWatchConfig(folder=card, stable_s=0.05, stalled_s=5.0))
+        config = PhotoWatchConfig(folder=card, stable_s=0.05, stalled_s=5.0)
+        watch = PhotoWatch(config, *by_the_clock_of(rig))
         watch.open()
         return CardPerson(rig, mishaps, folder=card, watch=watch)
 
     return held_run(begin, monkeypatch, folder, mishaps, STEP, person)
+
+
+def by_the_clock_of(rig: BenchRig) -> tuple[Callable[[], float], Callable[[float], None]]:
+    """Time and waiting by the clock that the rig will have: the store's, once the run goes on."""
+
+    def monotonic_s() -> float:
+        return rig.arm.clock.monotonic_s()
+
+    def sleep(seconds: float) -> None:
+        rig.arm.clock.sleep(seconds)
+
+    return monotonic_s, sleep
 
 
 def measured(bench: Bench) -> StepMeasured:

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Generator
 
 import numpy as np
-import psutil
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -31,6 +30,7 @@ from simulators.kuka_controller.kinematics import MODELS, frames
 from tests.support.arms.kuka_simulator import Controller, pendant, simulated_kuka
 from tests.support.arms.sunrise import needs_jdk, sunrise_engine
 from tests.support.arms.ur_simulator import address
+from tests.support.processes.hosts import driver_pid
 from tests.support.processes.lateness import Lateness
 from tests.support.processes.waiting import until
 from tests.support.rig.patience import PATIENT_KUKA
@@ -164,8 +164,7 @@ def test_a_moving_arm_that_nobody_looks_at_is_stopped(controller: Controller) ->
 def test_a_driver_that_stands_still_sends_no_heartbeat_and_the_arm_stops(controller: Controller) -> None:
     host = address(77)
     with controller(host, patience_s=0), opened(host) as arm, Lateness() as lateness:
-        children = psutil.Process().children(recursive=True)
-        (driver,) = [child.pid for child in children if "drivers.host" in " ".join(child.cmdline())]
+        driver = driver_pid(arm)
         start = arm.state().sample.joints_rad[0]
         move(arm, turned(arm, 2.5))
         os.kill(driver, signal.SIGSTOP)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
+import signal
 import socket
 import struct
 import time
@@ -30,6 +32,7 @@ from service.core.arms.known import arm_model
 from service.core.seven_axes import forward
 from tests.support.arms.kuka_simulator import pendant, simulated_kuka, transcript
 from tests.support.arms.ur_simulator import address
+from tests.support.processes.hosts import driver_pid
 from tests.support.processes.waiting import until
 from tests.support.rig.patience import PATIENT_KUKA
 from tests.support.rig.rig import orthocapture
@@ -258,9 +261,8 @@ def test_doctor_says_how_fri_fares(tmp_path: Path) -> None:
 
 def test_its_process_ends_with_the_driver() -> None:
     host = address(95)
-    with simulated_kuka(host), opened(host):
+    with simulated_kuka(host), opened(host) as arm:
         children = psutil.Process().children(recursive=True)
-        (driver,) = [child for child in children if "drivers.host" in " ".join(child.cmdline())]
         (listener,) = [child for child in children if "drivers.kuka.fri" in " ".join(child.cmdline())]
-        driver.kill()
+        os.kill(driver_pid(arm), signal.SIGKILL)
         assert not psutil.wait_procs([listener], timeout=90)[1]

@@ -9,6 +9,7 @@ import pytest
 from drivers.errors import DeviceRefusedError, ReleasedElsewhereError, StaleImageError, UnreadableFileError
 from drivers.interfaces import CameraSettings
 from drivers.photo_watch import PhotoWatch, PhotoWatchConfig
+from tests.support.record.stepped_clock import SteppedClock
 from tests.support.rig.card import BEGAN, after, half_copied, photograph, put
 
 SINCE_S = BEGAN.timestamp()
@@ -22,9 +23,10 @@ def card(tmp_path: Path) -> Path:
 
 
 def watching(card: Path, **settings: float) -> PhotoWatch:
-    camera = PhotoWatch(
-        PhotoWatchConfig.model_validate({"folder": card, "stable_s": 0.2, "stalled_s": 0.8} | settings)
-    )
+    """A camera that waits in virtual time."""
+    clock = SteppedClock()
+    config = PhotoWatchConfig.model_validate({"folder": card, "stable_s": 0.2, "stalled_s": 0.8} | settings)
+    camera = PhotoWatch(config, clock.monotonic_s, clock.sleep)
     camera.open()
     return camera
 

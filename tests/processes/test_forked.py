@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -60,15 +61,21 @@ def lightbox(folder: Path, *options: str, cwd: Path = ROOT, **more: Any) -> Fork
     return process
 
 
-def test_a_fork_finds_what_a_real_start_finds(tmp_path: Path) -> None:
-    mine = {**os.environ, "ORTHOCAPTURE_MINE": "to be read later"}
+@pytest.mark.parametrize(
+    "of_python", [{}, {"PYTHONPATH": f"/srv/some{os.pathsep}/srv/more", "PYTHONUNBUFFERED": "1"}]
+)
+def test_a_fork_finds_what_a_real_start_finds(tmp_path: Path, of_python: dict[str, str]) -> None:
+    mine = {**os.environ, "ORTHOCAPTURE_MINE": "to be read later", **of_python}
     given: dict[str, Any] = {
         "typed": "two\nlines",
         "env": mine,
         "start_new_session": True,
         "stderr": subprocess.STDOUT,
     }
-    forked, real = (ended(kind, *PROBE, "0", "word", **given).told for kind in (Forked, subprocess.Popen))
+    with socket.socket() as passed, (tmp_path / "file").open("wb") as file:
+        given["pass_fds"] = [passed.fileno(), file.fileno()]
+        forked, real = (ended(kind, *PROBE, "0", "word", **given).told for kind in (Forked, subprocess.Popen))
+    assert sum(" s" in at or at.startswith(f"{given['pass_fds'][1]} -") for at in forked["found"]["files"]) >= 2
     assert forked["found"]["environment"]["ORTHOCAPTURE_MINE"] == "to be read later"
     for told in (forked, real):  # what libraries set depends on which this process and the zygote have imported
         environment: dict[str, str] = told["found"]["environment"]

@@ -24,6 +24,7 @@ from service.core.records.events import ViewpointCaptured
 from service.rig import load_rig
 from service.station import Station
 from service.store.store import Store
+from tests.support.processes.forked import Forked
 from tests.support.processes.waiting import until
 from tests.support.rig.patience import PATIENT_UR
 from tests.support.rig.rig import REPOSITORY, RigLock, orthocapture, simulated_rig, without_calibration_and_ct
@@ -62,10 +63,15 @@ class Hands:
 
 
 @contextmanager
-def rig_process(folder: Path) -> Generator[tuple[subprocess.Popen[str], dict[str, Any], list[psutil.Process]]]:
-    """A rig that the test ends itself; yields it with its ready line and all its processes."""
+def rig_process(
+    folder: Path, start: type[subprocess.Popen[str]] = subprocess.Popen
+) -> Generator[tuple[subprocess.Popen[str], dict[str, Any], list[psutil.Process]]]:
+    """A rig that the test ends itself; yields it with its ready line and all its processes.
+
+    `start`: Forked, or for real.
+    """
     with RigLock(OWN_HOST), (folder / "rig.log").open("w") as log:
-        process = subprocess.Popen(
+        process = start(
             [sys.executable, "-m", "simulators", "rig", "--dir", str(folder), "--host", OWN_HOST, *SMALL],
             cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
         )  # fmt: skip
@@ -219,8 +225,9 @@ def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:
 
 
 def test_a_device_that_dies_ends_the_rig_with_a_reason(tmp_path: Path) -> None:
-    with rig_process(tmp_path) as (process, _, processes):
-        camera = next(p for p in processes if "camera" in p.cmdline())
+    with rig_process(tmp_path, Forked) as (process, ready, processes):
+        port = int(load_rig(Path(ready["rig"])).section.devices["camera"]["port"].rpartition(":")[2])
+        (camera,) = [p for p in processes if port in {c.laddr.port for c in p.net_connections("tcp") if not c.raddr}]
         os.kill(camera.pid, signal.SIGKILL)
         process.wait(timeout=90)
         until(lambda: not any(p.is_running() for p in processes), "all have ended")
@@ -229,20 +236,17 @@ def test_a_device_that_dies_ends_the_rig_with_a_reason(tmp_path: Path) -> None:
         assert "Traceback" not in log
 
 
-def test_a_killed_rig_takes_its_devices_with_it(tmp_path: Path) -> None:
-    with rig_process(tmp_path) as (process, _, processes):
-        process.kill()
-        process.wait(timeout=90)
-        until(lambda: not any(p.is_running() for p in processes[1:]), "its devices have ended")
-
-
 def test_sigterm_also_ends_a_ct_scan_that_is_under_way(tmp_path: Path) -> None:
-    with rig_process(tmp_path) as (process, ready, _), ThreadPoolExecutor(1) as pool, Hands(ready["world"]) as hands:
+    with (
+        rig_process(tmp_path, Forked) as (process, ready, before),
+        ThreadPoolExecutor(1) as pool,
+        Hands(ready["world"]) as hands,
+    ):
         pool.submit(hands.act, "ct_scan")
         root = psutil.Process(process.pid)
 
         def scans() -> list[psutil.Process]:
-            return [child for child in root.children() if child.cmdline()[2:4] == ["simulators", "ct"]]
+            return [child for child in root.children(recursive=True) if child not in before]
 
         until(lambda: len(scans()) == 1, "the CT does not scan")
         (scan,) = scans()
@@ -252,12 +256,13 @@ def test_sigterm_also_ends_a_ct_scan_that_is_under_way(tmp_path: Path) -> None:
         assert not scan.is_running()
 
 
-def test_a_ct_scan_ends_with_a_rig_that_was_killed(tmp_path: Path) -> None:
+def test_devices_and_a_ct_scan_end_with_a_rig_that_was_killed(tmp_path: Path) -> None:
     with rig_process(tmp_path) as (process, ready, _), ThreadPoolExecutor(1) as pool, Hands(ready["world"]) as hands:
         pool.submit(hands.send, '{"op": "act", "action": "ct_scan"}')
         root = psutil.Process(process.pid)
         until(lambda: any("ct" in child.cmdline() for child in root.children()), "the CT does not scan")
         children = root.children()
+        assert len(children) == 4  # arm, camera, light box and scan
         process.kill()  # before the scan's own process has begun to look whose child it is
         process.wait(timeout=90)
         until(lambda: not any(child.is_running() for child in children), "its processes have not ended")

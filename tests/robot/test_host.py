@@ -29,6 +29,11 @@ from tests.support.rig.host_fake_driver import Fake, FakeConfig
 SPEC = "tests.support.rig.host_fake_driver:DRIVER"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def forked_hosts() -> None:
+    """Start processes for real: this is about their start and end."""
+
+
 @pytest.fixture
 def fake(tmp_path: Path) -> Iterator[Fake]:
     device = hosted(Fake, SPEC, FakeConfig(trace=tmp_path / "trace"), call_timeout_s=20.0, name="fake one")
@@ -81,9 +86,9 @@ def test_segfault_names_the_signal_and_open_restarts(fake: Fake) -> None:
 
 
 def test_call_timeout_kills_the_child(tmp_path: Path) -> None:
-    device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=3.0, name="slow")
+    device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=1.5, name="slow")
     pid = int(device.open().serial)
-    with pytest.raises(DeviceTimeoutError, match="hang did not return within 3 s"):
+    with pytest.raises(DeviceTimeoutError, match=r"hang did not return within 1\.5 s"):
         device.hang(600)
     assert not psutil.pid_exists(pid)
     with pytest.raises(DeviceUnavailableError, match="killed after hang"):
@@ -233,7 +238,7 @@ def test_child_exits_when_its_parent_is_killed(tmp_path: Path, busy: bool) -> No
         "from tests.support.rig.host_fake_driver import Fake, FakeConfig\n"
         f"d = hosted(Fake, {SPEC!r}, FakeConfig(**{files!r}), call_timeout_s=20, name='orphan')\n"
         "print(d.open().serial, flush=True)\n"
-        f"d.hang(3.0) if {busy} else None\n"
+        f"d.hang(1.0) if {busy} else None\n"
         "signal.pause()\n"
     )
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import socket
 import struct
-import subprocess
 import sys
 from collections.abc import Generator
 from pathlib import Path
@@ -18,6 +17,7 @@ from simulators.ur_controller import rtde_codec as codec
 from simulators.ur_controller.kinematics import MODELS, forward, from_pose, inverse, to_pose
 from simulators.ur_controller.motion import MoveJ, MoveL, Stop
 from tests.support.arms.ur_simulator import address, simulated_ur
+from tests.support.processes.forked import run
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 DATA = Path(__file__).parents[1] / "data"
@@ -241,7 +241,7 @@ def test_dashboard_lines(controller: tuple[str, str]) -> None:
 def test_unmodified_ur_rtde(controller: tuple[str, str]) -> None:
     host, version = controller
     command = [sys.executable, "-m", "tests.support.vendor.ur_vendor_session", host, version]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = run(command, timeout_s=60)
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout.splitlines()[-1])
     assert said["polyscopeVersion"].startswith(version)
@@ -280,7 +280,7 @@ def rare_calls() -> dict[str, Any]:
     host = address(48)
     with simulated_ur(host, "--version", "5.12", "--model", "UR10e", "--speed-up", "5", patience_s=0):
         command = [sys.executable, "-m", "tests.support.vendor.ur_vendor_calls", host]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
+        done = run(command, timeout_s=90)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 

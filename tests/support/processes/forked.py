@@ -1,13 +1,15 @@
 """Starts processes of the program for tests without importing everything again: by forks of a zygote.
 
 `Forked` and `run` stand for `subprocess.Popen` and `subprocess.run`. What is forked: `orthocapture …`,
-`python -m service.cli.main …`, `python -m simulators …`, some programs of the tests (OF_TESTS), and what the pages of
-a site in this process start for exports, previews and verifications (OF_PAGES, by `pages_fork`). Everything else is a
-real start, as are these where the environment differs in a variable that something may read while it starts.
+`python -m service.cli.main …`, `python -m simulators …`, `python -m drivers.host …`, some programs of the tests
+(OF_TESTS), and what the pages of a site in this process start for exports, previews and verifications (OF_PAGES, by
+`pages_fork`). Everything else is a real start, as are these where the environment differs in a variable that
+something may read while it starts.
 
 What is about starting itself is a real start too, by `subprocess`: tests/cli/test_start_up.py, the installed command
 in tests/cli, the package in tests/system, the tree of a rig's processes in tests/rig/test_rig.py, `python -I`. So is
-what the program starts by itself: drivers, runners and workers. The devices of a forked rig are forks too.
+what the program starts by itself: runners, workers, and drivers where a test does not ask for forks
+(tests/support/processes/hosts.py). The devices of a forked rig are forks too.
 """
 
 from __future__ import annotations
@@ -28,16 +30,17 @@ from typing import Any, AnyStr, cast
 from unittest.mock import patch
 
 from service.audit.background import child_process
-from tests.support.processes.zygote import COMMANDS, OF_PAGES, OF_TESTS, SIMULATORS
+from tests.support.processes.zygote import COMMANDS, HOST, MOST_PASSED, OF_PAGES, OF_TESTS, SIMULATORS
 
 ROOT = Path(__file__).resolve().parents[3]
 INSTALLED = Path(sys.executable).with_name("orthocapture")
 _ZYGOTE = "tests.support.processes.zygote"
-_MODULES = (COMMANDS, SIMULATORS, *OF_PAGES, *OF_TESTS)
+_MODULES = (COMMANDS, SIMULATORS, HOST, *OF_PAGES, *OF_TESTS)
 # Variables that begin so decide nothing while a process starts, or are set by it: by libraries when they are imported
 # (cv2, gdcm, gphoto2, torch), and by drivers that tests use in their own process.
 SET_BY_IMPORTS = ("LD_LIBRARY_PATH", "GDCM_RESOURCES_PATH", "CAMLIBS", "IOLIBS", "TORCHINDUCTOR_CACHE_DIR")
 _READ_LATER = ("ORTHOCAPTURE_", "PYTEST_", "GENTL_CAMERA", "OPENCV_FFMPEG_", "XDG_CONFIG_HOME", *SET_BY_IMPORTS)
+_DONE_BY_ZYGOTE = ("PYTHONPATH", "PYTHONUNBUFFERED")  # it does what the interpreter would with these
 _ENVIRONMENT = dict(os.environ)  # before any test has changed it
 _NUMBER_BYTES = 8
 _PARENT = "--parent"
@@ -52,13 +55,13 @@ class _Parent:
         self._control: socket.socket | None = None
         self._pid = 0
 
-    def start(self, request: dict[str, Any], standard: Sequence[int]) -> tuple[int, socket.socket]:
+    def start(self, request: dict[str, Any], descriptors: Sequence[int]) -> tuple[int, socket.socket]:
         """Fork a process; returns its id, and what will tell its exit status."""
         ours, theirs = socket.socketpair()
         try:
             with self._lock, theirs:
                 control, pid = self._begun()
-                socket.send_fds(control, [b"+"], [theirs.fileno(), *standard])
+                socket.send_fds(control, [b"+"], [theirs.fileno(), *descriptors])
             words = request["words"]
             request["words"] = [str(pid) if _states_parent(words, at) else word for at, word in enumerate(words)]
             data = json.dumps(request).encode()
@@ -168,7 +171,9 @@ class Forked(subprocess.Popen[AnyStr]):
         """Start the process: the one method in which `subprocess.Popen` of Python 3.11 to 3.13 does so."""
         environment = dict(os.environ if env is None else env)
         folder = os.fspath(cwd or Path.cwd())
-        plain = close_fds and not (preexec_fn or pass_fds or shell or executable or not restore_signals)
+        passed: list[int] = sorted(map(int, pass_fds))
+        plain = close_fds and not (preexec_fn or shell or executable or not restore_signals)
+        plain = plain and len(passed) <= MOST_PASSED
         plain = plain and (gid, gids, uid, umask, process_group) == (None, None, None, -1, -1)
         started = _of_the_program(args)
         if not (plain and started and Path(folder).is_dir() and _at_start(environment) == _at_start(_ENVIRONMENT)):
@@ -178,10 +183,10 @@ class Forked(subprocess.Popen[AnyStr]):
                 start_new_session, process_group,
             )  # fmt: skip
             return
-        request = {**started, "cwd": folder, "env": environment, "session": start_new_session}
+        request = {**started, "cwd": folder, "env": environment, "session": start_new_session, "passed": passed}
         standard = [own if own != -1 else ours for ours, own in enumerate((p2cread, c2pwrite, errwrite))]
         try:
-            self.pid, self._news = _PARENT_OF_ALL.start(request, standard)
+            self.pid, self._news = _PARENT_OF_ALL.start(request, [*standard, *passed])
             self._child_created = True
         finally:
             self._close_pipe_fds(  # pyright: ignore[reportAttributeAccessIssue]
@@ -190,11 +195,17 @@ class Forked(subprocess.Popen[AnyStr]):
 
 
 def run(
-    words: Sequence[str], *, timeout_s: float, cwd: Path | None = None, typed: str | None = None
+    words: Sequence[str],
+    *,
+    timeout_s: float,
+    cwd: Path | None = None,
+    env: Mapping[str, str] | None = None,
+    typed: str | None = None,
 ) -> subprocess.CompletedProcess[str]:
     """Run a process to its end, with its input and output as text. Raises TimeoutExpired."""
-    stdin = None if typed is None else subprocess.PIPE
-    with Forked(words, cwd=cwd, stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    stdin = subprocess.DEVNULL if typed is None else subprocess.PIPE
+    pipes: dict[str, Any] = {"stdin": stdin, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with Forked(words, cwd=cwd, env=env, text=True, **pipes) as process:
         try:
             stdout, stderr = process.communicate(typed, timeout_s)
         except BaseException:
@@ -230,7 +241,8 @@ def _forks() -> bool:
 
 def _at_start(environment: Mapping[str, str]) -> dict[str, str]:
     """The variables that somebody may read while a process starts."""
-    return {name: value for name, value in environment.items() if not name.startswith(_READ_LATER)}
+    plain = {name: value for name, value in environment.items() if name not in _DONE_BY_ZYGOTE}
+    return {name: value for name, value in plain.items() if not name.startswith(_READ_LATER)}
 
 
 def _states_parent(words: Sequence[str], at: int) -> bool:

@@ -10,6 +10,9 @@ of one zygote share the seed of `hash()`.
 
 from __future__ import annotations
 
+import atexit
+import contextlib
+import fcntl
 import gc
 import importlib
 import io
@@ -25,7 +28,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, Literal, TextIO
 
-COMMANDS, SIMULATORS = "service.cli.main", "simulators"
+COMMANDS, SIMULATORS, HOST = "service.cli.main", "simulators", "drivers.host"
 # What the pages start: modules of the program, each with those that it imports only once it needs them.
 OF_PAGES = {
     "service.audit.export.formats": ("service.audit.export.posed",),
@@ -38,12 +41,21 @@ OF_PAGES = {
     "service.audit.verify.process": (),
     "service.web.dataset.process": ("service.audit.record.run", "service.dataset.preview.making"),
 }
-OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe")
+VENDORS = tuple(f"tests.support.vendor.{name}" for name in (
+    "camera_vendor_session", "ur_vendor_session", "ur_vendor_calls",
+))  # fmt: skip
+OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe", *VENDORS)
 _REQUEST_BYTES, _NUMBER_BYTES = 8, 8  # lengths of a request's size, and of a process id or an exit status
 _STANDARD = (0, 1, 2)
+_statuses: list[int] = []  # of this process, if it is a fork that has come to its end
+MOST_PASSED = 4  # descriptors that a process may get besides those
 _RIG = "rig"  # the simulator that starts others
 _DESCRIBE = "--describe"  # asks for the options of the simulator that is named next
 _LATE = ("simulators.rendering.render",)  # what simulators import only once they need it
+_DRIVERS = (  # and what they import only once they are opened
+    "drivers.gphoto.camera", "drivers.ur.robot", "drivers.ur.vendor", "drivers.grbl.table", "drivers.kuka.robot",
+    "drivers.video", "drivers.host.serving", "scipy.optimize", "scipy.spatial.transform",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +68,7 @@ class _Request:
     cwd: str
     env: dict[str, str]
     session: bool  # whether it leads a session of its own
+    passed: list[int]  # descriptors that it gets besides the standard ones, under these numbers
 
     @property
     def is_rig(self) -> bool:
@@ -65,7 +78,7 @@ class _Request:
     @property
     def main(self) -> str:
         """The module that will run as `__main__`."""
-        return f"{self.module}.__main__" if self.module == SIMULATORS else self.module
+        return f"{self.module}.__main__" if self.module in (SIMULATORS, HOST) else self.module
 
 
 @dataclass
@@ -87,16 +100,16 @@ class _Zygote:
                     poll.unregister(ready)
                     self._tell(ready)
                     continue
-                told, request, standard = self._receive()
+                told, request, descriptors = self._receive()
                 if request is None:
                     self._end()
                     return None
                 self._prepare(request)
                 pid = os.fork()
                 if pid == 0:
-                    _become(request, standard, _changed(self.environment))
+                    _become(request, descriptors, self.environment)
                     return request
-                for descriptor in standard:
+                for descriptor in descriptors:
                     os.close(descriptor)
                 pidfd = os.pidfd_open(pid)
                 self.children[pidfd] = (pid, told)
@@ -104,20 +117,21 @@ class _Zygote:
                 _write(told, pid)
 
     def _receive(self) -> tuple[int, _Request | None, tuple[int, ...]]:
-        """A request, where its answers go, and its stdin, stdout and stderr; None at the end of all."""
+        """A request, where its answers go, and its stdin, stdout, stderr and others; None at the end of all."""
         control = socket.socket(fileno=os.dup(self.control))
         with control:
-            data, descriptors, _flags, _address = socket.recv_fds(control, 1, 1 + len(_STANDARD))
+            data, descriptors, _flags, _address = socket.recv_fds(control, 1, 1 + len(_STANDARD) + MOST_PASSED)
         if not data:
             return -1, None, ()
-        told, *standard = descriptors
+        told, *its_own = descriptors
         size = int.from_bytes(_read(told, _REQUEST_BYTES), "little")
-        return told, _Request(**json.loads(_read(told, size))), tuple(standard)
+        return told, _Request(**json.loads(_read(told, size))), tuple(its_own)
 
     def _prepare(self, request: _Request) -> None:
         """Import what the process needs, unless it was done for one like it; no thread may begin by that."""
         described = request.words[:1] == [_DESCRIBE]
-        kind = (request.module, *request.words[: 2 if described else 1])
+        alike = request.module in (HOST, *VENDORS)
+        kind = (request.module, *([] if alike else request.words[: 2 if described else 1]))
         if kind in self.prepared:
             return
         self.prepared.add(kind)
@@ -131,10 +145,13 @@ class _Zygote:
         elif request.module == COMMANDS:  # it imports the module of a command on demand
             place = vars(main)["_COMMANDS"].get(word)
             needed = [place.place.partition(":")[0]] if place else []
+        elif request.module == HOST:  # it is told its driver later
+            needed = list(_DRIVERS)
         else:
             needed = OF_PAGES.get(request.module, ())
         for name in needed:
-            importlib.import_module(name)
+            with contextlib.suppress(ModuleNotFoundError):  # the library of a device may not be installed
+                importlib.import_module(name)
         assert len(os.listdir("/proc/self/task")) == 1, f"importing for {kind} started a thread"
         gc.collect()
         gc.freeze()  # the children's collections leave alone, and so share, what is here
@@ -162,22 +179,30 @@ def _changed(before: dict[str, str]) -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if before.get(name) != value}
 
 
-def _become(request: _Request, standard: tuple[int, ...], from_imports: dict[str, str]) -> None:
-    """Turn this fork into the process that was asked for, but for its main module."""
+def _become(request: _Request, descriptors: tuple[int, ...], before: dict[str, str]) -> None:
+    """Turn this fork into the process that was asked for, but for its main module.
+
+    `descriptors`: its standard ones and those passed. `before`: the environment when the zygote began.
+    """
+    from_imports = _changed(before)
     if request.session:
         os.setsid()
-    for descriptor, of_request in zip(_STANDARD, standard, strict=True):
-        os.dup2(of_request, descriptor)
-    highest = max(map(int, os.listdir("/proc/self/fd")))
+    numbers = (*_STANDARD, *request.passed)
+    highest = max(*map(int, os.listdir("/proc/self/fd")), *numbers)
+    moved = [fcntl.fcntl(descriptor, fcntl.F_DUPFD, highest + 1) for descriptor in descriptors]  # out of the way
     os.closerange(len(_STANDARD), highest + 1)
+    for number, descriptor in zip(numbers, moved, strict=True):
+        os.dup2(descriptor, number)
+    os.closerange(highest + 1, max(moved) + 1)
     os.chdir(request.cwd)
     os.environ.clear()
     os.environ.update(request.env | from_imports)
     time.tzset()
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    sys.path[0] = os.path.dirname(request.script) or request.cwd
+    others = [place for place in sys.path[1:] if place not in _listed(before)]
+    sys.path[:] = [os.path.dirname(request.script) or request.cwd, *_listed(request.env), *others]
     sys.argv = [request.script or request.main, *request.words]
-    _open_standard_streams()
+    _open_standard_streams(unbuffered=bool(request.env.get("PYTHONUNBUFFERED")))
     if "numpy" in sys.modules:
         sys.modules["numpy"].random.seed()  # Python's own was seeded anew by fork
     if "multiprocessing.process" in sys.modules:
@@ -187,12 +212,16 @@ def _become(request: _Request, standard: tuple[int, ...], from_imports: dict[str
         delattr(sys.modules[parent], name)
 
 
-def _open_standard_streams() -> None:
+def _listed(environment: dict[str, str]) -> list[str]:
+    """Where modules are looked for by the environment."""
+    return [place for place in environment.get("PYTHONPATH", "").split(os.pathsep) if place]
+
+
+def _open_standard_streams(*, unbuffered: bool) -> None:
     """Open `sys.stdin`, `sys.stdout` and `sys.stderr` as the interpreter does at its start."""
 
     def opened(before: TextIO, descriptor: int, mode: Literal["rb", "wb"]) -> TextIO:
         assert isinstance(before, io.TextIOWrapper)
-        unbuffered = before.write_through  # the option -u, or its variable
         binary = open(descriptor, mode, 0 if unbuffered and mode == "wb" else -1, closefd=False)  # noqa: SIM115
         lines = not unbuffered and (descriptor == _STANDARD[2] or os.isatty(descriptor))
         return io.TextIOWrapper(
@@ -238,13 +267,32 @@ def _below(zygote: _Zygote, rig: _Request) -> _Request | None:
     return rig
 
 
+def _leave_at_once() -> None:
+    """End this fork once all is done, unless it failed: to take the modules apart would copy all of their memory."""
+    if _statuses:
+        try:
+            sys.stdout.flush()
+            sys.stderr.flush()
+        except (OSError, ValueError):  # the interpreter has a status of its own for this
+            return
+        os._exit(_statuses[-1])
+
+
 if __name__ == "__main__":
+    atexit.register(_leave_at_once)  # before all others, so that it is called after them
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tests, and they end this
     _of_tests = _Zygote(int(sys.argv[1]), dict(os.environ))
     _asked = _of_tests.serve()
     if _asked is not None and _asked.is_rig:
         _asked = _below(_of_tests, _asked)
-    if _asked is not None and _asked.script:
-        runpy.run_path(_asked.script, run_name="__main__")
-    elif _asked is not None:
-        runpy.run_module(_asked.module, run_name="__main__", alter_sys=True)
+    try:
+        if _asked is not None and _asked.script:
+            runpy.run_path(_asked.script, run_name="__main__")
+        elif _asked is not None:
+            runpy.run_module(_asked.module, run_name="__main__", alter_sys=True)
+    except SystemExit as _ended:
+        if _ended.code is None or isinstance(_ended.code, int):
+            _statuses.append((_ended.code or 0) & 0xFF)
+        raise
+    else:
+        _statuses.append(0)

@@ -18,7 +18,7 @@ from simulators.still_camera.raw_file import encode_raw
 
 BEGAN = datetime(2026, 11, 21, 10, 0, tzinfo=UTC)
 _COPY = """\
-import shutil, sys
+import sys
 target, source = sys.argv[1:]
 data = open(source, "rb").read()
 with open(target, "wb") as stream:
@@ -56,7 +56,7 @@ def half_copied(folder: Path, name: str, data: bytes, *, whole: bool = True) -> 
     """Let another process copy half a file and pause; at the end of the block it finishes, or gives up."""
     source = folder.parent / f"{name}.source"
     source.write_bytes(data)
-    command = [sys.executable, "-c", _COPY, str(folder / name), str(source)]
+    command = [sys.executable, "-I", "-S", "-c", _COPY, str(folder / name), str(source)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdin is not None

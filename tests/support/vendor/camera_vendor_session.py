@@ -9,11 +9,12 @@ import hashlib
 import importlib
 import json
 import os
-import subprocess
 import sys
 import tempfile
 import time
 from typing import Any
+
+from tests.support.processes.forked import run
 
 gp: Any = importlib.import_module("gphoto2")
 
@@ -21,15 +22,8 @@ gp: Any = importlib.import_module("gphoto2")
 def vendor_session(port: str, *commands: list[Any], timeout_s: float = 60.0) -> list[Any]:
     """Run the commands in a new process; an answer is {"error": code} if libgphoto2 raised."""
     with tempfile.TemporaryDirectory() as settings:  # libgphoto2 keeps some in the user's
-        done = subprocess.run(
-            [sys.executable, "-m", "tests.support.vendor.camera_vendor_session", port, json.dumps(commands)],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=timeout_s,
-            check=False,
-            env={**os.environ, "XDG_CONFIG_HOME": settings},
-        )
+        words = [sys.executable, "-m", "tests.support.vendor.camera_vendor_session", port, json.dumps(commands)]
+        done = run(words, timeout_s=timeout_s, env={**os.environ, "XDG_CONFIG_HOME": settings})
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
