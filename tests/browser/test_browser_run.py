@@ -54,7 +54,10 @@ def server(rig: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 @pytest.fixture(scope="module")
 def people(server: Served, browser: Browser) -> None:
-    """Set up the people as in practice: a one-time link for the administrator, who invites the others, the first of them on the page."""
+    """Set up the people as in practice: a one-time link for the administrator, who invites the others.
+
+    The first of them is invited on the page.
+    """
     with screen(browser, server.url) as first:
         page = first.page
         page.goto(server.set_up)

@@ -1,12 +1,13 @@
 """Starts processes of the program for tests without importing everything again: by forks of a zygote.
 
 `Forked` and `run` stand for `subprocess.Popen` and `subprocess.run`. What is forked: `orthocapture …`,
-`python -m service.cli.main …`, `python -m simulators …` and some programs of the tests (OF_TESTS). Everything else is
-a real start, as are these where the environment differs in a variable that something may read while it starts.
+`python -m service.cli.main …`, `python -m simulators …` and some programs of the tests (OF_TESTS); and the devices that
+a forked rig starts, and the drivers, workers and runners that a forked command starts. Everything else is a real
+start, as are these where the environment differs in a variable that something may read while it starts.
 
 What is about starting itself is a real start too, by `subprocess`: tests/cli/test_start_up.py, the installed command
-in tests/cli, the package in tests/system, the tree of a rig's processes in tests/rig/test_rig.py, `python -I`. So is
-what the program starts by itself: drivers, runners and workers. The devices of a forked rig are forks too.
+in tests/cli, the package in tests/system, the tree of a rig's processes in tests/rig/test_rig.py, `python -I`. So are
+the children in which a worker computes.
 """
 
 from __future__ import annotations
@@ -23,12 +24,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, AnyStr, cast
 
-from tests.support.processes.zygote import COMMANDS, OF_TESTS, SIMULATORS
+from tests.support.processes.zygote import COMMANDS, DRIVERS, OF_TESTS, SIMULATORS
 
 ROOT = Path(__file__).resolve().parents[3]
 INSTALLED = Path(sys.executable).with_name("orthocapture")
 _ZYGOTE = "tests.support.processes.zygote"
-_MODULES = (COMMANDS, SIMULATORS, *OF_TESTS)
+_MODULES = (COMMANDS, SIMULATORS, DRIVERS, *OF_TESTS)
+_GIVEN_TO_DRIVERS = ("PYTHONPATH", "PYTHONUNBUFFERED")  # which a fork heeds too
 # Variables that begin so decide nothing while a process starts, or are set by it: by libraries when they are imported
 # (cv2, gdcm, gphoto2, torch), and by drivers that tests use in their own process.
 SET_BY_IMPORTS = ("LD_LIBRARY_PATH", "GDCM_RESOURCES_PATH", "CAMLIBS", "IOLIBS", "TORCHINDUCTOR_CACHE_DIR")
@@ -163,20 +165,21 @@ class Forked(subprocess.Popen[AnyStr]):
         """Start the process: the one method in which `subprocess.Popen` of Python 3.11 to 3.13 does so."""
         environment = dict(os.environ if env is None else env)
         folder = os.fspath(cwd or Path.cwd())
-        plain = close_fds and not (preexec_fn or pass_fds or shell or executable or not restore_signals)
+        plain = close_fds and not (preexec_fn or shell or executable or not restore_signals)
         plain = plain and (gid, gids, uid, umask, process_group) == (None, None, None, -1, -1)
         started = _of_the_program(args)
-        if not (plain and started and Path(folder).is_dir() and _at_start(environment) == _at_start(_ENVIRONMENT)):
+        given = _GIVEN_TO_DRIVERS if started and started["module"] == DRIVERS else ()
+        if not (plain and started and Path(folder).is_dir() and _same(environment, given)):
             super()._execute_child(  # pyright: ignore[reportAttributeAccessIssue]
                 args, executable, preexec_fn, close_fds, pass_fds, cwd, env, startupinfo, creationflags, shell,
                 p2cread, p2cwrite, c2pread, c2pwrite, errread, errwrite, restore_signals, gid, gids, uid, umask,
                 start_new_session, process_group,
             )  # fmt: skip
             return
-        request = {**started, "cwd": folder, "env": environment, "session": start_new_session}
+        request = {**started, "cwd": folder, "env": environment, "session": start_new_session, "passed": [*pass_fds]}
         standard = [own if own != -1 else ours for ours, own in enumerate((p2cread, c2pwrite, errwrite))]
         try:
-            self.pid, self._news = _PARENT_OF_ALL.start(request, standard)
+            self.pid, self._news = _PARENT_OF_ALL.start(request, [*standard, *pass_fds])
             self._child_created = True
         finally:
             self._close_pipe_fds(  # pyright: ignore[reportAttributeAccessIssue]
@@ -214,6 +217,12 @@ def _of_the_program(words: object) -> dict[str, Any] | None:
 def _forks() -> bool:
     """Whether this machine has what it takes, and one thread of linear algebra, as the zygote must not have more."""
     return hasattr(os, "pidfd_open") and _ENVIRONMENT.get("OPENBLAS_NUM_THREADS") == "1"
+
+
+def _same(environment: Mapping[str, str], but_for: Sequence[str]) -> bool:
+    """Whether a process would find at its start what the zygote found, but for these variables."""
+    here, there = ({k: v for k, v in _at_start(e).items() if k not in but_for} for e in (environment, _ENVIRONMENT))
+    return here == there
 
 
 def _at_start(environment: Mapping[str, str]) -> dict[str, str]:

@@ -10,6 +10,7 @@ of one zygote share the seed of `hash()`.
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import importlib
 import io
@@ -25,11 +26,16 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, Literal, TextIO
 
-COMMANDS, SIMULATORS = "service.cli.main", "simulators"
+COMMANDS, SIMULATORS, DRIVERS = "service.cli.main", "simulators", "drivers.host"
 OF_TESTS = ("tests.support.processes.stubborn_program", "tests.support.processes.probe")
 _REQUEST_BYTES, _NUMBER_BYTES = 8, 8  # lengths of a request's size, and of a process id or an exit status
 _STANDARD = (0, 1, 2)
+_MOST_PASSED = 8  # descriptors of a request beside the standard ones
 _RIG = "rig"  # the simulator that starts others
+# Commands that start drivers, workers and runners, and what these import.
+_STARTING = ("run", "resume", "serve", "import", "doctor")
+_STARTED = ("worker", "resume")
+_OF_DRIVERS = ("drivers.ur.robot", "drivers.gphoto.camera", "drivers.lightbox")
 _LATE = ("simulators.rendering.render",)  # what simulators import only once they need it
 
 
@@ -43,6 +49,7 @@ class _Request:
     cwd: str
     env: dict[str, str]
     session: bool  # whether it leads a session of its own
+    passed: list[int]  # further descriptors, which it has under these numbers
 
     @property
     def is_rig(self) -> bool:
@@ -50,9 +57,14 @@ class _Request:
         return self.module == SIMULATORS and self.words[:1] == [_RIG]
 
     @property
+    def starts_others(self) -> bool:
+        """Whether it starts processes that can be forked."""
+        return self.is_rig or (self.module == COMMANDS and "".join(self.words[:1]) in _STARTING)
+
+    @property
     def main(self) -> str:
         """The module that will run as `__main__`."""
-        return f"{self.module}.__main__" if self.module == SIMULATORS else self.module
+        return f"{self.module}.__main__" if self.module in (SIMULATORS, DRIVERS) else self.module
 
 
 @dataclass
@@ -62,6 +74,7 @@ class _Zygote:
     control: int
     environment: dict[str, str]  # as it was when this process began
     prepared: set[tuple[str, ...]] = field(default_factory=set[tuple[str, ...]])  # kinds of processes
+    ends_children: bool = True  # at its end; otherwise they go on, as those of a program do
     children: dict[int, tuple[int, int]] = field(default_factory=dict[int, tuple[int, int]])  # pidfd: pid, to tell
 
     def serve(self) -> _Request | None:
@@ -74,32 +87,34 @@ class _Zygote:
                     poll.unregister(ready)
                     self._tell(ready)
                     continue
-                told, request, standard = self._receive()
+                told, request, standard, passed = self._receive()
                 if request is None:
-                    self._end()
+                    if self.ends_children:
+                        self._end()
                     return None
                 self._prepare(request)
                 pid = os.fork()
                 if pid == 0:
-                    _become(request, standard, _changed(self.environment))
+                    _become(request, standard, passed, _changed(self.environment))
                     return request
-                for descriptor in standard:
+                for descriptor in (*standard, *passed):
                     os.close(descriptor)
                 pidfd = os.pidfd_open(pid)
                 self.children[pidfd] = (pid, told)
                 poll.register(pidfd, select.POLLIN)
                 _write(told, pid)
 
-    def _receive(self) -> tuple[int, _Request | None, tuple[int, ...]]:
-        """A request, where its answers go, and its stdin, stdout and stderr; None at the end of all."""
+    def _receive(self) -> tuple[int, _Request | None, tuple[int, ...], tuple[int, ...]]:
+        """A request, where its answers go, its standard streams, and what is passed; None at the end of all."""
         control = socket.socket(fileno=os.dup(self.control))
         with control:
-            data, descriptors, _flags, _address = socket.recv_fds(control, 1, 1 + len(_STANDARD))
+            data, descriptors, _flags, _address = socket.recv_fds(control, 1, 1 + len(_STANDARD) + _MOST_PASSED)
         if not data:
-            return -1, None, ()
-        told, *standard = descriptors
+            return -1, None, (), ()
+        told, *others = descriptors
+        standard, passed = others[: len(_STANDARD)], others[len(_STANDARD) :]
         size = int.from_bytes(_read(told, _REQUEST_BYTES), "little")
-        return told, _Request(**json.loads(_read(told, size))), tuple(standard)
+        return told, _Request(**json.loads(_read(told, size))), tuple(standard), tuple(passed)
 
     def _prepare(self, request: _Request) -> None:
         """Import what the process needs, unless it was done for one like it; no thread may begin by that."""
@@ -115,8 +130,12 @@ class _Zygote:
             self.prepared.update((SIMULATORS, name) for name in names)
             needed = [*(known[name][0] for name in names), *(_LATE if names else ())]
         elif request.module == COMMANDS:  # it imports the module of a command on demand
-            place = vars(main)["_COMMANDS"].get(word)
-            needed = [place.place.partition(":")[0]] if place else []
+            commands = vars(main)["_COMMANDS"]
+            names = {word, *_STARTED} if request.starts_others else {word}
+            needed = [commands[name].place.partition(":")[0] for name in sorted(names) if name in commands]
+            if request.starts_others:
+                self.prepared.update({(DRIVERS,), *((COMMANDS, name) for name in _STARTED)})
+                needed += [f"{DRIVERS}.__main__", *_OF_DRIVERS]
         else:
             needed = []
         for name in needed:
@@ -148,22 +167,31 @@ def _changed(before: dict[str, str]) -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if before.get(name) != value}
 
 
-def _become(request: _Request, standard: tuple[int, ...], from_imports: dict[str, str]) -> None:
+def _become(
+    request: _Request, standard: tuple[int, ...], passed: tuple[int, ...], from_imports: dict[str, str]
+) -> None:
     """Turn this fork into the process that was asked for, but for its main module."""
     if request.session:
         os.setsid()
     for descriptor, of_request in zip(_STANDARD, standard, strict=True):
         os.dup2(of_request, descriptor)
-    highest = max(map(int, os.listdir("/proc/self/fd")))
-    os.closerange(len(_STANDARD), highest + 1)
+    above = 1 + max(*request.passed, *map(int, os.listdir("/proc/self/fd")))
+    kept = [fcntl.fcntl(descriptor, fcntl.F_DUPFD, above) for descriptor in passed]
+    os.closerange(len(_STANDARD), above)
+    for descriptor, number in zip(kept, request.passed, strict=True):
+        os.dup2(descriptor, number)
+        os.close(descriptor)
     os.chdir(request.cwd)
     os.environ.clear()
     os.environ.update(request.env | from_imports)
     time.tzset()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.path[0] = os.path.dirname(request.script) or request.cwd
+    sys.path += [
+        path for path in request.env.get("PYTHONPATH", "").split(os.pathsep) if path and path not in sys.path
+    ]
     sys.argv = [request.script or request.main, *request.words]
-    _open_standard_streams()
+    _open_standard_streams(unbuffered=bool(request.env.get("PYTHONUNBUFFERED")))
     if "numpy" in sys.modules:
         sys.modules["numpy"].random.seed()  # Python's own was seeded anew by fork
     if "multiprocessing.process" in sys.modules:
@@ -173,12 +201,11 @@ def _become(request: _Request, standard: tuple[int, ...], from_imports: dict[str
         delattr(sys.modules[parent], name)
 
 
-def _open_standard_streams() -> None:
+def _open_standard_streams(*, unbuffered: bool) -> None:
     """Open `sys.stdin`, `sys.stdout` and `sys.stderr` as the interpreter does at its start."""
 
     def opened(before: TextIO, descriptor: int, mode: Literal["rb", "wb"]) -> TextIO:
         assert isinstance(before, io.TextIOWrapper)
-        unbuffered = before.write_through  # the option -u, or its variable
         binary = open(descriptor, mode, 0 if unbuffered and mode == "wb" else -1, closefd=False)  # noqa: SIM115
         lines = not unbuffered and (descriptor == _STANDARD[2] or os.isatty(descriptor))
         return io.TextIOWrapper(
@@ -203,10 +230,11 @@ def _write(descriptor: int, number: int) -> None:
     os.write(descriptor, number.to_bytes(_NUMBER_BYTES, "little", signed=True))
 
 
-def _below(zygote: _Zygote, rig: _Request) -> _Request | None:
-    """Let this process, a rig, fork its simulators from a zygote of its own, which is forked before any thread is.
+def _below(zygote: _Zygote, asked: _Request) -> tuple[_Request | None, bool]:
+    """Let this process fork what it starts from a zygote of its own, which is forked before any thread is.
 
-    Returns twice: the rig's own request, and in each fork of that zygote its request. None is that zygote's end.
+    Returns twice: the process's own request, and in each fork of that zygote its request, with whether this is such a
+    fork. None is that zygote's end.
     """
     ours, theirs = socket.socketpair()
     pid = os.fork()
@@ -216,20 +244,22 @@ def _below(zygote: _Zygote, rig: _Request) -> _Request | None:
         with open(os.devnull, "r+b") as nowhere:  # not the rig's, whose end its reader waits for
             for descriptor in _STANDARD[:2]:
                 os.dup2(nowhere.fileno(), descriptor)
-        return _Zygote(theirs.detach(), rig.env, zygote.prepared).serve()
+        below = _Zygote(theirs.detach(), asked.env, zygote.prepared, ends_children=asked.is_rig)
+        return below.serve(), True
     theirs.close()
     forked: Any = importlib.import_module("tests.support.processes.forked")
     forked.use(ours, pid)
     subprocess.Popen = forked.Forked  # pyright: ignore[reportAttributeAccessIssue]
-    return rig
+    return asked, False
 
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tests, and they end this
     _of_tests = _Zygote(int(sys.argv[1]), dict(os.environ))
     _asked = _of_tests.serve()
-    if _asked is not None and _asked.is_rig:
-        _asked = _below(_of_tests, _asked)
+    _fresh = True  # whether it is a fork that has no zygote of its own yet
+    while _fresh and _asked is not None and _asked.starts_others:
+        _asked, _fresh = _below(_of_tests, _asked)
     if _asked is not None and _asked.script:
         runpy.run_path(_asked.script, run_name="__main__")
     elif _asked is not None:
