@@ -44,7 +44,7 @@ def short_protocol(folder: Path) -> Path:
 @pytest.mark.slow
 def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> None:
     data = tmp_path / "data"
-    with simulated_rig(tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3", host=HOST) as ready:
+    with simulated_rig(tmp_path, "--scene", "3", "--image-width", "320", "--speed-up", "3", host=HOST) as ready:
         words = ["run", str(short_protocol(tmp_path)), "--rig", ready["rig"], "--data", str(data), "--auto-confirm"]
         with started(words, tmp_path / "run.log") as runner:
             wait_for_captures(data, 2, runner, tmp_path / "run.log")

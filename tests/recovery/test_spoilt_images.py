@@ -61,7 +61,7 @@ def protocol(folder: Path, *wanted: str) -> Path:
 def run(folder: Path, faults: Sequence[Mapping[str, Any]], *wanted: str, host: str) -> Ran:
     """The run with --auto-confirm on a rig whose camera has these faults."""
     plan = json.dumps([{"device": "camera", "on": "image", **fault} for fault in faults])
-    options = ("--scene", "3", "--image-width", "720", "--speed-up", "10", "--ct-voxel-mm", "1.0", "--faults", plan)
+    options = ("--scene", "3", "--image-width", "600", "--speed-up", "10", "--ct-voxel-mm", "1.5", "--faults", plan)
     with simulated_rig(folder, *options, host=host) as rig:
         answer = orthocapture(
             "run", str(protocol(folder, *wanted)), "--rig", rig["rig"], "--data", str(folder / "data"), "--operator",

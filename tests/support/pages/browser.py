@@ -56,8 +56,9 @@ def chromium() -> Generator[Browser]:
     path = next((found for name in _NAMES if (found := shutil.which(name))), None)
     if path is None:
         pytest.fail(
-            "Chromium is not installed, and the browser tests need it: `sudo apt-get install chromium-headless-shell` "
-            "on Debian, `sudo snap install chromium` on Ubuntu, `brew install --cask chromium` on macOS",
+            "Chromium is not installed, and the browser tests need it: "
+            "`sudo apt-get install chromium-headless-shell` on Debian, `sudo snap install chromium` on Ubuntu, "
+            "`brew install --cask chromium` on macOS",
             pytrace=False,
         )
     with sync_playwright() as playwright:
