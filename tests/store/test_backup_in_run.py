@@ -51,6 +51,7 @@ def test_a_run_is_backed_up_in_its_capture_and_finished_where_it_was_restored(tm
             "--data",
             str(data),
             "--auto-confirm",
+            "--no-worker",
         ]
         with started(words, tmp_path / "run.log") as runner:
             wait_for_captures(data, 2, runner, tmp_path / "run.log")
@@ -71,7 +72,9 @@ def test_a_run_is_backed_up_in_its_capture_and_finished_where_it_was_restored(tm
 
         rotated = orthocapture("audit", "rotate-key", "--lost", "--reason", "test", "--data", str(restored))
         assert rotated.returncode == 0, rotated.stderr
-        again = orthocapture("resume", "latest", "--data", str(restored), "--auto-confirm", timeout_s=300)
+        again = orthocapture(
+            "resume", "latest", "--data", str(restored), "--auto-confirm", "--no-worker", timeout_s=300
+        )
         assert again.returncode == 0, again.stdout + again.stderr
     after = captured(restored)
     assert after[: len(kept)] == kept
