@@ -19,13 +19,12 @@ UP = np.array([0.0, 0.0, 1.0])
 MARKERS = (Markers(CENTRE_M[None], 0.005, UP, 0.002, 0.05),)
 
 
-def plate(z_m: float = 0.0) -> Surface:
-    """A plate of 80 × 80 mm at a height, of faces of 1 mm."""
-    x, y = (g.ravel() * 0.001 - 0.04 for g in np.meshgrid(np.arange(81), np.arange(81)))
-    corner = (np.arange(80)[:, None] * 81 + np.arange(80)).ravel()
-    faces = np.concatenate(
-        [np.stack([corner, corner + 1, corner + 82], 1), np.stack([corner, corner + 82, corner + 81], 1)]
-    )
+def plate(z_m: float = 0.0, side_mm: int = 80) -> Surface:
+    """A square plate at a height, of faces of 1 mm."""
+    x, y = (g.ravel() * 0.001 - 0.0005 * side_mm for g in np.meshgrid(*2 * [np.arange(side_mm + 1)]))
+    corner = (np.arange(side_mm)[:, None] * (side_mm + 1) + np.arange(side_mm)).ravel()
+    across = corner + side_mm + 2
+    faces = np.concatenate([np.stack([corner, corner + 1, across], 1), np.stack([corner, across, across - 1], 1)])
     return Surface(np.stack([x, y, np.full(len(x), z_m)], 1), faces.astype(np.int64))
 
 
@@ -46,9 +45,10 @@ def test_faces_on_spheres_and_posts_are_cut_out_and_no_others() -> None:
 
 @pytest.mark.slow
 def test_a_missing_sphere_does_not_count_and_an_error_of_the_specimen_does(tmp_path: Path) -> None:
-    truth = with_ball(plate())
+    side_mm = 48
+    truth = with_ball(plate(side_mm=side_mm))
     for name, z_m in (("right", 0.0), ("off", 0.001)):
-        write_ply(tmp_path / f"{name}.ply", plate(z_m), 1.0, {}, ["metres"])
+        write_ply(tmp_path / f"{name}.ply", plate(z_m, side_mm), 1.0, {}, ["metres"])
     right = score_specimen(tmp_path / "right.ply", truth, MARKERS)
     off = score_specimen(tmp_path / "off.ply", truth, MARKERS)
     assert right.completeness_mm < 2 * right.floor_mm

@@ -18,8 +18,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.packages("chromium"))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
-    """Chromium, started once for each file, because some tests elsewhere start their own."""
+    """Chromium, started once for the files of this folder that a process runs one after another.
+
+    It does not outlive them: Playwright keeps an event loop, beside which other tests could not run theirs.
+    """
     with chromium() as running:
         yield running

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
 
 from service.store.store import Store
 from tests.support.pages.browser import (
@@ -15,7 +15,6 @@ from tests.support.pages.browser import (
     Screen,
     accessibility_faults,
     add_people,
-    chromium,
     screen,
     served,
 )
@@ -27,7 +26,7 @@ CHECKS = (Path(__file__).parents[1] / "support" / "pages" / "page_checks.js").re
 
 
 @pytest.fixture(scope="module")
-def tablet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Screen]:
+def tablet(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Screen]:
     """A supervisor's tablet, on which the page of the recorded run's data set is complete."""
     folder = tmp_path_factory.mktemp("dataset")
     data = unpack_recorded_run(folder)
@@ -36,7 +35,7 @@ def tablet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Screen]:
     add_people(data, (("sam", "supervisor"),))
     with Store.open(data) as store:
         run = store.runs()[0].run_id
-    with served(rig, data) as server, chromium() as browser, screen(browser, server.url, touch=True) as shown:
+    with served(rig, data) as server, screen(browser, server.url, touch=True) as shown:
         shown.sign_in("sam")
         shown.go(f"/runs/{run}/dataset")
         expect(shown.page.locator("[data-pending]")).to_have_count(0, timeout=200_000)

@@ -7,20 +7,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, expect
 
 from service.core.records.entered import NoteTaken
 from service.core.records.events import RunStarted
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.pages.browser import add_people, chromium, screen, served
+from tests.support.pages.browser import add_people, screen, served
 from tests.support.runs.bench_run import PROTOCOL
 
 pytestmark = [pytest.mark.timeout(300)]
 
 
 @pytest.mark.slow
-def test_a_run_is_started_noted_on_and_found(tmp_path: Path) -> None:
+def test_a_run_is_started_noted_on_and_found(tmp_path: Path, browser: Browser) -> None:
     (tmp_path / "rig.yaml").write_text("name: bench\nsimulated: true\ndevices: {}\n")
     protocols = tmp_path / "protocols"
     protocols.mkdir()
@@ -31,7 +31,6 @@ def test_a_run_is_started_noted_on_and_found(tmp_path: Path) -> None:
     picture = cv2.imencode(".jpg", np.full((600, 800, 3), 120, np.uint8))[1].tobytes()
     with (
         served(tmp_path / "rig.yaml", data, "--protocols", str(protocols)) as server,
-        chromium() as browser,
         screen(browser, server.url) as tablet,
     ):
         page = tablet.page

@@ -22,7 +22,6 @@ from tests.support.pages.browser import (
     Screen,
     Served,
     accessibility_faults,
-    chromium,
     press_until,
     screen,
     served,
@@ -184,7 +183,7 @@ class Desk:
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
+def desk(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Desk]:
     folder = tmp_path_factory.mktemp("shown")
     site = shown_site(folder)
     data = folder / "data"
@@ -194,7 +193,6 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
     names |= {"image": image, "link": invitation(folder)}
     with (
         served(folder / "rig.yaml", data, "--protocols", str(folder / "protocols")) as server,
-        chromium() as browser,
         contextlib.ExitStack() as screens,
     ):
         yield Desk(browser, server, site, names, screens)

@@ -2,36 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
 
 from service.audit.record.run import read_run
 from service.audit.report.content import report_content
 from service.audit.report.output.html import write_html
 from service.store.verification.verify import verify
-from tests.support.pages.browser import chromium
 from tests.support.recorded.reported_run import record_reported_run
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Generator[Page]:
+def page(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Page]:
     """The report of a registered run, from a file and without network."""
     folder = tmp_path_factory.mktemp("report")
     record_reported_run(folder, registered=True)
     run = read_run(folder / "data", "latest")
     path = Path(folder, "report.html")
     write_html(report_content(run, verify(folder / "data", run.run_id)), path)
-    with chromium() as browser:
-        shown = browser.new_page(viewport={"width": 1280, "height": 900})
-        complaints: list[str] = []
-        shown.on("pageerror", lambda error: complaints.append(str(error)))
-        shown.on("request", lambda asked: complaints.append(asked.url) if asked.url.startswith("http") else None)
-        shown.goto(path.as_uri())
-        yield shown
-        assert not complaints, complaints
+    shown = browser.new_page(viewport={"width": 1280, "height": 900})
+    complaints: list[str] = []
+    shown.on("pageerror", lambda error: complaints.append(str(error)))
+    shown.on("request", lambda asked: complaints.append(asked.url) if asked.url.startswith("http") else None)
+    shown.goto(path.as_uri())
+    yield shown
+    shown.close()
+    assert not complaints, complaints
 
 
 @pytest.mark.slow

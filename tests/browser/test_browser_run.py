@@ -24,6 +24,7 @@ from tests.support.pages.browser import (
     Screen,
     Served,
     accessibility_faults,
+    invite_people,
     screen,
     served,
 )
@@ -39,7 +40,7 @@ LONG_MS = 60_000
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     folder = tmp_path_factory.mktemp("rig")
-    with simulated_rig(folder, "--scene", "3", "--image-width", "600", "--speed-up", "3", host="127.0.0.51") as ready:
+    with simulated_rig(folder, "--scene", "3", "--image-width", "400", "--speed-up", "3", host="127.0.0.51") as ready:
         yield ready
 
 
@@ -53,7 +54,10 @@ def server(rig: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 @pytest.fixture(scope="module")
 def people(server: Served, browser: Browser) -> None:
-    """Set up the people as in practice: a one-time link for the administrator, who invites the others."""
+    """Set up the people as in practice: a one-time link for the administrator, who invites the others.
+
+    The first of them is invited on the page.
+    """
     with screen(browser, server.url) as first:
         page = first.page
         page.goto(server.set_up)
@@ -63,25 +67,20 @@ def people(server: Served, browser: Browser) -> None:
         page.get_by_role("button", name="Set up the account").click()
         if page.get_by_role("button", name="Sign out").count() == 0:
             first.sign_in("ada")
-        for account, role in (
-            ("tina", "technician"),
-            ("tom", "technician"),
-            ("sam", "supervisor"),
-            ("otto", "auditor"),
-        ):
-            first.go("/accounts")
-            page.get_by_label("Name, as records and signatures show it").fill(f"{account.title()} Example")
-            page.get_by_label("Account, to sign in with").fill(account)
-            page.get_by_role("combobox", name="Role").select_option(role)
-            page.get_by_role("button", name="Make a one-time link").click()
-            link = page.locator(".once").inner_text()
-            with screen(browser, server.url) as own:
-                own.page.goto(link)
-                fill_secrets(own.page)
-                own.page.get_by_role("button", name=re.compile("Set up|account", re.IGNORECASE)).click()
-                expect(own.page.get_by_text("The account is ready")).to_be_visible()
-                # The link works only once.
-                assert own.page.goto(link).status in (404, 409, 410)  # type: ignore[union-attr]
+        first.go("/accounts")
+        page.get_by_label("Name, as records and signatures show it").fill("Tina Example")
+        page.get_by_label("Account, to sign in with").fill("tina")
+        page.get_by_role("combobox", name="Role").select_option("technician")
+        page.get_by_role("button", name="Make a one-time link").click()
+        link = page.locator(".once").inner_text()
+        with screen(browser, server.url) as own:
+            own.page.goto(link)
+            fill_secrets(own.page)
+            own.page.get_by_role("button", name=re.compile("Set up|account", re.IGNORECASE)).click()
+            expect(own.page.get_by_text("The account is ready")).to_be_visible()
+            # The link works only once.
+            assert own.page.goto(link).status in (404, 409, 410)  # type: ignore[union-attr]
+    invite_people(server.data, (("tom", "technician"), ("sam", "supervisor"), ("otto", "auditor")))
 
 
 def fill_secrets(page: Page) -> None:

@@ -92,7 +92,15 @@ def test_a_run_with_the_turntable_instead_of_the_arm(tmp_path: Path) -> None:
         assert told["problems"] == []
         assert told["details"]["state"] == "Alarm"  # locked, and the doctor unlocks nothing
         done = orthocapture(
-            "run", str(protocol), "--rig", str(rig), "--data", str(data), "--auto-confirm", timeout_s=300
+            "run",
+            str(protocol),
+            "--rig",
+            str(rig),
+            "--data",
+            str(data),
+            "--auto-confirm",
+            "--no-worker",
+            timeout_s=300,
         )
         assert done.returncode == 0, done.stdout + done.stderr
         exposures = [json.loads(row) for row in (folder / "truth_exposures.jsonl").read_text().splitlines()]

@@ -22,7 +22,7 @@ PROTOCOL = REPOSITORY / "protocols" / "import_spine.yaml"
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Photographs with raw files beside them, except for the board's; scans, but no CT."""
     folder = tmp_path_factory.mktemp("raw") / "spine"
-    photographer = Photographer(folder, 800)
+    photographer = Photographer(folder, 640)
     photographer.photographs("calibration", over_the_board(9), board=True)
     photographer.raw = True
     photographer.photographs("control", around(2, turn=0.1))
@@ -38,7 +38,7 @@ def protocol(tmp_path_factory: pytest.TempPathFactory) -> Path:
     protocol = yaml.safe_load(PROTOCOL.read_text())
     steps = {step["id"]: step for step in protocol["steps"]}
     steps["registration"]["params"] |= {"poses": ["colmap"], "measure_on": "raw"}
-    steps["registration"]["params"]["structure_from_motion"] = {"max_image_size": 800, "max_features": 3000}
+    steps["registration"]["params"]["structure_from_motion"] = {"max_image_size": 640, "max_features": 3000}
     for name, measure in (("calibration_images", "images_imported"), ("camera_calibration", "views")):
         next(g for g in steps[name]["gates"] if g["measure"] == measure)["min"] = 6
     path = tmp_path_factory.mktemp("protocol") / "raw.yaml"

@@ -57,7 +57,7 @@ def test_outlines_found_in_the_jpeg_are_measured_in_the_raw_file(tmp_path: Path)
             context: RecordedContext = JobContext(arguments, store, tmp_path, lambda _what, _done, _total: None)
             return handler_of(job_kinds()[kind])(context)
 
-        for number, azimuth in enumerate((0.4, 2.0, 3.9)):
+        for number, azimuth in enumerate((0.4, 2.8)):
             T_world_camera = pose_above(azimuth, 0.4)
             view = {
                 "T_world_camera": T_world_camera.tolist(),
@@ -89,7 +89,7 @@ def test_outlines_found_in_the_jpeg_are_measured_in_the_raw_file(tmp_path: Path)
             done = run("detect_spheres", **search, **more)
             assert ("outlines_not_in_raw" in done.measures) == (where == "raw")
             found[where] = JobContext({}, store, tmp_path, lambda *_: None).input_json(done.artefacts[0].sha256)
-            assert done.measures["outlines"] == sum(map(len, found[where].values())) >= 24
+            assert done.measures["outlines"] == sum(map(len, found[where].values())) >= 16
         with pytest.raises(DataError, match=r"1200×800 pixels.*JPEG's size"):
             run("detect_spheres", **search | {"camera": asdict(camera.scaled(600, 400)), "reduced_to": [600, 400]},
                 developed=developed)  # fmt: skip

@@ -179,6 +179,23 @@ def test_the_devices_of_a_forked_rig_are_forks_too_and_end_with_it(tmp_path: Pat
     assert not (tmp_path / "lightbox").is_symlink()  # the light box ended in order
 
 
+@pytest.mark.parametrize("kind", [Forked, subprocess.Popen])
+def test_a_driver_has_the_connection_that_it_is_passed_and_ends_with_it(kind: type[subprocess.Popen[str]]) -> None:
+    ours, theirs = socket.socketpair()
+    given: dict[str, Any] = {
+        "pass_fds": [theirs.fileno()],
+        "env": {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
+        "start_new_session": True,
+    }
+    with kind([sys.executable, "-m", "drivers.host", str(theirs.fileno())], cwd=ROOT, text=True, **given) as driver:
+        assert not isinstance(driver, Forked) or driver.is_fork
+        theirs.close()
+        with pytest.raises(subprocess.TimeoutExpired):
+            driver.wait(0.5)
+        ours.close()
+        assert driver.wait(60) == 0
+
+
 def test_forks_and_zygote_end_with_the_tests_however_these_end(tmp_path: Path) -> None:
     program = (
         "import os, sys\n"

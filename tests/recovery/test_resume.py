@@ -44,8 +44,17 @@ def short_protocol(folder: Path) -> Path:
 @pytest.mark.slow
 def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> None:
     data = tmp_path / "data"
-    with simulated_rig(tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3", host=HOST) as ready:
-        words = ["run", str(short_protocol(tmp_path)), "--rig", ready["rig"], "--data", str(data), "--auto-confirm"]
+    with simulated_rig(tmp_path, "--scene", "3", "--image-width", "320", "--speed-up", "3", host=HOST) as ready:
+        words = [
+            "run",
+            str(short_protocol(tmp_path)),
+            "--rig",
+            ready["rig"],
+            "--data",
+            str(data),
+            "--auto-confirm",
+            "--no-worker",
+        ]
         with started(words, tmp_path / "run.log") as runner:
             wait_for_captures(data, 2, runner, tmp_path / "run.log")
             os.kill(runner.pid, signal.SIGKILL)
@@ -53,7 +62,7 @@ def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> Non
         before, sessions = captured(data), len(recorded(data, SessionStarted))
         assert 2 <= len(before) < 6
 
-        words = ["resume", "latest", "--data", str(data), "--screens"]
+        words = ["resume", "latest", "--data", str(data), "--screens", "--no-worker"]
         with started(words, tmp_path / "resume.log") as again, watched_arm(HOST) as arm:
             wait_for(lambda: len(recorded(data, SessionStarted)) > sessions, again, tmp_path / "resume.log")
             arm.wait_resting()

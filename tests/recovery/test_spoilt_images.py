@@ -17,6 +17,7 @@ from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.run_start import recorded_run
 from service.store.store import Store
+from tests.support.protocols.small_demo import COARSE, SLICE_MM
 from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig
 
 pytestmark = [pytest.mark.timeout(600)]
@@ -52,6 +53,7 @@ def protocol(folder: Path, *wanted: str) -> Path:
     capture["params"]["viewpoints"][0]["arcs"] = [arc]
     for step, measure, least in ((calibration, "views", BOARDS), (capture, "viewpoints_captured", VIEWS)):
         next(gate for gate in step["gates"] if gate["measure"] == measure)["min"] = least
+    next(gate for gate in steps["ct_import"]["gates"] if gate["measure"] == "slice_spacing_mm")["max"] = SLICE_MM
     document["steps"] = [steps[name] for name in wanted]
     path = folder / "spoilt.yaml"
     path.write_text(yaml.safe_dump(document, sort_keys=False))
@@ -61,7 +63,7 @@ def protocol(folder: Path, *wanted: str) -> Path:
 def run(folder: Path, faults: Sequence[Mapping[str, Any]], *wanted: str, host: str) -> Ran:
     """The run with --auto-confirm on a rig whose camera has these faults."""
     plan = json.dumps([{"device": "camera", "on": "image", **fault} for fault in faults])
-    options = ("--scene", "3", "--image-width", "720", "--speed-up", "10", "--ct-voxel-mm", "1.0", "--faults", plan)
+    options = ("--scene", "3", "--image-width", "600", "--speed-up", "10", *COARSE, "--faults", plan)
     with simulated_rig(folder, *options, host=host) as rig:
         answer = orthocapture(
             "run", str(protocol(folder, *wanted)), "--rig", rig["rig"], "--data", str(folder / "data"), "--operator",

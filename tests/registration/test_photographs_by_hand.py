@@ -19,7 +19,7 @@ from simulators.scan_station.station import scan_scene
 from simulators.scene.world import Scene
 from tests.support.scenes.scene_photographs import photograph, pose_above
 
-WIDTH_PX, IMAGES, SEED = 800, 10, 7
+WIDTH_PX, IMAGES, SEED = 640, 8, 7
 
 
 def run(*words: object) -> None:

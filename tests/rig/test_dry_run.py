@@ -58,7 +58,7 @@ def test_a_camera_described_the_wrong_way_round_costs_viewpoints_in_the_plan(tmp
 def test_the_dry_run_takes_its_five_photographs(tmp_path: Path) -> None:
     data = tmp_path / "data"
     with simulated_rig(
-        tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "8", host="127.0.0.37"
+        tmp_path, "--scene", "3", "--image-width", "320", "--speed-up", "8", host="127.0.0.37"
     ) as ready:
         words = ("run", str(DRY_RUN), "--rig", ready["rig"], "--data", str(data), "--auto-confirm")
         done = orthocapture(*words, timeout_s=240)

@@ -31,7 +31,7 @@ from tests.support.rig.rig import REPOSITORY, RigLock, orthocapture, simulated_r
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
 
-SMALL = ("--scene", "3", "--image-width", "480", "--speed-up", "10")
+SMALL = ("--scene", "3", "--image-width", "240", "--speed-up", "10")
 # These rigs use an address of their own, so that they do not wait for those of other tests.
 OWN_HOST = "127.0.0.61"
 

@@ -66,7 +66,7 @@ def test_a_run_driven_from_screens_and_pedal_survives_its_starter(tmp_path: Path
     data = tmp_path / "data"
     with (
         simulated_rig(
-            tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3", host="127.0.0.41"
+            tmp_path, "--scene", "3", "--image-width", "320", "--speed-up", "3", host="127.0.0.41"
         ) as ready,
         no_runner_left(data),
         Store.open(data) as store,

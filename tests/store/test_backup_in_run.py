@@ -16,7 +16,7 @@ from tests.support.protocols.short_protocol import short_protocol
 from tests.support.rig.rig import orthocapture, simulated_rig
 
 pytestmark = [pytest.mark.timeout(400)]
-VIEWS = 16
+VIEWS = 12
 
 
 def captured(data: Path) -> list[str]:
@@ -41,7 +41,7 @@ def wait_for_captures(data: Path, count: int, runner: subprocess.Popen[bytes], l
 def test_a_run_is_backed_up_in_its_capture_and_finished_where_it_was_restored(tmp_path: Path) -> None:
     data, restored = tmp_path / "data", tmp_path / "restored"
     with simulated_rig(
-        tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "2", host="127.0.0.34"
+        tmp_path, "--scene", "3", "--image-width", "320", "--speed-up", "2", host="127.0.0.34"
     ) as ready:
         words = [
             "run",
@@ -51,6 +51,7 @@ def test_a_run_is_backed_up_in_its_capture_and_finished_where_it_was_restored(tm
             "--data",
             str(data),
             "--auto-confirm",
+            "--no-worker",
         ]
         with started(words, tmp_path / "run.log") as runner:
             wait_for_captures(data, 2, runner, tmp_path / "run.log")
@@ -71,7 +72,9 @@ def test_a_run_is_backed_up_in_its_capture_and_finished_where_it_was_restored(tm
 
         rotated = orthocapture("audit", "rotate-key", "--lost", "--reason", "test", "--data", str(restored))
         assert rotated.returncode == 0, rotated.stderr
-        again = orthocapture("resume", "latest", "--data", str(restored), "--auto-confirm", timeout_s=300)
+        again = orthocapture(
+            "resume", "latest", "--data", str(restored), "--auto-confirm", "--no-worker", timeout_s=300
+        )
         assert again.returncode == 0, again.stdout + again.stderr
     after = captured(restored)
     assert after[: len(kept)] == kept

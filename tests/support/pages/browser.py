@@ -32,7 +32,8 @@ DESKTOP = (1920, 1080)
 PASSWORD = "correct horse battery"
 PIN = "246810"
 _FAILURES = REPOSITORY / "build" / "browser-failures"  # screenshots of failed tests
-_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+# The first is the same engine without the interface of a desktop browser, which costs three times as much.
+_NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # Without the last options a browser looks up its vendor's hosts at every start. SwiftShader draws the 3D view.
 _OPTIONS = (
     "--no-sandbox",
@@ -55,8 +56,9 @@ def chromium() -> Generator[Browser]:
     path = next((found for name in _NAMES if (found := shutil.which(name))), None)
     if path is None:
         pytest.fail(
-            "Chromium is not installed, and the browser tests need it: `sudo apt-get install chromium` on Debian, "
-            "`sudo snap install chromium` on Ubuntu, `brew install --cask chromium` on macOS",
+            "Chromium is not installed, and the browser tests need it: "
+            "`sudo apt-get install chromium-headless-shell` on Debian, `sudo snap install chromium` on Ubuntu, "
+            "`brew install --cask chromium` on macOS",
             pytrace=False,
         )
     with sync_playwright() as playwright:
@@ -178,6 +180,13 @@ def add_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
     with Store.open(data) as store:
         desk = People(store)
         desk.accounts.set_up(desk.first_link() or "", "ada", "Ada Example", PASSWORD, PIN)
+    invite_people(data, people)
+
+
+def invite_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
+    """Create further accounts of that kind: the administrator Ada is there already."""
+    with Store.open(data) as store:
+        desk = People(store)
         token = desk.sign_in("ada", PASSWORD)
         administrator = desk.person(token, idle_lock_s=600, deliberate=True)
         assert administrator is not None

@@ -51,6 +51,9 @@ _statuses: list[int] = []  # of this process, if it is a fork that has come to i
 MOST_PASSED = 4  # descriptors that a process may get besides those
 _RIG = "rig"  # the simulator that starts others
 _DESCRIBE = "--describe"  # asks for the options of the simulator that is named next
+# Commands that start drivers, workers and runners, and the commands that these are.
+_STARTING = ("run", "resume", "serve", "import", "doctor")
+_STARTED = ("worker", "resume")
 _LATE = ("simulators.rendering.render",)  # what simulators import only once they need it
 _DRIVERS = (  # and what they import only once they are opened
     "drivers.gphoto.camera", "drivers.ur.robot", "drivers.ur.vendor", "drivers.grbl.table", "drivers.kuka.robot",
@@ -76,6 +79,11 @@ class _Request:
         return self.module == SIMULATORS and self.words[:1] == [_RIG]
 
     @property
+    def starts_others(self) -> bool:
+        """Whether it starts processes that can be forked."""
+        return self.is_rig or (self.module == COMMANDS and "".join(self.words[:1]) in _STARTING)
+
+    @property
     def main(self) -> str:
         """The module that will run as `__main__`."""
         return f"{self.module}.__main__" if self.module in (SIMULATORS, HOST) else self.module
@@ -88,6 +96,7 @@ class _Zygote:
     control: int
     environment: dict[str, str]  # as it was when this process began
     prepared: set[tuple[str, ...]] = field(default_factory=set[tuple[str, ...]])  # kinds of processes
+    ends_children: bool = True  # at its end; otherwise they go on, as those of a program do
     children: dict[int, tuple[int, int]] = field(default_factory=dict[int, tuple[int, int]])  # pidfd: pid, to tell
 
     def serve(self) -> _Request | None:
@@ -102,7 +111,8 @@ class _Zygote:
                     continue
                 told, request, descriptors = self._receive()
                 if request is None:
-                    self._end()
+                    if self.ends_children:
+                        self._end()
                     return None
                 self._prepare(request)
                 pid = os.fork()
@@ -143,8 +153,12 @@ class _Zygote:
             self.prepared.update((SIMULATORS, name) for name in names)
             needed = [*(known[name][0] for name in names), *(_LATE if names else ())]
         elif request.module == COMMANDS:  # it imports the module of a command on demand
-            place = vars(main)["_COMMANDS"].get(word)
-            needed = [place.place.partition(":")[0]] if place else []
+            commands = vars(main)["_COMMANDS"]
+            names = {word, *_STARTED} if request.starts_others else {word}
+            needed = [commands[name].place.partition(":")[0] for name in sorted(names) if name in commands]
+            if request.starts_others:
+                self.prepared.update({(HOST,), *((COMMANDS, name) for name in _STARTED)})
+                needed += [f"{HOST}.__main__", *_DRIVERS]
         elif request.module == HOST:  # it is told its driver later
             needed = list(_DRIVERS)
         else:
@@ -246,10 +260,11 @@ def _write(descriptor: int, number: int) -> None:
     os.write(descriptor, number.to_bytes(_NUMBER_BYTES, "little", signed=True))
 
 
-def _below(zygote: _Zygote, rig: _Request) -> _Request | None:
-    """Let this process, a rig, fork its simulators from a zygote of its own, which is forked before any thread is.
+def _below(zygote: _Zygote, asked: _Request) -> tuple[_Request | None, bool]:
+    """Let this process fork what it starts from a zygote of its own, which is forked before any thread is.
 
-    Returns twice: the rig's own request, and in each fork of that zygote its request. None is that zygote's end.
+    Returns twice: the process's own request, and in each fork of that zygote its request, with whether this is such a
+    fork. None is that zygote's end.
     """
     ours, theirs = socket.socketpair()
     pid = os.fork()
@@ -259,12 +274,13 @@ def _below(zygote: _Zygote, rig: _Request) -> _Request | None:
         with open(os.devnull, "r+b") as nowhere:  # not the rig's, whose end its reader waits for
             for descriptor in _STANDARD[:2]:
                 os.dup2(nowhere.fileno(), descriptor)
-        return _Zygote(theirs.detach(), rig.env, zygote.prepared).serve()
+        below = _Zygote(theirs.detach(), asked.env, zygote.prepared, ends_children=asked.is_rig)
+        return below.serve(), True
     theirs.close()
     forked: Any = importlib.import_module("tests.support.processes.forked")
     forked.use(ours, pid)
     subprocess.Popen = forked.Forked  # pyright: ignore[reportAttributeAccessIssue]
-    return rig
+    return asked, False
 
 
 def _leave_at_once() -> None:
@@ -283,8 +299,9 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tests, and they end this
     _of_tests = _Zygote(int(sys.argv[1]), dict(os.environ))
     _asked = _of_tests.serve()
-    if _asked is not None and _asked.is_rig:
-        _asked = _below(_of_tests, _asked)
+    _fresh = True  # whether it is a fork that has no zygote of its own yet
+    while _fresh and _asked is not None and _asked.starts_others:
+        _asked, _fresh = _below(_of_tests, _asked)
     try:
         if _asked is not None and _asked.script:
             runpy.run_path(_asked.script, run_name="__main__")
