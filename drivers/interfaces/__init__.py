@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drivers.interfaces.camera import Camera, CameraSettings, CapturedFile, CapturedImage
 from drivers.interfaces.device import Array, Device, DeviceIdentity, DeviceReport, Transform
-from drivers.interfaces.lightbox import EnvironmentReading, Lightbox, TowerLight
+from drivers.interfaces.lightbox import EnvironmentReading, Lightbox, PedalReading, TowerLight
 from drivers.interfaces.robot import (
     Payload,
     RobotArm,
@@ -44,6 +44,7 @@ __all__ = [
     "Lightbox",
     "Mesh",
     "Payload",
+    "PedalReading",
     "RobotArm",
     "RobotSample",
     "RobotState",
