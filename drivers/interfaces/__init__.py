@@ -6,6 +6,7 @@ from drivers.interfaces.camera import Camera, CameraSettings, CapturedFile, Capt
 from drivers.interfaces.device import Array, Device, DeviceIdentity, DeviceReport, Transform
 from drivers.interfaces.lightbox import EnvironmentReading, Lightbox, PedalReading, TowerLight
 from drivers.interfaces.robot import (
+    Abandoned,
     Payload,
     RobotArm,
     RobotSample,
@@ -27,6 +28,7 @@ from drivers.interfaces.surfaces import (
 )
 
 __all__ = [
+    "Abandoned",
     "Array",
     "Camera",
     "CameraSettings",

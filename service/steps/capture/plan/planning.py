@@ -22,6 +22,7 @@ from service.compute.planning.motion_plan import (
 from service.compute.planning.optics import depth_of_field
 from service.core.arms.known import known_arm
 from service.core.arms.model import ArmModel
+from service.core.arms.motion_limits import motion_problems
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from service.core.protocol.models import Motion
@@ -122,7 +123,18 @@ def arm_at_station(context: StepContext, station: str, T_flange_camera: Transfor
     model = known_arm(collision.arm or context.devices.robot(station).report().identity.model)
     if model is None:
         return None
+    _require_slow_enough(context, layout, model)
     return ArmAtStation(layout, model, T_flange_camera, collision, optics, context.protocol.motion)
+
+
+def _require_slow_enough(context: StepContext, layout: StationLayout, model: ArmModel) -> None:
+    """Refuse a motion faster than this arm may move, or than it can stop in time. Raises ConfigurationError."""
+    for field, words in motion_problems(context.protocol.motion, [model], layout.abandoned):
+        raise ConfigurationError(
+            f"{field} of the protocol's motion is too large: {words}",
+            where=f"station {layout.name}",
+            remedy="Lower it in the protocol; docs/decisions/0013-leave-to-move.md says how fast an arm may move",
+        )
 
 
 def plan_step(
