@@ -42,6 +42,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import DeviceIdentity, DeviceReport, EnvironmentReading, PedalReading, TowerLight
 from drivers.plugin import DriverConfig, DriverSpec
+from service.core.units import seconds_of_ms
 
 _LINK_ERRORS = (serial.SerialException, OSError, termios.error)
 _ATTEMPTS = 3
@@ -121,7 +122,7 @@ class SerialLightbox:
         last: PedalReading | None = None
         for _ in range(_PEDAL_READINGS):
             count, *times = map(int, self._ask("PEDAL?", "PEDAL").split(" "))
-            reading = PedalReading(count, *(milliseconds / 1000 for milliseconds in times))
+            reading = PedalReading(count, *(seconds_of_ms(time_ms) for time_ms in times))
             if last is not None and (last.presses, last.pressed_s) == (reading.presses, reading.pressed_s):
                 return reading
             last = reading

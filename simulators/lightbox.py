@@ -15,6 +15,7 @@ from types import FrameType
 from simulators.faults import Fault, FaultPlan
 from simulators.serial_line import Terminal
 from simulators.serve import SimulatorError, Termination, announce
+from simulators.units import ms
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +101,7 @@ class Lightbox:
         return self._firmware == "1.4"
 
     def _now_ms(self) -> int:
-        return round(1000 * (time.monotonic() - self._on_since_s))
+        return round(ms(time.monotonic() - self._on_since_s))
 
     def plug_in(self) -> str:
         """Plug the line in and send the banner; returns the path of the terminal."""
@@ -195,7 +196,7 @@ class Lightbox:
         """Return the count of the pedal, and from firmware 1.4 the times of the last press and of this reply."""
         of_rig = int(view.get("pedal_presses", 0))
         if of_rig != self._rig_pressed:
-            ago_ms = round(1000 * view.get("pedal_ago_s", 0.0))
+            ago_ms = round(ms(view.get("pedal_ago_s", 0.0)))
             self._rig_pressed, self._pressed_ms = of_rig, max(self._now_ms() - ago_ms, 1)
         count = f"PEDAL {self._pressed + of_rig}"
         return f"{count} {self._pressed_ms} {self._now_ms()}" if self._checks else count
