@@ -49,6 +49,10 @@ class LeaveNeededError(DeviceError):
     """A person must confirm motion first: the arm was just connected, or its program ended unexpectedly."""
 
 
+class ArmDepartedError(DeviceError):
+    """The arm does not stand where it was sent: somebody or something moved it."""
+
+
 class UnreachablePoseError(DeviceError):
     """The controller has no joint solution for this pose."""
 

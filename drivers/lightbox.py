@@ -9,14 +9,23 @@ late reply or noise is recognised and skipped. Lines that begin with # are comme
     TEMP?        TEMP <degrees Celsius>      decimal number
     SHUTTER?     SHUTTER <0|1>               1: relay closed
     SHUTTER 0|1  SHUTTER <0|1>               the state after switching
-    PEDAL?       PEDAL <count>               presses since power-up
+    PEDAL?       PEDAL <count> <last> <now>  presses since power-up; milliseconds since power-up of the last press (0
+                                             before the first) and of this reply; before firmware 1.4 the count alone
     TOWER OFF|GREEN|YELLOW|RED   TOWER <light that is on>   one light of the signal tower; boxes before firmware 1.3
                                                             have none and answer ERR 1
-    other        ERR <code> <text>           1 unknown request, 2 wrong argument, 3 sensor fault
+    other        ERR <code> <text>           1 unknown request, 2 wrong argument, 3 sensor fault, 4 wrong checksum
+
+From firmware 1.4 each reply ends with `*` and its checksum: CRC-16/XMODEM of all that precedes the `*`, in four
+digits to base 16. A digit is the character 0x30 + its value (0 to 9, then : ; < = > ?) rather than hexadecimal,
+so that a bit of the checksum is a bit of the line. So no error of up to three bits passes (P. Koopman and
+T. Chakravarty, "Cyclic redundancy code (CRC) polynomial selection for embedded networks", 2004: a distance of 4 for
+lines of this length), and what noise made of a number is not believed. A request may end so too; with a wrong
+checksum it is refused with ERR 4.
 """
 
 from __future__ import annotations
 
+import binascii
 import math
 import termios
 import time
@@ -31,19 +40,22 @@ from drivers.errors import (
     DeviceTimeoutError,
     DeviceUnavailableError,
 )
-from drivers.interfaces import DeviceIdentity, DeviceReport, EnvironmentReading, TowerLight
+from drivers.interfaces import DeviceIdentity, DeviceReport, EnvironmentReading, PedalReading, TowerLight
 from drivers.plugin import DriverConfig, DriverSpec
+from service.core.units import seconds_of_ms
 
 _LINK_ERRORS = (serial.SerialException, OSError, termios.error)
 _ATTEMPTS = 3
 _MAX_LINE = 256
+_SEND_AGAIN = ""  # no reply has this value
+_PEDAL_READINGS = 6  # until two in a row agree; a press may fall between two
 
 
 _LIGHTS = tuple(light.value for light in TowerLight)
 
 
-class _UnknownRequestError(DeviceRefusedError):
-    """The box's firmware is too old to know the request."""
+class _NotUnderstoodError(DeviceRefusedError):
+    """The box does not know the request or its argument: its firmware is too old for it."""
 
 
 class LightboxConfig(DriverConfig):
@@ -62,11 +74,12 @@ class SerialLightbox:
         self._port: serial.Serial | None = None
         self._pending = b""
         self._has_tower = True  # until the box refuses the request
+        self._checks = False  # whether this box ends its lines with a checksum
 
     def open(self) -> DeviceIdentity:
         """Open the port and return the box's identity; skips unsolicited lines such as the banner."""
         self.close()
-        self._has_tower = True
+        self._has_tower, self._checks = True, False
         return self._identity()
 
     def close(self) -> None:
@@ -85,9 +98,11 @@ class SerialLightbox:
         problems: list[str] = []
         for request, unit in (("LIGHT", "lx"), ("TEMP", "°C"), ("SHUTTER", ""), ("PEDAL", "")):
             try:
-                details[request.lower()] = f"{self._ask(f'{request}?', request)} {unit}".strip()
+                number = self._ask(f"{request}?", request).partition(" ")[0]  # of the pedal, the count alone
             except DeviceRefusedError as error:
                 problems.append(str(error))
+            else:
+                details[request.lower()] = f"{number} {unit}".strip()
         return DeviceReport(identity=identity, details=details, problems=tuple(problems))
 
     def read(self) -> EnvironmentReading:
@@ -99,9 +114,23 @@ class SerialLightbox:
             monotonic_s=time.monotonic(),
         )
 
-    def pedal_presses(self) -> int:
-        """Return the number of pedal presses since the box was powered up."""
-        return int(self._number("PEDAL"))
+    def pedal(self) -> PedalReading:
+        """Return the foot pedal's count, as two readings in a row agree on it.
+
+        Raises DeviceFaultError if no two do: what comes over the line is noise.
+        """
+        last: PedalReading | None = None
+        for _ in range(_PEDAL_READINGS):
+            count, *times = map(int, self._ask("PEDAL?", "PEDAL").split(" "))
+            reading = PedalReading(count, *(seconds_of_ms(time_ms) for time_ms in times))
+            if last is not None and (last.presses, last.pressed_s) == (reading.presses, reading.pressed_s):
+                return reading
+            last = reading
+        raise DeviceFaultError(
+            f"the foot pedal's count differs in each of {_PEDAL_READINGS} readings",
+            where=self._config.port,
+            remedy="Check the cable of the light box and of its pedal: the line is disturbed",
+        )
 
     def show_tower(self, light: TowerLight) -> bool:
         """Switch on one light of the signal tower, or none.
@@ -112,7 +141,7 @@ class SerialLightbox:
             return False
         try:
             lit = self._ask(f"TOWER {light.value}", "TOWER")
-        except _UnknownRequestError:
+        except _NotUnderstoodError:
             self._has_tower = False
             return False
         if lit != light.value:
@@ -125,6 +154,12 @@ class SerialLightbox:
 
     def _identity(self) -> DeviceIdentity:
         fields = [field.strip() for field in self._ask("*IDN?", "*IDN").split(",")]
+        if len(fields) == 4 and not self._checks and _checks_lines(fields[3]):
+            raise DeviceFaultError(
+                f"its identity {','.join(fields)!r} comes without the checksum of its firmware",
+                where=self._config.port,
+                remedy="Check the cable of the light box: the line is disturbed",
+            )
         if len(fields) != 4:
             raise DeviceFaultError(
                 f"this is not a light box: it identifies itself as {','.join(fields)!r}",
@@ -147,17 +182,25 @@ class SerialLightbox:
     def _ask(self, request: str, name: str) -> str:
         """Send a request and return the value of the reply named `name`; retries if no usable reply comes in time."""
         heard = b""
+        refused: DeviceRefusedError | None = None
         try:
             port = self._opened()
             for _ in range(_ATTEMPTS):
                 # The buffer can hold a banner or the reply to an earlier request.
                 port.reset_input_buffer()
                 self._pending = b""
-                port.write(request.encode("ascii") + b"\n")
+                port.write((with_checksum(request) if self._checks else request).encode("ascii") + b"\n")
                 deadline = time.monotonic() + self._config.timeout_s
                 while (line := self._line(port, deadline)) is not None:
                     heard = line or heard
-                    value = self._value(line, request, name)
+                    try:
+                        value = self._value(line, request, name)
+                    except _NotUnderstoodError as error:
+                        if not self._checks:
+                            raise
+                        refused, value = error, _SEND_AGAIN  # its checksum may have been what was disturbed
+                    if value == _SEND_AGAIN:
+                        break
                     if value is not None:
                         return value
         except _LINK_ERRORS as error:
@@ -167,6 +210,8 @@ class SerialLightbox:
                 where=self._config.port,
                 remedy="Check the cable and the power of the box; it is opened again at the next request",
             ) from error
+        if refused is not None:
+            raise refused
         detail = f"; it said {heard[:40]!r}" if heard else ""
         raise DeviceTimeoutError(
             f"no usable reply to {request} in {_ATTEMPTS} × {self._config.timeout_s:g} s{detail}",
@@ -201,18 +246,46 @@ class SerialLightbox:
         return line.strip()
 
     def _value(self, line: bytes, request: str, name: str) -> str | None:
-        """The value if this line is the expected reply, otherwise None. Raises DeviceRefusedError for ERR."""
+        """Return the value if this line is the expected reply, None if another may follow, or _SEND_AGAIN.
+
+        Raises DeviceRefusedError for ERR.
+        """
         if not line.isascii():
             return None
-        word, _, value = line.decode("ascii").partition(" ")
+        text = line.decode("ascii")
+        bare = without_checksum(text)
+        if bare is None and self._checks:
+            return None if text.startswith("#") else _SEND_AGAIN  # disturbed on its way here
+        self._checks = bare is not None
+        word, _, value = (text if bare is None else bare).partition(" ")
         if word == "ERR":
-            refusal = _UnknownRequestError if value.split(" ")[0] == "1" else DeviceRefusedError
+            if value.startswith("4"):
+                return _SEND_AGAIN  # disturbed on its way there
+            refusal = _NotUnderstoodError if value.split(" ")[0] in ("1", "2") else DeviceRefusedError
             raise refusal(
                 f"the light box refuses {request}: {value}",
                 where=self._config.port,
                 remedy="See the box's manual for the error; check its sensors",
             )
         return value if word == name and value.isprintable() and _usable(name, value) else None
+
+
+def with_checksum(line: str) -> str:
+    """Return a line with its checksum, as boxes from firmware 1.4 send and take it."""
+    checksum = binascii.crc_hqx(line.encode("ascii"), 0)
+    return f"{line}*{''.join(chr(0x30 + (checksum >> shift & 15)) for shift in (12, 8, 4, 0))}"
+
+
+def without_checksum(line: str) -> str | None:
+    """Return a line without its checksum; None if it has none, or a wrong one."""
+    bare = line[:-5]
+    return bare if line == with_checksum(bare) else None
+
+
+def _checks_lines(firmware: str) -> bool:
+    """Whether boxes of this firmware end their lines with a checksum."""
+    numbers = firmware.split(".")
+    return len(numbers) == 2 and all(n.isdecimal() for n in numbers) and tuple(map(int, numbers)) >= (1, 4)
 
 
 def _usable(name: str, value: str) -> bool:
@@ -222,8 +295,11 @@ def _usable(name: str, value: str) -> bool:
             return True
         case "TOWER":
             return value in _LIGHTS
-        case "SHUTTER" | "PEDAL":
-            return value.isdigit()
+        case "SHUTTER":
+            return value.isdecimal()
+        case "PEDAL":
+            numbers = value.split(" ")
+            return len(numbers) in (1, 3) and all(number.isdecimal() and len(number) < 16 for number in numbers)
         case _:
             try:
                 return math.isfinite(float(value))

@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict
 
-from drivers.interfaces import Device
+from drivers.interfaces import Abandoned, Device
 
 READING_TIMEOUT_S = 45.0
 
@@ -17,6 +17,11 @@ class DriverConfig(BaseModel):
     """Base class of a driver's section in rig.yaml."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    @property
+    def abandoned(self) -> Abandoned | None:
+        """What becomes of a motion whose program died; None for a device that limits its speed by itself."""
+        return None
 
     @property
     def longest_call_s(self) -> float:

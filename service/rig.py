@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
+from drivers.interfaces import Abandoned
 from service.core.errors import ConfigurationError, DataError, ProtocolError
 from service.core.records.events import Record
 from service.core.records.import_list import ImportList
@@ -157,6 +158,14 @@ class SigningSection(Record):
 
     pin: bool = False  # a PIN may
     badge: bool = False  # read by a reader that types the code and Enter
+
+
+@dataclass(frozen=True, slots=True)
+class RigDevice:
+    """What the driver of a device in the rig file says of it."""
+
+    kind: str  # robot, camera, scanner, ct or lightbox
+    abandoned: Abandoned | None  # what becomes of its motion if the program that drives it dies
 
 
 class RigSection(Record):

@@ -12,7 +12,7 @@ from service.core.protocol.models import LoadedProtocol, Protocol
 from service.core.records.entered import RunAbout
 from service.core.records.events import ActionAfterEnd, ActionRefused, OperatorAction, RunStarted
 from service.core.run.state import RunState
-from service.rig import Rig, parse_recorded_rig, read_rig
+from service.rig import Rig, RigDevice, parse_recorded_rig, read_rig
 from service.run_record import recorded_protocol, recorded_root
 from service.runner.software import software_versions
 from service.steps.protocol_check import require_devices, require_plausible
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
 _SCHEMES = ("ptpip:", "socket://")
 
 
-def require_runnable(loaded: LoadedProtocol, rig: Rig, device_kinds: Mapping[str, str]) -> None:
+def require_runnable(loaded: LoadedProtocol, rig: Rig, devices: Mapping[str, RigDevice]) -> None:
     """Refuse what could not be run to its end: it would fail hours later, when little can be done again.
 
     Args:
         loaded: the protocol.
         rig: the rig. One without any device captures nothing, so that its stations and devices are not asked for.
-        device_kinds: of the rig's devices by name, as the station knows them.
+        devices: of the rig by name, as the station knows them.
 
     Raises:
         ProtocolError: params name the wrong steps, a gate a measure that its step does not have, or a step a station
-            that the rig does not have.
+            that the rig does not have; or an arm would move too fast.
         ConfigurationError: the rig lacks a device of a step.
     """
     captures = bool(rig.section.devices)
-    require_plausible(loaded, f"{loaded.protocol.id}.yaml", rig.section if captures else None)
+    require_plausible(loaded, f"{loaded.protocol.id}.yaml", rig.section if captures else None, devices)
     if captures:
-        require_devices(loaded.protocol, rig, device_kinds)
+        require_devices(loaded.protocol, rig, devices)
 
 
 def start_run(

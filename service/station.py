@@ -17,6 +17,7 @@ from drivers.errors import DeviceUnavailableError, SafetyStopError
 from drivers.host.device_lock import DeviceLock
 from drivers.host.hosted_device import hosted
 from drivers.interfaces import (
+    Abandoned,
     Camera,
     CtSource,
     Device,
@@ -32,7 +33,7 @@ from service.core.declared_kinds import plug_ins
 from service.core.errors import ConfigurationError
 from service.core.records.import_list import ImportList
 from service.core.text.checked_yaml import problem_of, refuse
-from service.rig import CollisionSection, FurtherCameraSection, LensSection, OpticsSection, Rig
+from service.rig import CollisionSection, FurtherCameraSection, LensSection, OpticsSection, Rig, RigDevice
 from service.steps.context import FurtherCamera, LeaveToMove, StationLayout
 
 GROUP = "orthocapture.drivers"
@@ -251,6 +252,10 @@ class Station:
         """The kind of a device: robot, camera, scanner, ct or lightbox."""
         return self._spec(name)[0].kind
 
+    def abandoned(self, name: str) -> Abandoned | None:
+        """What becomes of a motion of this device whose program died, by its section of the rig file."""
+        return self._config(name, self._spec(name)[0]).abandoned
+
     def _of_kind(self, kind: str) -> list[str]:
         return [name for name in self.names() if self.kind_of(name) == kind]
 
@@ -318,10 +323,13 @@ def _one_name(field: str, address: str) -> str:
         return address
 
 
-def device_kinds(rig: Rig) -> dict[str, str]:
-    """The kind of each device in a rig file, by name. Raises ConfigurationError if a driver is not installed."""
+def devices_of(rig: Rig) -> dict[str, RigDevice]:
+    """Return what the drivers say of each device in a rig file, by name.
+
+    Raises ConfigurationError if a driver is not installed, or refuses its section.
+    """
     station = Station(rig)
-    return {name: station.kind_of(name) for name in station.names()}
+    return {name: RigDevice(station.kind_of(name), station.abandoned(name)) for name in station.names()}
 
 
 def layout_of(rig: Rig, station: str) -> StationLayout:
@@ -335,8 +343,12 @@ def layout_of(rig: Rig, station: str) -> StationLayout:
     azimuth = math.radians(section.approach_azimuth_deg)
     approach = (math.cos(azimuth), math.sin(azimuth), 0.0)
     obstacles = tuple(section.obstacles.items())
-    is_arm = _is_arm(rig.section.devices.get(section.robot, {}).get("driver"))
-    return StationLayout(station, section.robot, section.scene_centre_m, approach, obstacles, is_arm=is_arm)
+    driver = rig.section.devices.get(section.robot, {}).get("driver")
+    is_arm = _is_arm(driver)
+    abandoned = Station(rig).abandoned(section.robot) if is_arm and driver in _installed() else None
+    return StationLayout(
+        station, section.robot, section.scene_centre_m, approach, obstacles, is_arm=is_arm, abandoned=abandoned
+    )
 
 
 def _is_arm(driver: object) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import binascii
 import json
 import logging
 import signal
@@ -14,26 +15,30 @@ from types import FrameType
 from simulators.faults import Fault, FaultPlan
 from simulators.serial_line import Terminal
 from simulators.serve import SimulatorError, Termination, announce
+from simulators.units import ms
 
 log = logging.getLogger(__name__)
 
 BANNER = b"# ORTHO-LB1 light and environment box ready\r\n"
-IDENTITY = "orthocapture,ORTHO-LB1 simulated,LB-0001,1.3"
-OLD_IDENTITY = "orthocapture,ORTHO-LB1 simulated,LB-0001,1.2"  # without a signal tower
+IDENTITY = "orthocapture,ORTHO-LB1 simulated,LB-0001"
+FIRMWARES = ("1.2", "1.3", "1.4")  # 1.3 has a signal tower; 1.4 ends lines with a checksum, and times the pedal
 TOWER_LIGHTS = ("OFF", "GREEN", "YELLOW", "RED")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--link", type=Path, metavar="PATH", help="symbolic link to the pseudo-terminal")
-    parser.add_argument("--without-tower", action="store_true", help="a box of firmware 1.2, without a signal tower")
+    parser.add_argument(
+        "--firmware", choices=FIRMWARES, default=FIRMWARES[-1],
+        help="1.2 has no signal tower; before 1.4 lines have no checksum, and presses of the pedal no time",
+    )  # fmt: skip
     parser.add_argument("--world", metavar="HOST:PORT", help="control socket of the rig that knows light and pedal")
 
 
 def serve(args: argparse.Namespace) -> None:
     """Serve until SIGTERM; each SIGUSR1 is one press of the pedal."""
     termination = Termination()
-    box = Lightbox(args.faults, World(args.world) if args.world else None, args.link, tower=not args.without_tower)
+    box = Lightbox(args.faults, World(args.world) if args.world else None, args.link, firmware=args.firmware)
 
     def press(number: int, frame: FrameType | None) -> None:
         del number, frame
@@ -60,13 +65,13 @@ class World:
         self._asked_s = -1.0
 
     def view(self) -> dict[str, float]:
-        """Return light_lux, temperature_c and pedal_presses; the last known values if the world does not answer."""
+        """Return light, temperature and pedal; the last known values if the world does not answer."""
         if time.monotonic() - self._asked_s > 0.05:
             try:
                 with socket.create_connection(self._address, timeout=1.0) as link, link.makefile("rb") as lines:
                     link.sendall(b'{"op": "view"}\n')
                     answer = json.loads(lines.readline())
-                keys = ("light_lux", "temperature_c", "pedal_presses")
+                keys = ("light_lux", "temperature_c", "pedal_presses", "pedal_ago_s")
                 self._view = {key: float(answer[key]) for key in keys if key in answer}
                 self._asked_s = time.monotonic()
             except (OSError, ValueError) as error:
@@ -77,14 +82,26 @@ class World:
 class Lightbox:
     """The state of the box and its end of the serial line."""
 
-    def __init__(self, faults: FaultPlan, world: World | None, link: Path | None, *, tower: bool = True) -> None:
+    def __init__(
+        self, faults: FaultPlan, world: World | None, link: Path | None, *, firmware: str = FIRMWARES[-1]
+    ) -> None:
         self._faults = faults
         self._world = world
         self._line = Terminal(link)
         self._heard = b""
         self._shutter = 0
-        self._pressed = 0
-        self._tower = "OFF" if tower else None
+        self._on_since_s = time.monotonic()
+        self._pressed, self._pressed_ms = 0, 0  # by its own pedal; the last press, of the rig's pedal too
+        self._rig_pressed = 0
+        self._firmware = firmware
+        self._tower = None if firmware == "1.2" else "OFF"
+
+    @property
+    def _checks(self) -> bool:
+        return self._firmware == "1.4"
+
+    def _now_ms(self) -> int:
+        return round(ms(time.monotonic() - self._on_since_s))
 
     def plug_in(self) -> str:
         """Plug the line in and send the banner; returns the path of the terminal."""
@@ -99,6 +116,7 @@ class Lightbox:
     def press_pedal(self) -> None:
         """Press the pedal once, without a rig."""
         self._pressed += 1
+        self._pressed_ms = self._now_ms()
 
     def serve_once(self, timeout_s: float) -> None:
         """Answer the requests that arrive within `timeout_s`."""
@@ -110,14 +128,22 @@ class Lightbox:
                 self._reply(request)
 
     def _reply(self, request: str) -> None:
+        bare, star, checksum = request.rpartition("*")
+        if self._checks and star and bare:
+            request, wrong = bare, checksum != _checksum(bare)
+        else:
+            wrong = False
         fault = self._faults.check("lightbox", request)
-        answer = (self._answer(request) + "\r\n").encode("ascii")
+        answer = self._line_of("ERR 4 wrong checksum" if wrong else self._answer(request))
         if fault is not None:
             log.info("fault %s at %s", fault.kind, request)
             if self._spoiled(fault, answer):
                 return
-            answer = b"ERR 3 sensor fault\r\n" if fault.kind == "reject" else answer
+            answer = self._line_of("ERR 3 sensor fault") if fault.kind == "reject" else answer
         self._line.send(answer)
+
+    def _line_of(self, answer: str) -> bytes:
+        return (f"{answer}*{_checksum(answer)}\r\n" if self._checks else f"{answer}\r\n").encode("ascii")
 
     def _spoiled(self, fault: Fault, answer: bytes) -> bool:
         """Apply the fault; returns whether it replaces the answer."""
@@ -147,10 +173,10 @@ class Lightbox:
     def _answer(self, request: str) -> str:
         view = self._world.view() if self._world is not None else {}
         readings = {
-            "*IDN?": f"*IDN {OLD_IDENTITY if self._tower is None else IDENTITY}",
+            "*IDN?": f"*IDN {IDENTITY},{self._firmware}",
             "LIGHT?": f"LIGHT {view.get('light_lux', 45_000.0):.1f}",
             "TEMP?": f"TEMP {view.get('temperature_c', 21.5):.2f}",
-            "PEDAL?": f"PEDAL {self._pressed + int(view.get('pedal_presses', 0))}",
+            "PEDAL?": self._pedal(view),
         }
         if request in ("SHUTTER 0", "SHUTTER 1"):
             self._shutter = int(request[-1])
@@ -165,3 +191,18 @@ class Lightbox:
             return f"TOWER {self._tower}"
         wrong = "ERR 2 wrong argument" if request.startswith("SHUTTER") else "ERR 1 unknown request"
         return readings.get(request, wrong)
+
+    def _pedal(self, view: dict[str, float]) -> str:
+        """Return the count of the pedal, and from firmware 1.4 the times of the last press and of this reply."""
+        of_rig = int(view.get("pedal_presses", 0))
+        if of_rig != self._rig_pressed:
+            ago_ms = round(ms(view.get("pedal_ago_s", 0.0)))
+            self._rig_pressed, self._pressed_ms = of_rig, max(self._now_ms() - ago_ms, 1)
+        count = f"PEDAL {self._pressed + of_rig}"
+        return f"{count} {self._pressed_ms} {self._now_ms()}" if self._checks else count
+
+
+def _checksum(line: str) -> str:
+    """Return CRC-16/XMODEM of a line as four digits to base 16, each the character 0x30 + its value."""
+    checksum = binascii.crc_hqx(line.encode("ascii", "replace"), 0)
+    return "".join(chr(0x30 + (checksum >> shift & 15)) for shift in (12, 8, 4, 0))

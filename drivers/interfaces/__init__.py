@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from drivers.interfaces.camera import Camera, CameraSettings, CapturedFile, CapturedImage
 from drivers.interfaces.device import Array, Device, DeviceIdentity, DeviceReport, Transform
-from drivers.interfaces.lightbox import EnvironmentReading, Lightbox, TowerLight
+from drivers.interfaces.lightbox import EnvironmentReading, Lightbox, PedalReading, TowerLight
 from drivers.interfaces.robot import (
+    Abandoned,
     Payload,
     RobotArm,
     RobotSample,
@@ -27,6 +28,7 @@ from drivers.interfaces.surfaces import (
 )
 
 __all__ = [
+    "Abandoned",
     "Array",
     "Camera",
     "CameraSettings",
@@ -44,6 +46,7 @@ __all__ = [
     "Lightbox",
     "Mesh",
     "Payload",
+    "PedalReading",
     "RobotArm",
     "RobotSample",
     "RobotState",

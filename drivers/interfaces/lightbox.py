@@ -19,6 +19,19 @@ class EnvironmentReading:
     monotonic_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class PedalReading:
+    """The count of the foot pedal, and when it was last pressed by the clock of the box.
+
+    The times are seconds since the box was switched on; None where the box does not tell them. Two presses are set
+    apart by them alone: what the host knows of a press is only that it lies between two of its readings.
+    """
+
+    presses: int  # since the box was switched on
+    pressed_s: float | None = None  # the last press; 0.0 before the first
+    now_s: float | None = None  # the reading itself
+
+
 class TowerLight(Enum):
     """One light of a signal tower that can be seen across the room."""
 
@@ -35,8 +48,8 @@ class Lightbox(Device, Protocol):
         """Return the current light level, temperature and relay state."""
         ...
 
-    def pedal_presses(self) -> int:
-        """Return the number of pedal presses since the box started; an increase means a new press."""
+    def pedal(self) -> PedalReading:
+        """Return the foot pedal's count, as two readings in a row agree on it."""
         ...
 
     def show_tower(self, light: TowerLight) -> bool:

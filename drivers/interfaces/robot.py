@@ -27,6 +27,14 @@ class SafetyState(Enum):
 
 
 @dataclass(frozen=True, slots=True)
+class Abandoned:
+    """What becomes of a motion whose program died: the controller notices, and the arm brakes."""
+
+    noticed_after_s: float  # until the controller ends the motion
+    rest_within_s: float  # longest time that the site allows until the arm stands
+
+
+@dataclass(frozen=True, slots=True)
 class Payload:
     """The load on the flange: camera, lens and mount."""
 

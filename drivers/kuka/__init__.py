@@ -6,10 +6,14 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
+from drivers.interfaces import Abandoned
 from drivers.plugin import DriverConfig, DriverSpec
 
 if TYPE_CHECKING:
     from drivers.interfaces import Device
+
+
+HEARTBEAT_S = 0.3  # without one, the Sunrise application stops the arm (sunrise/engine, Engine.java)
 
 
 class KukaConfig(DriverConfig):
@@ -29,6 +33,12 @@ class KukaConfig(DriverConfig):
         gt=0,
         description="time after which a moving arm is stopped whose program is alive but does not query it",
     )
+    rest_within_s: float = Field(
+        default=0.55,
+        gt=0,
+        description="longest time until the arm stands after the program that drives it died: a protocol that moves "
+        "faster than the arm brakes in it is refused",
+    )
     fri_port: int | None = Field(
         default=None,
         ge=1,
@@ -41,6 +51,11 @@ class KukaConfig(DriverConfig):
         description="address of this machine in the network of FRI, if that is not the application's (KONI)",
     )
     fri_period_ms: int = Field(default=10, ge=1, le=100, description="milliseconds between two messages of FRI")
+
+    @property
+    def abandoned(self) -> Abandoned:
+        """The application ends the motion."""
+        return Abandoned(HEARTBEAT_S, self.rest_within_s)
 
 
 def _build(config: KukaConfig) -> Device:

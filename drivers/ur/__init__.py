@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, cast
 from pydantic import Field
 
 from drivers.errors import DriverMissingError
+from drivers.interfaces import Abandoned
 from drivers.plugin import DriverConfig, DriverSpec
 
 if TYPE_CHECKING:
@@ -32,11 +33,22 @@ class UrConfig(DriverConfig):
         le=1.0,
         description="time without a heartbeat of the program that drives the arm after which the controller stops it",
     )
+    rest_within_s: float = Field(
+        default=0.45,
+        gt=0,
+        description="longest time until the arm stands after that program died: a protocol that moves faster than "
+        "the arm brakes in it is refused",
+    )
     unattended_s: float = Field(
         default=5.0,
         gt=0,
         description="the same for a program that is alive but does not query the moving arm (it may store an image)",
     )
+
+    @property
+    def abandoned(self) -> Abandoned:
+        """The watchdog ends the motion."""
+        return Abandoned(self.watchdog_s, self.rest_within_s)
 
 
 _LIBRARY = ("dashboard_client", "rtde_control", "rtde_receive")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from os import getpid
 from pathlib import Path
 
-from drivers.interfaces import DeviceReport
+from drivers.interfaces import DeviceReport, PedalReading
 from service.core.gates.verdict import describe_judged
 from service.core.protocol.models import Protocol
 from service.core.records.events import (
@@ -88,7 +88,7 @@ class Runner:
                 self._seal.sign_if_missing()
                 return self._run.state
             disk = DiskWatch(self._run, self.protocol, operator.tell, clock.monotonic_s)
-            self._pedal = Pedal(self._presses, clock.monotonic_s, operator.tell)
+            self._pedal = Pedal(self._pedal_reading, clock.monotonic_s, operator.tell)
             self._clocks = ClockWatch(self._run.follower, operator.tell)
             workers = WorkerWatch(self.store.database_path.parent, operator.tell, clock)
             self._steps = StepExecution(self._run, self.protocol, self.devices, operator, disk, workers, clock)
@@ -193,9 +193,9 @@ class Runner:
         ticked = self.operator.ticked(question, state)
         return OperatorAction(action="confirm", step=question.step, checklist=ticked, via="pedal")
 
-    def _presses(self) -> int:
+    def _pedal_reading(self) -> PedalReading | None:
         lightbox = self.devices.lightbox()
-        return lightbox.pedal_presses() if lightbox is not None else 0
+        return None if lightbox is None else lightbox.pedal()
 
     def _opened(self, device: str, report: DeviceReport) -> None:
         self._run.append(DeviceOpened(device=device, report=dataclasses.asdict(report)))

@@ -7,7 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, Self, TypeVar
 
-from drivers.interfaces import Camera, CtSource, Device, DeviceReport, Lightbox, RobotArm, Scanner, Transform
+from drivers.interfaces import (
+    Abandoned,
+    Camera,
+    CtSource,
+    Device,
+    DeviceReport,
+    Lightbox,
+    RobotArm,
+    Scanner,
+    Transform,
+)
 from service.core.errors import OrthocaptureError
 from service.core.jobs.priorities import WAITED
 from service.core.jobs.references import Each, Reference
@@ -42,6 +52,7 @@ class StationLayout:
     approach: tuple[float, float, float]  # horizontal unit vector from the scene towards the base
     obstacles: tuple[tuple[str, ObstacleSection], ...] = ()  # what else stands there, by name
     is_arm: bool = True  # not axes of another kind, whose motions are not planned
+    abandoned: Abandoned | None = None  # what becomes of a motion whose program died, if the driver's section says so
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,12 +10,14 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 
+from service.core.arms.known import arm_model, known_arms
+from service.core.arms.motion_limits import motion_problems
 from service.core.errors import ConfigurationError, ProtocolError
 from service.core.protocol.models import Gate, LoadedProtocol, Protocol, Step
 from service.core.protocol.step_params import named_steps
 from service.core.text.checked_yaml import refuse
 from service.core.text.yaml_tree import FieldPath, Plain, YamlProblem, field_name, parse_yaml
-from service.rig import Rig, RigSection
+from service.rig import Rig, RigDevice, RigSection
 from service.steps import step_kinds
 from service.steps.measures import Measure, RegistrationMeasures
 from service.steps.poses.sources import WantedRegistrations, needing_mount
@@ -27,6 +29,7 @@ _SECTIONS: Mapping[tuple[str, str], tuple[float, float, str]] = {
     ("camera", "aperture_f"): (0.7, 64.0, ""),
     ("camera", "iso"): (25.0, 409600.0, ""),
 }
+NO_DEVICES: Mapping[str, RigDevice] = {}
 _TERMS = {"camera": "camera", "scanner": "scanner", "ct": "CT source"}
 _ALIAS = {"deg": "°", "1": "", "degrees": "°"}
 
@@ -46,8 +49,16 @@ def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, 
     )
 
 
-def implausible(loaded: LoadedProtocol, rig: RigSection | None = None) -> tuple[YamlProblem, ...]:
-    """Unknown measures, wrong units, limits that are not credible and, with a rig, unknown stations; by line."""
+def implausible(
+    loaded: LoadedProtocol, rig: RigSection | None = None, devices: Mapping[str, RigDevice] = NO_DEVICES
+) -> tuple[YamlProblem, ...]:
+    """Unknown measures, wrong units, limits that are not credible, motions too fast, unknown stations; by line.
+
+    Args:
+        loaded: the protocol.
+        rig: in which it is to run, if that is known.
+        devices: of the rig, by name.
+    """
     tree = parse_yaml(loaded.source, name="the protocol")
     found: list[tuple[FieldPath, str]] = []
     data = tree.data if isinstance(tree.data, dict) else {}
@@ -68,33 +79,38 @@ def implausible(loaded: LoadedProtocol, rig: RigSection | None = None) -> tuple[
         found += [
             (("steps", index, *at), words) for at, words in (*_named(step, earlier, steps), *_mount(step, steps))
         ]
+    found += list(_too_fast(loaded.protocol, rig, devices))
     if rig is not None:
         found += list(_stations(data, rig))
     problems = [YamlProblem(tree.line(at), field_name(at), words) for at, words in found]
     return tuple(sorted(problems, key=lambda p: (p.line, p.field)))
 
 
-def require_plausible(loaded: LoadedProtocol, name: str, rig: RigSection | None = None) -> None:
+def require_plausible(
+    loaded: LoadedProtocol, name: str, rig: RigSection | None = None, devices: Mapping[str, RigDevice] = NO_DEVICES
+) -> None:
     """Refuse a protocol that `implausible` finds fault with; `name` is its file.
 
     Raises:
         ProtocolError: the message lists every problem with its line.
     """
-    problems = implausible(loaded, rig)
+    problems = implausible(loaded, rig, devices)
     if problems:
         remedy = "Correct it; docs/reference/steps.md lists the parameters, measures and units of each kind of step"
         refuse(problems, what="protocol", name=name, remedy=remedy, error=ProtocolError)
 
 
-def require_devices(protocol: Protocol, rig: Rig, kinds: Mapping[str, str]) -> None:
-    """Refuse a rig that lacks a device of a step which nobody may skip; `kinds` are those of its devices, by name.
+def require_devices(protocol: Protocol, rig: Rig, devices: Mapping[str, RigDevice]) -> None:
+    """Refuse a rig that lacks a device of a step which nobody may skip.
 
     Raises:
         ConfigurationError: the message names the first such step.
     """
     for step in protocol.steps:
         for needed in () if step.skippable else step.params.needed_devices:
-            own = [name for name, kind in kinds.items() if kind == needed.kind and name not in rig.section.cameras]
+            own = [
+                name for name, one in devices.items() if one.kind == needed.kind and name not in rig.section.cameras
+            ]
             if needed.name is None and len(own) != 1:
                 raise ConfigurationError(
                     f"step {step.id} needs exactly one {_TERMS[needed.kind]}, the rig has {len(own)}",
@@ -105,7 +121,7 @@ def require_devices(protocol: Protocol, rig: Rig, kinds: Mapping[str, str]) -> N
                 raise ConfigurationError(
                     f"step {step.id} needs the {_TERMS[needed.kind]} {needed.name!r}, which the rig does not have",
                     where=str(rig.path),
-                    remedy=f"Name it so among the devices; the rig has {', '.join(kinds) or 'none'}",
+                    remedy=f"Name it so among the devices; the rig has {', '.join(devices) or 'none'}",
                 )
 
 
@@ -153,6 +169,20 @@ def _mount(step: Step, steps: Mapping[str, Step]) -> Iterator[tuple[FieldPath, s
             f"the images of {carried[0]} are an arm's, and {' and '.join(unknown)} poses need its `hand_eye`; "
             "without it, `poses` are spheres, colmap or glomap",
         )
+
+
+def _too_fast(
+    protocol: Protocol, rig: RigSection | None, devices: Mapping[str, RigDevice]
+) -> Iterator[tuple[FieldPath, str]]:
+    """The protocol's motion, if it moves an arm faster than that may move, or than it can stop in time."""
+    if not any(step.moves_robot for step in protocol.steps):
+        return
+    named = None if rig is None else rig.collision.arm
+    arms = known_arms() if named is None else [arm_model(named)]
+    abandoned = [device.abandoned for device in devices.values() if device.abandoned is not None]
+    strictest = min(abandoned, key=lambda one: one.rest_within_s - one.noticed_after_s, default=None)
+    for field, words in motion_problems(protocol.motion, arms, strictest):
+        yield ("motion", field), words
 
 
 def _stations(data: Mapping[str, Plain], rig: RigSection) -> Iterator[tuple[FieldPath, str]]:

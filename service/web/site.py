@@ -12,7 +12,7 @@ from weakref import WeakValueDictionary
 from fastapi import Depends, Request
 
 from service.people.sessions import People
-from service.rig import Rig
+from service.rig import Rig, RigDevice
 from service.run_record import RunFollower, RunRecord
 from service.run_start import recorded_run
 from service.store.store import Store
@@ -55,7 +55,7 @@ class Site:
     store: Store
     people: People
     launcher: Launcher
-    device_kinds: Callable[[Rig], Mapping[str, str]]  # of a rig file's devices, by name
+    devices_of: Callable[[Rig], Mapping[str, RigDevice]]  # of a rig file, by name
     secure: bool = True  # cookies are sent over TLS, or to this machine, only
     idle_lock_s: float = 600.0
     hosts: tuple[str, ...] = ("127.0.0.1", "localhost")  # names by which browsers may ask

@@ -21,4 +21,5 @@ def patient(section: dict[str, Any], patience_s: float) -> dict[str, Any]:
     guards = {name: max(usual_s, patience_s) for name, usual_s in _GUARDS.get(section["driver"], {}).items()}
     if section["driver"] == "ur":
         guards["watchdog_s"] = _LONGEST_WATCHDOG_S
+        guards["rest_within_s"] = patience_s  # nobody stands beside it
     return {**section, **guards}

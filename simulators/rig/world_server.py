@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socketserver
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -54,6 +55,7 @@ class World:
     board_placed: bool = False
     lens_cleanings: int = 0
     pedal_presses: int = 0
+    pedal_pressed_s: float = 0.0  # time.monotonic() of the last press
     further: Mapping[str, FurtherCamera] = field(default_factory=dict[str, FurtherCamera])  # by name
     camera_held: bool = False  # in the technician's hands, instead of on the arm
     T_world_held: Array = field(default_factory=HELD_CAMERAS["above"].copy)  # where it is held
@@ -113,6 +115,7 @@ class World:
                 "light_lux": self.scene.light_lux,
                 "temperature_c": self.scene.temperature_c,
                 "pedal_presses": self.pedal_presses,
+                "pedal_ago_s": time.monotonic() - self.pedal_pressed_s,
                 "lens_cleanings": self.lens_cleanings,
                 "hand": {"shake": self.press.shake, "finger": self.press.finger},
             }
@@ -168,6 +171,7 @@ class World:
                     self.lens_cleanings += 1
                 case "press_pedal":
                     self.pedal_presses += 1
+                    self.pedal_pressed_s = time.monotonic()
                 case _:
                     return {"ok": False, "error": f"hands cannot do {action!r}"}
         return {"ok": True}

@@ -16,8 +16,8 @@ import pytest
 import serial
 
 from drivers.errors import DeviceFaultError, DeviceRefusedError, DeviceTimeoutError, DeviceUnavailableError
-from drivers.interfaces import TowerLight
-from drivers.lightbox import DRIVER, LightboxConfig, SerialLightbox
+from drivers.interfaces import PedalReading, TowerLight
+from drivers.lightbox import DRIVER, LightboxConfig, SerialLightbox, with_checksum
 from tests.support.processes.waiting import until
 from tests.support.rig.simulator_process import simulator
 
@@ -36,6 +36,11 @@ def opened(port: str | Path, timeout_s: float = 2.0) -> Generator[SerialLightbox
         driver.close()
 
 
+def line_of(reply: str) -> bytes:
+    """A reply as a box of firmware 1.4 sends it."""
+    return with_checksum(reply).encode() + b"\r\n"
+
+
 def faults(**fields: object) -> tuple[str, str]:
     return "--faults", json.dumps([{"device": "lightbox", **fields}])
 
@@ -46,13 +51,15 @@ def test_the_signal_tower(tmp_path: Path) -> None:
         assert all(driver.show_tower(light) for light in TowerLight)
         with serial.Serial(str(link), timeout=60) as other:
             other.write(b"TOWER?\nTOWER BLUE\n")
-            assert other.read_until(b"\n") + other.read_until(b"\n") == b"TOWER RED\r\nERR 2 wrong argument\r\n"
+            assert other.read_until(b"\n") + other.read_until(b"\n") == line_of("TOWER RED") + line_of(
+                "ERR 2 wrong argument"
+            )
         assert running.process.poll() is None
 
 
 def test_a_box_without_a_tower_is_no_error_and_is_asked_once(tmp_path: Path) -> None:
     link = tmp_path / "lightbox"
-    with simulator("lightbox", "--link", str(link), "--without-tower"), opened(link) as driver:
+    with simulator("lightbox", "--link", str(link), "--firmware", "1.2"), opened(link) as driver:
         assert driver.open().firmware == "1.2"
         assert not driver.show_tower(TowerLight.STOPPED)
         assert driver.read().light_lux == 45_000.0
@@ -103,14 +110,20 @@ def test_reads_switches_and_counts(tmp_path: Path) -> None:
     link = tmp_path / "lightbox"
     with simulator("lightbox", "--link", str(link)) as running, opened(link) as driver:
         identity = driver.open()
-        assert (identity.kind, identity.serial, identity.firmware) == ("lightbox", "LB-0001", "1.3")
+        assert (identity.kind, identity.serial, identity.firmware) == ("lightbox", "LB-0001", "1.4")
         reading = driver.read()
         assert (reading.light_lux, reading.temperature_c) == (45_000.0, 21.5)
         assert not reading.shutter_relay_closed
-        assert driver.pedal_presses() == 0
+        assert (driver.pedal().presses, driver.pedal().pressed_s) == (0, 0.0)
         running.process.send_signal(signal.SIGUSR1)
-        until(lambda: driver.pedal_presses() > 0, "the pedal's press is not counted")
-        assert driver.pedal_presses() == 1
+        until(lambda: driver.pedal().presses > 0, "the pedal's press is not counted")
+        first, later = driver.pedal(), driver.pedal()
+        assert first.presses == later.presses == 1
+        assert first.pressed_s == later.pressed_s
+        assert first.pressed_s is not None
+        assert first.now_s is not None
+        assert later.now_s is not None
+        assert 0.0 < first.pressed_s <= first.now_s <= later.now_s
         report = driver.report()
         assert report.details["light"] == "45000.0 lx"
         assert report.problems == ()
@@ -170,7 +183,7 @@ def test_a_box_goes_on_after_a_client_that_asked_and_never_read(tmp_path: Path) 
         with serial.Serial(str(tmp_path / "box"), timeout=0.5, write_timeout=60) as rude:
             for _ in range(400):
                 rude.write(b"*IDN?\n" * 10)
-            until(lambda: answers_to(rude) == b"TOWER OFF\r\n", "it does not go on", every_s=0)
+            until(lambda: answers_to(rude) == line_of("TOWER OFF"), "it does not go on", every_s=0)
         with opened(tmp_path / "box", timeout_s=20) as driver:
             assert driver.read().light_lux == 45_000.0
 
@@ -213,6 +226,61 @@ def test_values_that_are_not_numbers_are_skipped() -> None:
         driver.close()
 
 
+def test_the_checksum_is_crc_16_xmodem() -> None:
+    assert with_checksum("123456789") == "123456789*31<3"  # 0x31C3, the check value of the catalogue of CRCs
+
+
+def test_what_noise_made_of_a_line_is_never_believed() -> None:
+    """A light of 85000 lx, a press that nobody made: one bit each."""
+    good = {b"LIGHT?": "LIGHT 45000.0", b"TEMP?": "TEMP 21.50", b"SHUTTER?": "SHUTTER 0", b"PEDAL?": "PEDAL 6 2 9"}
+    asked: list[bytes] = []
+
+    def disturbed(line: bytes) -> bytes:
+        asked.append(line)
+        if line.startswith(b"*IDN"):
+            return line_of("*IDN a,b,c,1.4")
+        reply = line_of(good[line.strip().partition(b"*")[0]])
+        flipped = {b"L": (6, 0x0C), b"P": (6, 0x01)}.get(reply[:1])
+        if flipped is None or len(asked) % 2:
+            return reply
+        place, bits = flipped
+        return reply[:place] + bytes([reply[place] ^ bits]) + reply[place + 1 :]
+
+    with answering(disturbed) as port, opened(port) as driver:
+        assert driver.read().light_lux == 45_000.0
+        assert all(driver.pedal() == PedalReading(6, 0.002, 0.009) for _ in range(3))
+    assert all(b"*" in line for line in asked[1:])  # its own requests have one too
+
+
+def test_a_request_that_was_disturbed_is_sent_again_at_once(tmp_path: Path) -> None:
+    answers = iter([line_of("*IDN a,b,c,1.4"), line_of("ERR 4 wrong checksum"), line_of("TOWER RED")])
+    with answering(lambda _: next(answers)) as port, opened(port, timeout_s=60.0) as driver:
+        assert driver.show_tower(TowerLight.STOPPED)
+    link = tmp_path / "lightbox"
+    with simulator("lightbox", "--link", str(link)), serial.Serial(str(link), timeout=60) as other:
+        other.read_until(b"\n")  # the banner
+        other.write(b"TOWER RED*0000\n")
+        assert other.read_until(b"\n") == line_of("ERR 4 wrong checksum")
+
+
+def test_a_box_that_should_send_checksums_and_does_not_is_not_opened() -> None:
+    with answering(lambda _: b"*IDN a,b,c,1.4\n") as port:
+        driver = box(port)
+        with pytest.raises(DeviceFaultError, match="without the checksum"):
+            driver.open()
+        driver.close()
+
+
+def test_a_count_on_which_no_two_readings_agree_is_a_fault() -> None:
+    counts = iter(range(100))
+    with answering(lambda line: b"*IDN a,b,c,1.3\n" if line[:1] == b"*" else b"PEDAL %d\n" % next(counts)) as port:
+        driver = box(port)
+        driver.open()
+        with pytest.raises(DeviceFaultError, match="differs in each of 6 readings"):
+            driver.pedal()
+        driver.close()
+
+
 def test_over_a_socket() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
 
@@ -226,7 +294,7 @@ def test_over_a_socket() -> None:
         thread = threading.Thread(target=serve)
         thread.start()
         with opened(f"socket://127.0.0.1:{server.getsockname()[1]}") as driver:
-            assert driver.pedal_presses() == 7
+            assert driver.pedal() == PedalReading(7)
         thread.join()
 
 
@@ -253,7 +321,7 @@ def test_the_box_asks_the_world(tmp_path: Path) -> None:
             with simulator("lightbox", "--world", world) as running, opened(running.ready["port"]) as driver:
                 reading = driver.read()
                 assert (reading.light_lux, reading.temperature_c) == (1234.5, 19.25)
-                assert driver.pedal_presses() == 3
+                assert driver.pedal().presses == 3
         finally:
             done.set()
             thread.join()

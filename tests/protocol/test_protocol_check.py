@@ -110,7 +110,9 @@ def test_poses_of_an_arm_need_its_mount(tmp_path: Path) -> None:
 def test_a_station_that_the_rig_has_not_is_said(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     station = "{robot: robot, scene_centre_m: [0, 0, 0], approach_azimuth_deg: 0}"
-    rig.write_text(f"name: r\ndevices:\n  robot: {{driver: ur}}\nstations: {{station_1: {station}}}\n")
+    rig.write_text(
+        f"name: r\ndevices:\n  robot: {{driver: ur, host: 192.0.2.1}}\nstations: {{station_1: {station}}}\n"
+    )
     file = PROTOCOLS / "exvivo_spine.yaml"
     assert _check(file)[0] == 0
     status, said = _check(file, "--rig", str(rig))

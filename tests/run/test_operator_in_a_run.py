@@ -16,7 +16,7 @@ from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, OpticsSection
-from tests.support.rig.bench_rig import Answer, BenchRig, ScriptedOperator
+from tests.support.rig.bench_rig import BenchRig, ScriptedOperator
 from tests.support.runs.bench_run import PROTOCOL, VIEWS, Bench, say
 
 # --- pause, abort, redo, skip ----------------------------------------------------------------------------
@@ -247,18 +247,16 @@ def test_where_the_robot_will_move_the_pedal_is_pressed_twice_within_seconds(ben
     box = bench.rig.box
     assert box is not None
 
-    def press(after_s: float) -> Answer:
-        def act(_question: AskOperator, _state: RunState) -> None:
-            bench.clock.passed_s += after_s
-            box.presses += 1
-
-        return act
+    def press(_question: AskOperator, _state: RunState) -> None:
+        box.presses += 1
 
     def look(_question: AskOperator, _state: RunState) -> None:
+        bench.clock.passed_s += 0.3
         assert not bench.rig.arm.moves
 
     # The second press comes too late and arms again, the third bounces, the fourth counts.
-    bench.script("capture", "confirm", look, press(0), press(10), press(0.1), look, press(2))
+    late, in_time = [look] * 16, [look] * 5
+    bench.script("capture", "confirm", look, press, *late, press, press, *in_time, press)
     assert bench.run().status == "completed"
     confirmed = [a for a in bench.payloads(OperatorAction) if a.step == "capture"]
     assert [(a.action, a.via) for a in confirmed] == [("confirm", "pedal")]

@@ -52,7 +52,7 @@ from service.run_start import (
     time_stamp_authority,
 )
 from service.runner.loop import Runner
-from service.station import Station, device_kinds, layout_of
+from service.station import Station, devices_of, layout_of
 from service.steps import params_models
 from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.timestamps import stamp_end
@@ -92,7 +92,7 @@ def run_command(
         rig_file = load_rig(rig)
         if auto_confirm:
             require_simulated(rig_file)
-        require_runnable(loaded, rig_file, device_kinds(rig_file))
+        require_runnable(loaded, rig_file, devices_of(rig_file))
         with Store.open(data) as store:
             who = acting_person(store, operator, password_stdin=password_stdin)
             if not auto_confirm:  # simulated rigs need no approval

@@ -14,7 +14,7 @@ from service.core.documents.ways_docs import ways_text
 from service.core.protocol.models import load_protocol
 from service.core.text.counts import counted
 from service.rig import load_rig
-from service.station import device_kinds
+from service.station import devices_of
 from service.steps import params_models
 from service.steps.protocol_check import require_devices, require_plausible
 
@@ -34,9 +34,12 @@ def check_command(
         loaded = load_protocol(file, params_models())
         protocol = loaded.protocol
         site = None if rig is None else load_rig(rig)
-        require_plausible(loaded, str(file), None if site is None else site.section)
-        if site is not None:
-            require_devices(loaded.protocol, site, device_kinds(site))
+        if site is None:
+            require_plausible(loaded, str(file))
+        else:
+            devices = devices_of(site)
+            require_plausible(loaded, str(file), site.section, devices)
+            require_devices(loaded.protocol, site, devices)
         if json:
             steps = [{"id": s.id, "kind": s.kind, "irreversible": s.irreversible} for s in protocol.steps]
             print_json({"id": protocol.id, "version": protocol.version, "sha256": loaded.sha256, "steps": steps})

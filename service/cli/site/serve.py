@@ -28,7 +28,7 @@ from service.logs.file_log import file_log
 from service.people.sessions import People
 from service.rig import Rig, load_rig
 from service.run_start import signature_copy
-from service.station import device_kinds
+from service.station import devices_of
 from service.steps import params_models
 from service.store.database.engine import BUSY_TIMEOUT_S
 from service.store.records import SITE
@@ -116,7 +116,7 @@ def serve_command(
                 store=store,
                 people=people,
                 launcher=Launcher(data.resolve(), store),
-                device_kinds=device_kinds,
+                devices_of=devices_of,
                 secure=tls is not None or not lan,
                 idle_lock_s=60 * idle_lock_min,
                 hosts=_names(host, name or []),

@@ -61,6 +61,8 @@ class ArmModel:
         alpha_rad: (N,) link twists.
         limits_rad: (N,) largest absolute angle of each joint.
         speeds_rad_s: (N,) largest speed of each joint.
+        acceleration_rad_s2: largest that its controller takes for a joint motion.
+        braking_rad_s2: with which the controller brakes the fastest joint when it ends a motion by itself.
         links: capsules from the base to the flange; the camera comes from the rig file.
         allowed: pairs of parts that touch by design, or cannot touch: links, `camera`, `table`, `specimen`,
             `spheres`, `surroundings`; the first of a pair is the one nearer to the base.
@@ -76,6 +78,8 @@ class ArmModel:
     alpha_rad: Array
     limits_rad: Array
     speeds_rad_s: Array
+    acceleration_rad_s2: float
+    braking_rad_s2: float
     links: tuple[Link, ...] = field(repr=False)
     allowed: frozenset[tuple[str, str]] = field(repr=False)
     usual_rad: Array = field(repr=False)

@@ -17,6 +17,7 @@ NEEDS_A_PERSON = frozenset(
     {
         "SafetyStopError",
         "LeaveNeededError",
+        "ArmDepartedError",
         "DeviceStorageFullError",
         "IntegrityError",
         "ImagesSpoiltError",

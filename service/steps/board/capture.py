@@ -280,12 +280,13 @@ class BoardCapture:
         there = {capture.viewpoint for capture in self.context.evidence.captures(self.context.step.id)}
         todo = [v for v in poses if v.name not in there]
         refused: Mapping[str, str] = {}
+        stands_rad: dict[str, Array] = {}
         if todo and not self.given:
             board = self._knowledge(self.looks(wait=False)).T_base_board
             planned = plan_step(
                 self.context, todo, self._mount, "shortest", sharp_at_m=apply(board, self.board.points())
             )
-            todo, refused = list(planned.viewpoints), planned.refused
+            todo, refused, stands_rad = list(planned.viewpoints), planned.refused, dict(planned.starts_rad)
         task = CaptureTask(
             [*todo, *(v for v in poses if v.name in there)],
             self._mount,
@@ -294,6 +295,7 @@ class BoardCapture:
             on_captured=self._looks.begin,
             stop=lambda: bool(self._looks.spoilt_in_a_row()),
             again=to_take_again(self.context),
+            stands_rad=stands_rad,
         )
         capture_viewpoints(self.context, task)
 

@@ -95,7 +95,7 @@ class HeldCamera:
         if lightbox is None:
             return None
         try:
-            return lightbox.pedal_presses()
+            return lightbox.pedal().presses
         except DeviceError:
             return None  # the camera can still be released in other ways
 

@@ -6,11 +6,15 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
-from drivers.errors import DeviceError, DeviceTimeoutError, SafetyStopError
+import numpy as np
+
+from drivers.errors import ArmDepartedError, DeviceError, DeviceTimeoutError, SafetyStopError
 from drivers.interfaces import RobotArm, SettleCriteria, SettleReport
 from service.core.geometry import Array
 from service.steps.context import StepContext, StepInterruptedError
 
+# How far each joint may be from where it was sent. Controllers hold a thousandth of a radian, stepper motors several.
+STANDS_RAD = 0.005
 _POLL_S = 0.02
 _POLL_AT_THE_END_S = 0.004  # when the arm may have settled: waiting longer delays the viewpoint
 
@@ -61,6 +65,22 @@ def move_and_settle(
         with suppress(DeviceError):
             robot.stop()
         raise
+
+
+def require_there(robot_name: str, joints_rad: Array, sent_rad: Array, *, step: str) -> None:
+    """Refuse to go on with an arm whose joints (N,) are not where they were sent.
+
+    Poses and paths were checked for where it was sent, and for nowhere else. Raises ArmDepartedError.
+    """
+    away_rad = np.abs(np.asarray(joints_rad) - np.asarray(sent_rad))
+    joint = int(np.argmax(away_rad))
+    if away_rad[joint] > STANDS_RAD:
+        raise ArmDepartedError(
+            f"joint {joint + 1} of {robot_name} stands {away_rad[joint]:.3f} rad from where it was sent",
+            where=step,
+            remedy="Look at what moved it, and whether anybody is in reach; the step goes on after you confirm, and "
+            "plans the motions anew from where the arm stands",
+        )
 
 
 def _wait_settled(

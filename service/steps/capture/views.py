@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from drivers.errors import (
+    ArmDepartedError,
     DeviceBusyError,
     DeviceError,
     DeviceTimeoutError,
@@ -31,7 +32,7 @@ from service.steps.capture.exposure import (
     wanted_settings,
 )
 from service.steps.capture.further_cameras.images import exposing_at, settings_of
-from service.steps.capture.motion import MotionLimits, move_and_settle, settle_criteria
+from service.steps.capture.motion import MotionLimits, move_and_settle, require_there, settle_criteria
 from service.steps.capture.plan.viewpoints import Viewpoint, flange_target
 from service.steps.context import FurtherCamera, StepContext
 
@@ -80,6 +81,8 @@ class CaptureTask:
         stop: called before each viewpoint; if it returns True, the rest is not captured.
         again: SHA-256 of images to take again.
         all_cameras: whether the rig's further cameras expose as well.
+        stands_rad: joints (N,) where the arm of each station must stand when it is moved next: from where its motions
+            were planned, then where it was sent last. The capture keeps it up to date.
     """
 
     viewpoints: Sequence[Viewpoint]
@@ -90,6 +93,7 @@ class CaptureTask:
     stop: Callable[[], bool] = lambda: False
     again: Collection[str] = ()
     all_cameras: bool = False
+    stands_rad: dict[str, Array] = field(default_factory=dict[str, Array])
 
 
 def capture_viewpoints(context: StepContext, task: CaptureTask) -> CaptureTotals:
@@ -237,12 +241,27 @@ class _CaptureLoop:
 
     def _go_to(self, robot: RobotArm, viewpoint: Viewpoint) -> SettleReport:
         context = self.context
+        name = context.devices.layout(viewpoint.station).robot
+        sent_rad = self.task.stands_rad.pop(viewpoint.station, None)  # a motion that is cut short ends anywhere
+        if sent_rad is not None:
+            self._require_there(robot, name, robot.state().sample.joints_rad, sent_rad)
         target = self._targets.pop(viewpoint.name, None)
         if target is None:
             target = self._solve(robot, viewpoint)
         motion = context.protocol.motion
         limits = MotionLimits(motion.speed_rad_s, motion.acceleration_rad_s2, context.protocol.settle.timeout_s)
-        return move_and_settle(context, robot, target, limits, settle_criteria(context), meanwhile=self.keep)
+        settled = move_and_settle(context, robot, target, limits, settle_criteria(context), meanwhile=self.keep)
+        self._require_there(robot, name, settled.joints_rad, target)
+        self.task.stands_rad[viewpoint.station] = target
+        return settled
+
+    def _require_there(self, robot: RobotArm, name: str, joints_rad: Array, sent_rad: Array) -> None:
+        """Hold the arm until a person has confirmed, if it does not stand where it was sent."""
+        try:
+            require_there(name, joints_rad, sent_rad, step=self.context.step.id)
+        except ArmDepartedError:
+            self.context.devices.reopen(robot)  # which revokes its leave to move
+            raise
 
     def _dwell(self, robot: RobotArm, later: Sequence[Viewpoint]) -> dict[str, float]:
         """Let the arm rest before the exposure, and use that time; returns the environment."""

@@ -83,7 +83,7 @@ def start(
         )
     loaded = load_protocol(known[form.protocol], params_models())
     rig = load_rig(site.rig.path)
-    require_runnable(loaded, rig, site.device_kinds(rig))
+    require_runnable(loaded, rig, site.devices_of(rig))
     require_rig_free(site.store, site.rig.path)
     changed = standing_of(site.store, loaded).changed
     if changed:

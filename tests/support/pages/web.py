@@ -22,7 +22,7 @@ from service.people.person import Person
 from service.people.roles import ROLES, Role
 from service.people.sessions import People
 from service.rig import load_rig
-from service.station import device_kinds
+from service.station import devices_of
 from service.store.durable_effects import Clock
 from service.store.store import Store
 from service.web.app import create_app
@@ -177,7 +177,7 @@ def web_site(folder: Path, *, clock: Clock | None = None, idle_lock_s: float = 6
             store=store,
             people=people,
             launcher=NoLauncher(data, store),
-            device_kinds=device_kinds,
+            devices_of=devices_of,
             idle_lock_s=idle_lock_s,
             hosts=("testserver",),
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from drivers.interfaces import DeviceIdentity, DeviceReport, EnvironmentReading, TowerLight
+from drivers.interfaces import DeviceIdentity, DeviceReport, EnvironmentReading, PedalReading, TowerLight
 from service.store.durable_effects import Clock, SystemClock
 
 
@@ -16,6 +16,8 @@ class BenchLightbox:
     tower: bool = True
     shown: list[TowerLight] = field(default_factory=list[TowerLight])
     clock: Clock = field(default_factory=SystemClock)
+    _counted: int = field(init=False, default=0)
+    _pressed_s: float = field(init=False, default=0.0)
 
     def open(self) -> DeviceIdentity:
         return self.report().identity
@@ -29,8 +31,11 @@ class BenchLightbox:
     def read(self) -> EnvironmentReading:
         return EnvironmentReading(812.0, 21.5, False, self.clock.monotonic_s())
 
-    def pedal_presses(self) -> int:
-        return self.presses
+    def pedal(self) -> PedalReading:
+        now_s = self.clock.monotonic_s()
+        if self.presses != self._counted:
+            self._counted, self._pressed_s = self.presses, now_s
+        return PedalReading(self.presses, self._pressed_s, now_s)
 
     def show_tower(self, light: TowerLight) -> bool:
         self.shown.append(light)

@@ -120,6 +120,13 @@ class BenchArm:
         start_s, start, _, target = self._legs[-1]
         self._legs[-1] = (start_s, start, start_s + 10.0, target)
 
+    def push(self, by_rad: float, *, joint: int = 2) -> None:
+        """Let somebody push a joint by hand, as in free drive; a motion under way ends there."""
+        at_s = max(self.clock.monotonic_s(), self._legs[-1][2])
+        there = self._joints(at_s).copy()
+        there[joint] += by_rad
+        self._legs.append((at_s, there, at_s, there))
+
     def stop(self) -> None:
         self.stops += 1
         if self.is_moving():

@@ -7,7 +7,8 @@ from drivers.grbl import GrblConfig
 PATIENCE_S = 20.0  # less than the driver's calls may take (drivers.plugin)
 #: What guards a device against a dead program or line, for a driver's section of a rig file.
 PATIENT_UR: dict[str, float] = {
-    "connect_timeout_s": PATIENCE_S, "watchdog_s": 1.0, "stale_after_s": PATIENCE_S, "unattended_s": PATIENCE_S,
+    "connect_timeout_s": PATIENCE_S, "watchdog_s": 1.0, "rest_within_s": PATIENCE_S, "stale_after_s": PATIENCE_S,
+    "unattended_s": PATIENCE_S,
 }  # fmt: skip
 PATIENT_KUKA: dict[str, float] = {
     "connect_timeout_s": PATIENCE_S, "answer_timeout_s": PATIENCE_S, "stale_after_s": PATIENCE_S,

@@ -14,6 +14,9 @@ _ALLOWED = frozenset(
         ("base", "specimen"), ("base", "spheres"), ("base", "surroundings"),
     }
 )  # fmt: skip
+# KUKA publishes no acceleration; the Sunrise application takes this one for the largest (Lbr14.java).
+_ACCELERATION_RAD_S2 = 15.0
+_BRAKING_RAD_S2 = 4.0  # of a motion that was ended; assumed: measure it on the arm (docs/howto/your_hardware.md)
 _BASE_DEPTH_M = 0.10  # pedestal top below the base frame
 
 
@@ -57,6 +60,8 @@ def lbr(
         alpha_rad=np.radians([-90.0, 90.0, 90.0, -90.0, -90.0, 90.0, 0.0]),
         limits_rad=np.radians(limits_deg),
         speeds_rad_s=np.radians(speeds_deg_s),
+        acceleration_rad_s2=_ACCELERATION_RAD_S2,
+        braking_rad_s2=_BRAKING_RAD_S2,
         links=(
             Link("base", 0, (0, 0, -_BASE_DEPTH_M), (0, 0, 0.16), 0.10),
             Link("shoulder", 0, (0, 0, 0.16), (0, 0, base), 0.09),

@@ -17,6 +17,9 @@ _ALLOWED = frozenset(
         ("base", "specimen"), ("base", "spheres"), ("base", "surroundings"),
     }
 )  # fmt: skip
+# Data sheets state no acceleration; the client library takes no more than this (ur_rtde: UR_JOINT_ACCELERATION_MAX).
+_ACCELERATION_RAD_S2 = 40.0
+_BRAKING_RAD_S2 = 4.0  # of a program that was ended; assumed: measure it on the arm (docs/howto/your_hardware.md)
 _BASE_DEPTH_M = 0.10  # pedestal top below the base frame
 
 
@@ -51,6 +54,8 @@ def universal_robot(
         alpha_rad=np.array([half, 0, 0, half, -half, 0]),
         limits_rad=np.radians(limits_deg),
         speeds_rad_s=np.radians(speeds_deg_s),
+        acceleration_rad_s2=_ACCELERATION_RAD_S2,
+        braking_rad_s2=_BRAKING_RAD_S2,
         links=_links(*a_m, *d_m[1:]),
         allowed=_ALLOWED,
         usual_rad=np.array([np.pi, -1.6, 1.9, -1.9, -1.57, 0.0]),  # at 0 the arm lies along -x

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from service.compute.planning.motion_plan import (
 from service.compute.planning.optics import depth_of_field
 from service.core.arms.known import known_arm
 from service.core.arms.model import ArmModel
+from service.core.arms.motion_limits import motion_problems
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from service.core.protocol.models import Motion
@@ -45,6 +46,7 @@ class StepPlan:
     refused: Mapping[str, str]
     text: str
     motions: tuple[noted.NotedStation, ...]  # where the arm's kinematics are known
+    starts_rad: Mapping[str, Array] = field(default_factory=dict[str, Array])  # joints at the start, by station
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +124,18 @@ def arm_at_station(context: StepContext, station: str, T_flange_camera: Transfor
     model = known_arm(collision.arm or context.devices.robot(station).report().identity.model)
     if model is None:
         return None
+    _require_slow_enough(context, layout, model)
     return ArmAtStation(layout, model, T_flange_camera, collision, optics, context.protocol.motion)
+
+
+def _require_slow_enough(context: StepContext, layout: StationLayout, model: ArmModel) -> None:
+    """Refuse a motion faster than this arm may move, or than it can stop in time. Raises ConfigurationError."""
+    for name, words in motion_problems(context.protocol.motion, [model], layout.abandoned):
+        raise ConfigurationError(
+            f"{name} of the protocol's motion is too large: {words}",
+            where=f"station {layout.name}",
+            remedy="Lower it in the protocol; docs/decisions/0013-leave-to-move.md says how fast an arm may move",
+        )
 
 
 def plan_step(
@@ -165,7 +178,8 @@ def plan_step(
                 remedy="Take `arm` out of `collision`: each arm is then planned as its controller names it",
             )
         scene = arm.scene(start_rad, sharp_at_m=sharp_at_m)
-        plans.append(plan_station(mine, arm, scene, order, _attending(context)))
+        plan = plan_station(mine, arm, scene, order, _attending(context))
+        plans.append(replace(plan, starts_rad={station: start_rad}))
     return _recorded(context, plans)
 
 
@@ -209,6 +223,7 @@ def _recorded(context: StepContext, plans: Sequence[StepPlan]) -> StepPlan:
         {name: reason for plan in plans for name, reason in plan.refused.items()},
         "; ".join(plan.text for plan in plans),
         tuple(station for plan in plans for station in plan.motions),
+        {station: start_rad for plan in plans for station, start_rad in plan.starts_rad.items()},
     )
     if whole.motions:
         stations = [station.model_dump(mode="json") for station in whole.motions]

@@ -105,7 +105,7 @@ class _Capture:
         self._nominal = context.devices.nominal_T_flange_camera()
         there = {capture.viewpoint for capture in context.evidence.captures(context.step.id)}
         planned = plan_step(context, [v for v in plan if v.name not in there], self._nominal, params.order)
-        self._refused = planned.refused
+        self._refused, self._stands_rad = planned.refused, dict(planned.starts_rad)
         self._features = EarlyFeatures.begin(context, plan)
         self.viewpoints = [*planned.viewpoints, *(v for v in plan if v.name in there)]
 
@@ -120,6 +120,7 @@ class _Capture:
             stop=lambda: self.live is not None and bool(self.live.spoilt_in_a_row()),
             again=again,
             all_cameras=self._purpose == "dataset",
+            stands_rad=self._stands_rad,
         )
         return capture_viewpoints(self._context, task)
 

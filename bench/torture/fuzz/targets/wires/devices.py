@@ -304,6 +304,7 @@ def _box_answers(_: Path) -> list[bytes]:
     return [
         b"# banner\r\n*IDN orthocapture,simulated,1,1.0\r\nLIGHT 45000.0\r\nTEMP 21.50\r\nSHUTTER 0\r\nPEDAL 3\r\n",
         b"ERR 3 sensor fault\r\n*IDN a,b,c,d\nLIGHT 1e3\nTEMP -4\nSHUTTER 1\nPEDAL 0\n",
+        b"*IDN a,b,c,1.4*=0:;\nLIGHT 1.0*:<;?\nTEMP 2.0*=>12\nSHUTTER 0*629:\nPEDAL 1 20 30*56=:\nERR 4 x*0000\n",
     ]
 
 
@@ -315,7 +316,7 @@ def _box_driver(data: bytes, _: Path) -> None:
             identity = box.open()
             canonical(dataclasses.asdict(identity))  # as a run records it
             canonical(dataclasses.asdict(box.read()))
-            canonical({"presses": box.pedal_presses()})
+            canonical(dataclasses.asdict(box.pedal()))
             box.report()
         finally:
             box.close()
