@@ -107,6 +107,7 @@ def test_another_view_and_another_split_are_chosen(tablet: Screen) -> None:
     expect(page.get_by_alt_text(f"Photograph of view {names[0]}")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_a_format_is_exported_with_its_progress_shown(tablet: Screen) -> None:
     page = tablet.page
     page.get_by_role("link", name="Export…").click()

@@ -286,7 +286,6 @@ def test_a_dialog_holds_the_focus_and_gives_it_back(desk: Desk, run: str, opener
         expect(button).to_be_focused()
 
 
-@pytest.mark.slow
 def test_a_locked_screen_is_unlocked_by_keys_and_cannot_be_escaped(desk: Desk) -> None:
     shown = desk.screen("technician")
     page = shown.page
@@ -352,6 +351,7 @@ def test_a_checklist_is_worked_through_without_script(desk: Desk) -> None:
         expect(page.get_by_role("button", name="Sign in")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_a_page_that_cannot_fetch_the_news_says_so_and_goes_on_trying(desk: Desk) -> None:
     """A run that waits for a person sends no more updates, so a page would never show one that it missed."""
     asked: list[Route] = []

@@ -33,7 +33,6 @@ def page(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator
     assert not complaints, complaints
 
 
-@pytest.mark.slow
 def test_the_scene_is_turned_by_pointer_and_keys(page: Page) -> None:
     scene = page.locator(".turned")
     expect(scene).to_be_visible()

@@ -76,7 +76,6 @@ def test_the_banner_stays_and_a_new_step_begins_at_its_head(server: Served, brow
         assert scrolled(page) == 0
 
 
-@pytest.mark.slow
 def test_a_page_that_is_no_runs_keeps_the_robots_in_sight(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (tablet, _run_id):
         tablet.go("/account")

@@ -81,7 +81,6 @@ def test_end_run_stays_where_it_is(server: Served, browser: Browser) -> None:
 # --- a link, a checklist -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_an_invitation_is_scanned_or_copied(server: Served, browser: Browser) -> None:
     with screen(browser, server.url) as desk:
         desk.context.grant_permissions(["clipboard-read", "clipboard-write"])

@@ -204,7 +204,6 @@ def test_a_correction_of_seven_joints_does_not_fit_an_arm_of_six() -> None:
         corrected_T_base_flange(q, forward(UR10E, q[None])[0], nothing)
 
 
-@pytest.mark.slow
 def test_no_correction_where_the_arm_has_only_noise() -> None:
     scene = Scene.generate(3)
     shots = plan(scene, "exvivo_spine", "hand_eye")

@@ -71,7 +71,6 @@ def test_a_run_is_exported_recorded_and_still_verifies(recorded: Path, tmp_path:
             assert pixel is None or np.abs(pixel - 0.5 - ours).max() < 0.01
 
 
-@pytest.mark.slow
 def test_an_anonymous_export_has_none_of_the_scanners_own_files(recorded: Path, tmp_path: Path) -> None:
     for options, held in (((), True), (("--anonymous",), False)):
         out = tmp_path / f"plain{len(options)}"

@@ -127,6 +127,7 @@ def fused(bench: Bench) -> tuple[RunState, dict[str, Any], np.ndarray[Any, Any]]
     return state, dict(columns), points
 
 
+@pytest.mark.slow
 def test_a_run_with_a_ct_and_a_scan_makes_the_ground_truth(bench: Bench) -> None:
     state, columns, points = fused(bench)
     measures = state.steps["ground_truth"].measures

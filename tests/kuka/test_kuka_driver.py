@@ -141,7 +141,6 @@ def test_a_stop_latches_until_a_person_confirms_and_nothing_clears_it_by_itself(
         travel(arm, turned(arm, 0.1))
 
 
-@pytest.mark.slow
 @pytest.mark.realtime
 @both
 def test_a_moving_arm_that_nobody_looks_at_is_stopped(controller: Controller) -> None:

@@ -97,7 +97,6 @@ def test_both_networks_are_loaded_offline_and_search_an_image(tiny: Weights, mon
         assert min(np.arccos(np.clip(outline.cone.axis @ e.cone.axis, -1, 1)) for e in exact) < 0.01
 
 
-@pytest.mark.slow
 def test_boxes_are_those_of_the_models_own_program(tiny: Weights) -> None:
     torch, transformers, pillow = (
         importlib.import_module(name) for name in ("torch", "transformers.models.grounding_dino", "PIL.Image")
@@ -116,7 +115,6 @@ def test_boxes_are_those_of_the_models_own_program(tiny: Weights) -> None:
     assert np.allclose(scores, torch.sigmoid(expected.logits).max(-1)[0].numpy(), atol=1e-5)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("how", ["damaged", "another network"])
 def test_other_weights_are_refused(tiny: Weights, tmp_path: Path, how: str) -> None:
     for model in ("grounding-dino", "sam2"):

@@ -85,6 +85,7 @@ def true_spheres(made: Scene, image: int, located: LocatedOutlines) -> list[tupl
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poses", ["true", "robot", "no scale"])
 def test_as_good_as_the_search_of_whole_images(captured: Captured, poses: str) -> None:
     made, paths, whole = captured

@@ -80,7 +80,6 @@ def test_a_run_says_of_what_it_speaks_and_the_terminal_shows_what_it_showed(
     assert terminal.getvalue() == "the lens is cold\n"
 
 
-@pytest.mark.slow
 def test_the_processes_of_a_run_log_and_speak_to_the_terminal_as_ever(tmp_path: Path) -> None:
     _, begun = record_runs(tmp_path)
     resume = command("resume", "latest", "--data", str(tmp_path / "data"))
@@ -234,7 +233,6 @@ def test_what_is_no_secret_stays() -> None:
     assert without_secrets({"passed": 3, "pin_failures": 2}) == {"passed": 3, "pin_failures": 2}
 
 
-@pytest.mark.slow
 def test_a_server_logs_no_password_pin_token_or_link(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     rig.write_text("name: a small site\nsimulated: true\ndevices: {}\n")

@@ -159,7 +159,6 @@ def test_refused_motion_is_an_error_and_the_next_one_works() -> None:
         wait_for(lambda: not arm.is_moving())
 
 
-@pytest.mark.slow
 def test_reconnect_after_the_controller_restarted() -> None:
     host = address(54)
     with contextlib.ExitStack() as stack:

@@ -106,7 +106,6 @@ def test_scanned_spheres_are_where_they_are(sprayed: Scanned, glossy: Scanned) -
             assert 0.035e-3 < fit.rms_m < 0.08e-3
 
 
-@pytest.mark.slow
 def test_the_scan_is_in_a_frame_of_its_own_and_in_millimetres(sprayed: Scanned, glossy: Scanned) -> None:
     assert sprayed.mesh.unit == "mm"
     assert np.linalg.det(sprayed.T_world_scan[:3, :3]) == pytest.approx(1.0)
@@ -144,7 +143,6 @@ def test_other_formats_hold_the_same_scan(tmp_path: Path, form: str) -> None:
     assert names == ({"scan_01.obj", "scan_01.MTL", "scan_01_0.PNG"} if form == "obj" else {"scan_01.stl"})
 
 
-@pytest.mark.slow
 def test_a_scan_appears_gradually_and_is_not_taken_before_it_is_whole(tmp_path: Path) -> None:
     scanner = ScanFolder(ScanFolderConfig(folder=tmp_path, unit="mm", stable_s=0.0))
     seen: list[str] = []
@@ -169,7 +167,6 @@ def test_a_scan_appears_gradually_and_is_not_taken_before_it_is_whole(tmp_path: 
     assert any("cut short" in text for text in seen)
 
 
-@pytest.mark.slow
 def test_a_truncated_scan_is_recognised(tmp_path: Path) -> None:
     plan = json.dumps([{"device": "scanner", "on": "export", "kind": "truncate", "value": 0.7}])
     with pytest.raises(IncompleteExportError, match="cut short"):
@@ -292,7 +289,6 @@ def test_ct_faults_are_found(tmp_path: Path, fault: dict[str, object], words: st
     assert words in " ".join(series.problems)
 
 
-@pytest.mark.slow
 def test_a_ct_fault_plan_reaches_the_simulator(tmp_path: Path) -> None:
     plan = json.dumps([{"device": "ct", "on": "slice", "nth": 20, "kind": "drop", "times": 2}])
     words = ("ct", "--scene", str(SEED), "--folder", str(tmp_path), "--once", "--voxel-mm", "4", "--faults", plan)

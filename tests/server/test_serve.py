@@ -27,7 +27,6 @@ def rig(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.slow
 def test_it_serves_this_machine_records_its_start_and_signs_at_its_end(rig: Path) -> None:
     with serving(rig) as server:
         assert server.url.startswith("http://127.0.0.1:")
@@ -54,7 +53,6 @@ def test_it_serves_this_machine_records_its_start_and_signs_at_its_end(rig: Path
     assert report.unsigned_events == {SITE: 0}
 
 
-@pytest.mark.slow
 def test_other_machines_are_served_with_tls_or_on_an_explicit_word_only(rig: Path) -> None:
     data = str(rig.parent / "data")
     refused = orthocapture("serve", "--rig", str(rig), "--data", data, "--host", "0.0.0.0", "--port", "0", "--json")
@@ -67,7 +65,6 @@ def test_other_machines_are_served_with_tls_or_on_an_explicit_word_only(rig: Pat
             assert page.status == 200
 
 
-@pytest.mark.slow
 def test_tls(rig: Path) -> None:
     certificate, key = self_signed(rig.parent)
     options = ("--host", "0.0.0.0", "--tls-certificate", str(certificate), "--tls-key", str(key))

@@ -153,7 +153,6 @@ def test_a_form_of_an_allowed_role_gets_past_the_guard(site: WebSite, run_id: st
             assert answer.status_code not in (401, 423, 500), (way, answer.status_code, answer.text)
 
 
-@pytest.mark.slow
 def test_a_form_without_the_token_of_its_sign_in_is_refused(site: WebSite, run_id: str) -> None:
     other = site.browser("supervisor").person.csrf
     for role in ROLES:

@@ -71,7 +71,6 @@ def test_first_page_shows_deviations_before_everything_else(web: WebSite, run: s
     assert "a hand in the picture 0" in text
 
 
-@pytest.mark.slow
 def test_auditors_change_nothing_but_may_verify(web: WebSite, run: str) -> None:
     pages = (corrections, overview, runs, signatures, artefacts, events)
     routes = [route for page in pages for route in page.router.routes]
@@ -106,7 +105,6 @@ def test_supervisor_corrects_and_everybody_sees_both_values(web: WebSite, run: s
         assert 400 <= answer.status_code < 500, wrong
 
 
-@pytest.mark.slow
 def test_faults_of_a_verification_are_listed(tmp_path: Path) -> None:
     run = record_run(tmp_path)
     tamper(tmp_path / "data", "UPDATE events SET actor = 'Eve' WHERE seq = 3")

@@ -209,7 +209,6 @@ def test_a_name_on_the_page_is_escaped(web: WebSite, run: str, auditor: Browser)
     assert auditor.get(f"/runs/{run}/dataset?split={hostile}").status_code == 422
 
 
-@pytest.mark.slow
 def test_what_cannot_be_made_is_told_and_can_be_tried_again(web: WebSite, auditor: Browser) -> None:
     """The photographs of this run are smaller than its camera says."""
     run = record_reported_run(web.folder, registered=True)

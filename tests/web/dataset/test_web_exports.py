@@ -91,7 +91,6 @@ def test_a_release_takes_a_second_person_with_password_on_the_record_as_it_is(
     assert "Sign and release" not in page
 
 
-@pytest.mark.slow
 def test_a_bundle_is_made_recorded_and_fetched(web: WebSite, run: str, supervisor: Browser, tmp_path: Path) -> None:
     if not web.site.run(run).state.released_by:
         release(web, supervisor, run)
@@ -164,7 +163,6 @@ def test_a_data_set_without_registration_says_why_not(web: WebSite, supervisor: 
     assert "no evaluated registration" in page
 
 
-@pytest.mark.slow
 def test_a_data_set_leaves_with_all_that_belongs_to_it(
     web: WebSite, supervisor: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
