@@ -2,7 +2,7 @@
 
 What is read from the box may be wrong or late, and a robot moves by it. So a press is a count that is one more than
 before, and nothing else; a press that lets the robot move is timed by the box, and its time must fit what the host
-has read before; and the pedal is disarmed as soon as a reading is late.
+has read before; and as soon as a reading is late the pedal is disarmed.
 """
 
 from __future__ import annotations
@@ -84,14 +84,13 @@ class Pedal:
                 "Confirm on the screen"
             )
             return False
-        if not self._require_prompt(before, now):
-            return False
+        prompt = self._require_prompt(before, now)  # otherwise this press is a first one at most
         since_last_s = now.at_s - before.at_s + CLOCKS_DIFFER_S
         if not 0.0 <= now.reading.now_s - pressed_s <= since_last_s:
             self._disarm("the time of the press does not fit")
             return False
         earliest_s, latest_s = SECOND_PRESS_S
-        if self._armed_by_s is not None and earliest_s <= pressed_s - self._armed_by_s <= latest_s:
+        if prompt and self._armed_by_s is not None and earliest_s <= pressed_s - self._armed_by_s <= latest_s:
             self._armed_by_s = None
             return True
         self._armed_by_s, self._armed_at_s = pressed_s, now.at_s

@@ -133,7 +133,7 @@ def test_a_hundred_presses_a_second_and_a_box_that_is_late_for_0_7_s_let_nothing
         assert not look(moves=True)
     assert not pedal.armed
     box.now_s += 0.7
-    box.press()
+    box.count += 70
     assert not look(moves=True)
     assert not pedal.armed
     box.press()
@@ -154,6 +154,20 @@ def test_presses_that_the_host_reads_late_are_as_far_apart_as_the_box_says(
     box.press(ago_s=0.25)  # 0.15 s after the first: a bounce, whenever it is read
     assert not look(moves=True, after_s=0.3)
     assert pedal.armed
+
+
+def test_a_press_that_is_read_late_is_a_first_one_at_most(box: Box, pedal: Pedal, look: Callable[..., bool]) -> None:
+    look(moves=True)
+    box.press()
+    look(moves=True)
+    assert pedal.armed
+    box.now_s += 1.0
+    box.press()
+    assert not look(moves=True)
+    assert pedal.armed
+    assert not look(moves=True, after_s=0.6)
+    box.press()
+    assert look(moves=True)
 
 
 def test_a_late_reading_disarms(box: Box, pedal: Pedal, look: Callable[..., bool]) -> None:

@@ -61,6 +61,18 @@ class Watched:
         return (state.current, state.phase) == (step, phase)
 
 
+def pressed_twice(watched: Watched, world: str) -> bool:
+    """Press the pedal twice, a second apart, if the run still waits for it; never says that this was enough."""
+    if watched.at("viewpoint_capture_1", "ready") and watched.told.doing == "asking":
+        press_pedal(world)
+        until(lambda: watched.told.pedal_armed, "the pedal is armed again")
+        armed_utc_s = watched.told.at_utc_s
+        until(lambda: watched.told.at_utc_s > armed_utc_s + 1.0, "a second later")
+        press_pedal(world)
+        until(lambda: not watched.told.pedal_armed, "the second press is heeded")
+    return False
+
+
 @pytest.mark.slow
 def test_a_run_driven_from_screens_and_pedal_survives_its_starter(tmp_path: Path) -> None:
     data = tmp_path / "data"
@@ -99,7 +111,13 @@ def test_a_run_driven_from_screens_and_pedal_survives_its_starter(tmp_path: Path
         until(lambda: watched.told.at_utc_s > armed_utc_s + 1.0, "a second later")
         assert watched.at("viewpoint_capture_1", "ready")
         press_pedal(ready["world"])
-        until(lambda: len(watched.state().step.captured) >= 1, "the first image")
+        # Where this machine was too busy to read the second press in time, the pedal is pressed twice again.
+        until(
+            lambda: bool(watched.state().step.captured) or not watched.told.pedal_armed, "the second press is heeded"
+        )
+        until(
+            lambda: bool(watched.state().step.captured) or pressed_twice(watched, ready["world"]), "the first image"
+        )
         assert watched.told.robot in ("moving", "standing")
 
         watched.act(action="pause")
