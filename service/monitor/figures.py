@@ -116,7 +116,8 @@ def _viewpoint_s(connection: Connection, run_id: str) -> float | None:
         .limit(_LAST_CAPTURES)
     )
     rows = connection.execute(last).all()
-    between = [new.monotonic_s - old.monotonic_s for new, old in pairwise(rows) if new.step == old.step]
+    of_step = [new.monotonic_s - old.monotonic_s for new, old in pairwise(rows) if new.step == old.step]
+    between = [seconds for seconds in of_step if seconds > 0]  # after a reboot the clock begins anew
     return statistics.median(between) if between else None
 
 

@@ -80,8 +80,8 @@ class Snapshot(Record):
         return tuple(round(value / steps[name]) if name in steps and value else value for name, value in seen.items())
 
     def stale(self, now_utc_s: float) -> bool:
-        """Whether it is by now too old to tell the current state."""
-        return self.age_s(now_utc_s) > (STARTING_S if self.doing == "starting" else STALE_S)
+        """Whether it is by now too old to tell the current state, or from before the clock was set back."""
+        return abs(self.age_s(now_utc_s)) > (STARTING_S if self.doing == "starting" else STALE_S)
 
     @property
     def standing(self) -> Standing:

@@ -24,7 +24,7 @@ from service.runner.held_run import HeldRun
 from service.runner.operator import Operator
 from service.steps import step_kinds
 from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
-from service.store.durable_effects import Clock
+from service.store.durable_effects import Clock, moment_of
 
 _NOBODY_S = 30.0  # a worker that died has been replaced by then
 _TOLD_AGAIN_S = 300.0
@@ -115,6 +115,7 @@ class StepExecution:
             wait=self.clock.sleep,
             operator=operator.name,
             tell=operator.tell,
+            moment=partial(moment_of, self.clock),
             busy=operator.busy,
         )
 

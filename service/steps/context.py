@@ -26,6 +26,7 @@ from service.core.protocol.models import Step
 from service.core.protocol.step_params import StepParams
 from service.core.records.events import ArtefactRef, ComputedBy, Payload, Record, RecordedView, StepNote, Uncertainty
 from service.core.records.import_list import ImportList
+from service.core.records.moments import Moment
 from service.core.run.decide import RunState, StepState
 from service.core.run.state import JobState
 from service.jobs.kind import JobKind, JobRecord
@@ -266,6 +267,7 @@ class StepContext:
     wait: Callable[[float], None]
     operator: str
     tell: Callable[[str], None]  # one line of news for the operator
+    moment: Callable[[], Moment]  # now, in both clocks: for times that are kept and compared later
     busy: Callable[[str], None] = lambda _what: None  # call before a long call, with what it does
 
     @property

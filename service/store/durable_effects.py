@@ -11,6 +11,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Protocol
 
+from service.core.records.moments import Moment
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
 
 class Files(Protocol):
     """The durable effects of the store: each is one call of this interface. All methods raise OSError.
@@ -143,6 +147,10 @@ class Clock(Protocol):
         """Monotonic time of the host in seconds; all processes of one boot share its origin."""
         ...
 
+    def boot(self) -> str:
+        """The name of the host's present boot; "" if the system has none."""
+        ...
+
     def sleep(self, seconds: float) -> None:
         """Return when so many seconds have passed."""
         ...
@@ -167,6 +175,10 @@ class SystemClock:
         """Seconds of the host's monotonic clock."""
         return time.monotonic()
 
+    def boot(self) -> str:
+        """The boot id of the kernel, "" where it has none."""
+        return _BOOT_ID.read_text().strip() if _BOOT_ID.exists() else ""
+
     def sleep(self, seconds: float) -> None:
         """Suspend this thread for so many seconds."""
         time.sleep(seconds)
@@ -174,6 +186,11 @@ class SystemClock:
     def signal(self) -> Signal:
         """A `threading.Event`."""
         return threading.Event()
+
+
+def moment_of(clock: Clock) -> Moment:
+    """The present moment in both clocks of the host."""
+    return Moment(clock.monotonic_s(), utc_text(clock.utc_now()), clock.boot())
 
 
 def utc_text(at: datetime) -> str:

@@ -21,6 +21,7 @@ from service.core.errors import DataError
 from service.core.geometry import transform
 from service.core.protocol.models import load_protocol
 from service.core.records.events import ViewpointCaptured
+from service.core.records.moments import Moment
 from service.steps import params_models
 from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.context import StepContext
@@ -202,6 +203,7 @@ def test_images_of_a_later_step_are_held_against_the_calibration(tmp_path: Path)
         return StepContext(
             protocol, protocol.steps[step], 1, cast("Any", None), cast("Any", None), cast("Any", evidence),
             lambda: None, lambda *_: None, lambda: 0.0, lambda _: None, "Ada", told.append,
+            lambda: Moment(0.0, "", ""),
         )  # fmt: skip
 
     assert optics_departures(context(1, _Recorded({"v": [50.0]}))) is None

@@ -10,7 +10,6 @@ import logging
 import socket
 import threading
 from dataclasses import dataclass
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -20,10 +19,9 @@ from sqlalchemy import Connection, Row, bindparam, delete, insert, select, updat
 from service.core.errors import StoreError
 from service.store.database.engine import Database
 from service.store.database.tables import leases
-from service.store.durable_effects import Clock, IdSource
+from service.store.durable_effects import Clock, IdSource, SystemClock
 from service.store.errors import LeaseHeldError, LeaseLostError
 
-_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _SAME_START_S = 1.5  # the boot time is known to one second
 _HELD = select(leases.c.run_id).where(leases.c.token == bindparam("held"))  # put together once: every record asks it
 _log = logging.getLogger(__name__)
@@ -66,7 +64,7 @@ class ProcessIdentity:
 
 
 def _boot() -> str:
-    return _BOOT_ID.read_text().strip() if _BOOT_ID.exists() else ""
+    return SystemClock().boot()
 
 
 def _started_s(process: psutil.Process) -> float:

@@ -18,6 +18,7 @@ from service.store.records import SITE
 Rows = Sequence[Mapping[str, Any]]
 _REF_COLUMNS = tuple(ArtefactRef.model_fields)
 _CLOCK_READ_TWICE_S = 5.0
+_BACK_S = 1.0  # less is a step of the time service
 _OF_JOBS = frozenset({"job_enqueued", "job_finished", "job_failed"})
 _SIGNED_AT_ONCE = frozenset({"step_passed", "run_completed", "run_aborted"})
 # A runner records these only after it has signed; other processes may record other events at any moment.
@@ -75,6 +76,33 @@ class ChainFacts:
         default_factory=dict[int, int]
     )  # of `to_sign`: seq → signed before this seq
     first: Mapping[str, Any] | None = None
+    backwards: list[tuple[int, float]] = field(
+        default_factory=list[tuple[int, float]]
+    )  # seq, s before the one before
+    _last_utc: str = ""
+
+    def pass_time(self, seq: int, at_utc: str) -> None:
+        """Look at the time of the next event, and keep where the host's clock ran backwards."""
+        if at_utc < self._last_utc:  # ISO 8601 of one form sorts by time
+            try:
+                back_s = (datetime.fromisoformat(self._last_utc) - datetime.fromisoformat(at_utc)).total_seconds()
+            except (ValueError, TypeError):
+                back_s = 0.0  # no time at all, which its hash shows
+            if back_s > _BACK_S:
+                self.backwards.append((seq, back_s))
+        self._last_utc = at_utc
+
+    def backwards_notes(self, run_id: str) -> list[str]:
+        """A note, if times run backwards within the chain: the order of the events is that of their numbers."""
+        if not self.backwards:
+            return []
+        seq, back_s = self.backwards[0]
+        more = len(self.backwards) - 1
+        return [
+            f"{run_id}: at event {seq} the time is {back_s:.0f} s before that of the event before"
+            + (f", and so at {more} more" if more else "")
+            + "; the host's clock was set back. The events are in the order of their numbers"
+        ]
 
     def add(self, seq: int, payload: Any, at_utc: str) -> None:
         """Add an event whose content has verified."""
@@ -130,6 +158,7 @@ def run_faults(
         if problem:
             yield Fault(run_id, seq, "", problem)
             continue
+        facts.pass_time(seq, str(row["at_utc"]))
         facts.add(seq, payload, str(row["at_utc"]))
         recorded |= {(str(item["sha256"]), int(item["size_bytes"])) for item in mine}
         yield from _artefact_faults(run_id, row, payload, named, mine, recorded=recorded, files=files)

@@ -230,7 +230,12 @@ class _SignatureCheck:
             *(fault for fault in self.stamps_differ if fault.run_id == run and not stamped),
         ]
         _, note = signatures.unsigned(run, signed, len(facts.sha256_at))
-        return faults, [*notes, *signatures.late_signatures(run, signed, facts), *([note] if note else [])]
+        return faults, [
+            *notes,
+            *facts.backwards_notes(run),
+            *signatures.late_signatures(run, signed, facts),
+            *([note] if note else []),
+        ]
 
 
 def _derived_faults(connection: Connection, runs: Sequence[str], *, every_run: bool) -> Iterator[Fault]:

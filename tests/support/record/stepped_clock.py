@@ -28,6 +28,7 @@ class SteppedClock:
         self.on_sleep: Callable[[float], None] = lambda _seconds: None  # called before time goes on
         self._began, self._began_monotonic_s = began, began_monotonic_s
         self._passed_s, self._look_s = 0.0, look_s
+        self._boots = 1
         self.moved = threading.Condition()  # notified when time has passed, or a signal was set
 
     @classmethod
@@ -58,6 +59,21 @@ class SteppedClock:
 
     def monotonic_s(self) -> float:
         return self._began_monotonic_s + self._passed_s
+
+    def boot(self) -> str:
+        """The name of the present boot; `reboot` begins the next."""
+        return f"boot-{self._boots}"
+
+    def reboot(self, off_s: float) -> None:
+        """The host is off for so long, and begins with a new boot and a monotonic clock near zero."""
+        self.set_utc(off_s)
+        self._began_monotonic_s, self._boots = 20.0 - self._passed_s, self._boots + 1
+
+    def set_utc(self, by_s: float) -> None:
+        """UTC goes on or back by that, and the monotonic clock does not: the clock is set, or the host slept."""
+        with self.moved:
+            self._began += timedelta(seconds=by_s)
+            self.moved.notify_all()
 
     def sleep(self, seconds: float) -> None:
         self.on_sleep(seconds)

@@ -8,6 +8,7 @@ from pydantic import BaseModel
 
 from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import Record
+from service.core.records.moments import Moment
 from service.steps.context import Announcement, StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, MeasureRecord
 
@@ -36,27 +37,42 @@ class _Applied(BaseModel):
     """The note that the product was applied; notes on other things do not have the time."""
 
     applied_monotonic_s: float | None = None
+    applied_utc: str = ""
+    applied_boot: str = ""
 
 
 class Result(Record):
-    """When the coating was applied (host's monotonic clock), and its times."""
+    """When the coating was applied, in both clocks of the host, and its times."""
 
     product: str
     applied_monotonic_s: float
+    applied_utc: str = ""  # ISO 8601; "" in a run of a version that kept the monotonic time alone
+    applied_boot: str = ""  # boot id of the host, in which the monotonic time counts
     scan_within_s: float
     sublimates_after_s: float
+
+    @property
+    def applied(self) -> Moment:
+        """The moment of the application."""
+        return Moment(self.applied_monotonic_s, self.applied_utc, self.applied_boot)
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Start the timer at the operator's confirmation, and wait for the coating to settle."""
-    notes = [_Applied.model_validate(note.data) for note in context.state.notes]
-    earlier = [note.applied_monotonic_s for note in notes if note.applied_monotonic_s is not None]
-    applied = earlier[0] if earlier else context.monotonic_s()
+    notes = [(_Applied.model_validate(note.data), note.at_utc) for note in context.state.notes]
+    earlier = [
+        Moment(note.applied_monotonic_s, note.applied_utc or noted_utc, note.applied_boot)
+        for note, noted_utc in notes
+        if note.applied_monotonic_s is not None
+    ]
+    applied = earlier[0] if earlier else context.moment()
     if not earlier:  # after a restart, the timer goes on
         context.note(
             f"{params.product} applied: scan within {params.scan_within_s / 60:.0f} min, "
             f"gone after {params.sublimates_after_s / 3600:.1f} h",
-            applied_monotonic_s=applied,
+            applied_monotonic_s=applied.monotonic_s,
+            applied_utc=applied.at_utc,
+            applied_boot=applied.boot,
         )
     remaining = params.settle_s
     while remaining > 0:
@@ -66,7 +82,9 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         remaining -= 0.2
     result = Result(
         product=params.product,
-        applied_monotonic_s=applied,
+        applied_monotonic_s=applied.monotonic_s,
+        applied_utc=applied.at_utc,
+        applied_boot=applied.boot,
         scan_within_s=params.scan_within_s,
         sublimates_after_s=params.sublimates_after_s,
     )

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
+from drivers.interfaces import ScanExport
 from service.core.jobs.references import Reference
 from service.core.protocol.step_params import NAMES_SPHERES, NamesStep, NeededDevice, RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, Record
+from service.core.records.moments import elapsed
+from service.core.text.counts import counted
 from service.core.units import metres
 from service.jobs.records import Point, SphereDetails
 from service.jobs.surfaces import locate_spheres, merge_scans
@@ -20,6 +25,7 @@ from service.steps.kinds.by_hand import timed_application
 from service.steps.layouts import layout_uncertainties
 from service.steps.measures import Count, ErrorMm, Measure, SphereMeasures
 
+_NAMED = 20  # exports in a record of what was left out, the newest
 _NAMES_APPLICATION = NamesStep("applies a coat", lambda params: isinstance(params, timed_application.Params))
 
 
@@ -85,9 +91,15 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     importing = context.devices.imported() is not None
     since = "" if importing else max((step.ended_utc for step in context.run.steps.values()), default="")
 
+    left_out = _LeftOut(context, since)
+
     def fresh() -> list[Any]:
-        found = [e for e in scanner.exports() if not since or _time(e.modified_utc) >= _time(since)]
-        return [found[-params.parts :]] if len(found) >= params.parts else []
+        exports = scanner.exports()
+        found = [e for e in exports if not since or _time(e.modified_utc) >= _time(since)]
+        if len(found) >= params.parts:
+            return [found[-params.parts :]]
+        left_out.look([e for e in exports if e not in found])
+        return []
 
     wanted = "a complete scan export" if params.parts == 1 else f"{params.parts} complete scan exports"
     scans = [scanner.read(export) for export in wait_for(context, fresh, params.wait_s, wanted, scanner.report)]
@@ -95,8 +107,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     measures = {name: value for name, value in found.items() if name in Measures.declared()}  # a driver may find more
     measures["faces"] = float(sum(len(scan.mesh.faces) for scan in scans))
     if params.application is not None:
-        applied_s = earlier_result(context, params.application, timed_application.Result).applied_monotonic_s
-        measures["since_application_min"] = (context.monotonic_s() - applied_s) / 60
+        measures |= _age(context, params.application)
     kind = "scan_mesh" if params.parts == 1 else "scan_part"
     pairs = [keep_mesh(context, scan, device="scanner", kind=kind) for scan in scans]
     kept = tuple(ref for _, refs in pairs for ref in refs)
@@ -116,6 +127,45 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         uncertainties,
         (answer.source,),
     )
+
+
+class _LeftOut:
+    """Exports that are older than the step before: named to the operator and recorded, in case one is the new one."""
+
+    def __init__(self, context: StepContext, since: str) -> None:
+        self._context, self._since = context, since
+        self._told: set[tuple[str, str]] = set()
+
+    def look(self, exports: Sequence[ScanExport]) -> None:
+        """Tell of exports of which it was not told yet; a host whose clock was set back dates new ones before."""
+        new = [export for export in exports if (export.name, export.modified_utc) not in self._told]
+        if not new:
+            return
+        self._told.update((export.name, export.modified_utc) for export in new)
+        newest = max(new, key=lambda export: _time(export.modified_utc))
+        text = (
+            f"left out {counted(len(new), 'export')} older than the end of the step before ({self._since}); the "
+            f"newest is {newest.name}, written {newest.modified_utc}. If it is the new scan, the clock was set back: "
+            "export it again once the computer's clock is right and past that time"
+        )
+        self._context.tell(text)
+        shown = sorted(new, key=lambda export: _time(export.modified_utc))[-_NAMED:]
+        self._context.note(text, left_out={export.name: export.modified_utc for export in shown}, since=self._since)
+
+
+def _age(context: StepContext, application: str) -> dict[str, float]:
+    """The time since a coat was applied, and nothing if it cannot be told, with the reason; both clocks are noted."""
+    applied = earlier_result(context, application, timed_application.Result).applied
+    arrived = context.moment()
+    age = elapsed(applied, arrived)
+    clocks = {"applied": asdict(applied), "arrived": asdict(arrived)}
+    if age.seconds is None:
+        text = f"the time since the coat was applied is not known: {age.why}"
+        context.tell(text)
+        context.note(text, **clocks)
+        return {}
+    context.note(f"the scan arrived {age.seconds / 60:.1f} min after the coat was applied", **clocks)
+    return {"since_application_min": age.seconds / 60}
 
 
 def _request(context: StepContext, params: Params, meshes: list[ArtefactRef]) -> JobRequest:
