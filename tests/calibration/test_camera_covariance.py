@@ -102,7 +102,7 @@ def test_camera_json_is_read_for_it(tmp_path: Path) -> None:
 
 
 def test_the_covariance_of_the_lens_has_each_parameter_in_its_place() -> None:
-    """Parameters that the calibration held fixed are all but exact; a lens of another model has no such covariance."""
+    """Parameters that the calibration held fixed are all but exact; a lens of another model has none."""
     known = CameraCovariance(("cy", "fx", "p2"), np.array([[4.0, 0.5, 0.1], [0.5, 9.0, 0.2], [0.1, 0.2, 1.0]]))
     found = known.of_lens()
     assert found is not None
