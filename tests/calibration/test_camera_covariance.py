@@ -98,3 +98,30 @@ def test_camera_json_is_read_for_it(tmp_path: Path) -> None:
         path.write_text(json.dumps({**CAMERA.record(), "covariance": wrong}))
         with pytest.raises(DataError, match="not a square matrix"):
             read_camera_covariance(path)
+
+
+def test_the_covariance_of_the_lens_has_each_parameter_in_its_place() -> None:
+    """Parameters that the calibration held fixed are all but exact; a lens of another model has none."""
+    known = CameraCovariance(("cy", "fx", "p2"), np.array([[4.0, 0.5, 0.1], [0.5, 9.0, 0.2], [0.1, 0.2, 1.0]]))
+    found = known.of_lens()
+    assert found is not None
+    expected = 1e-18 * np.eye(8)  # fx, fy, cx, cy, k1, k2, p1, p2
+    for i, a in enumerate((3, 0, 7)):
+        for j, b in enumerate((3, 0, 7)):
+            expected[a, b] = known.matrix[i, j]
+    assert np.array_equal(found, expected)
+    assert CameraCovariance(("fx", "k3"), np.eye(2)).of_lens() is None
+
+
+def test_deviations_of_the_camera_add_up_to_its_covariance() -> None:
+    """Parameters of a thousand pixels and of thousandths alike, as they are correlated."""
+    names, sigma = ("fx", "cy", "k1"), np.array([12.0, 3.0, 1e-4])
+    matrix = np.array([[1.0, 0.6, -0.7], [0.6, 1.0, 0.1], [-0.7, 0.1, 1.0]]) * np.outer(sigma, sigma)
+    moved_by = np.array(
+        [
+            [getattr(other, name) - getattr(CAMERA, name) for name in names]
+            for other in CameraCovariance(names, matrix).deviations(CAMERA)
+        ]
+    )
+    assert len(moved_by) == 3
+    assert np.allclose(moved_by.T @ moved_by, matrix, rtol=1e-6, atol=1e-9 * np.outer(sigma, sigma))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import get_args
 
 import pytest
@@ -34,7 +35,9 @@ from service.core.run.decide import (
     fold,
     initial_state,
 )
+from service.core.run.effects.place import is_void
 from service.core.run.fold import RUN_EVENTS, kind_of
+from service.core.run.state import Status
 from tests.support.record.core import GOOD, TOY, Log, captured, toy_protocol
 from tests.support.record.core_log import at_capture, at_scan, failure, refused
 from tests.support.record.counting import calls_of
@@ -233,6 +236,48 @@ def test_folding_a_thousand_events_is_quick() -> None:
     assert len(fold(log.protocol, log.events).step.captured) == 1000
     # 96 calls per event when this was written, whatever their number.
     assert calls_of(lambda: fold(log.protocol, log.events)) < 200 * len(log.events)
+
+
+@pytest.mark.parametrize(
+    ("attempt", "status", "skipped", "when_completed", "void"),
+    [
+        (2, "active", False, False, False),
+        (1, "active", False, False, True),  # of an attempt before a redo
+        (2, "active", True, False, True),
+        (1, "active", True, False, True),
+        (2, "paused", False, False, False),
+        (2, "aborted", False, False, True),
+        (2, "completed", False, False, True),
+        (2, "completed", False, True, False),  # what may still be recorded then
+        (2, "aborted", False, True, True),
+        (2, "completed", True, True, True),
+    ],
+)
+def test_work_is_void_after_a_redo_a_skip_or_the_end(
+    attempt: int, status: Status, skipped: bool, when_completed: bool, void: bool
+) -> None:
+    log = at_capture()
+    step = replace(log.state.steps["capture"], attempt=2, skipped=skipped)
+    state = replace(log.state, status=status, steps={**log.state.steps, "capture": step})
+    event = log.events[-1]
+    assert is_void(state, event, "capture", attempt, when_completed=when_completed) is void
+    if not void:
+        with pytest.raises(IntegrityError, match="attempt 3 of capture has not begun"):
+            is_void(state, event, "capture", 3, when_completed=when_completed)
+        with pytest.raises(IntegrityError, match="no step 'other'"):
+            is_void(state, event, "other", attempt, when_completed=when_completed)
+
+
+def test_a_step_whose_gates_were_overridden_does_not_count_as_skipped() -> None:
+    """Its figures exist, so later gates that need them are judged; those of a step without figures fall away."""
+    early, late = at_capture(), at_capture()
+    early.act("skip", reason="no animal")
+    late.begin()
+    late.measure(views=2.0, sharp=0.5)
+    late.act("skip", reason="the animal moved")
+    assert early.state.steps["capture"].skipped
+    assert late.state.steps["capture"].skipped
+    assert (early.state.skipped, late.state.skipped) == ({"capture"}, set())
 
 
 def test_questions_are_values() -> None:

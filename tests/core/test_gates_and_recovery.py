@@ -7,7 +7,7 @@ import pytest
 import drivers.errors as device_errors
 import service.core.errors as core_errors
 from service.core.errors import IntegrityError
-from service.core.gates.verdict import describe
+from service.core.gates.verdict import describe, quantity, uncertain
 from service.core.protocol.models import Recovery
 from service.core.records.events import (
     RunAborted,
@@ -74,6 +74,75 @@ def test_a_number_with_its_uncertainty_is_judged_by_its_bounds(lower: float, upp
     assert without.passed
     assert without.lower is None
     assert " to " not in describe(without)
+
+
+@pytest.mark.parametrize(
+    ("minimum", "maximum", "lower", "upper", "outcome"),
+    [
+        (None, None, -9.0, 9.0, "passed"),
+        (3.0, None, 3.0, 4.0, "passed"),  # a bound on the limit is within it
+        (3.0, None, 2.0, 3.0, "undecided"),
+        (3.0, None, 2.0, 2.9, "failed"),
+        (None, 5.0, 4.0, 5.0, "passed"),
+        (None, 5.0, 5.0, 6.0, "undecided"),
+        (None, 5.0, 5.1, 6.0, "failed"),
+        (3.0, 5.0, 3.0, 5.0, "passed"),
+        (3.0, 5.0, 2.9, 5.0, "undecided"),
+        (3.0, 5.0, 3.0, 5.1, "undecided"),
+        (3.0, 5.0, 2.0, 6.0, "undecided"),  # the whole of the limits and more
+        (3.0, 5.0, 1.0, 2.0, "failed"),
+        (3.0, 5.0, 6.0, 7.0, "failed"),
+    ],
+)
+def test_bounds_are_judged_against_each_limit(
+    minimum: float | None, maximum: float | None, lower: float, upper: float, outcome: str
+) -> None:
+    step = toy_protocol().step("capture")
+    gate = step.gates[0].model_copy(update={"min": minimum, "max": maximum})
+    step = step.model_copy(update={"gates": (gate,)})
+    known = Uncertainty(sigma=0.2, lower=lower, upper=upper)
+    judged = evaluate_gates(step, 1, {"views": (lower + upper) / 2}, uncertainties={"views": known})
+    (verdict,) = judged.verdicts
+    found = "passed" if verdict.passed else "undecided" if verdict.undecided else "failed"
+    assert (found, judged.passed) == (outcome, outcome == "passed")
+    missing = evaluate_gates(step, 1, {"views": float("nan")}, uncertainties={"views": known}).verdicts[0]
+    assert (missing.passed, missing.undecided, missing.value, missing.sigma) == (False, False, None, None)
+    assert (missing.lower, missing.upper) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "words"),
+    [
+        (None, "px", "not measured"),
+        (1.0, "images", "1 image"),
+        (1.0, "s", "1 s"),
+        (2.0, "images", "2 images"),
+        (0.0, "images", "0 images"),
+        (0.71234, "px", "0.7123 px"),
+        (1234567.0, "points", "1234567 points"),
+        (9_999_999.0, "points", "9999999 points"),
+        (1e7, "points", "1e+07 points"),
+        (-1e7, "", "-1e+07"),
+    ],
+)
+def test_numbers_in_words(value: float | None, unit: str, words: str) -> None:
+    assert quantity(value, unit) == words
+
+
+@pytest.mark.parametrize(
+    ("value", "lower", "upper", "words"),
+    [
+        (0.52, 0.41, 0.63, "0.52 mm, 0.41 to 0.63"),
+        (523.4, 411.2, 631.9, "523 mm, 411 to 632"),
+        (5.21, 4.13, 6.34, "5.2 mm, 4.1 to 6.3"),
+        (0.00152, 0.00141, 0.00163, "0.0015 mm, 0.0014 to 0.0016"),
+        (0.5, 0.5, 0.5, "0.50 mm, 0.50 to 0.50"),
+    ],
+)
+def test_a_number_has_the_places_that_tell_its_bounds_apart(
+    value: float, lower: float, upper: float, words: str
+) -> None:
+    assert uncertain(value, lower, upper, "mm") == words
 
 
 def test_a_gate_falls_away_with_the_step_that_would_have_made_it_measurable() -> None:

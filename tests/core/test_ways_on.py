@@ -275,6 +275,27 @@ def test_before_two_views_are_taken_the_time_for_one_is_that_of_the_planned_moti
     assert view_s(log.protocol, log.state, log.protocol.step("capture")) == 15.0
 
 
+@pytest.mark.parametrize(
+    ("images", "again", "afresh"),
+    [
+        (0, "Nothing.", None),
+        (1, "Nothing. The image is kept.", "1 image no longer counts. All of it stays in the record."),
+        (2, "Nothing. The 2 images are kept.", "2 images no longer count. All of it stays in the record."),
+    ],
+)
+def test_each_way_says_what_is_lost_by_it(images: int, again: str, afresh: str | None) -> None:
+    text = TOY_TEXT.replace("max: 0.1, unit: mm}", "max: 0.1, unit: mm, unless_skipped: capture}")
+    log = Log(toy_protocol(text))
+    log.do()
+    log.begin()
+    log.capture([f"v{i}" for i in range(images)])
+    log.measure(views=2.0, sharp=0.5)
+    loses = {way.verb: way.loses for way in ways_on(log.protocol, log.state)}
+    assert loses["confirm"] == again
+    assert loses.get("redo") == afresh
+    assert loses["skip"] == "Its result does not count. These cannot begin: Spray. Not judged later: rms_mm."
+
+
 def test_minutes_in_words() -> None:
     assert [takes_words(m) for m in (None, 0.0, 0.4, 12.4)] == [
         "not known",

@@ -35,6 +35,13 @@ def test_pycolmap_projects_points_to_their_pixels(
             assert picture.size == (camera.width, camera.height)
 
 
+@pytest.mark.parametrize("name", ["colmap", "colmap-binary", "colmap-pinhole"])
+def test_a_model_of_cameras_alone_has_no_points(dataset: DataSet, tmp_path: Path, name: str) -> None:
+    """An invented point would count as measured for whoever triangulates from these poses."""
+    model = pycolmap.Reconstruction(str(written(dataset, name, tmp_path) / "sparse" / "0"))
+    assert (len(model.points3D), model.num_reg_images()) == (0, len(dataset.views))
+
+
 @pytest.mark.parametrize("name", ["colmap", "colmap-pinhole", "sugar", "eth3d"])
 def test_an_image_name_that_colmaps_text_cannot_hold_is_refused(dataset: DataSet, tmp_path: Path, name: str) -> None:
     first, *others = dataset.views

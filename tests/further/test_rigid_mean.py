@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.registration.further_cameras.pose_covariances import of_inverse, of_product
 from service.compute.registration.further_cameras.rigid_mean import RigidMean, rigid_mean
+from service.core.errors import DataError
 from service.core.geometry import Array, Transform, increment, inverse, rotation_angle_rad, transform
 
 SEEDS = st.integers(0, 1_000_000)
@@ -127,3 +128,34 @@ def test_covariances_of_inverses_and_products_follow_the_poses(seed: int) -> Non
         of_product(T_a_b, T_b_c, C, D), K @ C @ K.T + L @ D @ L.T, rtol=1e-3, atol=1e-3 * np.abs(C).max()
     )
     assert rotation_angle_rad(T_a_b @ inverse(T_a_b)) < 1e-7
+
+
+@pytest.mark.parametrize("axis", range(6))
+@pytest.mark.parametrize(("chi2_of_one", "kept"), [(16.0, True), (32.0, False)])
+def test_one_pose_is_left_out_if_its_distance_is_rarer_than_one_in_a_thousand(
+    axis: int, chi2_of_one: float, kept: bool
+) -> None:
+    """The others agree exactly, so it is the stated covariances alone that say how far is too far."""
+    sigma = np.array([1e-4, 2e-4, 3e-4, 1e-3, 2e-3, 3e-3])
+    error = np.where(np.arange(6) == axis, np.sqrt(chi2_of_one) * sigma, 0.0)
+    truth = some_pose(np.random.default_rng(7))
+    poses = np.array([truth] * 20 + [increment(truth, error[:3], error[3:])])
+    found = rigid_mean(poses, np.array([np.diag(sigma**2)] * 21))
+    assert found.kept.tolist() == [True] * 20 + [kept]
+    expected = error / 21 if kept else np.zeros(6)
+    assert np.allclose(deviation(found.T, truth), expected, atol=1e-3 * sigma.min())
+    assert np.allclose(found.covariance, np.diag(sigma**2) / (21 if kept else 20))  # it never states less than given
+    spread = np.linalg.norm(error) * np.sqrt(20) / 21 if kept else 0.0
+    assert np.allclose((found.rms_m, found.rms_rad), (spread, 0.0) if axis < 3 else (0.0, spread), atol=1e-9)
+
+
+def test_a_single_pose_is_its_own_mean_and_none_has_no_mean() -> None:
+    rng = np.random.default_rng(8)
+    pose, covariance = some_pose(rng), some_covariance(rng)
+    found = rigid_mean(pose[None], covariance[None])
+    assert np.allclose(found.T, pose)
+    assert np.allclose(found.covariance, covariance)
+    assert (found.chi2_reduced, found.kept.tolist()) == (1.0, [True])
+    for poses, covariances in ((pose[None][:0], covariance[None][:0]), (pose[None], covariance[None][:0])):
+        with pytest.raises(DataError, match="poses and"):
+            rigid_mean(poses, covariances)

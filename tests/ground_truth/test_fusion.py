@@ -154,6 +154,34 @@ def test_what_only_the_scan_shows_is_kept_as_a_part_of_its_own() -> None:
     assert len(cut.sigma_m) == len(cut.source) == len(cut.surface.vertices_m) < len(result.sigma_m)
 
 
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (3.0, 0.0, 0.0), (0.0, -0.2, 0.0)])
+@pytest.mark.parametrize("post_radius_m", [0.002, 0.0])
+def test_what_is_near_a_marker_is_its_sphere_and_its_post_below_with_the_margin(
+    up: tuple[float, float, float], post_radius_m: float
+) -> None:
+    """Spheres of 4 mm on posts of 2 mm and 20 mm, and 1 mm around both, wherever they stand and lean."""
+    has_post = post_radius_m > 0
+    points = [  # mm aside and along the post from the centre, and whether it is cut
+        (0.0, 4.9, True),
+        (0.0, 5.1, False),
+        (4.9, 0.0, True),
+        (5.1, 0.0, False),
+        (0.0, 8.0, False),  # above is no post
+        (0.0, -8.0, has_post),
+        (2.9, -8.0, has_post),
+        (3.1, -8.0, False),
+        (2.0, -19.9, has_post),
+        (2.0, -20.1, False),
+    ]
+    axis = np.array(up) / np.linalg.norm(up)
+    aside = np.roll(axis, 1)
+    centres = np.array([[0.1, -0.2, 0.3], [-0.4, 0.5, 0.2]])
+    markers = Markers(centres, 0.004, np.array(up), post_radius_m, post_length_m=0.02, margin_m=0.001)
+    for centre in centres:
+        near = markers.near(centre + 1e-3 * np.array([a * aside + b * axis for a, b, _ in points]))
+        assert near.tolist() == [cut for _, _, cut in points]
+
+
 def test_surfaces_in_different_frames_are_refused() -> None:
     with pytest.raises(ComputeError, match="agree nowhere"):
         fuse(ct_mesh(), scan_mesh().moved(transform(np.eye(3), np.array([0.0, 0.0, 0.5]))), UP)

@@ -12,6 +12,8 @@ from argon2.low_level import Type
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.core.records.events import SignInRecorded
+from service.people.credentials.tries import failed_tries
 from service.people.errors import NotSignedInError, PinRefusedError
 from service.people.sessions import People, wait_after_s
 from service.store.database.engine import database_path
@@ -118,6 +120,29 @@ def test_a_wrong_password_of_a_signature_counts(office: Office) -> None:
     office.clock.passed_s += 30
     office.people.check_password("grace", password_of("grace"))
     assert office.people.accounts.get("grace").failures == 0
+
+
+def test_a_restart_remembers_who_guessed_from_where(office: Office) -> None:
+    """Only a guess at a password from a known address counts, for as long as the window says."""
+    for outcome, account, address in (
+        ("refused", "grace", "10.0.0.1"),
+        ("refused", "", "10.0.0.2"),  # an account that does not exist
+        ("locked_out", "grace", "10.0.0.3"),  # a guess at an account that has to wait
+        ("locked_out", "", "10.0.0.4"),  # an address that has to wait: nothing was tried
+        ("refused", "grace", ""),  # a PIN or a signature at a screen that is signed in
+        ("locked_out", "grace", ""),
+        ("signed_in", "grace", "10.0.0.5"),
+        ("signed_out", "grace", "10.0.0.6"),
+        ("ended", "grace", "10.0.0.7"),
+        ("screen_locked", "grace", "10.0.0.8"),
+    ):
+        tried = SignInRecorded.model_validate({"outcome": outcome, "account": account, "address": address})
+        office.store.record_site([tried], actor="service")
+    office.clock.passed_s += 50.0
+    tries = failed_tries(office.store, 60.0)
+    assert [address for address, _ in tries] == ["10.0.0.1", "10.0.0.2", "10.0.0.3"]
+    assert [age_s for _, age_s in tries] == pytest.approx([50.0] * 3, abs=1.0)
+    assert failed_tries(office.store, 40.0) == []
 
 
 def test_hashes_follow_the_parameters_of_today(office: Office, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ import pytest
 from service.core.errors import DataError, StoreError
 from service.core.records.events import JobFailed, JobFinished, StepNote
 from service.store.errors import LeaseHeldError, LeaseLostError
-from service.store.queue.leases import RunLease
+from service.store.queue.leases import ProcessIdentity, RunLease
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
@@ -257,3 +258,18 @@ def test_leases_of_a_killed_process_are_taken_over_at_once(tmp_path: Path) -> No
         assert (job.job_id, job.tries) == (enqueued.job_id, 2)
         store.finish_job(job, measures={}, duration_s=0.1)
     assert verify(tmp_path).ok
+
+
+def test_a_process_is_known_by_its_host_its_boot_its_number_and_its_start() -> None:
+    """A number is given again, so another start, by more than the second to which it is known, is another process."""
+    this = ProcessIdentity.of_this_process()
+    assert this.boot
+    assert this.life() == "lives"
+    for other_start_s in (-1.2, 1.2):
+        assert replace(this, process_started_s=this.process_started_s + other_start_s).life() == "lives"
+    for other_start_s in (-2.0, 2.0):
+        assert replace(this, process_started_s=this.process_started_s + other_start_s).life() == "dead"
+    assert replace(this, boot="another").life() == "dead"
+    assert replace(this, pid=2**22 + 1).life() == "dead"  # beyond the largest that Linux gives
+    assert replace(this, host="another").life() == "unknown"
+    assert replace(this, host="another", boot="another").life() == "unknown"

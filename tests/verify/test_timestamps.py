@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rfc3161_client import HashAlgorithm, TimestampRequestBuilder
 
 from service.audit.bundle.export import export_bundle
 from service.audit.verify import bundle_verifier
@@ -21,7 +22,12 @@ from service.store.signatures.timestamps import Authority, stamp_end, timestamp
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.store import rows, tamper
-from tests.support.record.time_stamp_authority import TimeStampAuthority, make_certificates, time_stamp_authority
+from tests.support.record.time_stamp_authority import (
+    TimeStampAuthority,
+    make_certificates,
+    reply,
+    time_stamp_authority,
+)
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store, record_runs
 
 
@@ -85,6 +91,19 @@ def test_a_checkpoint_is_stamped_once_and_verified_with_and_without_certificates
         check.run(bundle, None, certificates)
         assert len(check.faults) == faults, check.faults
         assert said in " ".join([*check.notes, *(fault["what"] for fault in check.faults)])
+
+
+def test_the_stand_alone_verifier_follows_the_certificates_to_one_that_was_given(tmp_path: Path) -> None:
+    root, other = make_certificates(tmp_path / "one"), make_certificates(tmp_path / "other")
+    query = TimestampRequestBuilder().data(b"this").hash_algorithm(HashAlgorithm.SHA256).build().as_bytes()
+    token = bundle_verifier.Token(reply(tmp_path / "one", query))
+    token.check_message(b"this")
+    with pytest.raises(ValueError, match="something other"):
+        token.check_message(b"that")
+    token.check_signature(bundle_verifier.load_certificates(root))
+    for unknown in (other, None):  # the other root has the same name and another key
+        with pytest.raises(ValueError, match="no line of certificates"):
+            token.check_signature(bundle_verifier.load_certificates(unknown))
 
 
 def test_a_stamp_of_something_else_is_a_fault(

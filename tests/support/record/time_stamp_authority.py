@@ -80,7 +80,8 @@ def make_certificates(folder: Path) -> Path:
     return folder / "root.pem"
 
 
-def _reply(folder: Path, query: bytes) -> bytes:
+def reply(folder: Path, query: bytes) -> bytes:
+    """The answer to a query, signed with the certificates in a folder (see `make_certificates`)."""
     (folder / "query").write_bytes(query)
     words = ["openssl", "ts", "-reply", "-config", folder / "openssl.cnf", "-queryfile", folder / "query"]
     words += ["-inkey", folder / "key.pem", "-signer", folder / "leaf.pem", "-out", folder / "reply"]
@@ -98,7 +99,7 @@ def time_stamp_authority(folder: Path) -> Generator[TimeStampAuthority]:
             query = self.rfile.read(int(self.headers["Content-Length"]))
             with authority.lock:
                 authority.asked += 1
-                answer = _reply(folder, query)
+                answer = reply(folder, query)
                 authority.first = authority.first or answer
             kind = "text/html" if authority.behaviour == "html" else "application/timestamp-reply"
             content = {"garbage": b"\x30\x03\x02\x01\x00", "replay": authority.first}.get(authority.behaviour, answer)
