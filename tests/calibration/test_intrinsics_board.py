@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -78,7 +80,7 @@ def test_circles_are_measured_at_their_centroids() -> None:
     board = Board(4, 11, 0.012, "circles")
     centres = board.points()[:, :2]
 
-    def shade(xy: Array, footprint_m: float) -> Array:
+    def shade(xy: NDArray[np.floating[Any]], footprint_m: float) -> Array:
         nearest = np.full(len(xy), np.inf)
         for centre in centres:
             nearest = np.minimum(nearest, np.hypot(*(xy - centre).T))

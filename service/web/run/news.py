@@ -12,6 +12,7 @@ from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from service.monitor.snapshot import STALE_S, read_snapshot
+from service.people.control import Control
 from service.people.person import Person
 from service.web.security.guards import SignedInPerson, requires, token_of
 from service.web.site import CurrentSite, Site
@@ -73,8 +74,11 @@ def _signed_in(site: Site, token: str) -> Person | None:
 
 
 def _newest(site: Site, run_id: str) -> tuple[int, int]:
-    """The last event, and a number that changes with what the runner reports, or when it falls silent."""
+    """The last event, and a number that changes with the runner's reports, its silence, and who has control.
+
+    Who asks for control, and whether that was refused, are no events of the run: they are rows of the site.
+    """
     now_utc_s = site.store.clock.utc_s()
     snapshot = read_snapshot(site.data, run_id, now_utc_s)
     silent = snapshot.age_s(now_utc_s) // STALE_S if snapshot.stale(now_utc_s) else 0
-    return site.store.head(run_id), hash((silent, *snapshot.shown()))
+    return site.store.head(run_id), hash((silent, Control(site.store).holder(run_id), *snapshot.shown()))
