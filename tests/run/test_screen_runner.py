@@ -62,14 +62,18 @@ class Watched:
 
 
 def pressed_twice(watched: Watched, world: str) -> bool:
-    """Press the pedal twice, a second apart, if the run still waits for it; never says that this was enough."""
-    if watched.at("viewpoint_capture_1", "ready") and watched.told.doing == "asking":
+    """Press the pedal twice, a second apart, while the run waits for it; never says that this was enough."""
+
+    def waits() -> bool:
+        return watched.at("viewpoint_capture_1", "ready")
+
+    if waits():
         press_pedal(world)
-        until(lambda: watched.told.pedal_armed, "the pedal is armed again")
+        until(lambda: watched.told.pedal_armed or not waits(), "the pedal is armed again")
         armed_utc_s = watched.told.at_utc_s
-        until(lambda: watched.told.at_utc_s > armed_utc_s + 1.0, "a second later")
+        until(lambda: watched.told.at_utc_s > armed_utc_s + 1.0 or not waits(), "a second later")
         press_pedal(world)
-        until(lambda: not watched.told.pedal_armed, "the second press is heeded")
+        until(lambda: not watched.told.pedal_armed or not waits(), "the second press is heeded")
     return False
 
 
