@@ -7,6 +7,7 @@ import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import RLock
 from typing import Literal
 
 from service.audit.background.child_process import ChildProcesses, ChildState
@@ -16,7 +17,6 @@ from service.audit.export.wanted import (
     UnfinishedExport,
     WantedExport,
     discard_unfinished,
-    forget_request,
     keep_request,
     unfinished_exports,
 )
@@ -56,6 +56,7 @@ class Exports:
         self._data = data
         self._clock = clock
         self._children = ChildProcesses("service.audit.export.process", "export", clock)
+        self._starting = RLock()
 
     @property
     def folder(self) -> Path:
@@ -81,12 +82,11 @@ class Exports:
         )
         name = "-".join((self._name(run_id), *filter(None, options)))
         target = self.folder / marked_name(name, simulated=simulated)
-        keep_request(target, ExportRequest(run_id, wanted, by, utc_text(self._clock.utc_now())))
-        try:
+        # A second one within a second has the same name: it must not touch the request of the one that runs.
+        with self._starting:
+            self._require_free(run_id)
+            keep_request(target, ExportRequest(run_id, wanted, by, utc_text(self._clock.utc_now())))
             self._start(run_id, FORMAT, target, by)
-        except IllegalTransitionError:
-            forget_request(target)
-            raise
 
     def go_on(self, run_id: str, name: str, by: str) -> None:
         """Go on with an unfinished export. Raises DataError for any other name, IllegalTransitionError as `start`."""
@@ -159,10 +159,14 @@ class Exports:
         return self.folder / found
 
     def _start(self, run_id: str, export: str, target: Path, by: str) -> None:
-        if not self._children.start(run_id, [str(self._data), run_id, export, str(target), by], by=by):
-            now = self._children.state(run_id)
+        with self._starting:
+            self._require_free(run_id)
+            self._children.start(run_id, [str(self._data), run_id, export, str(target), by], by=by)
+
+    def _require_free(self, run_id: str) -> None:
+        """Raise IllegalTransitionError while an export of the run is running."""
+        now = self._children.state(run_id)
+        if now is not None and now.pending:
             raise IllegalTransitionError(
-                f"{now.by if now else 'somebody'} is exporting this run already",
-                where=run_id,
-                remedy="Wait until that one is ready",
+                f"{now.by} is exporting this run already", where=run_id, remedy="Wait until that one is ready"
             )

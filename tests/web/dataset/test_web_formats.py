@@ -232,7 +232,7 @@ def test_hostile_names_are_words_on_the_page(web: WebSite, run: str, supervisor:
 
 def test_a_running_export_is_stopped(web: WebSite, run: str, supervisor: Browser) -> None:
     assert ask(supervisor, run, "hdf5") == 303
-    assert ask(supervisor, run, "hdf5") == 409, "one at a time"
+    assert ask(supervisor, run, "hdf5") == 409, "one at a time"  # and it does not take away the first one's request
     while not supervisor.send_form(f"/runs/{run}/exports/stop").is_error and web.app.state.exports.state(run).pending:
         pass  # until the process is there to be stopped
     page = page_of(web, supervisor, run)
