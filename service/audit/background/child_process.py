@@ -62,7 +62,13 @@ class ChildProcesses:
             return self._states.get(run_id)
 
     def start(
-        self, run_id: str, arguments: Sequence[str], *, by: str, keep: Callable[[ChildState], None] | None = None
+        self,
+        run_id: str,
+        arguments: Sequence[str],
+        *,
+        by: str,
+        keep: Callable[[ChildState], None] | None = None,
+        tidy: Callable[[], None] | None = None,
     ) -> bool:
         """Start a child unless one is running for this run. Returns whether it was started.
 
@@ -71,6 +77,7 @@ class ChildProcesses:
             arguments: of the module's command line.
             by: who asked for it.
             keep: called with the result before it is shown; may raise OSError or ValueError.
+            tidy: called when the child has ended, however that was: one that is killed removes nothing itself.
         """
         with self._lock:
             now = self._states.get(run_id)
@@ -79,7 +86,10 @@ class ChildProcesses:
             begun = ChildState(by, utc_text(self._clock.utc_now()))
             self._states[run_id] = begun
             thread = Thread(
-                target=self._follow, args=(run_id, arguments, begun, keep), name=f"{self._name} {run_id}", daemon=True
+                target=self._follow,
+                args=(run_id, arguments, begun, keep, tidy),
+                name=f"{self._name} {run_id}",
+                daemon=True,
             )
             self._threads[run_id] = thread
         thread.start()
@@ -101,10 +111,17 @@ class ChildProcesses:
             thread.join(timeout_s)
 
     def _follow(
-        self, run_id: str, arguments: Sequence[str], begun: ChildState, keep: Callable[[ChildState], None] | None
+        self,
+        run_id: str,
+        arguments: Sequence[str],
+        begun: ChildState,
+        keep: Callable[[ChildState], None] | None,
+        tidy: Callable[[], None] | None,
     ) -> None:
         try:
             ended = self._heard(run_id, arguments, begun)
+            if tidy is not None:
+                tidy()
             if keep is not None and not ended.problem:
                 keep(ended)
         except (OSError, ValueError, TypeError) as error:

@@ -17,6 +17,7 @@ from service.audit.export.wanted import (
     UnfinishedExport,
     WantedExport,
     discard_unfinished,
+    forget_request,
     keep_request,
     unfinished_exports,
 )
@@ -161,7 +162,8 @@ class Exports:
     def _start(self, run_id: str, export: str, target: Path, by: str) -> None:
         with self._starting:
             self._require_free(run_id)
-            self._children.start(run_id, [str(self._data), run_id, export, str(target), by], by=by)
+            words = [str(self._data), run_id, export, str(target), by]
+            self._children.start(run_id, words, by=by, tidy=lambda: forget_request(target))
 
     def _require_free(self, run_id: str) -> None:
         """Raise IllegalTransitionError while an export of the run is running."""
