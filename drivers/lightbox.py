@@ -55,7 +55,14 @@ _LIGHTS = tuple(light.value for light in TowerLight)
 
 
 class _NotUnderstoodError(DeviceRefusedError):
-    """The box does not know the request or its argument: its firmware is too old for it."""
+    """The box does not know the request or its argument."""
+
+
+class _UnknownRequestError(_NotUnderstoodError):
+    """The box's firmware is too old to know the request."""
+
+
+_REFUSALS: dict[str, type[DeviceRefusedError]] = {"1": _UnknownRequestError, "2": _NotUnderstoodError}
 
 
 class LightboxConfig(DriverConfig):
@@ -141,7 +148,7 @@ class SerialLightbox:
             return False
         try:
             lit = self._ask(f"TOWER {light.value}", "TOWER")
-        except _NotUnderstoodError:
+        except _UnknownRequestError:
             self._has_tower = False
             return False
         if lit != light.value:
@@ -261,7 +268,7 @@ class SerialLightbox:
         if word == "ERR":
             if value.startswith("4"):
                 return _SEND_AGAIN  # disturbed on its way there
-            refusal = _NotUnderstoodError if value.split(" ")[0] in ("1", "2") else DeviceRefusedError
+            refusal = _REFUSALS.get(value.split(" ")[0], DeviceRefusedError)
             raise refusal(
                 f"the light box refuses {request}: {value}",
                 where=self._config.port,

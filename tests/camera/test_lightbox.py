@@ -75,6 +75,14 @@ def test_a_box_without_a_tower_is_no_error_and_is_asked_once(tmp_path: Path) -> 
         assert sum(line.startswith(b"TOWER") for line in asked) == 1
 
 
+def test_a_box_that_does_not_know_a_light_has_a_tower_all_the_same() -> None:
+    wrong = answering(lambda line: b"*IDN a,b,c,1.3\n" if line[:1] == b"*" else b"ERR 2 wrong argument\n")
+    with wrong as port, opened(port) as driver:
+        for _ in range(2):  # it is no box without a tower, which is asked once
+            with pytest.raises(DeviceRefusedError, match="wrong argument"):
+                driver.show_tower(TowerLight.STOPPED)
+
+
 def test_a_tower_that_stays_dark_is_a_fault() -> None:
     dark = answering(lambda line: b"*IDN a,b,c,1.3\n" if line[:1] == b"*" else b"TOWER OFF\n")
     with dark as port, opened(port) as driver, pytest.raises(DeviceFaultError, match="it shows OFF"):
