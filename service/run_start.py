@@ -32,7 +32,7 @@ def require_runnable(loaded: LoadedProtocol, rig: Rig, devices: Mapping[str, Rig
     Args:
         loaded: the protocol.
         rig: the rig. One without any device captures nothing, so that its stations and devices are not asked for.
-        devices: of the rig by name, as the station knows them.
+        devices: what the drivers say of the rig's devices, by name.
 
     Raises:
         ProtocolError: params name the wrong steps, a gate a measure that its step does not have, or a step a station

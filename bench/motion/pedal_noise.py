@@ -21,7 +21,6 @@ from scipy.stats import binom
 
 from bench.machine import RESULTS, commit, machine
 from drivers.errors import DeviceError
-from drivers.interfaces import PedalReading
 from drivers.lightbox import LightboxConfig, SerialLightbox, with_checksum, without_checksum
 from service.core.run.decide import AskOperator
 from service.runner.pedal import SECOND_PRESS_S, Pedal
@@ -87,7 +86,7 @@ class NoisyLine:
 
 @dataclass
 class OldPedal:
-    """The rule of before: any other count is a press, timed by the host when it is read."""
+    """The rule of before: any larger count is a press, timed by the host when it is read."""
 
     count: int | None = None
     armed_s: float | None = None
@@ -96,7 +95,7 @@ class OldPedal:
         """Whether this count would have let the robot move."""
         if self.armed_s is not None and now_s - self.armed_s > SECOND_PRESS_S[1]:
             self.armed_s = None
-        pressed = self.count is not None and count >= self.count and count != self.count
+        pressed = self.count is not None and count > self.count
         self.count = count
         if not pressed:
             return False
@@ -119,11 +118,7 @@ def poll(bit_errors: float, hours: float, seed: int, *, checks: bool) -> dict[st
                 break
             except DeviceError:
                 continue
-
-        def read() -> PedalReading:
-            return box.pedal()
-
-        pedal = Pedal(read, lambda: line.now_s, lambda _: None)
+        pedal = Pedal(box.pedal, lambda: line.now_s, lambda _: None)
         for _ in range(round(hours * 3600 / POLL_S)):
             line.now_s += POLL_S
             if checks:

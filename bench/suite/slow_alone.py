@@ -8,7 +8,6 @@ process had run is lost if it is killed, so a function is counted as covered too
 from __future__ import annotations
 
 import argparse
-import ast
 import os
 import shutil
 import subprocess
@@ -23,6 +22,7 @@ from pathlib import Path
 import coverage
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
+from bench.suite.mutants.recorder import functions
 
 PACKAGES = ("service", "drivers", "simulators")
 FAST = "not (slow or realtime or packages or whole or sweep)"
@@ -48,22 +48,11 @@ class Function:
     lines: frozenset[int]
 
 
-def functions(file: Path, lines: set[int]) -> list[Function]:
-    """Return the functions of a file, each with its own of `lines`; an inner function belongs to its outer one."""
-    found: list[Function] = []
-
-    def visit(body: Sequence[ast.stmt], prefix: str) -> None:
-        for node in body:
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                first, last = node.body[0].lineno, node.end_lineno or node.lineno
-                own = frozenset(line for line in lines if first <= line <= last)
-                if own:
-                    found.append(Function(file.relative_to(REPOSITORY).as_posix(), prefix + node.name, own))
-            elif isinstance(node, ast.ClassDef):
-                visit(node.body, f"{prefix}{node.name}.")
-
-    visit(ast.parse(file.read_bytes()).body, "")
-    return found
+def functions_of(file: Path, lines: set[int]) -> list[Function]:
+    """Return the functions of a file that have some of `lines` in their bodies, each with those."""
+    name = file.relative_to(REPOSITORY).as_posix()
+    own = {span: frozenset(n for n in lines if span.body <= n <= span.last) for span in functions(file)}
+    return [Function(name, span.name, inside) for span, inside in own.items() if inside]
 
 
 def covered(marks: str, words: Sequence[str], folder: Path, *, contexts: bool) -> coverage.CoverageData:
@@ -94,7 +83,7 @@ def only_slow(fast: coverage.CoverageData, rest: coverage.CoverageData) -> dict[
         measured = _of_file(rest, file)
         lines = set(measured)
         quick = set(_of_file(fast, file))
-        for function in functions(file, lines | quick):
+        for function in functions_of(file, lines | quick):
             if function.lines & lines and not function.lines & quick:
                 contexts = {context for line in function.lines for context in measured.get(line, ())}
                 alone[function] = {name for context in contexts if (name := _file_of_test(context))}
@@ -141,7 +130,7 @@ def main() -> int:
         rest = covered(REST, ["--draw", commit(), *options.tests], folder / "rest", contexts=True)
         alone = only_slow(fast, rest)
         counted = sum(
-            len(functions(path, set(_of_file(fast, path)) | set(_of_file(rest, path))))
+            len(functions_of(path, set(_of_file(fast, path)) | set(_of_file(rest, path))))
             for package in PACKAGES
             for path in (REPOSITORY / package).rglob("*.py")
         )

@@ -61,9 +61,10 @@ class Pedal:
         self._last = now = self._looked()
         if self.armed and (now is None or now.at_s - self._armed_at_s > SECOND_PRESS_S[1]):
             self._armed_by_s = None
-        if now is None or before is None or now.reading.presses == before.reading.presses:
-            if now is not None and before is not None:
-                self._require_prompt(before, now)
+        if now is None or before is None:
+            return False
+        if now.reading.presses == before.reading.presses:
+            self._in_time(before, now)
             return False
         if now.reading.presses != before.reading.presses + 1:
             fewer = now.reading.presses < before.reading.presses  # a box that was switched off counts from zero
@@ -84,7 +85,7 @@ class Pedal:
                 "Confirm on the screen"
             )
             return False
-        prompt = self._require_prompt(before, now)  # otherwise this press is a first one at most
+        prompt = self._in_time(before, now)  # otherwise this press is a first one at most
         since_last_s = now.at_s - before.at_s + CLOCKS_DIFFER_S
         if not 0.0 <= now.reading.now_s - pressed_s <= since_last_s:
             self._disarm("the time of the press does not fit")
@@ -97,7 +98,7 @@ class Pedal:
         self.tell(f"pedal: press again within {latest_s:.0f} s to let the robot move")
         return False
 
-    def _require_prompt(self, before: _Looked, now: _Looked) -> bool:
+    def _in_time(self, before: _Looked, now: _Looked) -> bool:
         """Whether a reading came in time, by both clocks; otherwise the pedal is disarmed."""
         by_host_s = now.at_s - before.at_s
         if by_host_s > LATE_S:

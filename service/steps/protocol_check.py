@@ -56,8 +56,8 @@ def implausible(
 
     Args:
         loaded: the protocol.
-        rig: in which it is to run, if that is known.
-        devices: of the rig, by name.
+        rig: the rig in which it is to run, if that is known.
+        devices: what the drivers say of the rig's devices, by name.
     """
     tree = parse_yaml(loaded.source, name="the protocol")
     found: list[tuple[FieldPath, str]] = []

@@ -132,7 +132,6 @@ def test_the_tests_that_reach_a_line_are_chosen_and_changed_files_are_added_whol
     assert [one.arguments for one in Reach(tmp_path).selected("gates", GATES, noted)] == [["tests/core/test_new.py"]]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("after", "outcome"), [("value < LIMIT", "killed"), ("value <= 2 * LIMIT", "survived")])
 def test_a_mutation_is_killed_by_a_test_that_fails_and_the_tree_is_as_before(
     tmp_path: Path, after: str, outcome: str
@@ -163,7 +162,7 @@ def test_the_record_is_of_tests_and_functions_that_exist() -> None:
     assert sum(test.partition("::")[0] not in present for test in tests) < 0.1 * len(tests)
     reached: dict[str, dict[str, list[int]]] = record["reached"]
     there = {
-        file: {name for _, _, name in functions(REPOSITORY / file)} if (REPOSITORY / file).exists() else set[str]()
+        file: {span.name for span in functions(REPOSITORY / file)} if (REPOSITORY / file).exists() else set[str]()
         for file in reached
     }
     named = [(file, name) for file, of_file in reached.items() for name in of_file]

@@ -64,7 +64,7 @@ class Reach:
 
         The cheapest come first.
         """
-        name = next((name for first, last, name in functions(self._tree / file) if first <= line <= last), "")
+        name = next((name for first, _body, last, name in functions(self._tree / file) if first <= line <= last), "")
         recorded = self._reached.get(file, {})
         numbers: Iterable[int] = recorded[name] if name in recorded else {n for of in recorded.values() for n in of}
         by_file: dict[str, list[str]] = {}

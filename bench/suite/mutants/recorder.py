@@ -12,7 +12,7 @@ import os
 from collections import defaultdict
 from collections.abc import Generator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import coverage
 import pytest
@@ -30,15 +30,24 @@ def cpu_s() -> float:
     return t.user + t.system + t.children_user + t.children_system
 
 
-def functions(file: Path) -> list[tuple[int, int, str]]:
-    """First line, last line and name of each function of a file; inner functions belong to the outermost one."""
-    found: list[tuple[int, int, str]] = []
+class Span(NamedTuple):
+    """Where a function stands in its file; decorators are its first lines."""
+
+    first: int
+    body: int
+    last: int
+    name: str
+
+
+def functions(file: Path) -> list[Span]:
+    """Return where each function of a file stands; an inner function belongs to the outermost one."""
+    found: list[Span] = []
 
     def visit(body: list[ast.stmt], prefix: str) -> None:
         for node in body:
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
-                found.append((first, node.end_lineno or node.lineno, prefix + node.name))
+                found.append(Span(first, node.body[0].lineno, node.end_lineno or node.lineno, prefix + node.name))
             elif isinstance(node, ast.ClassDef):
                 visit(node.body, f"{prefix}{node.name}.")
 
@@ -112,7 +121,7 @@ class Recorder:
         for file in self._files:
             by_line = data.contexts_by_lineno(str(TREE / file))
             of_file: dict[str, set[str]] = {}
-            for first, last, name in functions(TREE / file):
+            for first, _body, last, name in functions(TREE / file):
                 contexts = {c for line in range(min(first + 1, last), last + 1) for c in by_line.get(line, [])}
                 tests = {t.partition("[")[0] for c in contexts for t in users.get(c, ()) if t not in self._failed}
                 of_file[name] = tests

@@ -119,9 +119,11 @@ class ChildProcesses:
         tidy: Callable[[], None] | None,
     ) -> None:
         try:
-            ended = self._heard(run_id, arguments, begun)
-            if tidy is not None:
-                tidy()
+            try:
+                ended = self._heard(run_id, arguments, begun)
+            finally:
+                if tidy is not None:
+                    tidy()
             if keep is not None and not ended.problem:
                 keep(ended)
         except (OSError, ValueError, TypeError) as error:

@@ -7,7 +7,7 @@ import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from threading import RLock
+from threading import Lock
 from typing import Literal
 
 from service.audit.background.child_process import ChildProcesses, ChildState
@@ -57,7 +57,7 @@ class Exports:
         self._data = data
         self._clock = clock
         self._children = ChildProcesses("service.audit.export.process", "export", clock)
-        self._starting = RLock()
+        self._starting = Lock()
 
     @property
     def folder(self) -> Path:
@@ -83,11 +83,8 @@ class Exports:
         )
         name = "-".join((self._name(run_id), *filter(None, options)))
         target = self.folder / marked_name(name, simulated=simulated)
-        # A second one within a second has the same name: it must not touch the request of the one that runs.
-        with self._starting:
-            self._require_free(run_id)
-            keep_request(target, ExportRequest(run_id, wanted, by, utc_text(self._clock.utc_now())))
-            self._start(run_id, FORMAT, target, by)
+        request = ExportRequest(run_id, wanted, by, utc_text(self._clock.utc_now()))
+        self._start(run_id, FORMAT, target, by, request)
 
     def go_on(self, run_id: str, name: str, by: str) -> None:
         """Go on with an unfinished export. Raises DataError for any other name, IllegalTransitionError as `start`."""
@@ -159,16 +156,15 @@ class Exports:
             )
         return self.folder / found
 
-    def _start(self, run_id: str, export: str, target: Path, by: str) -> None:
+    def _start(self, run_id: str, export: str, target: Path, by: str, request: ExportRequest | None = None) -> None:
+        """Start an export unless one is running, and keep the request that its process reads."""
         with self._starting:
-            self._require_free(run_id)
+            now = self._children.state(run_id)
+            if now is not None and now.pending:
+                raise IllegalTransitionError(
+                    f"{now.by} is exporting this run already", where=run_id, remedy="Wait until that one is ready"
+                )
+            if request is not None:  # not before: one that runs may have the same name, which tells seconds
+                keep_request(target, request)
             words = [str(self._data), run_id, export, str(target), by]
             self._children.start(run_id, words, by=by, tidy=lambda: forget_request(target))
-
-    def _require_free(self, run_id: str) -> None:
-        """Raise IllegalTransitionError while an export of the run is running."""
-        now = self._children.state(run_id)
-        if now is not None and now.pending:
-            raise IllegalTransitionError(
-                f"{now.by} is exporting this run already", where=run_id, remedy="Wait until that one is ready"
-            )

@@ -19,7 +19,7 @@ def motion_problems(
     """Yield the fields of a protocol's motion that are too large, with words that say for what.
 
     Args:
-        motion: of the protocol; speed and acceleration are those of the fastest joint, whichever that is.
+        motion: the protocol's section; its speed and acceleration are those of the fastest joint, whichever that is.
         arms: those that may be meant, at least one; a motion is too fast if it is so for each of them.
         abandoned: when the controller notices that the program died, and how soon the arm must stand; None if the
             device sees to that by itself.
