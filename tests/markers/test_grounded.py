@@ -54,6 +54,9 @@ def grey_masks(images: Floats) -> Floats:
 COLOURS = Networks(colour_boxes, grey_masks, SIZE_PX, 384, "cpu")
 
 
+needs_torch = pytest.mark.packages("torch")
+
+
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Weights:
     """Both networks with random weights, as a site would put them in place; one thread: tests use all cores."""
@@ -77,6 +80,7 @@ def test_without_weights_the_message_names_the_files_and_their_place(
     assert "sam2/config.json," not in str(some.value).split("weights are missing")[1].split("\n")[0]
 
 
+@needs_torch
 @pytest.mark.slow
 def test_both_networks_are_loaded_offline_and_search_an_image(tiny: Weights, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
@@ -97,6 +101,7 @@ def test_both_networks_are_loaded_offline_and_search_an_image(tiny: Weights, mon
         assert min(np.arccos(np.clip(outline.cone.axis @ e.cone.axis, -1, 1)) for e in exact) < 0.01
 
 
+@needs_torch
 def test_boxes_are_those_of_the_models_own_program(tiny: Weights) -> None:
     torch, transformers, pillow = (
         importlib.import_module(name) for name in ("torch", "transformers.models.grounding_dino", "PIL.Image")
@@ -115,6 +120,7 @@ def test_boxes_are_those_of_the_models_own_program(tiny: Weights) -> None:
     assert np.allclose(scores, torch.sigmoid(expected.logits).max(-1)[0].numpy(), atol=1e-5)
 
 
+@needs_torch
 @pytest.mark.parametrize("how", ["damaged", "another network"])
 def test_other_weights_are_refused(tiny: Weights, tmp_path: Path, how: str) -> None:
     for model in ("grounding-dino", "sam2"):
@@ -188,6 +194,7 @@ def test_a_vote_keeps_what_both_find_and_what_one_finds_clearly() -> None:
     assert voted([], [clear, faint]) == (clear,)
 
 
+@needs_torch
 @pytest.mark.slow
 def test_all_detectors_are_measured_side_by_side(
     tiny: Weights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
