@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 from collections.abc import Generator
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from tests.plugins.cpu_record import CpuRecord
 from tests.plugins.draw import Draw
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is imported, here and in child processes
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # begun in the background: what it starts would be deaf as well
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A scene's textures and light are computed once, and kept for the next tests (simulators/rendering/kept.py).
 os.environ.setdefault("ORTHOCAPTURE_RENDER_CACHE", str(Path(__file__).parents[1] / "build" / "rendered"))

@@ -158,7 +158,8 @@ def _try(tree: Path, selected: Sequence[Selected], told: Path) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s + 5))
     os.chdir(tree)
     os.environ |= {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"}
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    for name in ("PYTHONDONTWRITEBYTECODE", "PYTEST_ADDOPTS"):
+        os.environ.pop(name, None)
     sys.dont_write_bytecode = False
     sys.path[:] = [str(tree), *(path for path in sys.path if Path(path or ".").resolve() != REPOSITORY)]
     for name in [name for name in sys.modules if name.partition(".")[0] in _OURS]:
