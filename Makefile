@@ -23,14 +23,17 @@ test: $(TOOLS)
 test-all: $(TOOLS) $(NETWORKS)
 	.ci/packages
 	$(BIN)/pytest -m "not realtime"
-	$(BIN)/pytest -m realtime -n 0
+	$(BIN)/pytest -m realtime -n 0 $(call with,realtime)
 
 # What `make test` leaves out, with a tenth of the whole runs and sweeps: SEED draws them.
 SEED = $(shell git rev-parse HEAD)
 test-drawn: $(TOOLS) $(NETWORKS)
 	.ci/packages
-	$(BIN)/pytest -m "(slow or packages or whole or sweep) and not realtime" --draw $(SEED)
-	$(BIN)/pytest -m realtime -n 0
+	$(BIN)/pytest -m "(slow or packages or whole or sweep) and not realtime" --draw $(SEED) $(call with,slow|packages|whole|sweep) tests/browser
+	$(BIN)/pytest -m realtime -n 0 $(call with,realtime)
+
+# The test files in which one of these marks stands: to read all of the others takes pytest half a minute.
+with = $$(grep -rlwE '$(1)' tests --include='test_*.py')
 
 # Every whole run; every row of every systematic sweep.
 test-whole test-sweeps: $(TOOLS) $(NETWORKS)

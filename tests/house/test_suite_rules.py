@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,15 @@ from tests.plugins.draw import drawn
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = "[pytest]\nmarkers =\n    slow\n    realtime\n    whole\n    sweep\n"
+
+
+def test_marks_stand_in_the_test_files_in_which_the_makefile_looks_for_them() -> None:
+    """It names the files of a mark, so that pytest reads no others; tests/browser it names whole."""
+    marks = re.compile(r"mark\.(slow|realtime|packages|whole|sweep)\b")
+    files = [path for path in (ROOT / "tests").rglob("*.py") if not path.name.startswith("test_")]
+    assert [str(path.relative_to(ROOT)) for path in files if marks.search(path.read_text())] == [
+        "tests/browser/conftest.py"
+    ]
 
 
 def pytest_in(folder: Path, source: str, *words: str) -> subprocess.CompletedProcess[str]:

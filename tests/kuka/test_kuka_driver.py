@@ -28,14 +28,16 @@ from service.core.geometry import inverse, rotation_angle_rad, transform
 from service.core.seven_axes import forward, nearest_posture, postures
 from simulators.kuka_controller.kinematics import MODELS, frames
 from tests.support.arms.kuka_simulator import Controller, pendant, simulated_kuka
-from tests.support.arms.sunrise import needs_jdk, sunrise_engine
+from tests.support.arms.sunrise import sunrise_engine
 from tests.support.arms.ur_simulator import address
 from tests.support.processes.hosts import driver_pid
 from tests.support.processes.lateness import Lateness
 from tests.support.processes.waiting import until
 from tests.support.rig.patience import PATIENT_KUKA
 
-both = pytest.mark.parametrize("controller", [simulated_kuka, pytest.param(sunrise_engine, marks=needs_jdk)])
+both = pytest.mark.parametrize(
+    "controller", [simulated_kuka, pytest.param(sunrise_engine, marks=pytest.mark.packages("default-jdk-headless"))]
+)
 PAYLOAD = Payload(1.6, (0.0, 0.0, 0.08))
 # At 1 rad/s: 0.3 s until its client is silent, 0.3 s until that is noticed, and the braking.
 STOPPED_BY_RAD, LATE_TIMES = 1.2, 5

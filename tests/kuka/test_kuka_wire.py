@@ -16,7 +16,7 @@ from drivers.kuka import DRIVER, KukaConfig
 from drivers.kuka.wire import WireError, from_abc, hello_of, parse, state_of, to_abc
 from service.core.geometry import transform
 from tests.support.arms.kuka_simulator import Controller, agrees, simulated_kuka, transcript
-from tests.support.arms.sunrise import needs_jdk, sunrise_engine
+from tests.support.arms.sunrise import sunrise_engine
 from tests.support.arms.ur_simulator import address
 from tests.support.processes.waiting import until
 from tests.support.rig.patience import PATIENT_KUKA
@@ -25,7 +25,9 @@ SILENCE_S = 2.0  # shorter than the motion of the transcript that is stopped bec
 
 
 @pytest.mark.parametrize("name", ["session.jsonl", "refusals.jsonl"])
-@pytest.mark.parametrize("controller", [simulated_kuka, pytest.param(sunrise_engine, marks=needs_jdk)])
+@pytest.mark.parametrize(
+    "controller", [simulated_kuka, pytest.param(sunrise_engine, marks=pytest.mark.packages("default-jdk-headless"))]
+)
 def test_simulator_and_application_answer_as_the_transcript(controller: Controller, name: str) -> None:
     host = address(70)
     with (
@@ -44,7 +46,9 @@ def test_simulator_and_application_answer_as_the_transcript(controller: Controll
             assert agrees(line, row["line"]), (line, row["line"])
 
 
-@pytest.mark.parametrize("controller", [simulated_kuka, pytest.param(sunrise_engine, marks=needs_jdk)])
+@pytest.mark.parametrize(
+    "controller", [simulated_kuka, pytest.param(sunrise_engine, marks=pytest.mark.packages("default-jdk-headless"))]
+)
 def test_a_client_that_stays_silent_gives_way_to_a_new_one(controller: Controller) -> None:
     host = address(70)
     said: list[str] = []

@@ -22,14 +22,13 @@ from tests.support.arms.sunrise import (
     TEST_SIDE,
     compile_java,
     java_program,
-    needs_jdk,
     sunrise_engine,
 )
 from tests.support.arms.ur_simulator import address
 from tests.support.processes.lateness import Lateness
 from tests.support.processes.waiting import until
 
-pytestmark = needs_jdk
+pytestmark = pytest.mark.packages("default-jdk-headless")
 
 HOME = [0.0, 0.5236, 0.0, -1.2217, 0.0, 1.3963, 0.0]
 FAR = [2.5, *HOME[1:]]

@@ -12,12 +12,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from drivers.kuka.robot import HEARTBEAT_S
 from tests.support.rig.patience import PATIENCE_S
-
-needs_jdk = pytest.mark.packages("default-jdk-headless")
 
 ROOT = Path(__file__).parents[3]
 APPLICATION = ROOT / "drivers" / "kuka" / "sunrise"
