@@ -35,9 +35,8 @@ from tests.support.processes.lateness import Lateness
 from tests.support.processes.waiting import until
 from tests.support.rig.patience import PATIENT_KUKA
 
-both = pytest.mark.parametrize(
-    "controller", [simulated_kuka, pytest.param(sunrise_engine, marks=pytest.mark.packages("default-jdk-headless"))]
-)
+ENGINE = pytest.param(sunrise_engine, marks=pytest.mark.packages("default-jdk-headless"))
+both = pytest.mark.parametrize("controller", [simulated_kuka, ENGINE])
 PAYLOAD = Payload(1.6, (0.0, 0.0, 0.08))
 # At 1 rad/s: 0.3 s until its client is silent, 0.3 s until that is noticed, and the braking.
 STOPPED_BY_RAD, LATE_TIMES = 1.2, 5
