@@ -30,7 +30,7 @@ from service.steps.context import StepContext, StepOutcome
 from service.steps.measures import Count, MeasureRecord
 from tests.support.record.core import GOOD, Log, toy_protocol
 from tests.support.record.core import TOY as TOY_TEXT
-from tests.support.record.core_log import at_capture
+from tests.support.record.core_log import at_capture, at_spray, failure
 from tests.support.rig.bench_rig import ScriptedOperator
 from tests.support.runs.bench_run import Bench, begin_run, bench_store
 
@@ -294,6 +294,15 @@ def test_each_way_says_what_is_lost_by_it(images: int, again: str, afresh: str |
     assert loses["confirm"] == again
     assert loses.get("redo") == afresh
     assert loses["skip"] == "Its result does not count. These cannot begin: Spray. Not judged later: rms_mm."
+
+
+def test_half_of_an_irreversible_step_may_be_done_again_and_nothing_is_lost() -> None:
+    log = at_spray()
+    log.begin()
+    log.append(failure(log, "SafetyStopError", "ask"))
+    redo = next(way for way in ways_on(log.protocol, log.state) if way.verb == "redo")
+    assert (redo.step, redo.words) == ("spray", "Do this step again from its beginning")
+    assert (redo.loses, redo.available) == ("Nothing.", True)
 
 
 def test_minutes_in_words() -> None:

@@ -79,6 +79,19 @@ def test_false_poses_are_left_out(seed: int, false: int) -> None:
     assert chi2(found, truth) < 40.0
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_false_poses_that_agree_with_one_another_do_not_win_over_more_true_ones(seed: int) -> None:
+    """Four of eleven are wrong by the same, thirty times their error: as after a blow to a camera."""
+    rng = np.random.default_rng([seed, 1])
+    truth, covariances = some_pose(rng), np.tile(1e-8 * np.eye(6), (11, 1, 1))
+    poses = drawn(truth, covariances, rng, factor=4.0)
+    blow = 3e-3 * np.array([1.0, -1.0, 0.5, 0.5, 1.0, -0.5])
+    poses[:4] = [increment(pose, blow[:3], blow[3:]) for pose in poses[:4]]
+    found = rigid_mean(poses, covariances)
+    assert not found.kept[:4].any()
+    assert np.linalg.norm(deviation(found.T, truth)) < 1.5e-3
+
+
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
 def test_the_mean_moves_with_the_frame(seed: int) -> None:

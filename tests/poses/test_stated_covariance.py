@@ -119,6 +119,17 @@ def test_errors_that_a_track_shares_count_as_often_as_they_are_repeated() -> Non
     assert clustered_information(ones, 1)[1][0, 0] == pytest.approx((2 * SEEN) ** 2 * 300, rel=0.25)
 
 
+def test_many_tracks_tell_by_themselves_which_parameter_errs_most() -> None:
+    """Half of them know the first parameters alone and err by three times as much as the others."""
+    rows = tracks(400, 6)
+    noisy = np.arange(len(rows.residual)) // (2 * SEEN) % 2 == 0
+    frame = np.where(noisy[:, None] == (np.arange(N) < 2), rows.frame.toarray(), 0.0)
+    apart = Rows(np.where(noisy, 3.0, 1.0) * rows.residual, csr_matrix(frame), rows.point, 2)
+    spread, information = np.diag(clustered_information(apart, N)[1]), np.diag(without_points(apart))
+    noisy_share, other_share = (spread / information)[:2].mean(), (spread / information)[2:].mean()
+    assert noisy_share / other_share == pytest.approx(9.0, rel=0.25)
+
+
 def test_few_tracks_leave_no_parameter_without_errors() -> None:
     """The plain sum of squared scores of three tracks has rank three; the shrunk one has all five."""
     rows = tracks(3, 4)

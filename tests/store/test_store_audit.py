@@ -101,6 +101,8 @@ SQL_TAMPERING = {
     "job state": (6, "is queued", ["UPDATE jobs SET state = 'queued'"]),
     "job arguments": (5, "differs", ["UPDATE jobs SET arguments = '{\"a\":1}'"]),
     "job deleted": (5, "no row", ["DELETE FROM jobs"]),
+    "run row deleted": (None, "the run's own row is missing", ["DELETE FROM runs"]),
+    "where the chain ends deleted": (None, "where the chain ends is missing", ["DELETE FROM heads"]),
     "run row": (1, "simulated", ["UPDATE runs SET simulated = 0"]),
     "run's time": (1, "was made at", ["UPDATE runs SET created_utc = '2026-11-20T12:00:00.250000Z'"]),
     "job priority": (5, "differs", ["UPDATE jobs SET priority = 0"]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 import sqlite3
 import subprocess
@@ -60,6 +61,18 @@ JSON = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
     max_leaves=12,
 )
+
+
+@pytest.mark.parametrize(("text", "of"), [("12", int), ("-9007199254740991", int), ("9007199254740992", float)])
+def test_numbers_without_a_point_are_integers_as_far_as_every_reader_has_them(text: str, of: type) -> None:
+    assert type(parse_canonical(text)) is of
+
+
+def test_what_was_parsed_is_written_in_order_and_not_at_all_where_a_number_is_none() -> None:
+    assert canonical_parsed({"b": 1, "a": [True]}) == '{"a":[true],"b":1}'
+    for number in (math.nan, math.inf):
+        with pytest.raises(StoreError):
+            canonical_parsed({"a": number})
 
 
 @given(JSON)

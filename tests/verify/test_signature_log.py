@@ -175,6 +175,9 @@ def test_a_database_put_back_as_it_was_shows(data: Path, tmp_path: Path) -> None
 def test_the_log_follows_the_key(data: Path) -> None:
     with Store.open(data) as store:
         rotate_key(store, reason="yearly", actor="ada")
+    before = read_log(data / NAME)
+    assert before is not None
+    assert len({line.key_id for line in before}) == 1, "the old key signs until the end of its life"
     sign_again(data)
     assert faults(data) == []
     lines = read_log(data / NAME)
