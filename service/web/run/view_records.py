@@ -43,8 +43,14 @@ class Viewer:
     holder: str = ""  # name of whoever has control; "" for nobody
     holder_screen: str = ""
     mine_elsewhere: bool = False  # the same person, on another screen
-    asked_by: str = ""  # who asks for control
+    asked_by: str = ""  # name of who asks for control
+    asked_by_screen: str = ""
     asked_by_me: bool = False
+    refused_by: str = ""  # name of who refused this screen's request
+    refused_utc: str = ""
+    taken_over_by: str = ""  # name of who took control from this person, if that was the last change of control
+    taken_over_utc: str = ""
+    taken_over_reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
