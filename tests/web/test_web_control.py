@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -55,7 +56,7 @@ def test_asking_refusing_and_asking_again_are_news_to_every_open_page(table: Tab
     told.append(newest(table.web.site, table.run))
     table.press(table.emmy, "control/ask")
     told.append(newest(table.web.site, table.run))
-    assert all(before != after for before, after in zip(told, told[1:], strict=False)), told
+    assert all(before != after for before, after in pairwise(told)), told
 
 
 def test_the_notice_gives_the_name_of_who_asks(table: Table) -> None:

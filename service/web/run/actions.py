@@ -222,7 +222,8 @@ def _require_same_redo(log: RunRecord, form: ActionForm) -> None:
     if form.replaces != image:
         what = f"{form.viewpoint} has another image by now" if image else f"{form.viewpoint} has no image any more"
     elif form.moves != moves:
-        what = f"the robot would {'drive' if moves else 'not drive'} to {form.viewpoint} at once, which the form did not say"
+        how = "drive" if moves else "not drive"
+        what = f"the robot would {how} to {form.viewpoint} at once, which the form did not say"
     else:
         return
     raise IllegalTransitionError(what, where=form.step, remedy=DECIDE_AGAIN)

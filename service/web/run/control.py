@@ -34,9 +34,7 @@ def take_control(
 
 
 @router.post("/runs/{run_id}/control/ask", name="ask_for_control", dependencies=[Depends(requires("operate"))])
-def ask_for_control(
-    site: CurrentSite, person: SignedInPerson, run_id: RunId, holder: Shown = ""
-) -> RedirectResponse:
+def ask_for_control(site: CurrentSite, person: SignedInPerson, run_id: RunId, holder: Shown = "") -> RedirectResponse:
     """Ask the one who has control to hand it over."""
     _require_open(site, run_id)
     Control(site.store).ask(run_id, person, shown=holder)

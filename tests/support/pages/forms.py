@@ -20,7 +20,7 @@ class PageForm:
     held: bool = False  # its button must be held
 
     def sent(self, **other: str) -> dict[str, str]:
-        """What is sent when a person fills it in and presses its first button; `other` fields in place of the page's."""
+        """What is sent when a person fills it in and presses its first button; `other` fields for the page's."""
         button = self.buttons[0] if self.buttons else {}
         pressed = {button["name"]: button.get("value", "")} if "name" in button else {}
         return {**self.hidden, **self.entered, **pressed, **other}
