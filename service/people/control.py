@@ -45,8 +45,8 @@ class Holder:
 class Control:
     """Control of the runs in a data folder. Methods raise ControlError if a request is refused.
 
-    `shown` is the screen of which a person's page spoke when they decided: the one in control ("" for none), or the one
-    that asked. Where it is another one by now, the request is refused; None: there was no page.
+    `shown` is the screen of which a person's page spoke when they decided: the one in control ("" for none), or the
+    one that asked. Where it is another one by now, the request is refused; None: there was no page.
     """
 
     def __init__(self, store: Store) -> None:

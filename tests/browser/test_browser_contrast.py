@@ -11,6 +11,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, CDPSession, Page, Route
 
+from service.people.roles import Role
 from tests.support.pages.browser import TABLET
 from tests.support.pages.states import (
     Seen,
@@ -97,7 +98,7 @@ RUN_PAGES: tuple[tuple[Callable[[WebSite], Seen], str], ...] = (
     (waiting_for_an_answer, "/runs/{run}"),
     (capturing, "/runs/{run}/capture"),
 )
-OTHER_PAGES = (
+OTHER_PAGES: tuple[tuple[Role, str], ...] = (
     ("technician", "/"),
     ("technician", "/start?protocol=bench.yaml"),
     ("technician", "/account"),
@@ -133,11 +134,11 @@ def test_every_control_of_other_pages_can_be_read_in_every_state(page: Page, tmp
     with web_site(tmp_path) as web:
         run = web.record_run()
         found: list[str] = []
-        for role, address in (
-            *OTHER_PAGES,
+        of_run: tuple[tuple[Role, str], ...] = (
             ("supervisor", f"/runs/{run}/exports"),
             ("auditor", f"/audit/runs/{run}"),
-        ):
+        )
+        for role, address in (*OTHER_PAGES, *of_run):
             show(page, web.browser(role), address)
             found += [f"{address}: {fault}" for fault in faults(page)]
         show(page, web.browser(), "/sign-in")
