@@ -115,6 +115,9 @@ def _attention(  # noqa: PLR0911 - one return a case
     if not isinstance(question, AskOperator):
         return Attention()
     title = protocol.step(question.step).title
+    wanted = state.step.in_course
+    if wanted is not None:
+        return Attention("waits", f"{title}: {wanted.title[:1].lower()}{wanted.title[1:]}.")
     if question.for_ == "recovery":
         return Attention("stopped", f"{title}: {stopped_words(protocol, state, question)}.")
     due = "a signature is due" if question.for_ == "sign" else "your confirmation is awaited"

@@ -129,8 +129,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         reasons=log.protocol.reasons,
         signing=site.rig.section.signing,
         drawing=drawing(log.protocol.step(view.shown.id)),
-        # Where the camera is set up the lens is focused: the live view belongs there.
-        lens_step=view.shown.drawing == "camera" and view.shown.current and view.shown.only_ticks,
+        lens_step=_aims(view),
         board_plan=_board_plan(log, view.shown.id),
         now_utc=site.store.clock.utc_now().isoformat(),
         depends=accepted_gates(log.protocol, log.state),
@@ -138,6 +137,13 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         result_note=shared_adjustment_note(log.protocol, log.state),
         further_cameras=rig_cameras(log),
     )
+
+
+def _aims(view: RunView) -> bool:
+    """Whether a person focuses or aims the camera now: the live view belongs there."""
+    focuses = view.shown.drawing == "camera" and view.shown.only_ticks
+    aims = view.shown.drawing == "layout_photo" and view.mode in ("ask", "more")
+    return view.shown.current and (focuses or aims)
 
 
 def _about(log: RunRecord) -> list[tuple[str, str]]:

@@ -90,6 +90,21 @@
     part.dispatchEvent(new CustomEvent("part-changed", { bubbles: true }));
   }
 
+  // --- verdicts: they stay until a person has decided something, or has pressed Seen on this screen -----------------
+
+  const seenKey = `orthocapture-seen-${body.dataset.run}`;
+  function hideSeen() {
+    for (const judged of document.querySelectorAll("[data-judged]")) judged.hidden = Number(judged.dataset.judged) <= Number(localStorage.getItem(seenKey));
+  }
+  document.addEventListener("click", (event) => {
+    const judged = event.target instanceof Element && event.target.closest("[data-seen]")?.closest("[data-judged]");
+    if (!judged) return;
+    localStorage.setItem(seenKey, judged.dataset.judged);
+    hideSeen();
+  });
+  document.addEventListener("part-changed", hideSeen);
+  hideSeen();
+
   // --- connection ------------------------------------------------------------------------------------------------
 
   let stream = null;
