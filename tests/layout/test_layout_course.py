@@ -91,7 +91,8 @@ def test_one_more_photograph_is_asked_for_and_nothing_is_called_stopped(web: Web
     steps = browser.get(f"/runs/{bench.run_id}/parts/side").text
     assert "stopped" not in steps
     home = words(browser.get("/").text)
-    assert "Waits for a confirmation One more photograph" in home
+    assert "word-stop" not in browser.get("/").text
+    assert "Waits for a confirmation: One more photograph" in home
 
 
 def test_the_other_ways_are_one_press_away(web: WebSite) -> None:
