@@ -70,6 +70,17 @@ def test_the_notice_gives_the_name_of_who_asks(table: Table) -> None:
     assert "Emmy Noether has just asked" in words(answer.text)
 
 
+@pytest.mark.parametrize("page", ["capture", "held", "scene"])
+def test_who_asks_is_said_on_the_other_pages_of_the_run_too(table: Table, page: str) -> None:
+    table.press(table.emmy, "control/ask")
+    assert "Emmy Noether asks to take over control. Answer" in words(
+        table.grace.get(f"/runs/{table.run}/{page}").text
+    )
+    assert "asks to take over" not in words(table.emmy.get(f"/runs/{table.run}/{page}").text)
+    table.press(table.grace, "control/answer", grant="false")
+    assert "asks to take over" not in words(table.grace.get(f"/runs/{table.run}/{page}").text)
+
+
 def test_a_refusal_reaches_the_one_who_asked_and_nobody_else(table: Table) -> None:
     table.press(table.emmy, "control/ask")
     assert "you have asked to take over and wait for an answer" in words(table.control(table.emmy))
