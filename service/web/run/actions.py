@@ -152,10 +152,8 @@ def act(
     log = site.run(run_id)
     if form.verb != "pause":
         Control(site.store).require(run_id, person)
-    if form.verb in ("confirm", "sign", "skip", "accept", "resume"):
-        _require_current(log, form.step, form.attempt, form.seen_seq)
-    if form.verb == "redo":
-        _require_same_redo(log, form)
+    if not log.state.terminal:  # else it is refused, and recorded as an action after the end
+        _require_shown(log, form)
     if form.verb == "sign":
         if not person.may("sign"):
             raise NotAllowedError(f"the role {person.role} may not sign", where=run_id)
@@ -200,6 +198,14 @@ def _append(site: Site, log: RunRecord, action: OperatorAction, actor: str) -> N
         record_refusal(site.store, log.run_id, log.state, action, refusal, actor)
         raise refusal
     site.store.record(log.run_id, [action], actor=actor)
+
+
+def _require_shown(log: RunRecord, form: ActionForm) -> None:
+    """Refuse what a person decided about something else than what there is now."""
+    if form.verb in ("confirm", "sign", "skip", "accept", "resume"):
+        _require_current(log, form.step, form.attempt, form.seen_seq)
+    if form.verb == "redo":
+        _require_same_redo(log, form)
 
 
 def _require_current(log: RunRecord, step: str, attempt: int, seen_seq: int) -> None:
