@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,11 +17,17 @@ from service.store.database.tables import accounts, control, runs, sessions
 from service.store.store import Store
 
 UNANSWERED_S = 60.0  # after this time a locked screen that does not answer may lose control
+_NOBODY_ASKS: Mapping[str, str | float] = {"asked_by_screen": "", "asked_by_account": "", "asked_utc_s": 0.0}
+_NOT_REFUSED: Mapping[str, str | float] = {"refused_screen": "", "refused_by_account": "", "refused_utc_s": 0.0}
+_DECIDE_AGAIN = "Read what the page shows now and decide again; nothing was done"
 
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Who has control of a run and who asks for it; "" for nobody. When a sign-in ends, so does its control."""
+    """Who has control of a run, who asks for it, and who was refused it; "" for nobody.
+
+    When a sign-in ends, so does its control.
+    """
 
     screen: str = ""
     account: str = ""
@@ -28,11 +35,19 @@ class Holder:
     locked: bool = False
     asked_by_screen: str = ""
     asked_by_account: str = ""
+    asked_by_name: str = ""
     asked_utc_s: float = 0.0
+    refused_screen: str = ""  # that asked last and was refused; until it asks again, or control changes
+    refused_by_name: str = ""
+    refused_utc_s: float = 0.0
 
 
 class Control:
-    """Control of the runs in a data folder. Methods raise ControlError if a request is refused."""
+    """Control of the runs in a data folder. Methods raise ControlError if a request is refused.
+
+    `shown` is the screen of which a person's page spoke when they decided: the one in control ("" for none), or the
+    one that asked. Where it is another one by now, the request is refused; None: there was no page.
+    """
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -54,13 +69,14 @@ class Control:
                 remedy="Ask for control" if holder.screen else "Take control first",
             )
 
-    def take(self, run_id: str, person: Person) -> None:
+    def take(self, run_id: str, person: Person, *, shown: str | None = None) -> None:
         """Take control that is free, one's own elsewhere, or held by a locked screen that does not answer."""
         _require_operator(person)
         with self._store.database.writing() as connection:
             holder = self._holder(connection, run_id)
             if holder.screen == person.screen:
                 return
+            _require_shown(shown, holder, run_id)
             unanswered = (
                 holder.locked
                 and holder.asked_by_screen == person.screen
@@ -81,7 +97,7 @@ class Control:
                     remedy="Ask for control, or have a supervisor take over",
                 )
 
-    def take_over(self, run_id: str, person: Person, reason: str) -> None:
+    def take_over(self, run_id: str, person: Person, reason: str, *, shown: str | None = None) -> None:
         """Let a supervisor take control from whoever has it, with a reason. Raises NotAllowedError for others."""
         if person.role != "supervisor":
             raise NotAllowedError(
@@ -93,19 +109,21 @@ class Control:
         with self._store.database.writing() as connection:
             holder = self._holder(connection, run_id)
             if holder.screen != person.screen:
+                _require_shown(shown, holder, run_id)
                 self._give(connection, run_id, person, holder, "taken_over" if holder.screen else "free", why)
 
-    def ask(self, run_id: str, person: Person) -> None:
+    def ask(self, run_id: str, person: Person, *, shown: str | None = None) -> None:
         """Ask the screen in control to hand over. A later request replaces one that was not answered in time."""
         _require_operator(person)
         with self._store.database.writing() as connection:
             holder = self._holder(connection, run_id)
             if not holder.screen or holder.screen == person.screen:
                 raise ControlError("there is nobody to ask", where=run_id, remedy="Take control; it is free")
+            _require_shown(shown, holder, run_id)
             recent = self._store.clock.utc_s() - holder.asked_utc_s < UNANSWERED_S
             if holder.asked_by_screen not in ("", person.screen) and recent:
                 raise ControlError(
-                    f"{holder.asked_by_account} has just asked", where=run_id, remedy="Wait for the answer"
+                    f"{holder.asked_by_name} has just asked", where=run_id, remedy="Wait for the answer"
                 )
             self._write(
                 connection,
@@ -116,9 +134,10 @@ class Control:
                 asked_utc_s=holder.asked_utc_s
                 if holder.asked_by_screen == person.screen
                 else self._store.clock.utc_s(),
+                **(_NOT_REFUSED if holder.refused_screen == person.screen else {}),
             )
 
-    def answer(self, run_id: str, person: Person, *, grant: bool) -> None:
+    def answer(self, run_id: str, person: Person, *, grant: bool, shown: str | None = None) -> None:
         """Answer a request as the screen in control: with `grant` hand over, else refuse."""
         with self._store.database.writing() as connection:
             holder = self._holder(connection, run_id)
@@ -126,12 +145,23 @@ class Control:
                 raise ControlError("this screen does not have control", where=run_id, remedy="Read the page again")
             if not holder.asked_by_screen:
                 raise ControlError("nobody asks for control any more", where=run_id, remedy="Nothing has to be done")
+            if shown not in (None, holder.asked_by_screen):
+                raise ControlError(
+                    f"by now it is {holder.asked_by_name} who asks for control", where=run_id, remedy=_DECIDE_AGAIN
+                )
             asker = connection.execute(_valid(holder.asked_by_screen, self._store.clock.utc_s())).one_or_none()
             if grant and asker is not None:
                 reason = f"asked for; granted by {person.account}"
                 self._record(connection, run_id, asker.account, holder.asked_by_screen, holder, "handed_over", reason)
             else:
-                self._write(connection, run_id, asked_by_screen="", asked_by_account="", asked_utc_s=0.0)
+                self._write(
+                    connection,
+                    run_id,
+                    **_NOBODY_ASKS,
+                    refused_screen=holder.asked_by_screen,
+                    refused_by_account=person.account,
+                    refused_utc_s=self._store.clock.utc_s(),
+                )
             if grant and asker is None:
                 ended = ControlError("the screen that asked is signed out", where=run_id, remedy="You keep control")
             else:
@@ -163,7 +193,11 @@ class Control:
             locked=bool(session.locked),
             asked_by_screen=row.asked_by_screen,
             asked_by_account=row.asked_by_account,
+            asked_by_name=_full_name(connection, row.asked_by_account),
             asked_utc_s=row.asked_utc_s,
+            refused_screen=row.refused_screen,
+            refused_by_name=_full_name(connection, row.refused_by_account),
+            refused_utc_s=row.refused_utc_s,
         )
 
     def _give(
@@ -194,13 +228,12 @@ class Control:
             run_id,
             screen=screen,
             account=account if screen else "",
-            asked_by_screen="",
-            asked_by_account="",
-            asked_utc_s=0.0,
+            **_NOBODY_ASKS,
+            **_NOT_REFUSED,
         )
 
     def _write(self, connection: Connection, run_id: str, **values: object) -> None:
-        nobody = {"screen": "", "account": "", "asked_by_screen": "", "asked_by_account": "", "asked_utc_s": 0.0}
+        nobody = {"screen": "", "account": "", **_NOBODY_ASKS, **_NOT_REFUSED}
         connection.execute(
             insert(control)
             .values(run_id=run_id, **{**nobody, **values})
@@ -218,6 +251,18 @@ def _valid(screen: str, now_s: float) -> Any:
             accounts.c.state == "active",
         )
     )
+
+
+def _full_name(connection: Connection, account: str) -> str:
+    """The name of the person with an account; "" for nobody."""
+    return connection.execute(select(accounts.c.full_name).where(accounts.c.account == account)).scalar() or ""
+
+
+def _require_shown(shown: str | None, holder: Holder, run_id: str) -> None:
+    """Refuse what a person decided about another screen than the one that has control now."""
+    if shown not in (None, holder.screen):
+        who = f"{holder.full_name} has control, on screen {holder.screen}" if holder.screen else "nobody has control"
+        raise ControlError(f"by now {who}", where=run_id, remedy=_DECIDE_AGAIN)
 
 
 def _require_operator(person: Person) -> None:

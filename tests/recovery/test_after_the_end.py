@@ -68,7 +68,8 @@ def test_in_a_run_that_goes_on_the_refusal_stays_with_it(web: WebSite) -> None:
     run_id = web.begin_run().run_id
     browser = web.browser("technician")
     web.take_control(run_id, browser)
-    browser.send_form(f"/runs/{run_id}/actions", verb="resume")
+    head = web.store.head(run_id)
+    browser.send_form(f"/runs/{run_id}/actions", verb="resume", step="fixation", attempt=1, seen_seq=head)
     refused = [e.payload for e in web.store.events(run_id) if isinstance(e.payload, ActionRefused)]
     assert [one.action for one in refused] == ["resume"]
     assert after_the_end(web.store) == []

@@ -23,6 +23,7 @@ from service.web.capture.view import StepViewpoint
 from service.web.page.charts import LEVELS, dots, heat_map, vector_field
 from service.web.record.planned_poses import StationPlan
 from tests.support.pages.browsed_run import BrowsedRun, words
+from tests.support.pages.forms import forms_of
 from tests.support.pages.web import web_site
 from tests.support.record.core import EYE
 from tests.support.recorded.calibrated_run import VIEWS, begin_calibrated_run, capture
@@ -95,9 +96,8 @@ def test_a_viewpoint_is_redone_with_a_reason_and_its_image_stays(shown: BrowsedR
     html = shown.browser.get(f"/runs/{shown.run}/capture?viewpoint=v1_001").text
     assert 'data-hold="1500"' in html, "the step runs: the robot drives there at once"
     reason = "<b>a drape</b> hung into it"
-    sent = shown.browser.send_form(
-        f"/runs/{shown.run}/actions", verb="redo", step="capture", viewpoint="v1_001", reason=reason
-    )
+    (form,) = (form for form in forms_of(html) if form.hidden.get("verb") == "redo")
+    sent = shown.browser.post(form.action, data=form.sent(reason=reason, preset=""), follow_redirects=False)
     assert sent.status_code == 303
     assert "To be redone 1" in shown.words()
     new = capture(shown.site, shown.run, "capture", "v1_001", EYE, shade=9)

@@ -87,9 +87,10 @@ def test_the_confirmation_of_a_motion_must_be_held(web: WebSite, run_id: str) ->
 def test_asking_for_control_and_handing_over(web: WebSite, run_id: str) -> None:
     mine, other = web.browser("technician"), web.browser("supervisor")
     web.take_control(run_id, mine)
-    assert other.send_form(f"/runs/{run_id}/control/ask").status_code == 303
+    assert other.send_form(f"/runs/{run_id}/control/ask", holder=mine.person.screen).status_code == 303
     assert "Hand over" in mine.get(f"/runs/{run_id}/parts/control").text
-    assert mine.send_form(f"/runs/{run_id}/control/answer", grant="true").status_code == 303
+    asker = other.person.screen
+    assert mine.send_form(f"/runs/{run_id}/control/answer", grant="true", asker=asker).status_code == 303
     assert "Confirm:" in other.get(f"/runs/{run_id}/parts/actions").text
     assert "Confirm:" not in mine.get(f"/runs/{run_id}/parts/actions").text
 

@@ -61,6 +61,12 @@ def needs_leave(protocol: Protocol, state: RunState) -> bool:
     return state.restarted and protocol.step(state.current).moves_robot
 
 
+def redo_moves(protocol: Protocol, state: RunState, step: str) -> bool:
+    """Whether the robot drives to a viewpoint of `step` as soon as that is to be redone, without asking again."""
+    under_way = state.current == step and state.phase == "running"
+    return under_way and not state.paused and not needs_leave(protocol, state)
+
+
 def unmet_requirements(step: Step, state: RunState) -> tuple[str, ...]:
     """The steps required by `step` that have not passed their gates; a skipped step has not."""
     return tuple(name for name in step.requires if not state.steps[name].passed_its_gates)

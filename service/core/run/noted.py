@@ -24,6 +24,8 @@ class Mending(_NoteRecord):
 
     Attributes:
         advice: what to do.
+        title: what is asked for, in few words, where that is the normal course of the step and nothing went wrong.
+        does: what the next confirmation does in that case, in the words of a button; "" where something went wrong.
         hands: the same for a simulated technician.
         viewpoints: further views that a retry takes; only their number counts.
         poses: further poses above the calibration board; only their number counts.
@@ -31,6 +33,8 @@ class Mending(_NoteRecord):
     """
 
     advice: str = ""
+    title: str = ""
+    does: str = ""
     hands: tuple[HandWork, ...] = ()
     viewpoints: tuple[object, ...] = ()
     poses: tuple[object, ...] = ()

@@ -143,6 +143,12 @@ class StepState:
         return None if newest is None else Mending.model_validate(dict(newest))
 
     @property
+    def in_course(self) -> Mending | None:
+        """What the step asks for in its normal course before it can be judged; None where something went wrong."""
+        mend = self.mend if self.phase == "recovering" and self.failure is None else None
+        return mend if mend is not None and mend.does else None
+
+    @property
     def motion_plan(self) -> NotedMotionPlan:
         """How the arm moves, by the newest plan; empty without one."""
         planned = (note.data for note in reversed(self.notes) if note.note == MOTION_PLAN)

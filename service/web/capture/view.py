@@ -13,7 +13,7 @@ import numpy as np
 from service.core.gates.verdict import limits
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import OperatorAction, ViewpointCaptured
-from service.core.run.actions import refuse
+from service.core.run.actions import redo_moves, refuse
 from service.core.run.state import JobState, StepState
 from service.core.units import mm, mrad
 from service.jobs.capture import further_view, live_summary, live_view
@@ -80,10 +80,13 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class ViewpointRedo:
-    """Whether a viewpoint may be redone now; and whether the robot drives there at once."""
+    """Whether a viewpoint may be redone now, from where the run is, and whether the robot drives there at once."""
 
     refused: str
+    current: str  # step
+    attempt: int  # of the current step
     moves: bool
+    paused: bool
 
 
 def capture_steps(protocol: Protocol) -> list[Step]:
@@ -296,8 +299,13 @@ def redo_of(log: RunRecord, step: Step, view: StepViewpoint, account: str) -> Vi
     """Whether a viewpoint may be sent back now. While the step runs, the robot then drives there by itself."""
     action = OperatorAction(action="redo", step=step.id, viewpoint=view.name, reason="asked", via="web")
     refusal = refuse(log.protocol, log.state, action, account)
-    moves = log.state.current == step.id and log.state.phase == "running"
-    return ViewpointRedo("" if refusal is None else ". ".join(filter(None, (refusal.what, refusal.remedy))), moves)
+    return ViewpointRedo(
+        refused="" if refusal is None else ". ".join(filter(None, (refusal.what, refusal.remedy))),
+        current=log.state.current,
+        attempt=log.state.step.attempt,
+        moves=redo_moves(log.protocol, log.state, step.id),
+        paused=log.state.paused,
+    )
 
 
 def suggestions_of(log: RunRecord, step: Step) -> tuple[str, tuple[live_summary.Suggestion, ...]]:

@@ -196,6 +196,8 @@ def _standing(protocol: Protocol, state: RunState, *, driven: bool) -> tuple[tup
     question = decide(protocol, state)
     if not isinstance(question, AskOperator):
         return ("Under way", "now"), ""
+    if state.step.in_course is not None:
+        return ("Waits for a confirmation", "attention"), state.step.in_course.title
     if question.for_ == "recovery":
         return ("Stopped", "stop"), stopped_words(protocol, state, question)
     return ("Waits for a signature" if question.for_ == "sign" else "Waits for a confirmation", "attention"), ""

@@ -12,6 +12,7 @@ from service.core.records.import_list import imported_sentence
 from service.core.run.decide import AskOperator, decide
 from service.core.run.state import RunState
 from service.monitor.snapshot import STALE_S, STOPS, Snapshot, Standing, read_snapshot
+from service.people.control import Control
 from service.web.page.run_words import stopped_words
 from service.web.site import Site
 
@@ -63,6 +64,7 @@ class RunFrame:
     imported: str  # the sentence that says so; "" for a run that captures its photographs itself
     live: bool  # not ended, so there may be new events
     pausable: bool
+    asked: tuple[str, str]  # the screen that has control, and the name of who asks for it; "" for nobody
     attention: Attention
     banner: Banner
     tabs: tuple[Tab, ...]
@@ -75,6 +77,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
     assert isinstance(root, RunStarted)  # checked when the run was read
     here = f"/runs/{run_id}"
     now_utc_s = site.store.clock.utc_s()
+    holder = Control(site.store).holder(run_id)
     driven, snapshot = site.launcher.driven(run_id), read_snapshot(site.data, run_id, now_utc_s)
     return RunFrame(
         run_id=run_id,
@@ -86,6 +89,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
         imported=imported_sentence(log.events[0].at_utc, root.operator) if root.origin == "imported" else "",
         live=not log.state.terminal,
         pausable=log.state.status == "active" and driven,
+        asked=(holder.screen, holder.asked_by_name),
         attention=_attention(log.protocol, log.state, snapshot, driven=driven),
         banner=robot_banner(log.state, snapshot, now_utc_s, driven=driven),
         tabs=(
@@ -115,6 +119,9 @@ def _attention(  # noqa: PLR0911 - one return a case
     if not isinstance(question, AskOperator):
         return Attention()
     title = protocol.step(question.step).title
+    wanted = state.step.in_course
+    if wanted is not None:
+        return Attention("waits", f"{title}: {wanted.title[:1].lower()}{wanted.title[1:]}.")
     if question.for_ == "recovery":
         return Attention("stopped", f"{title}: {stopped_words(protocol, state, question)}.")
     due = "a signature is due" if question.for_ == "sign" else "your confirmation is awaited"
@@ -148,8 +155,8 @@ def _unreadable(run_id: str) -> RunFrame:
     text = f"The record cannot be read now. Look at the robot. {NOT_THE_STOP}"
     banner = Banner("unknown", "unknown", "unknown", "Robot: unknown.", text)
     return RunFrame(
-        run_id, run_id, "", "", "", simulated=False, imported="", live=False, pausable=False, attention=Attention(),
-        banner=banner, tabs=(),
+        run_id, run_id, "", "", "", simulated=False, imported="", live=False, pausable=False, asked=("", ""),
+        attention=Attention(), banner=banner, tabs=(),
     )  # fmt: skip
 
 

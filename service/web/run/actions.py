@@ -25,7 +25,7 @@ from service.core.records.events import (
     StepNote,
 )
 from service.core.recovery.reasons import full_reason
-from service.core.run.actions import needs_leave, refuse
+from service.core.run.actions import needs_leave, redo_moves, refuse
 from service.core.run.state import RunState
 from service.people.approvals import approve, standing_of
 from service.people.authorisation import Identity, identity_for
@@ -45,6 +45,7 @@ router = APIRouter(tags=["acting"])
 Short = Annotated[str, Form(max_length=200)]
 Words = Annotated[str, Form(max_length=2000)]
 Number = Annotated[int, Form(ge=0, le=2**31)]
+DECIDE_AGAIN = "Close the form, read what the page shows now, and decide again; nothing was done"
 # Events that change nothing on the page on which the person decided.
 _HARMLESS = (
     NoteTaken,
@@ -151,8 +152,8 @@ def act(
     log = site.run(run_id)
     if form.verb != "pause":
         Control(site.store).require(run_id, person)
-    if form.verb in ("confirm", "sign", "skip", "accept"):
-        _require_current(log, form.step, form.attempt, form.seen_seq)
+    if not log.state.terminal:  # else it is refused, and recorded as an action after the end
+        _require_shown(log, form)
     if form.verb == "sign":
         if not person.may("sign"):
             raise NotAllowedError(f"the role {person.role} may not sign", where=run_id)
@@ -199,6 +200,14 @@ def _append(site: Site, log: RunRecord, action: OperatorAction, actor: str) -> N
     site.store.record(log.run_id, [action], actor=actor)
 
 
+def _require_shown(log: RunRecord, form: ActionForm) -> None:
+    """Refuse what a person decided about something else than what there is now."""
+    if form.verb in ("confirm", "sign", "skip", "accept", "resume"):
+        _require_current(log, form.step, form.attempt, form.seen_seq)
+    if form.verb == "redo":
+        _require_same_redo(log, form)
+
+
 def _require_current(log: RunRecord, step: str, attempt: int, seen_seq: int) -> None:
     """A page that shows an earlier question must not answer a later one."""
     state = log.state
@@ -207,9 +216,28 @@ def _require_current(log: RunRecord, step: str, attempt: int, seen_seq: int) -> 
         raise _out_of_date(state)
 
 
+def _require_same_redo(log: RunRecord, form: ActionForm) -> None:
+    """A redo does what its form said: from where the run was, of that image, and with that motion or none."""
+    state = log.state
+    if (form.current, form.attempt) != (state.current, state.step.attempt):
+        raise _out_of_date(state)
+    if not form.viewpoint or form.step not in state.steps:
+        return
+    image = state.steps[form.step].captured.get(form.viewpoint, 0)
+    moves = redo_moves(log.protocol, log.state, form.step)
+    if form.replaces != image:
+        what = f"{form.viewpoint} has another image by now" if image else f"{form.viewpoint} has no image any more"
+    elif form.moves != moves:
+        how = "drive" if moves else "not drive"
+        what = f"the robot would {how} to {form.viewpoint} at once, which the form did not say"
+    else:
+        return
+    raise IllegalTransitionError(what, where=form.step, remedy=DECIDE_AGAIN)
+
+
 def _out_of_date(state: RunState) -> IllegalTransitionError:
     return IllegalTransitionError(
         "the page was out of date: the run has gone on since it was shown",
         where=state.current,
-        remedy="Read what it shows now and decide again; nothing was done",
+        remedy=DECIDE_AGAIN,
     )

@@ -16,34 +16,37 @@ from service.web.site import CurrentSite, Site
 router = APIRouter(tags=["control"])
 
 Words = Annotated[str, Form(max_length=2000)]
+Shown = Annotated[str, Form(max_length=64)]  # the screen of which the page spoke; "" for none
 
 
 @router.post("/runs/{run_id}/control/take", name="take_control", dependencies=[Depends(requires("operate"))])
-def take_control(site: CurrentSite, person: SignedInPerson, run_id: RunId, reason: Words = "") -> RedirectResponse:
+def take_control(
+    site: CurrentSite, person: SignedInPerson, run_id: RunId, reason: Words = "", holder: Shown = ""
+) -> RedirectResponse:
     """Take control of a run that nobody controls; a supervisor takes it from somebody with a reason."""
     _require_open(site, run_id)
     control = Control(site.store)
     if reason.strip():
-        control.take_over(run_id, person, reason)
+        control.take_over(run_id, person, reason, shown=holder)
     else:
-        control.take(run_id, person)
+        control.take(run_id, person, shown=holder)
     return back_to(run_id)
 
 
 @router.post("/runs/{run_id}/control/ask", name="ask_for_control", dependencies=[Depends(requires("operate"))])
-def ask_for_control(site: CurrentSite, person: SignedInPerson, run_id: RunId) -> RedirectResponse:
-    """Ask whoever has control to hand it over."""
+def ask_for_control(site: CurrentSite, person: SignedInPerson, run_id: RunId, holder: Shown = "") -> RedirectResponse:
+    """Ask the one who has control to hand it over."""
     _require_open(site, run_id)
-    Control(site.store).ask(run_id, person)
+    Control(site.store).ask(run_id, person, shown=holder)
     return back_to(run_id)
 
 
 @router.post("/runs/{run_id}/control/answer", name="answer_for_control", dependencies=[Depends(requires("operate"))])
 def answer_for_control(
-    site: CurrentSite, person: SignedInPerson, run_id: RunId, grant: Annotated[bool, Form()]
+    site: CurrentSite, person: SignedInPerson, run_id: RunId, grant: Annotated[bool, Form()], asker: Shown = ""
 ) -> RedirectResponse:
     """Hand control over to the screen that asked for it, or keep it."""
-    Control(site.store).answer(run_id, person, grant=grant)
+    Control(site.store).answer(run_id, person, grant=grant, shown=asker)
     return back_to(run_id)
 
 

@@ -36,8 +36,11 @@ class ActionForm(BaseModel):
     Attributes:
         verb: the action.
         step: identifier of the step; "" for the current one.
-        attempt: of the step, as the page showed it.
+        current: the step at which the run was, as the page showed it; a redo is of another one.
+        attempt: of that step, as the page showed it.
         viewpoint: that is redone; "" for the whole step.
+        replaces: number of the event whose image of the viewpoint the page said is replaced; 0 for none.
+        moves: whether the page said that the robot then drives there at once.
         preset: a reason chosen from the list.
         reason: words that are added to it.
         meaning: what a signature stands for.
@@ -51,8 +54,11 @@ class ActionForm(BaseModel):
 
     verb: OperatorVerb
     step: str = Field("", max_length=200)
+    current: str = Field("", max_length=200)
     attempt: int = Field(0, ge=0, le=2**31)
     viewpoint: str = Field("", max_length=200)
+    replaces: int = Field(0, ge=0, le=2**31)
+    moves: bool = False
     preset: str = Field("", max_length=2000)
     reason: str = Field("", max_length=2000)
     meaning: str = Field("", max_length=2000)

@@ -57,7 +57,7 @@ async def _news(request: Request, site: Site, screen: str, run_id: str) -> Async
                     yield "event: signed_out\ndata: {}\n\n"
                     return
                 locked = person.locked
-            news = (*await run_in_threadpool(_newest, site, run_id), locked)
+            news = (*await run_in_threadpool(newest, site, run_id), locked)
             if news != told:
                 told, beat_s = news, now_s
                 data = {"seq": news[0], "monitor": news[1], "locked": locked}
@@ -73,7 +73,7 @@ def _signed_in(site: Site, token: str) -> Person | None:
     return site.people.person(token, idle_lock_s=site.idle_lock_s, deliberate=False)
 
 
-def _newest(site: Site, run_id: str) -> tuple[int, int]:
+def newest(site: Site, run_id: str) -> tuple[int, int]:
     """The last event, and a number that changes with the runner's reports, its silence, and who has control.
 
     Who asks for control, and whether that was refused, are no events of the run: they are rows of the site.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
 from typing import Annotated
@@ -14,7 +15,7 @@ from markupsafe import Markup
 from service.core.gates.dependence import AcceptedGate, accepted_gates
 from service.core.protocol.models import Step
 from service.core.records.entered import about_rows
-from service.core.records.events import RunStarted
+from service.core.records.events import ControlTaken, Event, RunStarted
 from service.core.recovery.reasons import Reasons
 from service.dataset.registrations import evaluated, shared_adjustment_note
 from service.jobs.registration.evaluate import Row
@@ -24,6 +25,7 @@ from service.people.person import Account, Person
 from service.rig import SigningSection
 from service.run_record import RunRecord, results_to_come
 from service.steps import step_kinds
+from service.store.durable_effects import utc_text
 from service.store.files.space_used import forecast_of
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
@@ -108,7 +110,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
     view = run_view(
         log,
         read_snapshot(site.data, run_id, site.store.clock.utc_s()),
-        _viewer(site, person, run_id),
+        _viewer(site, person, log),
         driven=site.launcher.driven(run_id),
         show=step,
         to_come=[left.text for left in results_to_come(log)],
@@ -127,8 +129,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         reasons=log.protocol.reasons,
         signing=site.rig.section.signing,
         drawing=drawing(log.protocol.step(view.shown.id)),
-        # Where the camera is set up the lens is focused: the live view belongs there.
-        lens_step=view.shown.drawing == "camera" and view.shown.current and view.shown.only_ticks,
+        lens_step=_aims(view),
         board_plan=_board_plan(log, view.shown.id),
         now_utc=site.store.clock.utc_now().isoformat(),
         depends=accepted_gates(log.protocol, log.state),
@@ -136,6 +137,13 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         result_note=shared_adjustment_note(log.protocol, log.state),
         further_cameras=rig_cameras(log),
     )
+
+
+def _aims(view: RunView) -> bool:
+    """Whether a person focuses or aims the camera now: the live view belongs there."""
+    focuses = view.shown.drawing == "camera" and view.shown.only_ticks
+    aims = view.shown.drawing == "layout_photo" and view.mode in ("ask", "more")
+    return view.shown.current and (focuses or aims)
 
 
 def _about(log: RunRecord) -> list[tuple[str, str]]:
@@ -151,9 +159,12 @@ def _board_plan(log: RunRecord, step: str) -> int:
     return 1 + sum(note.note == "board_poses" for note in log.state.steps[step].notes)
 
 
-def _viewer(site: Site, person: Person, run_id: str) -> Viewer:
-    holder = Control(site.store).holder(run_id)
+def _viewer(site: Site, person: Person, log: RunRecord) -> Viewer:
+    holder = Control(site.store).holder(log.run_id)
     mine = holder.screen == person.screen and bool(holder.screen)
+    refused = holder.refused_screen == person.screen
+    lost = None if mine else _taken_from(log, person.account)
+    names = {a.account: a.full_name for a in site.people.accounts.all()} if lost else {}
     return Viewer(
         may_operate=person.may("operate"),
         may_take_over=person.role == "supervisor",
@@ -161,9 +172,24 @@ def _viewer(site: Site, person: Person, run_id: str) -> Viewer:
         holder=holder.full_name,
         holder_screen=holder.screen,
         mine_elsewhere=not mine and bool(holder.screen) and holder.account == person.account,
-        asked_by=holder.asked_by_account,
+        asked_by=holder.asked_by_name,
+        asked_by_screen=holder.asked_by_screen,
         asked_by_me=bool(holder.asked_by_screen) and holder.asked_by_screen == person.screen,
+        refused_by=holder.refused_by_name if refused else "",
+        refused_utc=utc_text(datetime.fromtimestamp(holder.refused_utc_s, UTC)) if refused else "",
+        taken_over_by="" if lost is None else names.get(lost[0].actor, lost[0].actor),
+        taken_over_utc="" if lost is None else lost[0].at_utc,
+        taken_over_reason="" if lost is None else lost[1].reason,
     )
+
+
+def _taken_from(log: RunRecord, account: str) -> tuple[Event, ControlTaken] | None:
+    """The last change of control, if somebody else took it from this person."""
+    changes = ((event, taken) for event in reversed(log.events) if isinstance(taken := event.payload, ControlTaken))
+    last = next(changes, None)
+    if last is None or last[0].actor == account:
+        return None
+    return last if (last[1].how, last[1].previous) == ("taken_over", account) else None
 
 
 @cache

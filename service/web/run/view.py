@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from service.core.equipment.clocks import clock_readings
@@ -10,7 +10,7 @@ from service.core.equipment.disk_space import Forecast
 from service.core.gates.acceptance import acceptors, demanded_role, failed_gates
 from service.core.gates.dependence import dependent_steps, depends_on
 from service.core.protocol.models import Protocol, Step
-from service.core.records.events import OperatorVerb
+from service.core.records.events import Event, ItemTicked, OperatorAction, OperatorVerb
 from service.core.recovery.ways_on import WayOn, takes_words
 from service.core.run.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
 from service.core.run.decide import AskOperator, decide
@@ -22,6 +22,7 @@ from service.web.page.run_words import (
     drawing_of,
     figure_line,
     irreversible_warning,
+    needs,
     phase_words,
     planned_views,
     sentence,
@@ -36,12 +37,14 @@ from service.web.run.view_records import (
     Acceptance,
     ChecklistItem,
     Choice,
+    JudgedStep,
     MainAction,
     Question,
     RecordOfRun,
     RunView,
     SignedContent,
     StepLine,
+    StepMore,
     StepRedo,
     StepTrouble,
     StepView,
@@ -88,6 +91,7 @@ def run_view(
         steps=tuple(_line(protocol, state, step, shown, stopped=stopped) for step in protocol.steps),
         passed=sum(step.phase == "passed" for step in state.steps.values()),
         shown=_shown(protocol, state, protocol.step(shown), stopped=stopped, unused=unused),
+        judged=() if state.terminal else tuple(_judged(protocol, state, log.events)),
         question=_question(log, snapshot, decision, mode, may_operate=viewer.may_operate),
         viewer=viewer,
         progress=capture_progress(protocol, state, log.events),
@@ -103,16 +107,37 @@ def run_view(
     )
 
 
+# By these a person has decided something at the page; a pause says nothing about what was read.
+_DECIDED = frozenset({"confirm", "sign", "redo", "skip", "accept", "resume"})
+
+
+def _judged(protocol: Protocol, state: RunState, events: Sequence[Event]) -> Iterator[JudgedStep]:
+    """The steps whose verdicts came since a person last decided something: nobody may have seen them yet."""
+    acts = (event for event in reversed(events) if isinstance(event.payload, ItemTicked | OperatorAction))
+    decided = (event.seq for event in acts if not isinstance(act := event.payload, OperatorAction) or _decides(act))
+    since = next(decided, 0)
+    for step in sorted(protocol.steps, key=lambda step: -state.steps[step.id].passed_seq):
+        now = state.steps[step.id]
+        if now.phase == "passed" and now.passed_seq > since and now.verdicts and not step.params.only_ticks:
+            figures = tuple(figure_line(verdict) for verdict in now.verdicts)
+            yield JudgedStep(step.id, step.title, now.passed_seq, figures, accepted=now.accepted is not None)
+
+
+def _decides(act: OperatorAction) -> bool:
+    return act.action in _DECIDED and not act.automatic
+
+
 def _question(log: RecordOfRun, snapshot: Snapshot, decision: object, mode: str, *, may_operate: bool) -> Question:
     protocol, state = log.protocol, log.state
     return Question(
         main=_main(protocol, state, decision, mode, stopped=snapshot.robot in STOPS),
         options=_options(decision, state),
         can_pause=mode not in ("ended", "died", "paused") and may_operate,
-        asked_anew=needs_leave(protocol, state) and mode in ("ask", "recover"),
+        asked_anew=needs_leave(protocol, state) and mode in ("ask", "more", "recover"),
         standing=snapshot.doing == "paused" and snapshot.robot != "moving",
-        trouble=_trouble(protocol, state, decision),
-        ways=tuple(map(_way, decision.ways)) if isinstance(decision, AskOperator) else (),
+        more=_more(state) if mode == "more" else None,
+        trouble=None if mode == "more" else _trouble(protocol, state, decision),
+        ways=_ways(decision, mode),
         signature=_signature(protocol, state),
         acceptance=_acceptance(protocol, state),
         redos=() if state.terminal else tuple(_redo(protocol, state, s) for s in redoable_steps(protocol, state)),
@@ -128,7 +153,8 @@ def _mode(state: RunState, decision: object, *, driven: bool) -> str:
     if state.paused:
         return "paused"
     if isinstance(decision, AskOperator):
-        return {"confirm": "ask", "sign": "sign", "recovery": "recover"}[decision.for_]
+        asked = {"confirm": "ask", "sign": "sign", "recovery": "recover"}[decision.for_]
+        return asked if state.step.in_course is None else "more"
     return "work"
 
 
@@ -136,6 +162,8 @@ def _headline(protocol: Protocol, state: RunState, mode: str, decision: object) 
     title = protocol.step(state.current).title
     if mode == "recover" and isinstance(decision, AskOperator):
         return f"{title}. Stopped: {stopped_words(protocol, state, decision)}."
+    if mode == "more" and state.step.in_course is not None:
+        return f"{title}: {state.step.in_course.title}."
     return {
         "ended": f"The run is {state.status}.",
         "died": "The program that drives the robot has stopped. Everything captured is safe.",
@@ -214,13 +242,21 @@ def _wanted(protocol: Protocol, state: RunState, decision: object, mode: str) ->
         return MainAction("confirm", text, note, hold=moves, enabled=not left, why_not=why_not)
     if mode == "sign":
         return MainAction("sign", f"Sign: {step.title[:1].lower()}{step.title[1:]}", "Your signature is asked for.")
-    if mode == "recover" and isinstance(decision, AskOperator) and "confirm" in decision.options:
-        note = "What was captured is kept; only what is missing is done."
-        first = next((way for way in decision.ways if way.available), None)
-        mends = first is not None and first.verb == "confirm" and state.step.mend
-        text = f"Try again: {way_words(state, first)}" if mends and first is not None else "Try again"
-        return MainAction("confirm", text, note + (" The robot moves." if moves else ""), hold=moves)
-    return None
+    return _again(protocol, state, decision) if mode in ("recover", "more") else None
+
+
+def _again(protocol: Protocol, state: RunState, decision: object) -> MainAction | None:
+    """Another attempt: what the step asks for in its normal course, or one more try after something went wrong."""
+    moves, wanted = protocol.step(state.current).moves_robot, state.step.in_course
+    if wanted is not None:
+        return MainAction("confirm", wanted.does, "What was taken before is kept.", hold=moves)
+    if not isinstance(decision, AskOperator) or "confirm" not in decision.options:
+        return None
+    note = "What was captured is kept; only what is missing is done."
+    first = next((way for way in decision.ways if way.available), None)
+    mends = first is not None and first.verb == "confirm" and state.step.mend
+    text = f"Try again: {way_words(state, first)}" if mends and first is not None else "Try again"
+    return MainAction("confirm", text, note + (" The robot moves." if moves else ""), hold=moves)
 
 
 def _options(decision: object, state: RunState) -> tuple[OperatorVerb, ...]:
@@ -229,6 +265,15 @@ def _options(decision: object, state: RunState) -> tuple[OperatorVerb, ...]:
     asked = decision.options if isinstance(decision, AskOperator) else ()
     others: list[OperatorVerb] = [verb for verb in asked if verb in ("accept", "skip")]
     return (*others, "redo", "abort")
+
+
+def _more(state: RunState) -> StepMore | None:
+    wanted = state.step.in_course
+    if wanted is None:
+        return None
+    return StepMore(
+        wanted.title, sentence(wanted.advice), tuple(needs(v) for v in state.step.verdicts if not v.passed)
+    )
 
 
 def _trouble(protocol: Protocol, state: RunState, decision: object) -> StepTrouble | None:
@@ -255,6 +300,13 @@ _BUTTONS: Mapping[OperatorVerb, str] = {
     "accept": "Accept…",
     "abort": "End here…",
 }
+
+
+def _ways(decision: object, mode: str) -> tuple[Choice, ...]:
+    """The choices; without what the large button does, where that is the normal course and stands above."""
+    if not isinstance(decision, AskOperator):
+        return ()
+    return tuple(_way(way) for way in decision.ways if mode != "more" or way.verb != "confirm")
 
 
 def _way(way: WayOn) -> Choice:

@@ -43,8 +43,14 @@ class Viewer:
     holder: str = ""  # name of whoever has control; "" for nobody
     holder_screen: str = ""
     mine_elsewhere: bool = False  # the same person, on another screen
-    asked_by: str = ""  # who asks for control
+    asked_by: str = ""  # name of who asks for control
+    asked_by_screen: str = ""
     asked_by_me: bool = False
+    refused_by: str = ""  # name of who refused this screen's request
+    refused_utc: str = ""
+    taken_over_by: str = ""  # name of who took control from this person, if that was the last change of control
+    taken_over_utc: str = ""
+    taken_over_reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +72,17 @@ class ChecklistItem:
 
     text: str
     ticked: bool
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedStep:
+    """A step that passed while nobody decided anything."""
+
+    step: str
+    title: str
+    seq: int  # of the event by which it passed
+    figures: tuple[str, ...]
+    accepted: bool  # outside its limits
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +174,15 @@ class StepTrouble:
 
 
 @dataclass(frozen=True, slots=True)
+class StepMore:
+    """What a step asks for in its normal course before it can be judged."""
+
+    title: str
+    advice: str
+    open: tuple[str, ...]  # figures that what there is does not decide
+
+
+@dataclass(frozen=True, slots=True)
 class Choice:
     """A choice of what to do now."""
 
@@ -179,6 +205,7 @@ class Question:
         can_pause: whether this person can pause the run.
         asked_anew: the program that drove the robot has ended, so nothing moves before somebody confirms again.
         standing: the run is paused and the robot stands still.
+        more: what the step asks for in its normal course; None for nothing, or where something went wrong.
         trouble: why the run is stopped; None if it is not.
         ways: what can be done about that, the recommended one first.
         signature: what is to be signed; None for nothing.
@@ -192,6 +219,7 @@ class Question:
     can_pause: bool
     asked_anew: bool
     standing: bool
+    more: StepMore | None
     trouble: StepTrouble | None
     ways: tuple[Choice, ...]
     signature: SignedContent | None
@@ -208,13 +236,14 @@ class RunView:
     title: str
     seq: int
     status: str  # active, paused, completed, aborted
-    mode: str  # ask, sign, recover, work, paused, died, ended
+    mode: str  # ask, sign, more, recover, work, paused, died, ended
     headline: str  # news for screen readers when it changes
     current: str
     attempt: int
     steps: tuple[StepLine, ...]
     passed: int
     shown: StepView
+    judged: tuple[JudgedStep, ...]  # since a person last decided something, the newest first
     question: Question
     viewer: Viewer
     progress: CaptureProgress

@@ -24,7 +24,7 @@ from service.core.run.decide import AskOperator
 from service.core.run.noted import HandWork
 from service.core.run.state import RunState
 from service.monitor.reporter import Reporter
-from service.monitor.snapshot import Doing
+from service.monitor.snapshot import Asks, Doing
 from service.people.authorisation import Identity, identity_for
 from service.people.errors import PeopleError
 from service.people.sessions import People
@@ -98,7 +98,7 @@ class _Operator:
 
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
         """Report the run's state to the screens, the signal tower, and alerts to people elsewhere."""
-        asks, words = (asked.for_, _elsewhere(self.protocol, asked)) if asked is not None else ("", "")
+        asks, words = _elsewhere(self.protocol, state, asked) if asked is not None else ("", "")
         attempt = state.step.attempt
         self.display.reporter.attend(doing, state.current, attempt, pedal_armed=pedal_armed, asks=asks, words=words)
 
@@ -270,11 +270,13 @@ class TerminalOperator(_Operator):
         )
 
 
-def _elsewhere(protocol: Protocol, asked: AskOperator) -> str:
-    """A question in a few words, for people who are elsewhere."""
-    title = protocol.step(asked.step).title
+def _elsewhere(protocol: Protocol, state: RunState, asked: AskOperator) -> tuple[Asks, str]:
+    """A question in a few words, for people who are elsewhere; what a step asks for in its course is no trouble."""
+    title, wanted = protocol.step(asked.step).title, state.step.in_course
+    if wanted is not None:
+        return "confirm", f"{title}: {wanted.title[:1].lower()}{wanted.title[1:]}"
     due = {"confirm": "a confirmation is awaited", "sign": "a signature is due", "recovery": asked.text}
-    return f"{title}: {due[asked.for_]}"
+    return asked.for_, f"{title}: {due[asked.for_]}"
 
 
 def _ways_lines(question: AskOperator) -> list[str]:

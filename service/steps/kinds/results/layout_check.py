@@ -166,12 +166,18 @@ def _advise(
 
 def _ask_for_photograph(context: StepContext, taken: int, *, unseen: bool) -> None:
     side, where = _SIDES[taken % len(_SIDES)]
-    why = "not every sphere is seen" if unseen else "the photographs do not decide it yet"
+    why = "Not every sphere is seen so far" if unseen else "The photographs do not decide it yet"
     advice = (
-        f"One more photograph is needed, {why}: hold the camera {where}, so that it shows all spheres, "
-        "and confirm. What was photographed before is kept"
+        f"Hold the camera {where}, so that it shows all spheres, and confirm. {why}; what was photographed before is "
+        "kept"
     )
-    context.note(PHOTOGRAPH_WANTED, advice=advice, hands=[{"action": "hold_camera", "side": side}])
+    context.note(
+        PHOTOGRAPH_WANTED,
+        advice=advice,
+        title="One more photograph",
+        does=f"Take photograph {taken + 1}",
+        hands=[{"action": "hold_camera", "side": side}],
+    )
     context.tell(advice)
 
 

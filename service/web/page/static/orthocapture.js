@@ -8,6 +8,7 @@
   const PART_MS = 8000; // for a part to arrive
   const RETRY_MS = 1000;
   const ANSWER_MS = 60000; // for what a person asked for to be done
+  const SHORT_MS = 4000; // how long it is said that a button was let go too soon
   const body = document.body;
   const by = (id) => document.getElementById(id);
   let offline = false;
@@ -26,48 +27,7 @@
     }
   }
 
-  // --- parts: fetched again after a change, merged so that focus, caret, typed text and opened details stay --------
-
-  const KEPT = { DETAILS: ["open"], DIALOG: ["open"] };
-  const MARKS = new Set(["data-offline", "style"]);
-  function sameKind(a, b) {
-    return a.nodeType === b.nodeType && a.nodeName === b.nodeName
-      && (a.nodeType !== 1 || (a.id === b.id && (a.getAttribute("name") || "") === (b.getAttribute("name") || "")
-        && a.hasAttribute("data-hold") === b.hasAttribute("data-hold")));
-  }
-  function merge(old, fresh) {
-    if (old.nodeType !== 1) {
-      if (old.nodeValue !== fresh.nodeValue) old.nodeValue = fresh.nodeValue;
-      return;
-    }
-    if (old.nodeName === "DIALOG" && old.open) return; // somebody is writing in it
-    const kept = KEPT[old.nodeName] || [];
-    for (const { name } of [...old.attributes]) {
-      if (!fresh.hasAttribute(name) && !kept.includes(name) && !MARKS.has(name)) old.removeAttribute(name);
-    }
-    for (const { name, value } of fresh.attributes) {
-      if (!kept.includes(name) && old.getAttribute(name) !== value) old.setAttribute(name, value);
-    }
-    if (old.nodeName === "TEXTAREA") return;
-    mergeChildren(old, fresh);
-  }
-  function mergeChildren(old, fresh) {
-    const wanted = [...fresh.childNodes];
-    let here = old.firstChild;
-    for (const node of wanted) {
-      let match = here;
-      // Nodes before it may have been inserted or removed: look a little further.
-      for (let i = 0; match && i < 8 && !sameKind(match, node); i += 1) match = match.nextSibling;
-      if (match && sameKind(match, node)) {
-        while (here !== match) { const next = here.nextSibling; here.remove(); here = next; }
-        merge(match, node);
-        here = match.nextSibling;
-      } else {
-        old.insertBefore(node.cloneNode(true), here);
-      }
-    }
-    while (here) { const next = here.nextSibling; here.remove(); here = next; }
-  }
+  // --- parts: fetched again after a change -------------------------------------------------------------------------
 
   let fetching = false;
   let again = false;
@@ -126,9 +86,24 @@
   }
   function showPart(part, fresh) {
     for (const without of fresh.content.querySelectorAll("noscript")) without.replaceChildren(); // a template shows it
-    mergeChildren(part, fresh.content);
+    merging.mergeChildren(part, fresh.content);
     part.dispatchEvent(new CustomEvent("part-changed", { bubbles: true }));
   }
+
+  // --- verdicts: they stay until a person has decided something, or has pressed Seen on this screen -----------------
+
+  const seenKey = `orthocapture-seen-${body.dataset.run}`;
+  function hideSeen() {
+    for (const judged of document.querySelectorAll("[data-judged]")) judged.hidden = Number(judged.dataset.judged) <= Number(localStorage.getItem(seenKey));
+  }
+  document.addEventListener("click", (event) => {
+    const judged = event.target instanceof Element && event.target.closest("[data-seen]")?.closest("[data-judged]");
+    if (!judged) return;
+    localStorage.setItem(seenKey, judged.dataset.judged);
+    hideSeen();
+  });
+  document.addEventListener("part-changed", hideSeen);
+  hideSeen();
 
   // --- connection ------------------------------------------------------------------------------------------------
 
@@ -177,7 +152,7 @@
       const fresh = document.createElement("template");
       fresh.innerHTML = await answer.text();
       answeredAt = Date.now();
-      mergeChildren(robots, fresh.content);
+      merging.mergeChildren(robots, fresh.content);
       announce();
       document.dispatchEvent(new CustomEvent("page-changed"));
       if (offline && !body.dataset.stream) backOnline();
@@ -189,7 +164,7 @@
   function robotsUnknown() {
     if (!body.dataset.stream && !offline) goOffline();
     // The page of a run that lost its connection already says so for its own robot.
-    if (!body.dataset.stream || robots.childElementCount) mergeChildren(robots, by("robots-lost").content);
+    if (!body.dataset.stream || robots.childElementCount) merging.mergeChildren(robots, by("robots-lost").content);
   }
   document.addEventListener("visibilitychange", () => {
     if (robots && !document.hidden) { answeredAt = Date.now(); poll(); }
@@ -211,7 +186,7 @@
   }
   function setControls(off) {
     const which = off ? "button:not(:disabled), input:not(:disabled), select:not(:disabled), textarea:not(:disabled)" : "[data-offline]";
-    for (const control of document.querySelectorAll(`:is(main, aside, dialog) :is(${which})`)) {
+    for (const control of document.querySelectorAll(`:is(main, aside, dialog, .in-sight) :is(${which})`)) {
       control.disabled = off;
       control.toggleAttribute("data-offline", off);
     }
@@ -225,6 +200,7 @@
     if (offline || held || button.disabled || button.form?.dataset.busy) return;
     held = { button, from: performance.now(), need: Number(button.dataset.hold), key, frame: 0 };
     button.classList.add("held");
+    delete button.dataset.short;
     by("news").textContent = "Keep holding.";
     turn();
   }
@@ -235,13 +211,20 @@
     if (!button.isConnected || button.disabled) { cancelHold(); return; }
     button.style.setProperty("--held", String(still.matches ? Math.floor(share * 3) * 100 / 3 : share * 100));
     if (share < 1) { held.frame = requestAnimationFrame(turn); return; }
-    cancelHold();
+    endHold();
     button.dataset.done = "yes";
     button.form.requestSubmit(button);
     delete button.dataset.done;
   }
   function cancelHold() {
     if (!held) return;
+    const { button } = held;
+    endHold();
+    by("news").textContent = button.isConnected ? "Let go too soon: nothing was sent." : "The page has changed: nothing was sent.";
+    button.dataset.short = "yes";
+    setTimeout(() => { delete button.dataset.short; }, SHORT_MS);
+  }
+  function endHold() {
     cancelAnimationFrame(held.frame);
     held.button.classList.remove("held");
     held.button.style.removeProperty("--held");
@@ -286,18 +269,34 @@
     const fields = form.enctype === "multipart/form-data" ? entered : new URLSearchParams(entered); // with a file, or none
     const action = new URL(button?.getAttribute("formaction") || form.getAttribute("action") || location.href, location.href);
     if (action.pathname === "/theme") document.documentElement.dataset.theme = fields.get("theme");
-    form.dataset.busy = "yes";
-    button?.setAttribute("aria-disabled", "true");
+    const ended = showSent(form, button);
     say(form, "");
     try {
       const answer = await fetch(action, { method: "POST", body: fields, headers: { Accept: "application/json", "X-CSRF-Token": body.dataset.csrf || "" }, signal: AbortSignal.timeout(ANSWER_MS) });
+      ended();
       if (answer.ok) await succeed(form, action, answer);
       else await fail(form, answer);
     } catch {
+      ended();
       say(form, "This did not reach the service. Whether it had an effect shows when the connection is back.");
+      refresh();
     }
     delete form.dataset.busy;
-    button?.removeAttribute("aria-disabled");
+  }
+  // The form is sent once: it says so, stays as it was until the answer comes, and can be pressed again once that is shown.
+  function showSent(form, button) {
+    const sent = document.createElement("span");
+    form.dataset.busy = "sent";
+    button?.setAttribute("aria-disabled", "true");
+    sent.className = "sent";
+    sent.textContent = "Sent…";
+    if (!form.hasAttribute("data-quiet")) button?.append(sent);
+    by("news").textContent = "Sent…";
+    return () => {
+      form.dataset.busy = "answered";
+      button?.removeAttribute("aria-disabled");
+      sent.remove();
+    };
   }
   async function succeed(form, action, answer) {
     if (action.pathname === "/theme") return;
@@ -307,6 +306,7 @@
     const target = new URL(answer.url);
     const here = document.querySelector("[data-part]") && target.pathname === location.pathname;
     form.closest("dialog")?.close();
+    form.closest("details[open]")?.removeAttribute("open");
     if (!here || !answer.redirected) { location.assign(answer.redirected ? answer.url : location.href); return; }
     if (location.search) history.replaceState(null, "", location.pathname);
     form.reset();
@@ -323,7 +323,7 @@
     refresh();
   }
   function say(form, words) {
-    const own = form.querySelector(".form-problem");
+    const own = form.isConnected && form.querySelector(".form-problem");
     const place = own || by("problem");
     place.textContent = words;
     place.hidden = !words;
@@ -362,6 +362,8 @@
     if (event.key === " " && event.target.matches?.('a[role="button"]')) { event.preventDefault(); event.target.click(); }
   });
   document.addEventListener("close", (event) => { if (event.target.id !== "lock-screen") refresh(); }, true);
+  // What happened while a form was open was held back from it.
+  document.addEventListener("toggle", (event) => { if (event.target.matches("[data-part] details:has(form):not([open])")) refresh(); }, true);
   function showLock(locked) {
     const dialog = by("lock-screen");
     if (!dialog) return;
