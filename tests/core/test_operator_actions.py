@@ -101,7 +101,7 @@ def test_abort_ends_the_run_and_late_records_are_kept_without_effect() -> None:
 def test_refusals_by_the_command_line_are_deviations(log: Log) -> None:
     log.append(ActionRefused(action="skip", step="spray", why="not allowed"))
     assert log.state.deviations[0].text == "skip refused: not allowed"
-    assert log.state.deviation_count == 1
+    assert len(log.state.deviations) == 1
 
 
 # --- redo ------------------------------------------------------------------------------------------------

@@ -130,7 +130,7 @@ def import_command(
             answer = {"run": run_id, "status": state.status, "table": rows, "table_note": note}
             print_json({**answer, **listing_record(listing)})
         else:
-            _show_result(run_id, state.status, state.deviation_count, table, note)
+            _show_result(run_id, state.status, len(state.deviations), table, note)
         if state.status != "completed":
             raise typer.Exit(1)
 

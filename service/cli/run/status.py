@@ -66,8 +66,7 @@ def status_command(
         can = f"takes {takes_words(way.minutes)}, loses: {way.loses}" if way.available else f"no: {way.why_not}"
         console.print(f"way on: {way.verb} {way.step}: {escape(way.words)}; {escape(can)}")
     for deviation in state.deviations:
-        if not deviation.is_note:
-            console.print(f"deviation: {escape(deviation.text)}")
+        console.print(f"deviation: {escape(deviation.text)}")
 
 
 _STANDINGS: dict[Standing, str] = {
@@ -88,7 +87,7 @@ def status_record(run_id: str, state: RunState) -> dict[str, Any]:
         "run": run_id,
         "status": state.status,
         "current": state.current,
-        "deviations": [d.text for d in state.deviations if not d.is_note],
+        "deviations": [d.text for d in state.deviations],
         "steps": {
             name: {
                 "phase": s.phase,

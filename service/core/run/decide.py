@@ -147,7 +147,7 @@ def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - 
         case "recovering":
             return _decide_recovering(protocol, state)
         case "passed":
-            return FinishRun(state.deviation_count)
+            return FinishRun(len(state.deviations))
 
 
 def _what_goes_on(step: Step, now: StepState) -> str:
