@@ -94,6 +94,7 @@ def start(tablet: Screen) -> str:
     """Begin a run of the short protocol; returns its id."""
     tablet.go("/")
     tablet.page.get_by_role("button", name="Start A short protocol").click()
+    tablet.page.get_by_label("Specimen").fill("S1")
     tablet.page.get_by_role("button", name="Start the run").click()
     expect(tablet.page.get_by_role("heading", name="Fix the specimen and place the spheres")).to_be_visible(
         timeout=LONG_MS

@@ -9,7 +9,7 @@ from fastapi.responses import RedirectResponse
 
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.protocol.models import load_protocol
-from service.core.records.entered import NoteTaken, about_run
+from service.core.records.entered import NoteTaken, about_run, require_specimen
 from service.core.records.events import (
     ActionRefused,
     ControlTaken,
@@ -84,6 +84,7 @@ def start(
     loaded = load_protocol(known[form.protocol], params_models())
     rig = load_rig(site.rig.path)
     require_runnable(loaded, rig, site.devices_of(rig))
+    require_specimen(about)
     require_rig_free(site.store, site.rig.path)
     changed = standing_of(site.store, loaded).changed
     if changed:
