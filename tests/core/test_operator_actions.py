@@ -182,7 +182,7 @@ def test_a_redo_races_with_the_last_record(log: Log) -> None:
 
 def test_an_irreversible_step_needs_passed_captures_a_signature_and_a_confirmation() -> None:
     log = at_spray()
-    refused(log, "released by a signature", action="confirm", checklist=["window open"])
+    refused(log, "approved by a signature", action="confirm", checklist=["window open"])
     with pytest.raises(IntegrityError, match="not confirmed"):
         log.append(StepStarted(step="spray", attempt=1))
     log.sign()

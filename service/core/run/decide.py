@@ -171,9 +171,8 @@ def _decide_ready(protocol: Protocol, state: RunState) -> Decision:
     if unmet:
         return _ask(protocol, state, "recovery", f"Required before it and not passed: {', '.join(unmet)}")
     if needs_signature_now(protocol, state):
-        text = (
-            f"{step.title} cannot be undone. Its captures have passed: {', '.join(step.requires)}. Sign to release it"
-        )
+        passed = ", ".join(step.requires)
+        text = f"{step.title} cannot be undone. Its captures have passed: {passed}. Sign to let it begin"
         return _ask(protocol, state, "sign", text)
     if step.begins_confirmed and (not now.confirmed or needs_leave(protocol, state)):
         return _ask(protocol, state, "confirm", step.instructions or step.title)

@@ -50,7 +50,7 @@ class JobState:
     ended_seq: int = 0  # of its job_finished or job_failed event
     ended_utc: str = ""
     duration_s: float = 0.0
-    late_s: float | None = None  # after the specimen's release, or the run's end; None: in time
+    late_s: float | None = None  # after the specimen was freed, or the run's end; None: in time
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ class StepState:
     gates_passed: bool = False
     gates_sha256: str = ""  # of the gates_evaluated event: what a signature of this step binds
     accepted: AcceptedDeviation | None = None  # set if a person accepted figures outside the limits
-    passed_sha256: str = ""  # of the step_passed event: what the release of an irreversible step binds
+    passed_sha256: str = ""  # of the step_passed event: what the signature of an irreversible step binds
     passed_seq: int = 0
     failure: Failure | None = None
     failures: int = 0  # consecutive failures without a captured viewpoint or a confirmation in between
