@@ -203,6 +203,8 @@ def test_a_technician_is_led_through_a_run_and_a_second_person_releases_it(
         desk.sign_in("sam")
         desk.go(f"/runs/{run}/exports")
         assert accessibility_faults(page) == []
+        page.get_by_role("button", name="Verify now").click()
+        expect(page.get_by_role("button", name="Sign and release")).to_be_visible(timeout=LONG_MS)
         page.get_by_label(re.compile("password", re.IGNORECASE)).fill(PASSWORD)
         page.get_by_role("button", name="Sign and release").click()
         expect(page.get_by_text("This run has been released.")).to_be_visible()

@@ -45,6 +45,7 @@ router = APIRouter(tags=["acting"])
 Short = Annotated[str, Form(max_length=200)]
 Words = Annotated[str, Form(max_length=2000)]
 Number = Annotated[int, Form(ge=0, le=2**31)]
+_WITHOUT_CONTROL = ("pause", "sign", "accept")
 # Events that change nothing on the page on which the person decided.
 _HARMLESS = (
     NoteTaken,
@@ -147,10 +148,11 @@ def act(
 ) -> RedirectResponse:
     """Append what the person does if it is allowed now; otherwise append the refusal and say why.
 
-    Pausing needs neither control of the run nor an unlocked screen, because it can only make the run safer.
+    Pausing needs neither control of the run nor an unlocked screen, because it can only make the run safer. A
+    signature and an acceptance need no control: they are a person's word on figures, and nothing moves by them.
     """
     log = site.run(run_id)
-    if form.verb != "pause":
+    if form.verb not in _WITHOUT_CONTROL:
         Control(site.store).require(run_id, person)
     if form.verb in ("confirm", "sign", "skip", "accept"):
         _require_current(log, form.step, form.attempt, form.seen_seq)

@@ -12,6 +12,7 @@ from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
 from service.core.gates.dependence import AcceptedGate, accepted_gates
+from service.core.gates.release import loses_release
 from service.core.protocol.models import Step
 from service.core.records.entered import about_rows
 from service.core.records.events import RunStarted
@@ -108,7 +109,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
     view = run_view(
         log,
         read_snapshot(site.data, run_id, site.store.clock.utc_s()),
-        _viewer(site, person, run_id),
+        _viewer(site, person, log),
         driven=site.launcher.driven(run_id),
         show=step,
         to_come=[left.text for left in results_to_come(log)],
@@ -151,11 +152,14 @@ def _board_plan(log: RunRecord, step: str) -> int:
     return 1 + sum(note.note == "board_poses" for note in log.state.steps[step].notes)
 
 
-def _viewer(site: Site, person: Person, run_id: str) -> Viewer:
-    holder = Control(site.store).holder(run_id)
+def _viewer(site: Site, person: Person, log: RunRecord) -> Viewer:
+    holder = Control(site.store).holder(log.run_id)
     mine = holder.screen == person.screen and bool(holder.screen)
     return Viewer(
         may_operate=person.may("operate"),
+        may_sign=person.may("sign"),
+        role=person.role,
+        loses_release=person.may("release") and loses_release(log.protocol, log.state, person.account),
         may_take_over=person.role == "supervisor",
         in_control=mine and person.may("operate"),
         holder=holder.full_name,
