@@ -78,9 +78,9 @@ def web(shown: ShownSite, tmp_path: Path) -> Iterator[WebSite]:
         for run_id in shown.under_way:
             made.site.launcher.start(run_id)
         yield made
-        for run_id in made.store.runs():  # what was begun in passing
+        for row in made.store.runs():  # what was begun in passing
             for begun in (made.app.state.exports, made.app.state.audit.verifications):
-                begun.wait(run_id, 60)
+                begun.wait(row.run_id, 60)
 
 
 def _pages(shown: ShownSite) -> list[str]:

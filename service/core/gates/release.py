@@ -15,7 +15,7 @@ _NAMED = 20  # deviations that the words of a release name; the record has the o
 
 def release_meaning(state: RunState) -> str:
     """What a person states who releases the run: that they read it, and with which deviations."""
-    texts = [" ".join(one.text.split()).rstrip(".") for one in state.deviations]
+    texts = [f"{one.kind.replace('_', ' ')}, {' '.join(one.text.split()).rstrip('.')}" for one in state.deviations]
     if not texts:
         return "I have read this run, in which nothing deviated from the protocol, and release it"
     more = f"; and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""

@@ -155,7 +155,7 @@ def test_a_release_is_of_verified_evidence_and_its_words_name_the_deviations(
     assert len(state.deviations) == 2
     for one in state.deviations:
         assert one.text in words(page)
-    assert f"with its 2 deviations: {state.deviations[0].text}" in words(page)
+    assert f"with its 2 deviations: viewpoint skipped, {state.deviations[0].text}; redo, " in words(page)
     old = release_meaning(state).replace("2 deviations", "1 deviation")
     assert release(web, supervisor, run, meaning=old) == 409
     assert release(web, supervisor, run) == 303
