@@ -127,7 +127,7 @@ class _Soak:
         words = ("run", str(self.protocol), "--rig", str(self.rig), "--data", str(self.data))
         with self.log.open("wb") as log:
             runner = subprocess.Popen(
-                command(*words, "--operator", "soak", "--json"),
+                command(*words, "--operator", "soak", "--specimen", "soak", "--json"),
                 cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=log, stderr=log,
             )  # fmt: skip
         try:

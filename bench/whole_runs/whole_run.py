@@ -147,7 +147,7 @@ def whole_run(
     with Store.open(data, create=False) as store:
         summary = summarise(store, store.find_run("latest"), recorded_run(store, store.find_run("latest"))[0])
         record |= {"status": summary.state.status, "at": summary.state.current}
-        record |= {"deviations": [d.text for d in summary.state.deviations if not d.is_note]}
+        record |= {"deviations": [d.text for d in summary.state.deviations]}
         record["table"] = _table(summary, truth)
         record["figures"] = run_figures(summary, speed_up)
         record["bytes"] = _bytes(data)

@@ -9,11 +9,12 @@ from service.people.roles import ROLES, Permission, may
 _MEANINGS = {
     "read": "every page of every run, the audit's included",
     "operate": "start and drive a run: tick, confirm, redo, skip, pause, resume, end; take control",
-    "sign": "sign a step",
+    "sign": "sign a step, also without control of the run",
     "correct": "correct a recorded value, with a reason; the original stays",
     "release": "release a completed run as second person",
     "enrol": "give people badges, and take them away",
-    "export": "make a bundle, a report or a data set",
+    "report": "make a report or an evidence bundle",
+    "export": "make a data set",
     "administer": "accounts, invitations, the signing key",
 }
 _MORE = """\
@@ -25,7 +26,8 @@ the hash of what was signed, and is an event of the run.
   supervisor; `accept_by: another_supervisor` is one who neither began the run nor confirmed the step. The reason
   is listed with every result, as a deviation. Some measures can never be accepted, such as `moved_during_exposure`.
 - **A release** is given by a supervisor who took no part in the run (`release: second_person` in the protocol).
-  Nothing of the run can be exported before it.
+  Whoever took control, signed or accepted took part, and is told so before. The evidence is verified first. Nothing but
+  a report can be exported before the release, and that says so.
 - **A protocol** is approved, by its bytes, by the first person who begins a run with it. Changed content under the
   same id and version needs a reason and a password.
 """

@@ -40,7 +40,7 @@ def late_results(protocol: Protocol, state: RunState) -> list[LateResult]:
             name = row.poses
             if name not in known:
                 known.add(name)
-                text = f"{name}: {arrived(job)}. {_changed(row, mine)}"
+                text = f"{name}: {arrived(protocol, state, job)}. {_changed(row, mine)}"
                 found.append(LateResult(job.ended_seq, job.ended_utc, step, name, text))
     return sorted(found, key=lambda result: result.seq)
 

@@ -1,7 +1,7 @@
 """The registrations of a run and their evaluations, early or late, and which of them is the run's own.
 
 The run's own registration has the smallest error on the control spheres among those that the evaluation step judged:
-it was signed, and the specimen was released on it. One that arrives later may be better; it is reported as well and
+it was signed, and the specimen was freed on it. One that arrives later may be better; it is reported as well and
 does not replace it. Pages, report, exports and audit all follow this rule. Before the evaluation, the registration
 with the smallest predicted error is shown (`best_registration`).
 """
@@ -78,13 +78,15 @@ def evaluated(protocol: Protocol, state: RunState) -> list[Row]:
     known = {row.poses for row in rows}
     for _, job in later_evaluations(protocol, state) if rows else ():
         table = evaluate.KIND.read_answer(job.result).table
-        rows += [row.model_copy(update={"late": arrived(job)}) for row in table if row.poses not in known]
+        rows += [
+            row.model_copy(update={"late": arrived(protocol, state, job)}) for row in table if row.poses not in known
+        ]
     return rows
 
 
-def arrived(job: JobState) -> str:
-    """`arrived 12 min after the release`, or `arrived after the evaluation` if nothing had been released yet."""
-    return "arrived after the evaluation" if job.late_s is None else late_words(job.late_s)
+def arrived(protocol: Protocol, state: RunState, job: JobState) -> str:
+    """`arrived 12 min after the specimen was freed`, or `arrived after the evaluation` if it was not freed yet."""
+    return "arrived after the evaluation" if job.late_s is None else late_words(protocol, state, job.late_s)
 
 
 def shared_adjustment_note(protocol: Protocol, state: RunState) -> str:

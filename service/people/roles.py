@@ -12,14 +12,15 @@ Permission = Literal[
     "correct",  # correct a recorded value, with reason
     "release",  # release a completed run as second person
     "enrol",  # enrol and revoke people's badges
-    "export",  # make a bundle, a report or a data set
+    "report",  # make a report or an evidence bundle
+    "export",  # make a data set
     "administer",  # accounts, invitations, signing key
 ]
 ROLES: tuple[Role, ...] = ("technician", "supervisor", "auditor", "administrator")
 _GRANTED: dict[Role, frozenset[Permission]] = {
     "technician": frozenset({"read", "operate", "sign"}),
-    "supervisor": frozenset({"read", "operate", "sign", "correct", "release", "export", "enrol"}),
-    "auditor": frozenset({"read"}),
+    "supervisor": frozenset({"read", "operate", "sign", "correct", "release", "report", "export", "enrol"}),
+    "auditor": frozenset({"read", "report"}),
     "administrator": frozenset({"read", "administer", "enrol"}),
 }
 

@@ -354,7 +354,7 @@ class Store:
             duration_s: time that the computation took.
             result: the answer as plain data.
             artefacts: the answer's files.
-            late_s: seconds from the specimen's release to this answer; None if it is in time.
+            late_s: seconds from when the specimen was freed to this answer; None if it is in time.
             follow: a sequence number and a function that gets all events after it and returns the jobs that follow;
                 they are enqueued in the same transaction, so that a crash cannot lose them.
         """

@@ -94,6 +94,7 @@ def start(tablet: Screen) -> str:
     """Begin a run of the short protocol; returns its id."""
     tablet.go("/")
     tablet.page.get_by_role("button", name="Start A short protocol").click()
+    tablet.page.get_by_label("Specimen").fill("S1")
     tablet.page.get_by_role("button", name="Start the run").click()
     expect(tablet.page.get_by_role("heading", name="Fix the specimen and place the spheres")).to_be_visible(
         timeout=LONG_MS
@@ -202,6 +203,8 @@ def test_a_technician_is_led_through_a_run_and_a_second_person_releases_it(
         desk.sign_in("sam")
         desk.go(f"/runs/{run}/exports")
         assert accessibility_faults(page) == []
+        page.get_by_role("button", name="Verify now").click()
+        expect(page.get_by_role("button", name="Sign and release")).to_be_visible(timeout=LONG_MS)
         page.get_by_label(re.compile("password", re.IGNORECASE)).fill(PASSWORD)
         page.get_by_role("button", name="Sign and release").click()
         expect(page.get_by_text("This run has been released.")).to_be_visible()

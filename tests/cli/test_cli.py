@@ -219,7 +219,7 @@ def test_a_wrong_rig_file_is_refused_by_field(tmp_path: Path) -> None:
 def test_a_run_that_is_told_to_end_takes_its_worker_with_it(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text("name: bench\ndevices: {}\n")
     (tmp_path / "bench.yaml").write_text(PROTOCOL)
-    words = [COMMAND, "run", "bench.yaml", "--rig", "rig.yaml", "--data", "data"]
+    words = [COMMAND, "run", "bench.yaml", "--rig", "rig.yaml", "--data", "data", "--specimen", "S1"]
     with subprocess.Popen(
         words, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as run:

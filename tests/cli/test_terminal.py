@@ -85,6 +85,8 @@ def terminal(tmp_path: Path) -> Generator[Terminal]:
 
 
 def test_a_run_by_hand(terminal: Terminal) -> None:
+    terminal.wait_for("Specimen, name or number")
+    terminal.type("Spine 9")
     terminal.wait_for("Two wires hold each piece")
     terminal.type("")
     terminal.wait_for("is not possible now")
@@ -101,6 +103,7 @@ def test_a_run_by_hand(terminal: Terminal) -> None:
     answer = orthocapture("status", "latest", "--data", str(terminal.data), "--json")
     status = json.loads(answer.stdout)
     assert status["status"] == "completed"
+    assert dict(status["about"])["specimen"] == "Spine 9"
     assert any("other room" in text for text in status["deviations"])
     shown = orthocapture("audit", "show", "latest", "--data", str(terminal.data), "--json").stdout
     actions = [e for e in json.loads(shown)["events"] if e["kind"] == "operator_action"]
@@ -109,6 +112,8 @@ def test_a_run_by_hand(terminal: Terminal) -> None:
 
 
 def test_another_terminal_answers_and_aborts(terminal: Terminal) -> None:
+    terminal.wait_for("Specimen, name or number")
+    terminal.type("Spine 9")
     terminal.wait_for("Two wires hold each piece")
     data = str(terminal.data)
     answer = orthocapture("act", "confirm", "--data", data, "--operator", "B. Other")

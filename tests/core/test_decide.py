@@ -124,8 +124,8 @@ def test_automatic_confirmations_are_notes_and_only_for_simulated_rigs() -> None
     items = ["wires hold", "board lies"]
     log.act("confirm", checklist=items, automatic=True, via="auto")
     assert log.state.step.confirmed
-    assert log.state.deviations[0].is_note
-    assert log.state.deviation_count == 0
+    assert [d.kind for d in log.state.automatic] == ["automatic"]
+    assert log.state.deviations == ()
     for log in (Log(simulated=False), Log(auto_confirm=False)):
         refused(log, "simulated rigs only", action="confirm", checklist=items, automatic=True)
 

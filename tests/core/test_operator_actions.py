@@ -101,7 +101,7 @@ def test_abort_ends_the_run_and_late_records_are_kept_without_effect() -> None:
 def test_refusals_by_the_command_line_are_deviations(log: Log) -> None:
     log.append(ActionRefused(action="skip", step="spray", why="not allowed"))
     assert log.state.deviations[0].text == "skip refused: not allowed"
-    assert log.state.deviation_count == 1
+    assert len(log.state.deviations) == 1
 
 
 # --- redo ------------------------------------------------------------------------------------------------
@@ -182,7 +182,7 @@ def test_a_redo_races_with_the_last_record(log: Log) -> None:
 
 def test_an_irreversible_step_needs_passed_captures_a_signature_and_a_confirmation() -> None:
     log = at_spray()
-    refused(log, "released by a signature", action="confirm", checklist=["window open"])
+    refused(log, "approved by a signature", action="confirm", checklist=["window open"])
     with pytest.raises(IntegrityError, match="not confirmed"):
         log.append(StepStarted(step="spray", attempt=1))
     log.sign()

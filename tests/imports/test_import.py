@@ -70,7 +70,7 @@ def left_out(folder: Path) -> dict[str, str]:
 
 
 def refusal(*words: str) -> str:
-    result = CliRunner().invoke(app, ["import", *words, "--json"], catch_exceptions=False)
+    result = CliRunner().invoke(app, ["import", *words, "--specimen", "S1", "--json"], catch_exceptions=False)
     assert result.exit_code == 1, result.output
     error = json.loads(result.output.splitlines()[-1])["error"]
     return f"{error['what']} {error['where']} {error['remedy']}"
@@ -246,7 +246,8 @@ def test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere(
 ) -> None:
     folder, photographer = spine
     data = tmp_path / "data"
-    words = ["import", str(folder), "--protocol", str(short), "--simulated", "--operator", "Ada", "--data", str(data)]
+    words = ["import", str(folder), "--protocol", str(short), "--simulated", "--operator", "Ada", "--specimen", "S1"]
+    words += ["--data", str(data)]
     process = Forked(
         command(*words),
         cwd=REPOSITORY,

@@ -51,6 +51,7 @@ def protocol(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_develops_its_raw_files_and_measures_in_them(folder: Path, protocol: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     words = ["import", str(folder), "--protocol", str(protocol), "--simulated", "--operator", "Ada", "--json"]
+    words += ["--specimen", "S1"]
     answer = orthocapture(*words, "--data", str(data), timeout_s=900)
     assert answer.returncode == 0, answer.stdout + answer.stderr
     result = json.loads(answer.stdout.splitlines()[-1])
@@ -80,6 +81,7 @@ def test_a_run_without_raw_files_says_which_are_missing(folder: Path, protocol: 
     for raw in (alone / "images").glob("*.ARW"):
         raw.unlink()
     words = ["import", str(alone), "--protocol", str(protocol), "--simulated", "--operator", "Ada", "--json"]
+    words += ["--specimen", "S1"]
     answer = orthocapture(*words, "--data", str(tmp_path / "data"), timeout_s=300)
     assert answer.returncode != 0
     assert "8 images of 10 without a raw file" in answer.stdout

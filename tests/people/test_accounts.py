@@ -185,6 +185,7 @@ def test_roles_as_the_house_has_them() -> None:
     assert {role for role in ROLES if may(role, "release")} == {"supervisor"}
     assert {role for role in ROLES if may(role, "administer")} == {"administrator"}
     assert [p for p in ("operate", "sign", "correct", "release", "export", "administer") if may("auditor", p)] == []
+    assert {role for role in ROLES if may(role, "report")} == {"supervisor", "auditor"}
 
 
 def test_no_secret_reaches_the_record_or_the_database_in_clear(office: Office) -> None:

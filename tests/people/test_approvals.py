@@ -45,8 +45,8 @@ def approved(web: WebSite) -> list[tuple[str, ProtocolApproved]]:
 def test_the_first_who_begins_a_run_of_a_protocol_approves_it(web: WebSite) -> None:
     browser = web.browser("technician")
     assert "by starting it you approve this content" in words(browser.get("/").text)
-    assert browser.send_form("/runs", protocol="bench.yaml").status_code == 303
-    assert browser.send_form("/runs", protocol="bench.yaml").status_code in (303, 409)
+    assert browser.send_form("/runs", protocol="bench.yaml", specimen="S1").status_code == 303
+    assert browser.send_form("/runs", protocol="bench.yaml", specimen="S1").status_code in (303, 409)
     ((actor, record),) = approved(web)
     assert (actor, record.sha256, record.instead_of) == ("grace", loaded(PROTOCOL).sha256, "")
     assert "Approved by grace" in words(browser.get("/").text)
@@ -65,10 +65,10 @@ def test_another_content_under_the_same_version_needs_a_reason_and_a_signer(web:
         {"reason": "pilot", "password": "guessed"},
         {"reason": "  ", "password": password_of("grace")},
     ):
-        assert browser.send_form("/runs", protocol="bench.yaml", **fields).status_code >= 400
+        assert browser.send_form("/runs", protocol="bench.yaml", specimen="S1", **fields).status_code >= 400
     assert len(web.store.runs()) == 0
     sent = browser.send_form(
-        "/runs", protocol="bench.yaml", reason="one view is enough", password=password_of("grace")
+        "/runs", protocol="bench.yaml", specimen="S1", reason="one view is enough", password=password_of("grace")
     )
     assert sent.status_code == 303
     _, record = approved(web)[-1]

@@ -232,7 +232,7 @@ def test_a_later_and_better_registration_is_reported_and_takes_nobodys_place() -
     assert own_registration(run.protocol, state) == "robot_corrected"
     assert [(row.poses, row.late) for row in evaluated(run.protocol, state)] == [
         ("robot_corrected", ""),
-        ("colmap", "arrived 12 min after the release"),
+        ("colmap", "arrived 12 min after the end of the run"),
     ]
     better = better_later(run.protocol, state)
     assert better is not None
@@ -273,14 +273,15 @@ def test_page_report_and_export_show_the_same_registration(tmp_path: Path) -> No
     assert reported == [None, "colmap_640x360"], "nothing is reported or exported that was not evaluated"
 
 
-def test_lateness_counts_from_the_release_of_the_specimen() -> None:
+def test_lateness_counts_from_when_the_specimen_was_freed() -> None:
     demo = load_protocol(DEMO, params_models()).protocol
     state = initial_state(demo)
     assert late_s(demo, state, NOW) is None
     release = replace(state.steps["specimen_release"], phase="passed", ended_utc="2026-11-22T09:58:00Z")
     state = replace(state, steps={**state.steps, "specimen_release": release})
     assert late_s(demo, state, NOW) == 120.0
-    assert late_words(20.0) == "arrived after the release"
+    assert late_words(demo, state, 20.0) == "arrived after the specimen was freed"
+    assert late_words(demo, initial_state(demo), 720.0) == "arrived 12 min after the end of the run"
 
 
 def test_a_result_that_arrives_after_the_end_of_a_run_is_recorded_as_late_signed_and_verifies(tmp_path: Path) -> None:

@@ -28,14 +28,14 @@ def after_the_end(store: Store) -> list[ActionAfterEnd]:
 
 def test_on_the_screen(web: WebSite) -> None:
     run_id = web.record_run()
-    head, deviations = web.store.head(run_id), web.site.run(run_id).state.deviation_count
+    head, deviations = web.store.head(run_id), len(web.site.run(run_id).state.deviations)
     browser = web.browser("technician")
     web.take_control(run_id, browser)
     head = web.store.head(run_id)
     refused = browser.send_form(f"/runs/{run_id}/actions", verb="abort", reason="the board slipped")
     assert refused.status_code >= 400
     assert web.store.head(run_id) == head
-    assert web.site.run(run_id).state.deviation_count == deviations
+    assert len(web.site.run(run_id).state.deviations) == deviations
     (wanted,) = after_the_end(web.store)
     assert (wanted.run, wanted.action) == (run_id, "abort")
     assert "completed" in wanted.why

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zipfile
 from collections.abc import Generator
 from pathlib import Path
@@ -21,13 +22,14 @@ from service.audit.report.output.pdf import write_pdf
 from service.audit.runs.search import RunSearch, find_runs
 from service.audit.verify import bundle_verifier
 from service.cli.main import app
-from service.core.records.entered import NoteTaken
+from service.core.records.entered import NoteTaken, RunAbout
 from service.core.records.events import PAYLOAD, RunAborted, RunStarted
 from service.store.signatures.signing import checkpoint
 from service.store.verification.verify import verify
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import Browser, WebSite, web_site
 from tests.support.rig.rig import REPOSITORY
+from tests.support.runs.bench_run import PROTOCOL
 
 ENTERED = {
     "specimen": "Spine 7, L1–L5",
@@ -119,17 +121,42 @@ def test_the_start_form_shows_the_protocols_hash_and_its_approval(web: WebSite) 
     assert "Technicians and supervisors start runs" in web.browser("auditor").get("/start?protocol=bench.yaml").text
 
 
-def test_nothing_has_to_be_entered_and_too_much_is_refused(web: WebSite) -> None:
+@pytest.mark.parametrize("specimen", [None, "", "  \n\t ", "\u0007"])
+def test_a_run_does_not_begin_without_the_name_of_its_specimen(web: WebSite, specimen: str | None) -> None:
+    browser = web.browser("technician")
+    fields = {} if specimen is None else {"specimen": specimen}
+    answer = browser.send_form("/runs", protocol="bench.yaml", purpose="pilot", **fields)
+    assert answer.status_code == 422
+    assert "The specimen is not named" in words(answer.text)
+    assert "Enter its name or number" in words(answer.text)
+    assert web.store.runs() == []
+    form = browser.get("/start", params={"protocol": "bench.yaml"}).text
+    assert re.search(r'name="specimen"[^>]* required', form)
+
+
+def test_the_command_line_asks_for_the_specimen_too(tmp_path: Path) -> None:
+    (tmp_path / "p.yaml").write_text(PROTOCOL)
+    (tmp_path / "rig.yaml").write_text("name: bare\ndevices: {}\n")
+    words = ("run", str(tmp_path / "p.yaml"), "--rig", str(tmp_path / "rig.yaml"), "--data", str(tmp_path / "data"))
+    refused = typed(*words, "--operator", "A. Name", "--purpose", "pilot")
+    assert refused.exit_code == 1
+    assert "the specimen is not named" in refused.stderr
+    assert not (tmp_path / "data").exists()
+
+
+def test_only_the_specimen_has_to_be_entered_and_too_much_is_refused(web: WebSite) -> None:
     browser = web.browser("technician")
     answer = browser.send_form("/runs", protocol="bench.yaml", specimen="x" * 201)
     assert answer.status_code >= 400
     assert "at most 200" in answer.text
     assert web.store.runs() == []
-    empty = browser.send_form("/runs", protocol="bench.yaml").headers["location"].removeprefix("/runs/")
-    root = web.store.first_event(empty).payload
+    answer = browser.send_form("/runs", protocol="bench.yaml", specimen="S1")
+    least = answer.headers["location"].removeprefix("/runs/")
+    root = web.store.first_event(least).payload
     assert isinstance(root, RunStarted)
-    assert root.about is None
-    assert "<h2>This run</h2>" not in browser.get(f"/runs/{empty}").text
+    assert root.about == RunAbout(specimen="S1")
+    unattended = web.begin_run().run_id
+    assert "<h2>This run</h2>" not in browser.get(f"/runs/{unattended}").text
 
 
 def test_a_protocol_that_could_not_be_run_to_its_end_does_not_start_and_each_fault_is_a_line(web: WebSite) -> None:

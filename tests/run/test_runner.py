@@ -25,7 +25,7 @@ def test_a_run_goes_from_its_checklist_through_the_captures_to_its_end(bench: Be
     state = bench.run()
     assert state.status == "completed"
     assert bench.captured() == VIEWS
-    assert state.deviation_count == 0
+    assert state.deviations == ()
     assert [(d.device, d.report["identity"]["serial"]) for d in bench.payloads(DeviceOpened)] == [
         ("camera", "C-1"),
         ("robot", "A-1"),

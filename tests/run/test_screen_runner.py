@@ -98,7 +98,7 @@ def test_a_run_driven_from_screens_and_pedal_survives_its_starter(tmp_path: Path
 
         # The pedal acts as the screen's button: with open items it is refused, which is recorded.
         press_pedal(ready["world"])
-        until(lambda: watched.state().deviation_count == 1, "the refusal is recorded")
+        until(lambda: len(watched.state().deviations) == 1, "the refusal is recorded")
         assert "not ticked" in watched.state().deviations[0].text
         watched.tick_all()
         press_pedal(ready["world"])

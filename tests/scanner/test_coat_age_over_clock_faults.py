@@ -13,6 +13,9 @@ import trimesh
 from service.core.records.events import OperatorAction, StepNote
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
+from service.run_start import recorded_run
+from service.steps.coats import Coat, coats
+from service.store.durable_effects import moment_of
 from service.store.verification.verify import verify
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.rig.bench_rig import answer
@@ -142,6 +145,49 @@ def test_an_age_that_cannot_be_known_does_not_pass(
     assert why in note.note
     assert note.note in bench.operator.told
     assert {note.data["applied"]["boot"], note.data["arrived"]["boot"]} <= {"boot-1", "boot-2"}
+
+
+_BEFORE = "Coat of Blue: 34 min left."
+_SHOWN = {
+    _nothing: "Coat of Blue: 34 min left.",
+    _reboot: "Coat of Blue: 29 min left.",
+    _suspend: "Coat of Blue: 26 min too old.",
+    _hour_on: "Coat of Blue: 26 min too old.",
+    _hour_back: "Coat of Blue: how old it is cannot be known.",
+    _reboot_an_hour_back: "Coat of Blue: how old it is cannot be known.",
+}
+
+
+@pytest.mark.parametrize(("fault", "title"), _SHOWN.items())
+def test_what_the_clock_of_the_coat_shows_is_what_the_gate_judges(
+    bench: Bench, rig: OneScanner, fault: Callable[[SteppedClock], None], title: str
+) -> None:
+    shown: list[Coat] = []
+
+    def look() -> None:
+        protocol, _root = recorded_run(bench.store, bench.run_id)
+        shown.extend(coats(protocol, bench.state(), moment_of(bench.clock)))
+
+    def happens() -> None:
+        bench.clock.passed_s += _BETWEEN_S
+        look()
+        fault(bench.clock)
+        _export(rig, bench.clock.utc_s() + 7200.0)
+        look()
+
+    _before_the_import(bench, happens)
+    state = bench.run()
+    before, after = shown
+    assert (before.title, before.within_s, before.gated) == (_BEFORE, 60.0 * _LIMIT_MIN, True)
+    assert after.title == title
+    judged = state.steps["scan"].measures.get("since_application_min")
+    assert (after.age.seconds is None) == (judged is None)
+    if judged is not None and after.age.seconds is not None and after.left_s is not None:
+        assert after.age.seconds / 60 == pytest.approx(judged, abs=0.2)
+        assert (after.left_s > 0) == state.steps["scan"].gates_passed
+    assert after.due_utc == "" if after.left_s is None else after.due_utc > "2026"
+    look()
+    assert len(shown) == 2  # the run has ended
 
 
 def test_a_scan_dated_before_the_step_before_is_named(bench: Bench, rig: OneScanner) -> None:

@@ -66,8 +66,12 @@ def marked_name(name: str, *, simulated: bool) -> str:
     return f"{stem}-{MARK}.{suffix}" if dot else f"{name}-{MARK}"
 
 
-def require_exportable(store: Store, run_id: str, progress: Progress | None = None) -> ExportableRun:
+def require_exportable(
+    store: Store, run_id: str, progress: Progress | None = None, *, unreleased: bool = False
+) -> ExportableRun:
     """Verify the evidence with every file, and check that the run has been released if the protocol asks for it.
+
+    With `unreleased`, for a report that says so, the release may be missing.
 
     Raises:
         IntegrityError: the evidence does not verify; it names the first fault.
@@ -81,7 +85,7 @@ def require_exportable(store: Store, run_id: str, progress: Progress | None = No
             remedy="Run `orthocapture audit verify`, keep the folder as it is, and compare it with a copy",
         )
     protocol, root = recorded_run(store, run_id)
-    refusal = refuse_export(protocol, fold(protocol, store.events(run_id)))
+    refusal = None if unreleased else refuse_export(protocol, fold(protocol, store.events(run_id)))
     if refusal is not None:
         raise refusal
     return ExportableRun(protocol, root, report)

@@ -46,7 +46,7 @@ def export(data: Path, run_id: str, what: str, target: Path, actor: str, progres
             return made.path
         if what == "dataset":
             require_export_space(store, run_id, target)
-        exportable = require_exportable(store, run_id, progress)
+        exportable = require_exportable(store, run_id, progress, unreleased=what in ("report", "report_pdf"))
         # Imported here because numerics and typesetting take long to load, and a bundle needs neither.
         from service.audit.record.run import read_run  # noqa: PLC0415
 

@@ -60,7 +60,7 @@ class Digest:
     protocol: Protocol | None = None
     state: RunState | None = None  # None if the protocol cannot be read
     failed_gates: list[FailedGate] = field(default_factory=list[FailedGate])
-    times: dict[int, str] = field(default_factory=dict[int, str])  # of the deviations' events
+    times: dict[int, str] = field(default_factory=dict[int, str])  # of deviations and automatic confirmations
     facets: Facets = field(default_factory=Facets)
     problem: str = ""  # why the fold stopped before the end of the chain; "" if it did not
 
@@ -70,8 +70,13 @@ class Digest:
 
     @property
     def deviations(self) -> Sequence[Deviation]:
-        """All deviations in order, notes included."""
+        """All deviations in order."""
         return self.state.deviations if self.state else ()
+
+    @property
+    def automatic(self) -> Sequence[Deviation]:
+        """The automatic confirmations in order."""
+        return self.state.automatic if self.state else ()
 
     @property
     def late(self) -> list[LateResult]:
@@ -193,13 +198,13 @@ def _advance(digest: Digest, row: Any) -> None:
         previous_sha256=row.previous_sha256,
         sha256=row.sha256,
     )
-    known = len(digest.state.deviations)
+    known = len(digest.state.deviations) + len(digest.state.automatic)
     try:
         digest.state = advance(digest.protocol, replace(digest.state, seq=row.seq - 1), event)
     except IntegrityError as error:
         digest.problem = str(error)
         return
-    if len(digest.state.deviations) > known:
+    if len(digest.state.deviations) + len(digest.state.automatic) > known:
         digest.times[row.seq] = row.at_utc
     if isinstance(payload, GatesEvaluated) and not payload.passed:
         digest.failed_gates += [

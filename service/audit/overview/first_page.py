@@ -12,7 +12,7 @@ from service.audit.verify.verifications import Verification
 from service.core.gates.verdict import describe_judged
 from service.core.run.state import DeviationKind
 
-# Group on the page → its name in the plural, and the kinds of deviations in it.
+# Group on the page → its name in the plural, and the kinds of deviations in it; a group without any lists none.
 GROUPS: Mapping[str, tuple[str, frozenset[DeviationKind]]] = {
     "accepted": ("Gates accepted", frozenset({"gate_accepted"})),
     "redone": ("Re-dos", frozenset({"redo", "redo_viewpoint", "reset_by_redo"})),
@@ -40,6 +40,10 @@ _OF_ONE: Mapping[str, str] = {
 }
 
 
+DEVIATION_GROUPS = tuple(group for group, (_, kinds) in GROUPS.items() if kinds and "automatic" not in kinds)
+NOTE_GROUPS = tuple(group for group in GROUPS if group not in DEVIATION_GROUPS)  # recorded, and no deviations
+
+
 def group_name(group: str, number: int) -> str:
     """The name of a group for this number of findings."""
     return _OF_ONE[group] if number == 1 else GROUPS[group][0]
@@ -54,8 +58,8 @@ _NAMES: Mapping[str, str] = {
     "reset_by_redo": "Reset by a re-do",
     "viewpoint_skipped": "View skipped",
     "refused": "Refused",
-    "automatic": "Automatic (note)",
-    "late_result": "Result arrived later (note)",
+    "automatic": "Automatic",
+    "late_result": "Result arrived later",
     "failed_gate": "Gate failed",
     "undecided_gate": "Gate not decided",
 }
@@ -63,7 +67,7 @@ _NAMES: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A line in the list of deviations."""
+    """A line in the list of deviations, or of what else is recorded."""
 
     seq: int
     at_utc: str
@@ -74,34 +78,28 @@ class Finding:
 
     @property
     def name(self) -> str:
-        """The kind of deviation in words."""
+        """Its kind in words."""
         return _NAMES[self.kind]
-
-    @property
-    def is_note(self) -> bool:
-        """Whether this is a note, not a deviation."""
-        return self.kind in ("automatic", "late_result")
 
 
 def findings(digest: Digest, group: str = "") -> list[Finding]:
-    """Deviations and failed gates, with accepted gates first.
-
-    With `group`, only those of this group; otherwise all except notes.
-    """
+    """The deviations of a run, accepted gates first; with `group`, what is in this group, deviations or not."""
     kinds = GROUPS[group][1] if group in GROUPS else None
+    listed = digest.automatic if group == "automatic" else digest.deviations
     found = [
         Finding(d.seq, digest.times.get(d.seq, ""), d.kind, d.step or "", d.actor, d.text)
-        for d in digest.deviations
-        if (d.kind in kinds if kinds is not None else not d.is_note)
+        for d in listed
+        if kinds is None or d.kind in kinds
     ]
-    if kinds is None or group in _GATE_GROUPS.values():
-        found += [
-            _of_gate(gate) for gate in digest.failed_gates if kinds is None or _GATE_GROUPS[_gate_kind(gate)] == group
-        ]
-        found.sort(key=lambda finding: (finding.kind != "gate_accepted", finding.seq))
+    found += [_of_gate(gate) for gate in digest.failed_gates if _GATE_GROUPS[_gate_kind(gate)] == group]
     if group == "late_results":
         found += [Finding(late.seq, late.at_utc, "late_result", late.step, "", late.text) for late in digest.late]
-    return found
+    return sorted(found, key=lambda finding: (finding.kind != "gate_accepted", finding.seq))
+
+
+def failed_gates(digest: Digest) -> list[Finding]:
+    """The gates that did not pass in some attempt, in order: no deviations, but what a reader asks for next."""
+    return sorted(map(_of_gate, digest.failed_gates), key=lambda finding: finding.seq)
 
 
 _GATE_GROUPS = {"failed_gate": "failed_gates", "undecided_gate": "undecided_gates"}
@@ -119,7 +117,7 @@ def _of_gate(gate: FailedGate) -> Finding:
 def counts(digest: Digest) -> dict[str, int]:
     """The number of findings in each group."""
     by_kind: dict[str, int] = {}
-    for deviation in digest.deviations:
+    for deviation in (*digest.deviations, *digest.automatic):
         by_kind[deviation.kind] = by_kind.get(deviation.kind, 0) + 1
     found = {group: sum(by_kind.get(kind, 0) for kind in kinds) for group, (_, kinds) in GROUPS.items()}
     kinds_of_gates = [_gate_kind(gate) for gate in digest.failed_gates]
@@ -167,10 +165,10 @@ class ListedRun:
 
     @property
     def deviations(self) -> int | None:
-        """The number of deviations without the notes."""
+        """The number of deviations."""
         if self.digest is None or self.digest.state is None:
             return None
-        return self.digest.state.deviation_count
+        return len(self.digest.deviations)
 
     @property
     def verified(self) -> str:

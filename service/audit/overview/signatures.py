@@ -95,5 +95,5 @@ def _stands(digest: Digest, row: EventRow, action: OperatorAction | None, signed
         return step.accepted is not None and step.accepted.seq == row.seq
     if step is None or not step.signed or step.signed_by != row.actor:
         return False
-    # A step binds its gates; the release of an irreversible step binds what passed before it.
+    # A step binds its gates; that of an irreversible step binds what passed before it.
     return signed in {step.gates_sha256, *(other.passed_sha256 for other in state.steps.values())}

@@ -13,6 +13,7 @@ from service.audit.report.sections.course import (
     NotableEvent,
     deviations,
     deviations_section,
+    no_deviation,
     people_section,
     steps_section,
 )
@@ -56,7 +57,7 @@ def report_content(
         result=result_sentence(run.summary()),
         deviations=TableCell(f"{counted(len(listed), 'deviation')}, listed first", "attention")
         if listed
-        else TableCell("No deviation: every step was done as the protocol says", "ok"),
+        else no_deviation(run),
         release=_release(run),
         facts=facts(run),
         sections=tuple(section for section in sections if section is not None),

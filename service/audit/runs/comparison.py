@@ -283,7 +283,5 @@ def _longer(first: float | None, second: float | None) -> str:
 
 def _deviations(run: ComparedRun) -> tuple[str, ...]:
     return tuple(
-        f"{d.kind.replace('_', ' ')}: {d.text}" + (f" ({d.actor})" if d.actor else "")
-        for d in run.state.deviations
-        if not d.is_note
+        f"{d.kind.replace('_', ' ')}: {d.text}" + (f" ({d.actor})" if d.actor else "") for d in run.state.deviations
     )

@@ -19,7 +19,7 @@ from service.cli.common import (
     print_json,
     reporting_errors,
 )
-from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption
+from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption, described
 from service.cli.run.beside import worker_beside
 from service.cli.run.ending import sigterm_like_ctrl_c
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person, typed_password
@@ -87,12 +87,15 @@ def run_command(
 ) -> None:
     """Run a protocol step by step. Nothing moves before you have confirmed it."""
     with reporting_errors(json):
-        about = about_run(specimen=specimen, purpose=purpose, site=site, text=remarks)
         loaded = load_protocol(protocol, params_models())
         rig_file = load_rig(rig)
         if auto_confirm:
             require_simulated(rig_file)
         require_runnable(loaded, rig_file, devices_of(rig_file))
+        if auto_confirm:  # nobody attends: a simulated rig has the specimen of its scene
+            about = about_run(specimen=specimen, purpose=purpose, site=site, text=remarks)
+        else:
+            about = described(specimen, purpose=purpose, site=site, remarks=remarks)
         with Store.open(data) as store:
             who = acting_person(store, operator, password_stdin=password_stdin)
             if not auto_confirm:  # simulated rigs need no approval

@@ -23,14 +23,14 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
 )
-from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption
+from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption, described
 from service.cli.run.commands import WorkerOption, drive
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.cli.run.terminal.import_operator import part_of
 from service.cli.shipped_protocols import shipped_protocols
 from service.core.errors import ConfigurationError
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
-from service.core.records.entered import RunAbout, about_run
+from service.core.records.entered import RunAbout
 from service.core.records.import_list import FileRole, ImportedView, ImportList, PhotographRole
 from service.core.units import megabytes
 from service.dataset.registrations import shared_adjustment_note
@@ -105,7 +105,7 @@ def import_command(
         "ct": ct,
     }
     with reporting_errors(json):
-        about = about_run(specimen=specimen, purpose=purpose, site=site, text=remarks)
+        about = RunAbout() if dry_run else described(specimen, purpose=purpose, site=site, remarks=remarks)
         loaded = load_protocol(protocol, params_models())
         require_plausible(loaded, str(protocol))
         with progress_bar(quiet=json) as progress:
@@ -130,7 +130,7 @@ def import_command(
             answer = {"run": run_id, "status": state.status, "table": rows, "table_note": note}
             print_json({**answer, **listing_record(listing)})
         else:
-            _show_result(run_id, state.status, state.deviation_count, table, note)
+            _show_result(run_id, state.status, len(state.deviations), table, note)
         if state.status != "completed":
             raise typer.Exit(1)
 

@@ -27,6 +27,8 @@ from service.jobs.capture import live_summary, live_view
 from service.run_record import read_log, results_to_come
 from service.run_start import recorded_run
 from service.steps.capture.live_numbers import describe_view
+from service.steps.coats import coats
+from service.store.durable_effects import moment_of
 from service.store.store import Store
 
 
@@ -41,10 +43,12 @@ def status_command(
         protocol, root = recorded_run(store, run_id)
         log = read_log(store, run_id, protocol)
         state, missing = log.state, [left.text for left in results_to_come(log)]
+        aging = coats(protocol, state, moment_of(store.clock))
     if json:
         ways = [asdict(way) for way in ways_on(protocol, state)]
         about = None if root.about is None else root.about.model_dump()
-        print_json(status_record(run_id, state) | {"about": about, "still_to_come": missing, "ways_on": ways})
+        told = {"about": about, "still_to_come": missing, "coats": [f"{coat.title} {coat.text}" for coat in aging]}
+        print_json(status_record(run_id, state) | told | {"ways_on": ways})
         return
     table = Table(title=f"Run {run_id}: {state.status}", title_justify="left")
     for heading in ("step", "state", "attempt", "views", "gates"):
@@ -57,6 +61,8 @@ def status_command(
     print_table(table)
     for name, entered in about_rows(root.about):
         console.print(f"{name}: {escape(entered)}")
+    for coat in aging:
+        console.print(escape(f"{coat.title} {coat.text}"))
     live = [job for job in state.step.jobs.values() if job.kind == live_view.KIND.name and job.status != "enqueued"]
     for job in live[-3:]:
         console.print(escape(describe_view(job)))
@@ -66,8 +72,7 @@ def status_command(
         can = f"takes {takes_words(way.minutes)}, loses: {way.loses}" if way.available else f"no: {way.why_not}"
         console.print(f"way on: {way.verb} {way.step}: {escape(way.words)}; {escape(can)}")
     for deviation in state.deviations:
-        if not deviation.is_note:
-            console.print(f"deviation: {escape(deviation.text)}")
+        console.print(f"deviation: {escape(deviation.text)}")
 
 
 _STANDINGS: dict[Standing, str] = {
@@ -88,7 +93,7 @@ def status_record(run_id: str, state: RunState) -> dict[str, Any]:
         "run": run_id,
         "status": state.status,
         "current": state.current,
-        "deviations": [d.text for d in state.deviations if not d.is_note],
+        "deviations": [d.text for d in state.deviations],
         "steps": {
             name: {
                 "phase": s.phase,

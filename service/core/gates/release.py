@@ -1,10 +1,31 @@
-"""When a run may be exported: complete, and released by a second person where the protocol asks for it."""
+"""When a run may be exported: complete, and released by a second person where the protocol asks for it.
+
+A run is released; a specimen is freed (service/core/results/arrival.py).
+"""
 
 from __future__ import annotations
 
 from service.core.errors import IllegalTransitionError
 from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
+from service.core.text.counts import counted
+
+_NAMED = 20  # deviations that the words of a release name; the record has the others
+
+
+def release_meaning(state: RunState) -> str:
+    """What a person states who releases the run: that they read it, and with which deviations."""
+    texts = [f"{one.kind.replace('_', ' ')}, {' '.join(one.text.split()).rstrip('.')}" for one in state.deviations]
+    if not texts:
+        return "I have read this run, in which nothing deviated from the protocol, and release it"
+    more = f"; and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
+    named = "; ".join(texts[:_NAMED])
+    return f"I have read this run and release it with its {counted(len(texts), 'deviation')}: {named}{more}"
+
+
+def loses_release(protocol: Protocol, state: RunState, actor: str) -> bool:
+    """Whether a person who acts on the run now can no longer release it as the second person."""
+    return protocol.release == "second_person" and not state.released_by and actor not in state.people
 
 
 def refuse_release(state: RunState, actor: str, signed_sha256: str) -> IllegalTransitionError | None:

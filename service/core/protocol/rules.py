@@ -67,7 +67,7 @@ def _irreversible(step: dict[str, Plain], at: FieldPath) -> Iterator[tuple[Field
     if not step.get("requires"):
         yield where, "an irreversible step needs `requires`: the captures that must have passed before it"
     if step.get("sign") is not True:
-        yield where, "an irreversible step needs `sign: true`: a person releases it"
+        yield where, "an irreversible step needs `sign: true`: a person approves that it begins"
     if step.get("confirm") is False:
         yield (*at, "confirm"), "an irreversible step is always confirmed by a person"
 

@@ -18,7 +18,11 @@ _Text = Annotated[str, Field(max_length=TEXT_CHARACTERS)]
 
 
 class RunAbout(Record):
-    """Specimen, purpose and remarks of a run as entered at its start; "" for fields left empty."""
+    """Specimen, purpose and remarks of a run as entered at its start; "" for fields left empty.
+
+    A person who begins a run names its specimen. It may be missing in runs of older versions, and in those on a
+    simulated rig that nobody attends.
+    """
 
     specimen: _Line = ""
     purpose: _Line = ""
@@ -59,6 +63,17 @@ def about_run(
         operator=line(operator, "the operator"),
         text=paragraphs(text, "the remarks"),
     )
+
+
+def require_specimen(about: RunAbout) -> None:
+    """Raise ConfigurationError if the specimen is not named: nobody could tell later what was captured."""
+    if not about.specimen:
+        raise ConfigurationError(
+            "the specimen is not named",
+            where="specimen",
+            remedy="Enter its name or number. It goes into the first record of the run, which cannot be changed "
+            "afterwards",
+        )
 
 
 def about_rows(about: RunAbout | None) -> list[tuple[str, str]]:

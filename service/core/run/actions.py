@@ -101,7 +101,7 @@ def needs_signature_now(protocol: Protocol, state: RunState) -> bool:
 def record_to_sign(protocol: Protocol, state: RunState) -> str:
     """SHA-256 of the event that a signature must bind now, or "" when none is due.
 
-    That is the step's gates_evaluated event. For the release of an irreversible step it is the latest step_passed
+    That is the step's gates_evaluated event. For an irreversible step it is the latest step_passed
     among the steps it requires; the chain binds the earlier ones.
     """
     if not needs_signature_now(protocol, state):
@@ -164,7 +164,7 @@ def _confirm(protocol: Protocol, state: RunState, action: OperatorAction, actor:
         return refusal
     if step.irreversible and not now.signed:
         return Refusal(
-            "an irreversible step must be released by a signature first", where=step.id, remedy="Sign, then confirm"
+            "an irreversible step must be approved by a signature first", where=step.id, remedy="Sign, then confirm"
         )
     unticked = [item for item in step.checklist if item not in action.checklist]
     if unticked:

@@ -147,7 +147,7 @@ def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - 
         case "recovering":
             return _decide_recovering(protocol, state)
         case "passed":
-            return FinishRun(state.deviation_count)
+            return FinishRun(len(state.deviations))
 
 
 def _what_goes_on(step: Step, now: StepState) -> str:
@@ -171,9 +171,8 @@ def _decide_ready(protocol: Protocol, state: RunState) -> Decision:
     if unmet:
         return _ask(protocol, state, "recovery", f"Required before it and not passed: {', '.join(unmet)}")
     if needs_signature_now(protocol, state):
-        text = (
-            f"{step.title} cannot be undone. Its captures have passed: {', '.join(step.requires)}. Sign to release it"
-        )
+        passed = ", ".join(step.requires)
+        text = f"{step.title} cannot be undone. Its captures have passed: {passed}. Sign to let it begin"
         return _ask(protocol, state, "sign", text)
     if step.begins_confirmed and (not now.confirmed or needs_leave(protocol, state)):
         return _ask(protocol, state, "confirm", step.instructions or step.title)

@@ -50,7 +50,7 @@ class JobState:
     ended_seq: int = 0  # of its job_finished or job_failed event
     ended_utc: str = ""
     duration_s: float = 0.0
-    late_s: float | None = None  # after the specimen's release, or the run's end; None: in time
+    late_s: float | None = None  # after the specimen was freed, or the run's end; None: in time
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ class StepState:
     gates_passed: bool = False
     gates_sha256: str = ""  # of the gates_evaluated event: what a signature of this step binds
     accepted: AcceptedDeviation | None = None  # set if a person accepted figures outside the limits
-    passed_sha256: str = ""  # of the step_passed event: what the release of an irreversible step binds
+    passed_sha256: str = ""  # of the step_passed event: what the signature of an irreversible step binds
     passed_seq: int = 0
     failure: Failure | None = None
     failures: int = 0  # consecutive failures without a captured viewpoint or a confirmation in between
@@ -171,18 +171,13 @@ class Superseded:
 
 @dataclass(frozen=True, slots=True)
 class Deviation:
-    """A departure from the protocol. An automatic confirmation is only a note: listed, but not counted."""
+    """A departure from the protocol; in `RunState.automatic`, a confirmation that was given automatically."""
 
     seq: int
     kind: DeviationKind
     step: str | None
     text: str
     actor: str = ""
-
-    @property
-    def is_note(self) -> bool:
-        """Whether this is for the record only."""
-        return self.kind == "automatic"
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +238,10 @@ class RunState:
     restarted: bool = False  # a new process drives the run, and nobody has confirmed or resumed since
     leave: Leave | None = None  # the newest one in this session; each arm takes it once
     stop_reason: str = ""
+    # The one list of what departed from the protocol: whoever counts or lists deviations takes it whole. A gate that
+    # failed, a device that failed and a corrected value are none by themselves: what a person did about it is.
     deviations: tuple[Deviation, ...] = ()
+    automatic: tuple[Deviation, ...] = ()  # confirmations that a simulated rig gave by itself
     superseded: tuple[Superseded, ...] = ()
     overtaken: tuple[int, ...] = ()  # seq of events that an operator's action had already made void
     troubles: tuple[Trouble, ...] = ()
@@ -291,11 +289,6 @@ class RunState:
         return self.status in ("completed", "aborted")
 
     @property
-    def deviation_count(self) -> int:
-        """Number of deviations, not counting notes."""
-        return sum(not deviation.is_note for deviation in self.deviations)
-
-    @property
     def deviations_told(self) -> str:
         """The number of deviations in words, such as `1 deviation`."""
-        return counted(self.deviation_count, "deviation")
+        return counted(len(self.deviations), "deviation")

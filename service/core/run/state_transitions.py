@@ -67,5 +67,8 @@ def supersede(
 
 
 def deviate(state: RunState, event: Event, kind: DeviationKind, step: str | None, text: str) -> RunState:
-    """List a deviation that `event` caused."""
-    return replace(state, deviations=(*state.deviations, Deviation(event.seq, kind, step, text, event.actor)))
+    """List a deviation that `event` caused, or an automatic confirmation, which is none."""
+    one = Deviation(event.seq, kind, step, text, event.actor)
+    if kind == "automatic":
+        return replace(state, automatic=(*state.automatic, one))
+    return replace(state, deviations=(*state.deviations, one))

@@ -14,12 +14,14 @@ from service.audit.export.exports import Exports, What
 from service.audit.export.folder_zip import zip_chunks
 from service.audit.export.formats import Formats
 from service.audit.export.wanted import WantedExport
-from service.core.errors import ConfigurationError
-from service.core.gates.release import refuse_data_set, refuse_export, refuse_release
+from service.core.errors import ConfigurationError, IllegalTransitionError
+from service.core.gates.release import refuse_data_set, refuse_export, refuse_release, release_meaning
 from service.core.records.data_set import FIRST_VERSION, LONGEST_NAME, VERSION, DataSetStatement
 from service.core.records.events import RunReleased
+from service.people.errors import NotAllowedError
+from service.people.person import Person
 from service.store.signatures.signing import checkpoint
-from service.web.audit.frame import CurrentAudit, audit_frame
+from service.web.audit.frame import AuditFrame, CurrentAudit, audit_frame
 from service.web.page.rendering import render
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite
@@ -27,12 +29,10 @@ from service.web.site import CurrentSite
 router = APIRouter(tags=["exports"])
 
 RunId = Annotated[str, Path(max_length=64)]
-MEANINGS = (
-    "I have read this run and release it",
-    "I have read it and release it with its deviations",
-)
 _READ = [Depends(requires("read"))]
+_REPORT = [Depends(requires("report"))]
 _EXPORT = [Depends(requires("export"))]
+_REPORTS: tuple[What, ...] = ("report", "report_pdf")  # which say that a run is not released yet
 _LISTING_S, _STOPPING_S = 30.0, 5.0  # how long a press of a button may wait for it
 _LOCK = Lock()
 
@@ -87,7 +87,9 @@ def exports_page(
         incomplete=refuse_data_set(log.state),
         may_release=person.may("release"),
         unfit=unfit,
-        meanings=MEANINGS,
+        meaning=release_meaning(log.state),
+        may_report=person.may("report"),
+        may_stop=_may_stop(exports, person, run_id),
         may_export=person.may("export"),
         exporting=exports.state(run_id),
         formats=formats.known(),
@@ -104,32 +106,52 @@ def exports_page(
 @router.post("/runs/{run_id}/release", name="release", dependencies=[Depends(requires("release"))])
 def release(
     site: CurrentSite,
+    audit: CurrentAudit,
     person: SignedInPerson,
     run_id: RunId,
-    meaning: Annotated[str, Form(max_length=200)],
+    meaning: Annotated[str, Form(max_length=20_000)],
     password: Annotated[str, Form(max_length=1000)],
     signed_sha256: Annotated[str, Form(max_length=64)],
 ) -> RedirectResponse:
-    """Sign, as a second person, that a completed run may be exported."""
+    """Sign, as a second person, that a completed run may be exported; its evidence has to be verified first."""
     log = site.run(run_id)
-    if meaning not in MEANINGS:
-        raise ConfigurationError("the meaning is not among those offered", where="meaning", remedy="Choose one")
     refusal = refuse_release(log.state, person.account, signed_sha256)
     if refusal is not None:
         raise refusal
+    if meaning != release_meaning(log.state):
+        raise IllegalTransitionError(
+            "the words of this release are not those for the run as it is now",
+            where="meaning",
+            remedy="Read the run again and sign it as it is now",
+        )
+    _require_verified(audit_frame(audit, run_id, ""))
     site.people.check_password(person.account, password)
     site.store.record(run_id, [RunReleased(meaning=meaning, signed_sha256=signed_sha256)], actor=person.account)
     checkpoint(site.store, run_id)
     return _back(run_id)
 
 
-@router.post("/runs/{run_id}/exports", name="start_export", dependencies=_EXPORT)
+def _require_verified(frame: AuditFrame) -> None:
+    """Raise IllegalTransitionError unless the evidence, as it is now, was verified without a fault."""
+    if frame.verified == "current":
+        return
+    what = {
+        "faults": "the evidence does not verify",
+        "outdated": "the evidence has not been verified since its last event",
+    }.get(frame.verified, "the evidence has not been verified yet")
+    remedy = "Read the faults; nothing is released" if frame.verified == "faults" else "Verify it, then release"
+    raise IllegalTransitionError(what, where=frame.run.run_id, remedy=remedy)
+
+
+@router.post("/runs/{run_id}/exports", name="start_export", dependencies=_REPORT)
 def start_export(
     site: CurrentSite, exports: CurrentExports, person: SignedInPerson, run_id: RunId, what: Annotated[What, Form()]
 ) -> RedirectResponse:
     """Begin an export. It first verifies everything, and writes no file if anything differs."""
     log = site.run(run_id)
-    refusal = refuse_export(log.protocol, log.state)
+    if what == "dataset" and not person.may("export"):
+        raise NotAllowedError(f"the role {person.role} may not make a data set", where=run_id)
+    refusal = None if what in _REPORTS else refuse_export(log.protocol, log.state)
     if refusal is not None:
         raise refusal
     exports.start(run_id, what, person.account)
@@ -190,9 +212,11 @@ def start_format_export(
     return _back(run_id)
 
 
-@router.post("/runs/{run_id}/exports/stop", name="stop_export", dependencies=_EXPORT)
-def stop_export(exports: CurrentExports, run_id: RunId) -> RedirectResponse:
+@router.post("/runs/{run_id}/exports/stop", name="stop_export", dependencies=_REPORT)
+def stop_export(exports: CurrentExports, person: SignedInPerson, run_id: RunId) -> RedirectResponse:
     """Stop the export that is running. What a format has written so far stays, so that it can go on."""
+    if not _may_stop(exports, person, run_id):
+        raise NotAllowedError("somebody else has begun this export", where=run_id)
     if exports.stop(run_id):
         exports.wait(run_id, _STOPPING_S)
     return _back(run_id)
@@ -229,6 +253,12 @@ def exported_file(
         chunks = zip_chunks(path, record.sha256)
         return StreamingResponse(chunks, media_type="application/octet-stream", headers=headers)
     return FileResponse(path, filename=path.name, media_type="application/octet-stream", headers=headers)
+
+
+def _may_stop(exports: Exports, person: Person, run_id: str) -> bool:
+    """Whether a person may stop what is running: who may export stops everything, others what they began."""
+    state = exports.state(run_id)
+    return person.may("export") or state is None or not state.pending or state.by == person.account
 
 
 def _lines(text: str) -> tuple[str, ...]:

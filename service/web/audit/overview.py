@@ -14,7 +14,7 @@ from service.audit.background.incremental import Progress
 from service.audit.overview import findings, first_page
 from service.audit.overview.devices import bodies_of_run, opened_devices
 from service.audit.overview.digest import Digest
-from service.audit.overview.first_page import GROUPS
+from service.audit.overview.first_page import DEVIATION_GROUPS, GROUPS, NOTE_GROUPS
 from service.audit.overview.shots import failed_exposures_of, shots_of, together
 from service.audit.overview.signatures import RecordedSignature
 from service.audit.overview.signatures import signatures as signatures_of
@@ -100,6 +100,7 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
     known = first_page.known(digest)
     recorded = _recorded(audit, run_id, known)
     listed = first_page.findings(known) if known else []
+    gates = first_page.failed_gates(known) if known else []
     return render(
         request,
         "audit/run.html.j2",
@@ -109,10 +110,13 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
         digest=known,
         progress=digest if isinstance(digest, Progress) else None,
         counts=first_page.counts(known) if known else {},
-        groups=GROUPS,
+        deviation_groups=DEVIATION_GROUPS,
+        note_groups=NOTE_GROUPS,
         group_name=first_page.group_name,
         listed=listed[:_FIRST],
-        more=len(listed) - _FIRST,
+        deviations=len(listed),
+        failed_gates=gates[:_FIRST],
+        more_gates=len(gates) - _FIRST,
         accuracy=accuracy_of(known),
         dataset_exported=any(row.payload.get("what") == "dataset" for row in recorded.exports),
         shots=shots_of(known, recorded.failures),
@@ -135,7 +139,7 @@ def _to_come(audit: AuditState, run_id: str, digest: Digest | None) -> list[Pend
     "/audit/runs/{run_id}/deviations", name="audit_deviations", dependencies=_READ, response_class=HTMLResponse
 )
 def deviations_page(request: Request, audit: CurrentAudit, run_id: str, group: str = "", page: int = 1) -> Response:
-    """All deviations, or those of one group."""
+    """All deviations, or what is in one group of them or of what else is recorded."""
     frame = audit_frame(audit, run_id, "")
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)
@@ -149,6 +153,8 @@ def deviations_page(request: Request, audit: CurrentAudit, run_id: str, group: s
         audit=frame,
         progress=digest if isinstance(digest, Progress) else None,
         groups=GROUPS,
+        note_groups=NOTE_GROUPS,
+        deviations=len(known.deviations) if known else 0,
         counts=first_page.counts(known) if known else {},
         group=group,
         listed=listed[(page - 1) * run_rows.PAGE : page * run_rows.PAGE],

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Depends, Request
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Depends, Form, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
 from service.audit.background.incremental import Progress
@@ -45,8 +47,11 @@ def verification_page(request: Request, audit: CurrentAudit, run_id: str) -> Res
 
 
 @router.post("/audit/runs/{run_id}/verification", name="verify", dependencies=_READ)
-def verify_now(audit: CurrentAudit, person: SignedInPerson, run_id: str) -> Response:
+def verify_now(
+    audit: CurrentAudit, person: SignedInPerson, run_id: str, back: Annotated[Literal["", "exports"], Form()] = ""
+) -> Response:
     """Verify the run. It only reads, so everybody who may read may start it."""
     audit_frame(audit, run_id, "/verification")
     audit.verifications.start(run_id, person.account)
-    return RedirectResponse(f"/audit/runs/{run_id}/verification", status_code=303)
+    shown = f"/runs/{run_id}/exports" if back else f"/audit/runs/{run_id}/verification"
+    return RedirectResponse(shown, status_code=303)

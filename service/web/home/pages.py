@@ -179,7 +179,7 @@ def _line(site: Site, row: RunRow) -> RunLine:
         step=log.protocol.step(state.current).title,
         passed=sum(step.phase == "passed" for step in state.steps.values()),
         steps=len(log.protocol.steps),
-        deviations=state.deviation_count,
+        deviations=len(state.deviations),
         robot=robot,
         standing=standing,
         why=why,

@@ -12,7 +12,13 @@ from service.core.records.import_list import imported_sentence
 from service.core.run.decide import AskOperator, decide
 from service.core.run.state import RunState
 from service.monitor.snapshot import STALE_S, STOPS, Snapshot, Standing, read_snapshot
+<<<<<<< HEAD
 from service.people.control import Control
+=======
+from service.run_record import RunRecord
+from service.steps.coats import Coat, coats
+from service.store.durable_effects import moment_of
+>>>>>>> h36-release
 from service.web.page.run_words import stopped_words
 from service.web.site import Site
 
@@ -68,6 +74,7 @@ class RunFrame:
     attention: Attention
     banner: Banner
     tabs: tuple[Tab, ...]
+    coats: tuple[Coat, ...] = ()  # that disappear before a scan which is still to come
 
 
 def run_frame(site: Site, run_id: str) -> RunFrame:
@@ -100,7 +107,13 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
             Tab(f"{here}/dataset", "Data set"),
             Tab(f"/audit/runs/{run_id}", "Audit", below=True),
         ),
+        coats=coats_of(site, log),
     )
+
+
+def coats_of(site: Site, log: RunRecord) -> tuple[Coat, ...]:
+    """The coats of a run whose clocks run now."""
+    return coats(log.protocol, log.state, moment_of(site.store.clock))
 
 
 def _attention(  # noqa: PLR0911 - one return a case

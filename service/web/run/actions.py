@@ -9,7 +9,7 @@ from fastapi.responses import RedirectResponse
 
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.protocol.models import load_protocol
-from service.core.records.entered import NoteTaken, about_run
+from service.core.records.entered import NoteTaken, about_run, require_specimen
 from service.core.records.events import (
     ActionRefused,
     ControlTaken,
@@ -45,7 +45,11 @@ router = APIRouter(tags=["acting"])
 Short = Annotated[str, Form(max_length=200)]
 Words = Annotated[str, Form(max_length=2000)]
 Number = Annotated[int, Form(ge=0, le=2**31)]
+<<<<<<< HEAD
 DECIDE_AGAIN = "Close the form, read what the page shows now, and decide again; nothing was done"
+=======
+_WITHOUT_CONTROL = ("pause", "sign", "accept")
+>>>>>>> h36-release
 # Events that change nothing on the page on which the person decided.
 _HARMLESS = (
     NoteTaken,
@@ -85,6 +89,7 @@ def start(
     loaded = load_protocol(known[form.protocol], params_models())
     rig = load_rig(site.rig.path)
     require_runnable(loaded, rig, site.devices_of(rig))
+    require_specimen(about)
     require_rig_free(site.store, site.rig.path)
     changed = standing_of(site.store, loaded).changed
     if changed:
@@ -147,10 +152,11 @@ def act(
 ) -> RedirectResponse:
     """Append what the person does if it is allowed now; otherwise append the refusal and say why.
 
-    Pausing needs neither control of the run nor an unlocked screen, because it can only make the run safer.
+    Pausing needs neither control of the run nor an unlocked screen, because it can only make the run safer. A
+    signature and an acceptance need no control: they are a person's word on figures, and nothing moves by them.
     """
     log = site.run(run_id)
-    if form.verb != "pause":
+    if form.verb not in _WITHOUT_CONTROL:
         Control(site.store).require(run_id, person)
     if not log.state.terminal:  # else it is refused, and recorded as an action after the end
         _require_shown(log, form)

@@ -15,7 +15,7 @@ RunId = Annotated[str, Path(max_length=64)]
 
 
 class StartForm(BaseModel):
-    """What a run is begun with: a protocol file, and what people enter about the run.
+    """What a run is begun with: a protocol file, and what people enter about the run, of which it needs the specimen.
 
     A protocol whose content was changed without a new version also needs a reason and a password.
     """

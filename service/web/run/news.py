@@ -11,9 +11,11 @@ from fastapi import APIRouter, Depends, Path, Request
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
+from service.core.errors import OrthocaptureError
 from service.monitor.snapshot import STALE_S, read_snapshot
 from service.people.control import Control
 from service.people.person import Person
+from service.web.page.run_frame import coats_of
 from service.web.security.guards import SignedInPerson, requires, token_of
 from service.web.site import CurrentSite, Site
 
@@ -74,11 +76,24 @@ def _signed_in(site: Site, token: str) -> Person | None:
 
 
 def newest(site: Site, run_id: str) -> tuple[int, int]:
+<<<<<<< HEAD
     """The last event, and a number that changes with the runner's reports, its silence, and who has control.
+=======
+    """The last event, and a number that changes with the runner's reports, its silence, control, and a coat's age.
+>>>>>>> h36-release
 
     Who asks for control, and whether that was refused, are no events of the run: they are rows of the site.
     """
     now_utc_s = site.store.clock.utc_s()
     snapshot = read_snapshot(site.data, run_id, now_utc_s)
     silent = snapshot.age_s(now_utc_s) // STALE_S if snapshot.stale(now_utc_s) else 0
-    return site.store.head(run_id), hash((silent, Control(site.store).holder(run_id), *snapshot.shown()))
+    shown = (silent, Control(site.store).holder(run_id), *_ages(site, run_id), *snapshot.shown())
+    return site.store.head(run_id), hash(shown)
+
+
+def _ages(site: Site, run_id: str) -> list[str]:
+    """What the pages say of a coat's age; nothing of a run that cannot be read, which its pages say themselves."""
+    try:
+        return [coat.title for coat in coats_of(site, site.run(run_id))]
+    except OrthocaptureError:
+        return []

@@ -13,6 +13,7 @@ from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
 from service.core.gates.dependence import AcceptedGate, accepted_gates
+from service.core.gates.release import loses_release
 from service.core.protocol.models import Step
 from service.core.records.entered import about_rows
 from service.core.records.events import ControlTaken, Event, RunStarted
@@ -167,6 +168,9 @@ def _viewer(site: Site, person: Person, log: RunRecord) -> Viewer:
     names = {a.account: a.full_name for a in site.people.accounts.all()} if lost else {}
     return Viewer(
         may_operate=person.may("operate"),
+        may_sign=person.may("sign"),
+        role=person.role,
+        loses_release=person.may("release") and loses_release(log.protocol, log.state, person.account),
         may_take_over=person.role == "supervisor",
         in_control=mine and person.may("operate"),
         holder=holder.full_name,

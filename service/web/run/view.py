@@ -320,7 +320,7 @@ def _signature(protocol: Protocol, state: RunState) -> SignedContent | None:
     step = protocol.step(state.current)
     if step.irreversible:
         steps: tuple[str, ...] = step.requires
-        meaning = f"I release this step, which cannot be undone: {step.title}"
+        meaning = f"I approve that this step begins, which cannot be undone: {step.title}"
     else:
         steps = (step.id,)
         meaning = f"I have checked these figures and accept them: {step.title}"

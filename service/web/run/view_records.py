@@ -38,6 +38,9 @@ class Viewer:
     """Who looks, and how they stand to the control of this run."""
 
     may_operate: bool = False
+    may_sign: bool = False  # with or without control
+    role: str = ""
+    loses_release: bool = False  # this person could release the run, and acting on it ends that
     may_take_over: bool = False
     in_control: bool = False  # this screen
     holder: str = ""  # name of whoever has control; "" for nobody

@@ -62,8 +62,8 @@ def test_every_page_can_be_read_by_every_role_and_by_nobody_else(web: WebSite, r
 def test_first_page_shows_deviations_before_everything_else(web: WebSite, run: str) -> None:
     text = settle(web, f"/audit/runs/{run}")
     headings = re.findall(r"<h2[^>]*>(.*?)</h2>", text.split("<main", 1)[1])
-    assert headings[0] == "Deviations"
     digest = digest_of(web.store, run)
+    assert headings[0] == f'Deviations <span class="muted num">{len(digest.deviations)}</span>'
     for group, number in first_page.counts(digest).items():
         name = first_page.GROUPS[group][0]
         assert re.search(rf'count-number num">{number}</span> <span class="count-name">{name}<', text), group

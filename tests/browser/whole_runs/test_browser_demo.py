@@ -73,6 +73,7 @@ def run(server: Served, browser: Browser) -> str:
         tablet.sign_in("tina")
         tablet.go("/")
         tablet.page.get_by_role("button", name="Start Demonstration on a simulated rig").click()
+        tablet.page.get_by_label("Specimen").fill("S1")
         tablet.page.get_by_role("button", name="Start the run").click()
         expect(tablet.page.get_by_role("checkbox").first).to_be_visible(timeout=ANSWER_MS)
         name = tablet.page.url.rpartition("/")[2]

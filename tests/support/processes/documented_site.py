@@ -69,10 +69,13 @@ def asks_and_is_aborted(site: Site, command: str) -> None:
 
 
 def starts_and_is_aborted(site: Site, command: str) -> None:
-    """`asks_and_is_aborted` on a rig with all devices that a whole protocol needs; none of them is opened."""
+    """`asks_and_is_aborted` on a rig with all devices that a whole protocol needs; none of them is opened.
+
+    In a terminal, the command first asks for the specimen (tests/cli/test_terminal.py); a pipe is asked nothing.
+    """
     (site.folder / "ct").mkdir()
     (site.folder / "rig.yaml").write_text(COMPLETE_RIG)
-    asks_and_is_aborted(site, command)
+    asks_and_is_aborted(site, f"{command} --specimen S1")
 
 
 def says_how_to_get_the_data(site: Site, command: str) -> None:

@@ -171,7 +171,7 @@ def write_large_run(data: Path, sizes: Sizes) -> str:
             elif step.id == "viewpoint_capture_1":
                 brought = _captures(run, step, sizes)
             run.end(step, brought)
-        run.add(RunCompleted(deviations=run.state.deviation_count))
+        run.add(RunCompleted(deviations=len(run.state.deviations)))
         run.flush()
         checkpoint(store, run_id)
         head = run.store.runs()[-1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
@@ -12,19 +13,35 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from typer.testing import CliRunner
 
 from service.audit.export.process import export
 from service.audit.verify import bundle_verifier
+from service.cli.main import app
 from service.compute.poses.files.pose_files import read_poses_csv
 from service.core.errors import StoreError
-from service.core.records.events import EvidenceExported, RunReleased
+from service.core.gates.release import release_meaning
+from service.core.records.events import EvidenceExported, OperatorAction, RunReleased, ViewpointCaptured
+from service.core.run.actions import record_to_sign
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
+from service.people.control import Control
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.audit.exports import MEANINGS
+from tests.support.pages.browsed_run import words
 from tests.support.pages.web import Browser, WebSite, password_of, web_site
 from tests.support.recorded.registration_record import CAMERA
 from tests.support.recorded.reported_run import T_SCAN_CAMERA, record_reported_run
 from tests.support.runs.bench_run import PROTOCOL
+
+
+class LeftError(Exception):
+    """The person has gone."""
+
+
+def leave(_question: AskOperator, _state: RunState) -> OperatorAction:
+    raise LeftError
+
 
 NEEDS_RELEASE = PROTOCOL.replace("steps:", "release: second_person\nsteps:", 1)
 
@@ -48,11 +65,19 @@ def supervisor(web: WebSite) -> Browser:
 
 def release(web: WebSite, browser: Browser, run: str, **changes: str) -> int:
     fields = {
-        "meaning": MEANINGS[0],
+        "meaning": release_meaning(web.site.run(run).state),
         "password": password_of(web.account("supervisor")),
         "signed_sha256": web.site.run(run).state.completed_sha256,
     }
     return browser.send_form(f"/runs/{run}/release", **fields | changes).status_code
+
+
+def verified(web: WebSite, browser: Browser, run: str) -> str:
+    """The page of exports, after its button has verified the run."""
+    sent = browser.send_form(f"/audit/runs/{run}/verification", back="exports")
+    assert sent.headers["location"] == f"/runs/{run}/exports"
+    web.app.state.audit.verifications.wait(run, 60)
+    return browser.get(f"/runs/{run}/exports").text
 
 
 def ended(web: WebSite, browser: Browser, run: str, what: str) -> str:
@@ -70,13 +95,17 @@ def test_a_release_takes_a_second_person_with_password_on_the_record_as_it_is(
     page = supervisor.get(f"/runs/{run}/exports").text
     assert "Awaited" in page
     assert "Blocked" in page
-    assert web.site.run(run).state.completed_sha256 in page
     refused = supervisor.send_form(f"/runs/{run}/exports", what="bundle")
     assert refused.status_code == 409
     assert "second person" in refused.text
+    assert "Sign and release" not in page
+    assert release(web, supervisor, run) == 409  # not verified yet
+    page = verified(web, supervisor, run)
+    assert "in which nothing deviated from the protocol" in page
+    assert web.site.run(run).state.completed_sha256 in page
     assert release(web, supervisor, run, password="wrong") in (401, 403)
     assert release(web, supervisor, run, signed_sha256="0" * 64) == 409
-    assert release(web, supervisor, run, meaning="something else") == 422
+    assert release(web, supervisor, run, meaning="something else") == 409
     for role in ("technician", "auditor", "administrator"):
         assert release(web, web.browser(role), run) == 403
     assert not any(isinstance(event.payload, RunReleased) for event in web.store.events(run))
@@ -93,6 +122,7 @@ def test_a_release_takes_a_second_person_with_password_on_the_record_as_it_is(
 
 def test_a_bundle_is_made_recorded_and_fetched(web: WebSite, run: str, supervisor: Browser, tmp_path: Path) -> None:
     if not web.site.run(run).state.released_by:
+        verified(web, supervisor, run)
         release(web, supervisor, run)
     page = ended(web, supervisor, run, "hashes")
     assert "Ready:" in page
@@ -107,9 +137,111 @@ def test_a_bundle_is_made_recorded_and_fetched(web: WebSite, run: str, superviso
     (tmp_path / "b.zip").write_bytes(fetched.content)
     assert bundle_verifier.main([str(tmp_path / "b.zip")]) == 0
     assert "SIMULATED" in exported.payload.file_name
-    for role in ("technician", "auditor", "administrator"):
+    for role in ("technician", "administrator"):
         assert web.browser(role).send_form(f"/runs/{run}/exports", what="bundle").status_code == 403
+    assert auditor.send_form(f"/runs/{run}/exports", what="dataset").status_code == 403
     assert supervisor.send_form(f"/runs/{run}/exports", what="everything").status_code == 422
+
+
+def test_a_release_is_of_verified_evidence_and_its_words_name_the_deviations(
+    web: WebSite, supervisor: Browser
+) -> None:
+    run = record_reported_run(web.folder, person="grace", release="second_person")
+    page = supervisor.get(f"/runs/{run}/exports").text
+    assert "The evidence is verified first" in words(page)
+    assert "Sign and release" not in page
+    page = verified(web, supervisor, run)
+    state = web.site.run(run).state
+    assert len(state.deviations) == 2
+    for one in state.deviations:
+        assert one.text in words(page)
+    assert f"with its 2 deviations: viewpoint skipped, {state.deviations[0].text}; redo, " in words(page)
+    old = release_meaning(state).replace("2 deviations", "1 deviation")
+    assert release(web, supervisor, run, meaning=old) == 409
+    assert release(web, supervisor, run) == 303
+    event = web.store.events(run)[-1].payload
+    assert isinstance(event, RunReleased)
+    assert all(one.text in event.meaning for one in state.deviations)
+    assert verify(web.site.data, run).ok
+
+
+def test_an_altered_run_is_not_released(web: WebSite, supervisor: Browser) -> None:
+    run = record_reported_run(web.folder, person="grace", release="second_person")
+    (image, *_) = [e.payload.artefacts[0] for e in web.store.events(run) if isinstance(e.payload, ViewpointCaptured)]
+    photograph = web.store.artefact_path(image.sha256)
+    original = photograph.read_bytes()
+    photograph.chmod(0o644)
+    photograph.write_bytes(original + b"x")
+    page = verified(web, supervisor, run)
+    assert "Cannot be released" in page
+    assert release(web, supervisor, run) == 409
+    photograph.write_bytes(original)
+    assert "Sign and release" in verified(web, supervisor, run)
+
+
+def test_an_auditor_makes_and_downloads_report_and_bundle(web: WebSite, run: str, supervisor: Browser) -> None:
+    auditor = web.browser("auditor")
+    unreleased = record_reported_run(web.folder, person="grace", release="second_person")
+    page = ended(web, auditor, unreleased, "report")
+    assert "Ready:" in page
+    (made,) = [e.payload for e in web.store.events(unreleased) if isinstance(e.payload, EvidenceExported)]
+    assert b"NOT RELEASED" in auditor.get(f"/runs/{unreleased}/exports/{made.file_name}").content
+    assert auditor.send_form(f"/runs/{unreleased}/exports", what="bundle").status_code == 409
+    if not web.site.run(run).state.released_by:
+        verified(web, supervisor, run)
+        release(web, supervisor, run)
+    ended(web, auditor, run, "bundle")
+    event = web.store.events(run)[-1]
+    assert isinstance(event.payload, EvidenceExported)
+    assert event.actor == web.account("auditor")
+    fetched = auditor.get(f"/runs/{run}/exports/{event.payload.file_name}")
+    assert fetched.headers["x-sha256"] == event.payload.sha256
+
+
+def test_exports_made_in_the_terminal_are_on_the_page(web: WebSite, tmp_path: Path) -> None:
+    run = record_reported_run(web.folder, person="grace", registered=True)
+    data = ("--data", str(web.site.data), "--operator", "emmy", "--password-stdin")
+    made = {
+        "b-SIMULATED.zip": ("audit", "export", run, str(tmp_path / "b.zip"), "--hashes-only", *data),
+        "r.html": ("audit", "report", run, "--html", str(tmp_path / "r.html"), *data),
+        "plain-SIMULATED": ("export", run, "--format", "plain", "--out", str(tmp_path / "plain-SIMULATED"), *data),
+    }
+    for words_of in made.values():
+        done = CliRunner().invoke(app, list(words_of), input=password_of("emmy") + "\n")
+        assert done.exit_code == 0, done.output
+    for role in ("technician", "supervisor", "auditor"):
+        page = web.browser(role).get(f"/runs/{run}/exports").text
+        assert all(name in page for name in made)
+        assert page.count("not kept here: made in the terminal, or taken away") == 3
+
+
+def test_a_supervisor_signs_without_control_and_is_told_before_that_she_cannot_release_it_then(web: WebSite) -> None:
+    bench = web.begin_run(NEEDS_RELEASE)
+    bench.script("spraying", "sign", leave)
+    with contextlib.suppress(LeftError):
+        bench.run()
+    web.site.launcher.start(bench.run_id)
+    technician, supervisor = web.browser("technician"), web.browser("supervisor")
+    web.take_control(bench.run_id, technician)
+    page = supervisor.get(f"/runs/{bench.run_id}").text
+    told = "You could release this run as the second person. Once you {}, you have taken part in it"
+    for act in ("take control", "take over", "sign"):
+        assert told.format(act) in words(page), act
+    assert "You could release" not in technician.get(f"/runs/{bench.run_id}").text
+    assert 'id="dialog-sign"' in page
+    assert "decides on the next action" not in page
+    state = bench.state()
+    fields = {"verb": "sign", "step": "spraying", "attempt": "1", "meaning": "seen", "seen_seq": str(state.seq)}
+    fields["signed_sha256"] = record_to_sign(web.site.run(bench.run_id).protocol, state)
+    address = f"/runs/{bench.run_id}/actions"
+    assert supervisor.send_form(address, **fields, password="wrong").status_code in (401, 403)
+    assert supervisor.send_form(address, **fields, password=password_of("emmy")).status_code == 303
+    state = bench.state()
+    assert (state.step.signed_by, state.controller) == ("emmy", "grace")
+    assert Control(web.store).holder(bench.run_id).account == "grace"
+    assert "You could release" not in supervisor.get(f"/runs/{bench.run_id}").text  # she has taken part
+    refused = supervisor.send_form(address, verb="confirm", step="spraying", attempt="1")
+    assert refused.status_code == 409  # anything but a signature still needs control
 
 
 @pytest.mark.parametrize(

@@ -256,7 +256,7 @@ def _snapshot(data: bytes, folder: Path) -> None:
 _RUN = "RUN"  # placeholder in URLs for the site's run
 _REQUESTS: tuple[dict[str, Any], ...] = (
     {"path": "/sign-in", "role": "", "form": {"account": "grace", "password": "x", "next": "/"}},
-    {"path": "/runs", "role": "supervisor", "form": {"protocol": "bench.yaml"}},
+    {"path": "/runs", "role": "supervisor", "form": {"protocol": "bench.yaml", "specimen": "S1"}},
     {"path": f"/runs/{_RUN}/ticks", "role": "technician",
      "form": {"step": "fixation", "attempt": "1", "item": "wires hold", "ticked": "true"}},
     {"path": f"/runs/{_RUN}/actions", "role": "supervisor",

@@ -36,13 +36,19 @@ class NotableEvent:
 
 
 def deviations(run: RecordedRun) -> list[NotableEvent]:
-    """Accepted gates, then deviations, failed gates, device faults and corrections in the order of their events."""
+    """The deviations of the run, accepted gates first, then in the order of their events."""
     titles = {step.id: step.title for step in run.protocol.steps}
     found = [
         NotableEvent(d.seq, words(d.kind), titles.get(d.step or "", ""), d.text, d.actor)
         for d in run.state.deviations
-        if not d.is_note
     ]
+    return sorted(found, key=lambda departure: (departure.kind != words("gate_accepted"), departure.seq))
+
+
+def incidents(run: RecordedRun) -> list[NotableEvent]:
+    """What else a reader must know of, and is no deviation: failed gates, faults, corrections, what is not done."""
+    titles = {step.id: step.title for step in run.protocol.steps}
+    found: list[NotableEvent] = []
     for event in run.events:
         found += [
             NotableEvent(event.seq, kind, titles.get(step, ""), text, event.actor)
@@ -55,7 +61,7 @@ def deviations(run: RecordedRun) -> list[NotableEvent]:
             found.append(NotableEvent(last, "unsigned", step.title, "nobody has signed this step", ""))
         elif state.phase != "passed":
             found.append(NotableEvent(last, "not done", step.title, f"the step is {words(state.phase)}", ""))
-    return sorted(found, key=lambda departure: (departure.kind != words("gate_accepted"), departure.seq))
+    return found
 
 
 def _of_event(payload: object) -> Iterator[tuple[str, str, str]]:
@@ -79,25 +85,16 @@ def _of_event(payload: object) -> Iterator[tuple[str, str, str]]:
 
 
 def deviations_section(run: RecordedRun, listed: Sequence[NotableEvent]) -> Section:
-    """The deviations, and the number of replaced attempts and views."""
-    blocks: list[Block] = []
-    if listed:
-        at = {event.seq: clock(event.at_utc) for event in run.events}
-        columns = (
-            Column("event", 0.55, "number"),
-            Column("time (UTC)", 0.8),
-            Column("kind", 1.0),
-            Column("step", 1.5),
-            Column("what happened", 3.2),
-            Column("who", 0.8),
+    """The deviations; then what else happened, and the number of replaced attempts and views."""
+    blocks: list[Block] = [_table(run, listed) if listed else _none(run)]
+    others = incidents(run)
+    if others:
+        told = (
+            "The table below is not of deviations. It lists gates that failed in some attempt, faults, corrections "
+            "of the record, and steps that were not done."
         )
-        rows = tuple(
-            (str(d.seq), at[d.seq], TableCell(d.kind, "attention"), d.step, d.text, run.named(d.who)) for d in listed
-        )
-        blocks.append(Table(columns, rows))
-    else:
-        blocks.append(Paragraph("None: every step was done once, by the protocol, within its limits.", "ok"))
-    automatic = sum(deviation.is_note for deviation in run.state.deviations)
+        blocks += [Paragraph(told), _table(run, others)]
+    automatic = len(run.state.automatic)
     if automatic:
         were = "was" if automatic == 1 else "were"
         text = f"{counted(automatic, 'confirmation')} {were} given automatically, which only a simulated rig allows."
@@ -108,6 +105,35 @@ def deviations_section(run: RecordedRun, listed: Sequence[NotableEvent]) -> Sect
         told = f"Replaced by later ones: attempts at steps {len(redone)}, single views {len(retaken)}."
         blocks.append(Paragraph(f"{told} Their evidence was kept and is part of what was verified."))
     return Section("Deviations", tuple(blocks))
+
+
+def no_deviation(run: RecordedRun) -> TableCell:
+    """The statement on a run without deviations, which says so where the run has not been done to its end."""
+    if run.state.status == "completed":
+        return TableCell("No deviation: every step was done as the protocol says", "ok")
+    undone = sum(step.phase != "passed" for step in run.state.steps.values())
+    return TableCell(f"No deviation in what was done; {counted(undone, 'step')} not done", "attention")
+
+
+def _none(run: RecordedRun) -> Paragraph:
+    none = no_deviation(run)
+    return Paragraph(f"{none.text}.", none.tone)
+
+
+def _table(run: RecordedRun, listed: Sequence[NotableEvent]) -> Table:
+    at = {event.seq: clock(event.at_utc) for event in run.events}
+    columns = (
+        Column("event", 0.55, "number"),
+        Column("time (UTC)", 0.8),
+        Column("kind", 1.0),
+        Column("step", 1.5),
+        Column("what happened", 3.2),
+        Column("who", 0.8),
+    )
+    rows = tuple(
+        (str(d.seq), at[d.seq], TableCell(d.kind, "attention"), d.step, d.text, run.named(d.who)) for d in listed
+    )
+    return Table(columns, rows)
 
 
 def steps_section(run: RecordedRun) -> Section:

@@ -262,7 +262,7 @@ class TerminalOperator(_Operator):
                 "step": target if names_step else question.step,
                 "reason": reason,
                 "checklist": question.checklist if verb == "confirm" else (),
-                "meaning": (reason or "checked and released") if verb == "sign" else "",
+                "meaning": (reason or "checked and approved") if verb == "sign" else "",
                 "signed_sha256": question.sign_sha256 if verb == "sign" else "",
                 "role": self.who.role if self.who else "",
                 "identified": self.who.identified if self.who else "",

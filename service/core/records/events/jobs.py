@@ -36,7 +36,7 @@ class JobFinished(Record):
     artefacts: tuple[ArtefactRef, ...] = ()
     result: dict[str, Any] = Field(default_factory=dict)
     duration_s: float
-    late_s: float | None = None  # after the specimen's release, or the run's end; None: in time
+    late_s: float | None = None  # after the specimen was freed, or the run's end; None: in time
 
 
 class JobFailed(Record):

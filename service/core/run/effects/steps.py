@@ -89,7 +89,7 @@ def step_retried(protocol: Protocol, state: RunState, event: Event, p: StepRetri
     state = replace(state, last_view=("", ""))
     changes: dict[str, Any] = {**UNMEASURED, "attempt": p.attempt, "retry_granted": False}
     changes["work_began_utc"] = event.at_utc
-    if protocol.step(p.step).irreversible:  # its signature released it to begin and remains valid
+    if protocol.step(p.step).irreversible:  # its signature let it begin and remains valid
         changes |= {"signed": now.signed, "signed_by": now.signed_by}
     if now.retry_granted:  # viewpoints that were given up are tried again
         changes |= {"failures": 0, "viewpoint_failures": {}, "skipped_viewpoints": ()}

@@ -62,7 +62,7 @@ def about_run(
         fusion=_fusion(summary, personal=personal),
         gates=tuple(gates_in_words(summary).items()),
         accepted=tuple(gate.text for gate in accepted_gates(summary.protocol, summary.state)),
-        deviations=tuple(d.text for d in summary.state.deviations if not d.is_note),
+        deviations=tuple(d.text for d in summary.state.deviations),
         later=tuple(late.text for late in late_results(summary.protocol, summary.state)),
         not_in_yet=tuple(not_in_yet),
     )

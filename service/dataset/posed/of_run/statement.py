@@ -36,6 +36,6 @@ def described_run(
         "arrived_later": [late.text for late in late_results(summary.protocol, summary.state)],
         "arrived_later_and_better": None if later is None else later.poses,
         "not_in_yet": list(not_in_yet),
-        "deviations": [d.text for d in summary.state.deviations if not d.is_note],
+        "deviations": [d.text for d in summary.state.deviations],
         "head_of_chain_sha256": summary.events[-1].sha256,
     }

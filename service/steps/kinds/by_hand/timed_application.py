@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
 from pydantic import BaseModel
@@ -9,6 +10,7 @@ from pydantic import BaseModel
 from service.core.protocol.step_params import RepeatedStep, StepParams
 from service.core.records.events import Record
 from service.core.records.moments import Moment
+from service.core.run.state import Note
 from service.steps.context import Announcement, StepContext, StepKind, StepOutcome
 from service.steps.measures import Count, MeasureRecord
 
@@ -57,16 +59,20 @@ class Result(Record):
         return Moment(self.applied_monotonic_s, self.applied_utc, self.applied_boot)
 
 
+def applied_at(notes: Sequence[Note]) -> Moment | None:
+    """When the product was applied, by the notes of such a step; None if it was not yet."""
+    for noted in notes:
+        note = _Applied.model_validate(noted.data)
+        if note.applied_monotonic_s is not None:
+            return Moment(note.applied_monotonic_s, note.applied_utc or noted.at_utc, note.applied_boot)
+    return None
+
+
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Start the timer at the operator's confirmation, and wait for the coating to settle."""
-    notes = [(_Applied.model_validate(note.data), note.at_utc) for note in context.state.notes]
-    earlier = [
-        Moment(note.applied_monotonic_s, note.applied_utc or noted_utc, note.applied_boot)
-        for note, noted_utc in notes
-        if note.applied_monotonic_s is not None
-    ]
-    applied = earlier[0] if earlier else context.moment()
-    if not earlier:  # after a restart, the timer goes on
+    earlier = applied_at(context.state.notes)
+    applied = earlier or context.moment()
+    if earlier is None:  # after a restart, the timer goes on
         context.note(
             f"{params.product} applied: scan within {params.scan_within_s / 60:.0f} min, "
             f"gone after {params.sublimates_after_s / 3600:.1f} h",

@@ -25,6 +25,7 @@ from service.steps.kinds.by_hand import timed_application
 from service.steps.layouts import layout_uncertainties
 from service.steps.measures import Count, ErrorMm, Measure, SphereMeasures
 
+AGE = "since_application_min"  # the measure of how old the coat was
 _NAMED = 20  # exports in a record of what was left out, the newest
 _NAMES_APPLICATION = NamesStep("applies a coat", lambda params: isinstance(params, timed_application.Params))
 
@@ -165,7 +166,7 @@ def _age(context: StepContext, application: str) -> dict[str, float]:
         context.note(text, **clocks)
         return {}
     context.note(f"the scan arrived {age.seconds / 60:.1f} min after the coat was applied", **clocks)
-    return {"since_application_min": age.seconds / 60}
+    return {AGE: age.seconds / 60}
 
 
 def _request(context: StepContext, params: Params, meshes: list[ArtefactRef]) -> JobRequest:
