@@ -25,7 +25,7 @@ from service.core.run.decide import AskOperator, decide, evaluate_gates
 from service.core.run.fold import fold
 from service.monitor.snapshot import Message, Snapshot
 from service.steps import params_models
-from service.web.page.run_frame import robot_banner
+from service.web.page.robot_banner import robot_banner
 from service.web.page.run_words import limit, measure_name, planned_views
 from service.web.run.figures import duration, view_intervals_s
 from service.web.run.view import run_view

@@ -23,7 +23,8 @@ from service.steps import params_models
 from service.store.files.space_used import forecast_of
 from service.store.records import RunRow
 from service.web.page.rendering import render
-from service.web.page.run_frame import driven_frames, robot_banner
+from service.web.page.robot_banner import robot_banner
+from service.web.page.run_frame import driven_frames
 from service.web.page.run_words import stopped_words
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site

@@ -41,7 +41,7 @@ from service.core.run.state import RunState
 from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, LensSection, OpticsSection
 from service.runner.operator import AnswerBy
-from service.steps.context import FurtherCamera, LeaveToMove, StationLayout
+from service.steps.context import ConnectionEnd, FurtherCamera, LeaveToMove, StationLayout
 from service.store.durable_effects import Clock, SystemClock
 from tests.support.rig.bench_lightbox import BenchLightbox
 
@@ -252,6 +252,7 @@ class BenchRig:
     card: Camera | None = None  # instead of it: a camera without a cable
     box: BenchLightbox | None = field(default_factory=BenchLightbox)
     further: tuple[FurtherCamera, ...] = ()
+    ended: list[ConnectionEnd] = field(default_factory=list[ConnectionEnd])  # of which the runner is told next
     _on_open: Callable[[str, DeviceReport], None] | None = None
 
     def keep_time(self, clock: Clock) -> None:
@@ -315,6 +316,10 @@ class BenchRig:
 
     def watch(self, on_open: Callable[[str, DeviceReport], None], before_open: Callable[[str], None]) -> None:
         self._on_open = on_open
+
+    def ended_connections(self) -> tuple[ConnectionEnd, ...]:
+        ended, self.ended = tuple(self.ended), []
+        return ended
 
     def reopen(self, device: Device) -> None:
         device.close()
