@@ -52,8 +52,8 @@ def move_and_settle(
 ) -> SettleReport:
     """Move to joints (N,) and return when the pose stream is quiet. `meanwhile` is called after the motion has begun.
 
-    Raises SafetyStopError, DeviceTimeoutError (the arm is stopped), StepInterruptedError (the arm stands still; it did
-    not set out if the confirmation was too long ago).
+    Raises SafetyStopError, DeviceTimeoutError (the arm is stopped), StepInterruptedError (the arm stands still; it
+    did not set out if the confirmation was too long ago).
     """
     with context.motion():
         try:

@@ -178,6 +178,7 @@ class BenchCamera:
     connected: bool = False
     opened: int = 0
     exposures: int = 0
+    arrivals_s: list[float] = field(default_factory=list[float])  # monotonic time of each image that arrived
     applied: CameraSettings | None = None
     # Presses of its own button that were not collected yet; not None: settings to which the dials were turned.
     pressed: list[CameraSettings | None] = field(default_factory=list[CameraSettings | None])
@@ -215,6 +216,7 @@ class BenchCamera:
         path = folder / f"DSC{self.exposures:05d}.JPG"
         assert cv2.imwrite(str(path), picture)
         self.clock.sleep(EXPOSURE_S)
+        self.arrivals_s.append(self.clock.monotonic_s())
         data = path.read_bytes()
         jpeg = CapturedFile(path, path.name, hashlib.sha256(data).hexdigest(), len(data), "image/jpeg")
         return CapturedImage(
