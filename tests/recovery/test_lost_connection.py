@@ -66,7 +66,9 @@ ENDINGS: dict[str, Callable[[Log], object]] = {
     ),
     "its driver no longer answered (driver call state did not return within 30 s; its process was ended)": (
         lambda log: log.append(
-            trouble("stalled", "driver call state did not return within 30 s; its process was ended [robot]. Check it")
+            trouble(
+                "stalled", "driver call state did not return within 30 s; its process was ended [robot]. Check it"
+            )
         )
     ),
     "the arm no longer answered its driver (no sample for 2 s)": lambda log: log.append(
