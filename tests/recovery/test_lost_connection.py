@@ -60,16 +60,13 @@ def shown(state: RunState, *, driven: bool = True, **told: Any) -> Banner:
     return robot_banner(state, snapshot, NOW_S, driven=driven)
 
 
+STALLED = "driver call state did not return within 30 s; its process was ended [robot]. Check the device"
 ENDINGS: dict[str, Callable[[Log], object]] = {
     "its driver's process ended (driver process is not running: died of SIGKILL)": lambda log: log.append(
         trouble("died")
     ),
     "its driver no longer answered (driver call state did not return within 30 s; its process was ended)": (
-        lambda log: log.append(
-            trouble(
-                "stalled", "driver call state did not return within 30 s; its process was ended [robot]. Check it"
-            )
-        )
+        lambda log: log.append(trouble("stalled", STALLED))
     ),
     "the arm no longer answered its driver (no sample for 2 s)": lambda log: log.append(
         trouble("broken", "no sample for 2 s [10.0.0.1]. Check the cable")

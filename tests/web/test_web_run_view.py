@@ -252,32 +252,17 @@ def test_what_is_tried_again_by_itself_is_said_by_the_step_and_the_banner() -> N
     while log.state.phase != "running":
         go(log, "on")
     step, attempt = log.state.current, log.state.step.attempt
-    for _ in range(2):
-        log.append(
-            ViewpointFailed(
-                step=step,
-                attempt=attempt,
-                viewpoint="b001",
-                error="DeviceTimeoutError",
-                message="no file within 46 s [camera]. Look at the camera",
-                skipped=False,
-            )  # fmt: skip
-        )
+    why, message = "DeviceTimeoutError", "no file within 46 s [camera]. Look at the camera"
+    failed = ViewpointFailed(step=step, attempt=attempt, viewpoint="b001", error=why, message=message, skipped=False)
+    log.append(failed)
+    log.append(failed)
     said = "b001 failed twice: no file within 46 s; third try since 00:00:00 UTC, by itself"
     assert view_of(log).tries == f"B{said[1:]}."
     for robot in ("moving", "standing", "not_connected"):
         snapshot = Snapshot(at_utc_s=1.8e9, doing="working", robot=robot)
         words = tries_words(log.protocol, log.state, time_here)
         assert f"B{said[1:]}." in robot_banner(log.state, snapshot, 1.8e9, driven=True, tries=words).text
-    log.append(
-        StepFailed(
-            step=step,
-            attempt=attempt,
-            error="DeviceTimeoutError",
-            message="no file within 46 s [camera]. Look at the camera",
-            recovery="retry",
-        )  # fmt: skip
-    )
+    log.append(StepFailed(step=step, attempt=attempt, error=why, message=message, recovery="retry"))
     assert "third try at 00:00:01 UTC" in view_of(log).tries
     log.append(StepRetried(step=step, attempt=attempt + 1, why="DeviceTimeoutError: no file within 46 s"))
     assert "third try since" in view_of(log).tries
