@@ -62,9 +62,7 @@ def shown(state: RunState, *, driven: bool = True, **told: Any) -> Banner:
 
 STALLED = "driver call state did not return within 30 s; its process was ended [robot]. Check the device"
 ENDINGS: dict[str, Callable[[Log], object]] = {
-    "its driver's process ended (driver process is not running: died of SIGKILL)": lambda log: log.append(
-        trouble("died")
-    ),
+    "its driver's process ended (died of SIGKILL)": lambda log: log.append(trouble("died")),
     "its driver no longer answered (driver call state did not return within 30 s; its process was ended)": (
         lambda log: log.append(trouble("stalled", STALLED))
     ),

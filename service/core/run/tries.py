@@ -43,7 +43,7 @@ def tries_words(protocol: Protocol, state: RunState, clock: Callable[[str], str]
 def failed_words(tries: FailedTries) -> str:
     """`b001 failed twice: no file within 46 s`; without place and remedy, which the record has."""
     times = _TIMES[tries.times] if tries.times < len(_TIMES) else f"{tries.times} times"
-    return f"{tries.what or 'the step'} failed {times}: {what_of(tries.message)}"
+    return f"{tries.what or 'The step'} failed {times}: {what_of(tries.message)}"
 
 
 def _ordinal(number: int) -> str:

@@ -13,6 +13,8 @@ from service.monitor.snapshot import STALE_S, Snapshot
 
 Tone = Literal["moving", "standing", "paused", "unknown", "stop"]
 NOT_THE_STOP = "This screen is not the emergency stop."
+_TAKE_IT = "Robot: take it as moving."
+_FROM_OUTSIDE = "If it moves, press the emergency stop."
 _AS_MOVING = "It counts as moving until a person has looked: stay outside of its reach."
 _AT_THE_ROBOT = "This software cannot clear a stop; a person does it at the robot, and nothing moves again by itself."
 
@@ -39,10 +41,6 @@ class Banner:
     look: tuple[LookAt, ...] = ()  # what a person can say here to have looked at
 
 
-_LOOK = (
-    "Go where you can see the whole arm, without entering its reach. Wait until it stands, and see that nobody is "
-    "near it. Then say here that you have looked; your name is recorded. If it moves, press the emergency stop."
-)
 LOST = Banner(
     "unknown",
     "unknown",
@@ -67,13 +65,13 @@ def robot_banner(state: RunState, snapshot: Snapshot, now_utc_s: float, *, drive
     if not lost:
         return banner
     look = tuple(LookAt(name, loss.seq) for name, loss in lost.items())
-    words = f"{' '.join(_loss_words(name, loss) for name, loss in lost.items())} {_AS_MOVING}"
+    words = " ".join(_loss_words(name, loss) for name, loss in lost.items())
     if banner.tone in ("stop", "moving") or banner.key == "pausing":
-        return replace(banner, text=f"{banner.text} {words}", look=look)
+        return replace(banner, text=f"{banner.text} {words} {_AS_MOVING}", look=look)
     ended = "The run has ended. " if state.terminal else ""
     now = _now_words(snapshot) if driven and not state.terminal else ""
-    text = f"{ended}{words} {now}{NOT_THE_STOP}"
-    return Banner("lost", "unknown", "unknown", "Robot: take it as moving.", text, _LOOK, assertive=True, look=look)
+    text = f"{ended}{words} {now}{_AS_MOVING} {_FROM_OUTSIDE} {NOT_THE_STOP}"
+    return Banner("lost", "unknown", "unknown", _TAKE_IT, text, assertive=True, look=look)
 
 
 def _loss_words(name: str, loss: Loss) -> str:
@@ -100,7 +98,7 @@ def _present(  # noqa: PLR0911 - one return a case
         return _silent(snapshot, now_utc_s, driven=driven)
     if snapshot.doing == "starting" and connected_arms(state):
         text = f"The program that drove it has ended, and starts again. {_AS_MOVING} {NOT_THE_STOP}"
-        return Banner("lost", "unknown", "unknown", "Robot: take it as moving.", text)
+        return Banner("lost", "unknown", "unknown", _TAKE_IT, text)
     if snapshot.doing == "starting":
         text = f"It has moved nothing yet, and asks before it does. {NOT_THE_STOP}"
         return Banner("starting", "standing", "open", "The program that drives the robot is starting.", text)
@@ -126,7 +124,7 @@ def _present(  # noqa: PLR0911 - one return a case
 
 
 def _again(tries: str) -> str:
-    return f"{tries[:1].upper()}{tries[1:]}. " if tries else ""
+    return f"{tries}. " if tries else ""
 
 
 def _not_connected(state: RunState, snapshot: Snapshot, tries: str) -> Banner:
@@ -161,10 +159,10 @@ def _left_alone(state: RunState, snapshot: Snapshot) -> Banner:
     ended = "The run has ended. " if state.terminal else ""
     text = (
         f"{ended}The program that drove {' and '.join(arms)} does not run; it was last heard from at "
-        f"{time_here(at_utc)}, and nobody has looked since. {_AS_MOVING} {NOT_THE_STOP}"
+        f"{time_here(at_utc)}, and nobody has looked since. {_AS_MOVING} {_FROM_OUTSIDE} {NOT_THE_STOP}"
     )
     look = tuple(LookAt(name, 0) for name in arms)
-    return Banner("lost", "unknown", "unknown", "Robot: take it as moving.", text, _LOOK, assertive=True, look=look)
+    return Banner("lost", "unknown", "unknown", _TAKE_IT, text, assertive=True, look=look)
 
 
 def busy_words(snapshot: Snapshot) -> str:

@@ -96,7 +96,7 @@ def run_view(
         progress=capture_progress(protocol, state, log.events),
         readings=readings(snapshot, space, clock_readings(log.events)),
         working=(snapshot.what, snapshot.done, snapshot.total) if snapshot.doing == "working" else ("", 0, 0),
-        tries=sentence(words) if (words := tries_words(protocol, state, time_here)) else "",
+        tries=tries_words(protocol, state, time_here),
         deviations=tuple(reversed(state.deviations)),
         news=tuple((m.at_utc, m.text) for m in reversed(snapshot.messages)),
         to_come=tuple(to_come),

@@ -30,7 +30,8 @@ def device_trouble(protocol: Protocol, state: RunState, event: Event, p: DeviceT
     if p.connection == "refused":
         refused = replace(arm, connected=False, refused_utc=event.at_utc, refused_why=what_of(p.message))
         return with_arm(state, p.device, refused)
-    how = f"{ENDINGS[p.connection]} ({what_of(p.message)})"
+    why = what_of(p.message)
+    how = f"{ENDINGS[p.connection]} ({why.rpartition(': ')[2] if p.connection == 'died' else why})"
     return with_arm(state, p.device, lost(arm, event.seq, event.at_utc, how))
 
 
