@@ -93,6 +93,17 @@ def test_who_has_looked_at_a_lost_arm_says_so_on_any_page_and_ends_what_was_show
     assert event.actor == web.account("technician")
 
 
+def test_an_arm_that_nobody_has_looked_at_outlasts_its_run(web: WebSite, run_id: str) -> None:
+    trouble = DeviceTrouble(device="robot", error="DeviceUnavailableError", message="died", connection="died")
+    web.store.record(run_id, [trouble, RunAborted(reason="enough")], actor="runner")
+    browser, seq = web.browser("technician"), web.store.head(run_id) - 1
+    assert "Robot: take it as moving." in browser.get("/").text
+    assert "The run has ended. The connection to robot was lost at" in browser.get(f"/runs/{run_id}").text
+    assert browser.send_form(f"/runs/{run_id}/robot-seen", device="robot", lost_seq=seq).status_code == 303
+    assert "Robot: take it as moving." not in browser.get("/").text
+    assert "It drives no robot any more." in browser.get(f"/runs/{run_id}").text
+
+
 def test_a_page_from_before_a_loss_confirms_no_motion(web: WebSite, run_id: str) -> None:
     """Whoever confirms a motion says to have looked at the arm, so the question must have said so."""
     browser = web.browser("technician")

@@ -14,6 +14,7 @@ from service.core.gates.verdict import quantity
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.events import (
     DeviceOpened,
+    DeviceTrouble,
     ItemTicked,
     LeaveLapsed,
     OperatorVerb,
@@ -206,6 +207,29 @@ def test_paused_is_shown_only_once_the_robot_stands_still() -> None:
     # A silent runner says nothing about the robot.
     silent = robot_banner(log.state, Snapshot(), 0.0, driven=True)
     assert silent.key == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("robot", "words"),
+    [
+        ("standing", "The robot stands still."),
+        ("not_connected", "The robot is not connected."),
+        ("unknown", "The robot does not answer: take it as moving."),
+        ("protective_stop", "The robot reports: protective stop."),
+    ],
+)
+def test_a_paused_run_says_of_its_robot_what_is_known(robot: str, words: str) -> None:
+    """It said that the robot stands still when nobody knew."""
+    log = advance_to(DEMO, "viewpoint_capture_1")
+    log.append(DeviceOpened(device="ur", report={"identity": {"kind": "robot"}}))
+    log.act("pause")
+    told = Snapshot.model_validate({"doing": "paused", "robot": robot})
+    question = view_of(log, told).question
+    assert (question.paused, question.standing) == (f"Paused. {words}", robot == "standing")
+    log.append(DeviceTrouble(device="ur", error="DeviceUnavailableError", message="died", connection="died"))
+    lost = view_of(log, told).question
+    assert not lost.standing
+    assert robot == "protective_stop" or "Take the robot as moving" in lost.paused
 
 
 def test_a_dead_runner_offers_to_go_on() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from service.core.gates.verdict import limits
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import OperatorAction, ViewpointCaptured
-from service.core.run.actions import refuse
+from service.core.run.actions import needs_leave, refuse
 from service.core.run.state import JobState, StepState
 from service.core.units import mm, mrad
 from service.jobs.capture import further_view, live_summary, live_view
@@ -296,7 +296,8 @@ def redo_of(log: RunRecord, step: Step, view: StepViewpoint, account: str) -> Vi
     """Whether a viewpoint may be sent back now. While the step runs, the robot then drives there by itself."""
     action = OperatorAction(action="redo", step=step.id, viewpoint=view.name, reason="asked", via="web")
     refusal = refuse(log.protocol, log.state, action, account)
-    moves = log.state.current == step.id and log.state.phase == "running"
+    here = log.state.current == step.id and log.state.phase == "running"
+    moves = here and not needs_leave(log.protocol, log.state)  # else somebody is asked first
     return ViewpointRedo("" if refusal is None else ". ".join(filter(None, (refusal.what, refusal.remedy))), moves)
 
 

@@ -115,7 +115,8 @@ def _question(log: RecordOfRun, snapshot: Snapshot, decision: object, mode: str,
         can_pause=mode not in ("ended", "died", "paused") and may_operate,
         asked_anew=needs_leave(protocol, state) and mode in ("ask", "recover"),
         lapsed=sentence(lapsed_words(state.lapse)) if state.lapse is not None and not state.restarted else "",
-        standing=snapshot.doing == "paused" and snapshot.robot != "moving",
+        standing=snapshot.doing == "paused" and snapshot.robot == "standing" and not lost_arms(state),
+        paused=_paused_words(state, snapshot),
         trouble=_trouble(protocol, state, decision),
         ways=tuple(map(_way, decision.ways)) if isinstance(decision, AskOperator) else (),
         signature=_signature(protocol, state),
@@ -123,6 +124,18 @@ def _question(log: RecordOfRun, snapshot: Snapshot, decision: object, mode: str,
         redos=() if state.terminal else tuple(_redo(protocol, state, s) for s in redoable_steps(protocol, state)),
         skip_overrides=bool(state.step.verdicts) and not state.step.gates_passed,
     )
+
+
+def _paused_words(state: RunState, snapshot: Snapshot) -> str:
+    """How it stands with a paused run and its robot; what is not known to stand still is not said to."""
+    if snapshot.doing != "paused" or snapshot.robot == "moving":
+        return "Pausing… the robot may still move."
+    if lost_arms(state):
+        return "Paused. Take the robot as moving: nobody has looked since its connection was lost."
+    if snapshot.robot in STOPS:
+        return f"Paused. The robot reports: {snapshot.robot.replace('_', ' ')}."
+    told = {"standing": "The robot stands still.", "not_connected": "The robot is not connected."}
+    return f"Paused. {told.get(snapshot.robot, 'The robot does not answer: take it as moving.')}"
 
 
 def _mode(state: RunState, decision: object, *, driven: bool) -> str:

@@ -180,7 +180,8 @@ class Question:
         asked_anew: the program that drove the robot has ended, or the confirmation was too long ago, so nothing moves
             before somebody confirms again.
         lapsed: why the confirmation no longer holds; "" where the program has ended.
-        standing: the run is paused and the robot stands still.
+        standing: the run is paused and the robot is known to stand still.
+        paused: how it stands with a paused run and its robot, in words.
         trouble: why the run is stopped; None if it is not.
         ways: what can be done about that, the recommended one first.
         signature: what is to be signed; None for nothing.
@@ -195,6 +196,7 @@ class Question:
     asked_anew: bool
     lapsed: str
     standing: bool
+    paused: str
     trouble: StepTrouble | None
     ways: tuple[Choice, ...]
     signature: SignedContent | None
