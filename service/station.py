@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 import os
 import socket
+from collections import deque
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import EntryPoint
 from typing import Any, TypeVar, cast
 
 import numpy as np
 from pydantic import ValidationError
 
-from drivers.errors import DeviceUnavailableError, SafetyStopError
+from drivers.errors import DeviceError, DeviceUnavailableError, SafetyStopError
 from drivers.host.device_lock import DeviceLock
-from drivers.host.hosted_device import hosted
+from drivers.host.hosted_device import Ending, hosted
 from drivers.interfaces import (
     Abandoned,
     Camera,
@@ -30,11 +31,11 @@ from drivers.interfaces import (
 )
 from drivers.plugin import DriverConfig, DriverSpec
 from service.core.declared_kinds import plug_ins
-from service.core.errors import ConfigurationError
+from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.records.import_list import ImportList
 from service.core.text.checked_yaml import problem_of, refuse
 from service.rig import CollisionSection, FurtherCameraSection, LensSection, OpticsSection, Rig, RigDevice
-from service.steps.context import FurtherCamera, LeaveToMove, StationLayout
+from service.steps.context import ConnectionEnd, FurtherCamera, LeaveToMove, StationLayout
 
 GROUP = "orthocapture.drivers"
 INTERFACES: Mapping[str, type[Any]] = {
@@ -67,6 +68,7 @@ class Station:
         self._on_open: Callable[[str, DeviceReport], None] | None = None
         self._before_open: Callable[[str], None] | None = None
         self._leave: LeaveToMove | None = None
+        self._ended: deque[ConnectionEnd] = deque()  # of arms; drivers add to it from any thread
         self._told: dict[str, int] = {}  # arm → seq of the last leave to move that it was given
 
     def names(self) -> tuple[str, ...]:
@@ -77,11 +79,12 @@ class Station:
         """The device of this name, opened if need be. Raises ConfigurationError or DeviceError."""
         if name not in self._open:
             device = self._build(name)
-            self._lock(name)
             try:
+                self._lock(name)
                 self._connect(name, device)
-            except BaseException:
+            except BaseException as error:
                 self._unlock(name)
+                self._refused(name, error)
                 raise
             self._open[name] = device
         return self._open[name]
@@ -225,10 +228,26 @@ class Station:
         device.close()
         try:
             self._connect(name, device)
-        except BaseException:
+        except BaseException as error:
             self._unlock(name)
+            self._refused(name, error)
             raise
         self._open[name] = device
+
+    def ended_connections(self) -> tuple[ConnectionEnd, ...]:
+        """The connections to arms that have ended since the last call, in order."""
+        ended: list[ConnectionEnd] = []
+        while self._ended:
+            ended.append(self._ended.popleft())
+        return tuple(ended)
+
+    def _lost(self, name: str, how: Ending, error: DeviceError) -> None:
+        self._ended.append(ConnectionEnd(name, how, type(error).__name__, str(error)))
+
+    def _refused(self, name: str, error: BaseException) -> None:
+        """Remember that an arm could not be connected, or not be prepared."""
+        if self.kind_of(name) == "robot" and isinstance(error, OrthocaptureError):
+            self._ended.append(ConnectionEnd(name, "refused", type(error).__name__, str(error)))
 
     def _lock(self, name: str) -> None:
         """Lock a device that acts for this process; folders may be read by several processes."""
@@ -293,7 +312,8 @@ class Station:
                 "call_timeout_s": max(spec.call_timeout_s, config.longest_call_s),
                 "reading_timeout_s": spec.reading_timeout_s,
             }
-            return cast(Device, hosted(interface, spec_path, config, name=name, **times))
+            proxy = partial(hosted, interface, spec_path, config, name=name, **times)
+            return cast(Device, proxy(on_end=partial(self._lost, name)) if spec.kind == "robot" else proxy())
         return spec.build(config)
 
     def _config(self, name: str, spec: DriverSpec) -> DriverConfig:

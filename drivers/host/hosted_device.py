@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from subprocess import DEVNULL, PIPE, STDOUT, Popen, TimeoutExpired
-from typing import Any, TypeVar, cast
+from typing import Any, Literal, TypeVar, cast
 
 from pydantic import BaseModel
 
@@ -27,6 +27,9 @@ from drivers.plugin import READING_TIMEOUT_S
 from service.core.errors import OrthocaptureError
 
 T = TypeVar("T")
+# The driver's process died, did not answer, or has told that the device does not.
+Ending = Literal["died", "stalled", "broken"]
+OnEnd = Callable[[Ending, DeviceError], None]
 
 PING_TIMEOUT_S = 15.0
 _READING = frozenset({"report", "settings"})  # calls that only read what the device knows
@@ -43,6 +46,7 @@ def hosted(
     call_timeout_s: float,
     name: str,
     reading_timeout_s: float = READING_TIMEOUT_S,
+    on_end: OnEnd = lambda _how, _error: None,
 ) -> T:
     """Return a proxy with exactly the public methods of `interface`; each call runs in the driver's own process.
 
@@ -53,11 +57,17 @@ def hosted(
         call_timeout_s: longest time that one call may take before the child is killed.
         name: the device's name in rig.yaml, for messages and logs.
         reading_timeout_s: the same for `report` and `settings`, if shorter.
+        on_end: called by any thread when the connection to a device that was open has ended; must return at once.
 
     `open()` starts the child, and restarts it after it died. Methods raise only OrthocaptureError.
     """
     device = HostedDevice(
-        spec_path, config, call_timeout_s=call_timeout_s, name=name, reading_timeout_s=reading_timeout_s
+        spec_path,
+        config,
+        call_timeout_s=call_timeout_s,
+        name=name,
+        reading_timeout_s=reading_timeout_s,
+        on_end=on_end,
     )
     methods: dict[str, Any] = {"__init__": _keep_device, "__doc__": f"{interface.__name__} in a process of its own."}
     for base in reversed(interface.__mro__):
@@ -106,6 +116,7 @@ class HostedDevice:
         name: str,
         heartbeat_s: float = 5.0,
         reading_timeout_s: float = READING_TIMEOUT_S,
+        on_end: OnEnd = lambda _how, _error: None,
     ) -> None:
         self._spec_path = spec_path
         self._config_json = config.model_dump_json()
@@ -118,6 +129,8 @@ class HostedDevice:
         self._sequence = 0
         self._obituary = "not opened yet"
         self._suspect = False  # the driver reported a lost link
+        self._on_end = on_end
+        self._opened = False  # in this child
         self._watch_stop = threading.Event()
         self._watcher: threading.Thread | None = None
 
@@ -139,14 +152,16 @@ class HostedDevice:
             if fresh:
                 self._start()
             try:
-                return cast("DeviceIdentity", self.call("open"))
+                identity = cast("DeviceIdentity", self.call("open"))
             except DeviceError as error:
                 if fresh or self._child is not None:
                     raise
                 # The rest of the old connection crashed the child; a new child starts clean.
                 _LOG.warning("%s: %s; trying once more", self._name, error)
                 self._start()
-                return cast("DeviceIdentity", self.call("open"))
+                identity = cast("DeviceIdentity", self.call("open"))
+            self._opened = True
+            return identity
 
     def close(self) -> None:
         """Close the device and end the child; does not raise if either is already gone."""
@@ -186,18 +201,27 @@ class HostedDevice:
             ok, value = self._receive(child, timeout_s)
         except TimeoutError:
             child.process.kill()
-            self._bury()
+            opened = self._bury()
             self._obituary = f"killed after {method or 'ping'} did not return within {timeout_s:g} s"
-            raise DeviceTimeoutError(
+            stalled = DeviceTimeoutError(
                 f"driver call {method or 'ping'} did not return within {timeout_s:g} s; its process was ended",
                 where=self._name,
                 remedy="Check the device and its cable, then open it again",
-            ) from None
+            )
+            if opened:
+                self._on_end("stalled", stalled)
+            raise stalled from None
         except (EOFError, OSError) as error:
-            self._bury()
-            raise self._unavailable() from error
+            opened = self._bury()
+            died = self._unavailable()
+            if opened:
+                self._on_end("died", died)
+            raise died from error
         if not ok:
-            self._suspect = self._suspect or isinstance(value, DeviceUnavailableError)
+            if isinstance(value, DeviceUnavailableError) and not self._suspect:
+                self._suspect = True
+                if self._opened:
+                    self._on_end("broken", value)
             raise value
         return value
 
@@ -247,10 +271,12 @@ class HostedDevice:
         self._watcher = threading.Thread(target=self._watch, args=(self._watch_stop,), daemon=True)
         self._watcher.start()
 
-    def _bury(self) -> None:
+    def _bury(self) -> bool:
+        """End the child; whether the device was open in it."""
         child, self._child = self._child, None
+        opened, self._opened = self._opened, False
         if child is None:
-            return
+            return False
         child.line.close()  # the child exits when its connection closes
         try:
             status = child.process.wait(CLOSE_TIMEOUT_S)
@@ -264,6 +290,7 @@ class HostedDevice:
         if status != 0:
             _LOG.error("%s: driver process %d %s", self._name, child.process.pid, self._obituary)
         self._watch_stop.set()
+        return opened
 
     def _watch(self, stop: threading.Event) -> None:
         """Ping the child between calls, so that the log shows when it died or hung."""

@@ -35,6 +35,11 @@ class OrthocaptureError(Exception):
         return _rebuild, (type(self), self.what, self.where, self.remedy)
 
 
+def what_of(text: str) -> str:
+    """What is wrong, from the recorded text of an error: without the place and the remedy."""
+    return text.split(" [", maxsplit=1)[0].split(". ", maxsplit=1)[0].rstrip(".")
+
+
 def _shown(text: str) -> str:
     plain = _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
     return _cut("\n".join(_cut(line, _LONGEST_LINE) for line in plain.split("\n")), _LONGEST)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from drivers.errors import DeviceError, LeaveNeededError, SafetyStopError
@@ -12,6 +12,10 @@ from service.monitor.snapshot import RobotPhase
 
 _WATCHED_S = 0.3  # length of the pose stream that shows whether the arm moves
 _STILL_RAD_S = 0.001  # joints that turn more slowly stand still
+# Of several arms the first of these is told; the others could otherwise move beside "The robot stands still".
+_GRAVEST: tuple[RobotPhase, ...] = (
+    "emergency_stop", "protective_stop", "safeguard_stop", "fault", "unknown", "moving", "standing", "not_connected",
+)  # fmt: skip
 _STOPS: Mapping[SafetyState, RobotPhase] = {
     SafetyState.PROTECTIVE_STOP: "protective_stop",
     SafetyState.SAFEGUARD_STOP: "safeguard_stop",
@@ -32,7 +36,7 @@ class OpenDevices:
 
 @dataclass(frozen=True, slots=True)
 class RobotReading:
-    """The state of the first open robot; `name` is that in rig.yaml."""
+    """The state of the open robot with the gravest one; `name` is that in rig.yaml."""
 
     phase: RobotPhase = "not_connected"
     name: str = ""
@@ -56,32 +60,40 @@ class CameraReading:
 
 
 def read_robot(devices: OpenDevices) -> RobotReading:
-    """Ask the first open robot for its state; "unknown" if it does not answer."""
-    for name, robot in devices.robots.items():
-        try:
-            state = robot.state()
-            stop = _STOPS.get(state.sample.safety)
-            moving = stop is None and _moves(robot)
-        except DeviceError:
-            return RobotReading("unknown", name)
-        turning = moving or _turns(state.sample.joint_velocities_rad_s)
-        return RobotReading(stop or ("moving" if turning else "standing"), name, state.speed_fraction)
-    return RobotReading()
+    """Ask the open robots for their states, and return the gravest; "unknown" of one that does not answer."""
+    return _gravest(_asked(name, robot) for name, robot in devices.robots.items())
 
 
 def watch_robot(devices: OpenDevices, now_s: float) -> RobotReading:
-    """The first open robot's state by its pose stream up to `now_s` (monotonic), which satisfies no watchdog."""
-    for name, robot in devices.robots.items():
-        try:
-            samples = robot.samples(now_s - _WATCHED_S, now_s)
-        except DeviceError:
-            samples = ()
-        if not samples:
-            return RobotReading("unknown", name)
-        first, last = samples[0], samples[-1]
-        turning = _turns(last.joint_velocities_rad_s) or _turns(last.joints_rad - first.joints_rad)
-        return RobotReading(_STOPS.get(last.safety) or ("moving" if turning else "standing"), name)
-    return RobotReading()
+    """The open robots' gravest state by their pose streams up to `now_s` (monotonic), which satisfies no watchdog."""
+    return _gravest(_watched(name, robot, now_s) for name, robot in devices.robots.items())
+
+
+def _gravest(readings: Iterable[RobotReading]) -> RobotReading:
+    return min(readings, key=lambda reading: _GRAVEST.index(reading.phase), default=RobotReading())
+
+
+def _asked(name: str, robot: RobotArm) -> RobotReading:
+    try:
+        state = robot.state()
+        stop = _STOPS.get(state.sample.safety)
+        moving = stop is None and _moves(robot)
+    except DeviceError:
+        return RobotReading("unknown", name)
+    turning = moving or _turns(state.sample.joint_velocities_rad_s)
+    return RobotReading(stop or ("moving" if turning else "standing"), name, state.speed_fraction)
+
+
+def _watched(name: str, robot: RobotArm, now_s: float) -> RobotReading:
+    try:
+        samples = robot.samples(now_s - _WATCHED_S, now_s)
+    except DeviceError:
+        samples = ()
+    if not samples:
+        return RobotReading("unknown", name)
+    first, last = samples[0], samples[-1]
+    turning = _turns(last.joint_velocities_rad_s) or _turns(last.joints_rad - first.joints_rad)
+    return RobotReading(_STOPS.get(last.safety) or ("moving" if turning else "standing"), name)
 
 
 def read_light(box: Lightbox) -> LightReading:

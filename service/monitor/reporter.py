@@ -26,6 +26,7 @@ from service.monitor.devices import (
     watch_robot,
 )
 from service.monitor.heartbeat import Heartbeat
+from service.monitor.processor import waited_s
 from service.monitor.snapshot import (
     STOPS,
     Asks,
@@ -89,6 +90,7 @@ class Reporter:
     _writing: threading.Lock = field(default_factory=threading.Lock)
     _heartbeat: Heartbeat = field(init=False)
     _moment: _Moment | None = None
+    _attends: tuple[int, float] = (0, 0.0)  # the main loop's thread, and how long it had waited for a processor
     _tower_light: TowerLight | None = None  # that the signal tower shows
     _light: LightReading = field(default_factory=LightReading)
     _camera: CameraReading = field(default_factory=CameraReading)
@@ -127,6 +129,8 @@ class Reporter:
             words: the question, or what goes on, for alerts.
         """
         self._activity = ("", 0.0)
+        thread = threading.get_native_id()
+        self._attends = (thread, waited_s(thread))
         moment, before = _Moment(doing, step, attempt, pedal_armed, asks), self._moment
         if moment == before and not self._due("snapshot", _EVERY_S):
             return
@@ -145,6 +149,9 @@ class Reporter:
     def _snapshot(self, moment: _Moment, words: str, devices: OpenDevices) -> Snapshot:
         """The state now, with readings of the devices that are due."""
         robot = read_robot(devices)
+        # What a device told that is not connected any more is not the present state of anything.
+        self._light = self._light if devices.lightboxes else LightReading()
+        self._camera = self._camera if devices.cameras else CameraReading()
         for box in devices.lightboxes.values():
             if self._due("light", _LIGHT_S):
                 self._light = read_light(box)
@@ -183,11 +190,17 @@ class Reporter:
             told: dict[str, object] = {
                 "at_utc_s": self.clock.utc_s(), "pid": getpid(), "what": what, "done": done, "total": total,
                 "messages": self._news, "activity": activity, "activity_utc_s": since_s,
+                "starved_s": self._starved_s(),
             }  # fmt: skip
             if watched_s > newest.robot_utc_s:
                 told |= {"robot_utc_s": watched_s, "robot": robot.phase, "robot_name": robot.name}
             snapshot = newest.model_copy(update=told)
             self._write(lambda: write_snapshot(self.data, self.run_id, snapshot))
+
+    def _starved_s(self) -> float:
+        """How long the main loop has waited for a processor since it last reported."""
+        thread, waited_before_s = self._attends
+        return waited_s(thread) - waited_before_s if thread else 0.0
 
     def watch(self) -> None:
         """Read the robot's pose stream while the main loop is in a long call. May block on the robot."""

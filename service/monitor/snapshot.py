@@ -44,6 +44,7 @@ class Snapshot(Record):
     at_utc_s: float = 0.0
     attended_utc_s: float = 0.0  # 0: same as at_utc_s
     robot_utc_s: float = 0.0  # 0: same as attended_utc_s
+    starved_s: float = 0.0  # for which the main loop waited for a processor since its last report
     activity: str = ""  # the long call of the main loop, in words
     activity_utc_s: float = 0.0  # when it began
     pid: int = 0
@@ -75,6 +76,7 @@ class Snapshot(Record):
         steps = {"light_lux": 0.05, "temperature_c": 0.2, "disk_free_bytes": 1e9, "camera_free_bytes": 1e9}
         seen: dict[str, Any] = dict(self) | {"at_utc_s": 0.0, "activity_utc_s": 0.0, "activity": self.lasting}
         seen |= {"attended_utc_s": self.quiet_s // _QUIET_STEP_S, "robot_utc_s": self.robot_silent_s > STALE_S}
+        seen["starved_s"] = self.starved_s // _QUIET_STEP_S
         if self.light_lux:
             seen["light_lux"] = math.log(self.light_lux)
         return tuple(round(value / steps[name]) if name in steps and value else value for name, value in seen.items())

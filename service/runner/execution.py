@@ -21,6 +21,7 @@ from service.monitor.worker_sign import living_workers
 from service.run_record import StepEvidence
 from service.runner.disk import DiskWatch
 from service.runner.held_run import HeldRun
+from service.runner.leave import LeaveWatch
 from service.runner.operator import Operator
 from service.steps import step_kinds
 from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
@@ -69,6 +70,7 @@ class StepExecution:
     operator: Operator
     disk: DiskWatch
     workers: WorkerWatch
+    leave: LeaveWatch
     clock: Clock
 
     def execute(self, step_id: str, attempt: int) -> None:
@@ -77,6 +79,7 @@ class StepExecution:
         at(step=step_id, viewpoint="")
         checkpoint = partial(self._checkpoint, step_id, attempt)
         context = self._context(step, attempt, checkpoint)
+        self.leave.attempt()
         if (leave := self.run.state.leave) is not None:
             self.devices.let_move(LeaveToMove(leave.seq, leave.by, self.run.follower.leave_not_before_s))
         try:
@@ -90,6 +93,13 @@ class StepExecution:
             self._failed(step_id, attempt, error)
         else:
             self._measured(step_id, attempt, outcome)
+
+    def note_connections(self) -> None:
+        """Record which connections to arms have ended."""
+        for end in self.devices.ended_connections():
+            self.run.append(
+                DeviceTrouble(device=end.device, error=end.error, message=end.message, connection=end.how)
+            )
 
     def _context(self, step: Step, attempt: int, checkpoint: Callable[[], None]) -> StepContext:
         operator = self.operator
@@ -105,19 +115,25 @@ class StepExecution:
                 step.id,
                 attempt,
                 checkpoint,
-                operator.show,
-                self.clock.sleep,
+                self._show,
+                self.leave.wait_for_results,
                 self.disk.require,
             ),
             checkpoint=checkpoint,
-            progress=operator.show,
+            progress=self._show,
             monotonic_s=self.clock.monotonic_s,
             wait=self.clock.sleep,
             operator=operator.name,
             tell=operator.tell,
             moment=partial(moment_of, self.clock),
+            motion=self.leave.motion,
+            wait_for_results=self.leave.wait_for_results,
             busy=operator.busy,
         )
+
+    def _show(self, what: str, done: int, total: int) -> None:
+        self.leave.progress(what, done)
+        self.operator.show(what, done, total)
 
     def _measured(self, step: str, attempt: int, outcome: StepOutcome) -> None:
         self.run.append(
@@ -133,6 +149,7 @@ class StepExecution:
         )
 
     def _failed(self, step_id: str, attempt: int, error: OrthocaptureError) -> None:
+        self.note_connections()
         state = self.run.refresh().steps[step_id]
         name = type(error).__name__
         policy = recovery_policy(self.protocol.step(step_id).recovery, name, state.failures + 1)
@@ -146,7 +163,9 @@ class StepExecution:
 
     def _checkpoint(self, step: str, attempt: int) -> None:
         """Called by steps wherever they may stop. Raises StepInterruptedError if an operator paused or ended it."""
+        self.note_connections()
         state = self.run.refresh()
+        self.leave.look(state)
         self.operator.attend("pausing" if state.paused else "working", state, pedal_armed=False)
         self.workers.look(state.steps[step].jobs.values())
         if state.paused:

@@ -36,11 +36,13 @@ from service.core.run.decide import (
     evaluate_gates,
 )
 from service.core.run.state import RunState
+from service.core.run.tries import tries_words
 from service.monitor.host_clock import host_clock
 from service.runner.clocks import ClockWatch
 from service.runner.disk import DiskWatch
 from service.runner.execution import StepExecution, WorkerWatch
 from service.runner.held_run import HeldRun, held_run
+from service.runner.leave import LeaveWatch
 from service.runner.memory import short_collections
 from service.runner.operator import AnswerBy, Operator
 from service.runner.pedal import Pedal
@@ -72,6 +74,7 @@ class Runner:
     _seal: Seal = field(init=False)
     _pedal: Pedal = field(init=False)
     _clocks: ClockWatch = field(init=False)
+    _leave: LeaveWatch = field(init=False)
     _steps: StepExecution = field(init=False)
 
     def run(self) -> RunState:
@@ -90,12 +93,18 @@ class Runner:
             disk = DiskWatch(self._run, self.protocol, operator.tell, clock.monotonic_s)
             self._pedal = Pedal(self._pedal_reading, clock.monotonic_s, operator.tell)
             self._clocks = ClockWatch(self._run.follower, operator.tell)
-            workers = WorkerWatch(self.store.database_path.parent, operator.tell, clock)
-            self._steps = StepExecution(self._run, self.protocol, self.devices, operator, disk, workers, clock)
+            data = self.store.database_path.parent
+            workers = WorkerWatch(data, operator.tell, clock)
+            self._leave = LeaveWatch(self._run, self.protocol, data, clock, operator.tell)
+            self._steps = StepExecution(
+                self._run, self.protocol, self.devices, operator, disk, workers, self._leave, clock
+            )
             self._begin_session()
             disk.forecast()
             try:
                 while not (state := self._run.refresh()).terminal:
+                    self._leave.look(state)
+                    self._steps.note_connections()
                     self._act(state)
                 return state
             finally:
@@ -105,6 +114,7 @@ class Runner:
         """Record an action if it is allowed now; otherwise record its refusal and tell the operator why."""
         refusal = refuse(self.protocol, self._run.refresh(), action, actor)
         if refusal is None:
+            self._leave.given_here()
             self._run.append(action, actor=actor)
             return
         self._run.append(ActionRefused(action=action.action, step=action.step, why=str(refusal)), actor=actor)
@@ -165,13 +175,18 @@ class Runner:
     def _retry(self, decision: Retry, state: RunState) -> None:
         """Begin again after the wait, unless the decision has changed by then, such as by a pause or an abort."""
         left_s = decision.wait_s
+        if not state.step.retry_granted:
+            self.operator.tell(tries_words(self.protocol, state) or decision.why)
         while left_s > 0:
             self.store.clock.sleep(min(_POLL_S, left_s))
             left_s -= _POLL_S
             now = self._run.refresh()
-            if decide(self.protocol, now) != decision:
+            if decide(self.protocol, now) != decision or self._leave.lapsed(now):
                 return
+            self._steps.note_connections()
             self.operator.attend("working", now, pedal_armed=False)
+        if not state.step.retry_granted and self._leave.lapsed(self._run.refresh()):
+            return
         if state.step.retry_granted:
             hands = () if state.step.mend is None else state.step.mend.hands
             self.operator.mend(decision.step, decision.attempt, hands)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, Self, TypeVar
@@ -66,6 +67,16 @@ class LeaveToMove:
     seq: int  # of its event
     by: str
     not_before_monotonic_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionEnd:
+    """The end of a connection to an arm, or that none could be made: `refused`."""
+
+    device: str  # name in rig.yaml
+    how: Literal["died", "stalled", "broken", "refused"]  # died and stalled: the driver's process
+    error: str  # name of the error
+    message: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +149,10 @@ class Devices(Protocol):
 
     def reopen(self, device: Device) -> None:
         """Open a device again after its connection was lost. An arm then needs a new leave to move."""
+        ...
+
+    def ended_connections(self) -> tuple[ConnectionEnd, ...]:
+        """The connections to arms that have ended since the last call, in order."""
         ...
 
 
@@ -268,6 +283,9 @@ class StepContext:
     operator: str
     tell: Callable[[str], None]  # one line of news for the operator
     moment: Callable[[], Moment]  # now, in both clocks: for times that are kept and compared later
+    # Surrounds each motion of an arm; raises StepInterruptedError if nobody has let it move for too long.
+    motion: Callable[[], AbstractContextManager[None]]
+    wait_for_results: Callable[[float], None]  # as `wait`, where jobs are waited for
     busy: Callable[[str], None] = lambda _what: None  # call before a long call, with what it does
 
     @property

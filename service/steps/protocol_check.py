@@ -28,6 +28,7 @@ _SECTIONS: Mapping[tuple[str, str], tuple[float, float, str]] = {
     ("board", "square_mm"): (0.5, 1000.0, "mm"),
     ("camera", "aperture_f"): (0.7, 64.0, ""),
     ("camera", "iso"): (25.0, 409600.0, ""),
+    ("motion", "confirmed_for_s"): (10.0, 300.0, "s"),
 }
 NO_DEVICES: Mapping[str, RigDevice] = {}
 _TERMS = {"camera": "camera", "scanner": "scanner", "ct": "CT source"}
@@ -80,6 +81,7 @@ def implausible(
             (("steps", index, *at), words) for at, words in (*_named(step, earlier, steps), *_mount(step, steps))
         ]
     found += list(_too_fast(loaded.protocol, rig, devices))
+    found += list(_too_late(loaded.protocol))
     if rig is not None:
         found += list(_stations(data, rig))
     problems = [YamlProblem(tree.line(at), field_name(at), words) for at, words in found]
@@ -183,6 +185,18 @@ def _too_fast(
     strictest = min(abandoned, key=lambda one: one.rest_within_s - one.noticed_after_s, default=None)
     for field, words in motion_problems(protocol.motion, arms, strictest):
         yield ("motion", field), words
+
+
+def _too_late(protocol: Protocol) -> Iterator[tuple[FieldPath, str]]:
+    """Waits before a step that moves the robot tries again, after which the confirmation would not hold any more."""
+    holds_s = protocol.motion.confirmed_for_s
+    for index, step in enumerate(protocol.steps):
+        if step.moves_robot and step.recovery.retries and step.recovery.wait_s >= holds_s:
+            yield (
+                ("steps", index, "recovery", "wait_s"),
+                f"after {step.recovery.wait_s:g} s the robot does not try again by itself: a confirmation holds for "
+                f"{holds_s:g} s without progress (motion.confirmed_for_s)",
+            )
 
 
 def _stations(data: Mapping[str, Plain], rig: RigSection) -> Iterator[tuple[FieldPath, str]]:

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.records.events import FilesKept, StepStarted
+from service.core.text.clock_time import local_time
 from service.store.records import NewArtefact
-from service.web.page.rendering import local_time
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.processes.waiting import until

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
@@ -203,7 +204,7 @@ def test_images_of_a_later_step_are_held_against_the_calibration(tmp_path: Path)
         return StepContext(
             protocol, protocol.steps[step], 1, cast("Any", None), cast("Any", None), cast("Any", evidence),
             lambda: None, lambda *_: None, lambda: 0.0, lambda _: None, "Ada", told.append,
-            lambda: Moment(0.0, "", ""),
+            lambda: Moment(0.0, "", ""), nullcontext, lambda _: None,
         )  # fmt: skip
 
     assert optics_departures(context(1, _Recorded({"v": [50.0]}))) is None

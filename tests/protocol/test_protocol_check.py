@@ -32,6 +32,7 @@ def test_our_protocols_are_credible(file: Path) -> None:
         ("radius_mm: 15", "radius_mm: 0.015", "0.015 mm is not credible: 1 to 100 mm"),
         ("square_mm: 15", "square_mm: 0.015", "0.015 mm is not credible: 0.5 to 1000 mm"),
         ("measure: coverage, min: 0.9", "measure: coverage, min: 90", "a limit of 90 on coverage is not credible"),
+        ("motion: {speed", "motion: {confirmed_for_s: 3600, speed", "3600 s is not credible: 10 to 300 s"),
         ("measure: robot_corrected_rms_px", "measure: robo_rms_px", "registration measures no 'robo_rms_px'"),
     ],
 )
@@ -145,3 +146,14 @@ def test_a_run_does_not_start_on_a_rig_without_a_device_that_a_step_needs(tmp_pa
     done = CliRunner().invoke(app, [*arguments, "--operator", "Ada"])
     assert done.exit_code == 1
     assert "step control_scan needs exactly one scanner, the rig has 0" in done.output
+
+
+def test_a_wait_that_outlasts_the_confirmation_is_found(tmp_path: Path) -> None:
+    text = (PROTOCOLS / "exvivo_spine.yaml").read_text()
+    old = "recovery: {retries: 2}"
+    assert old in text
+    file = tmp_path / "protocol.yaml"
+    file.write_text(text.replace(old, "recovery: {retries: 2, wait_s: 120}"))
+    status, said = _check(file)
+    assert status == 1
+    assert "after 120 s the robot does not try again by itself: a confirmation holds for 60 s" in said

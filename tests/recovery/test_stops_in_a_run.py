@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drivers.host.hosted_device import HostedDevice
 from drivers.interfaces import Camera, Device, Lightbox
 from service.core.protocol.models import parse_protocol
-from service.core.records.events import OperatorAction, StepFailed, ViewpointCaptured
+from service.core.records.events import DeviceTrouble, OperatorAction, StepFailed, ViewpointCaptured
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.rig import load_rig
@@ -205,6 +205,10 @@ def test_a_driver_killed_in_mid_motion_is_asked_about_before_the_arm_moves_on(tm
         run.operator.on_attend = kill
         run.answers(looks_for(3.0, arm, "nobody has let the arm move since it was connected"))
         assert run.drive().status == "completed"
+        payloads = [event.payload for event in store.events(run.run_id)]
+        (trouble,) = [p for p in payloads if isinstance(p, DeviceTrouble) and p.connection]
+        assert trouble.connection == "died"
+        assert "SIGKILL" in trouble.message
     assert killed
     assert run.failures() == ["LeaveNeededError"]
     assert run.captured() == VIEWS

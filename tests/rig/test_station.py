@@ -66,6 +66,20 @@ def test_a_device_that_stays_away_is_built_anew_when_it_is_back(tmp_path: Path) 
         assert opened == ["scanner: scanner"] * 2
 
 
+def test_an_arm_that_could_not_be_connected_is_told_and_other_devices_are_not(tmp_path: Path) -> None:
+    with station_of(tmp_path) as (station, _):
+        with pytest.raises(DeviceError):
+            station.robot("station_1")
+        (ended,) = station.ended_connections()
+        assert (ended.device, ended.how) == ("arm", "refused")
+        assert ended.message
+        assert station.ended_connections() == ()
+        (tmp_path / "scans").rmdir()
+        with pytest.raises(DeviceError):
+            station.scanner()
+        assert station.ended_connections() == ()
+
+
 def test_layouts_point_from_the_scene_to_the_base(tmp_path: Path) -> None:
     with station_of(tmp_path) as (station, _):
         layout = station.layout("station_1")

@@ -97,6 +97,35 @@ def test_call_timeout_kills_the_child(tmp_path: Path) -> None:
     device.close()
 
 
+def test_however_the_connection_to_an_open_device_ends_it_is_told_once(tmp_path: Path) -> None:
+    ended: list[tuple[str, str]] = []
+    device = hosted(
+        Fake, SPEC, FakeConfig(), call_timeout_s=1.5, name="arm",
+        on_end=lambda how, error: ended.append((how, type(error).__name__)),
+    )  # fmt: skip
+    with pytest.raises(DeviceUnavailableError):
+        device.double(np.ones(1))
+    assert ended == [], "it was never open"
+    device.open()
+    with pytest.raises(DeviceUnavailableError):
+        device.crash(signal.SIGKILL)
+    with pytest.raises(DeviceUnavailableError):
+        device.double(np.ones(1))
+    assert ended == [("died", "DeviceUnavailableError")]
+    device.open()
+    with pytest.raises(DeviceTimeoutError):
+        device.hang(600)
+    assert ended[1:] == [("stalled", "DeviceTimeoutError")]
+    device.open()
+    for _ in range(2):
+        with pytest.raises(DeviceUnavailableError):
+            device.lose_link()
+    assert ended[2:] == [("broken", "DeviceUnavailableError")]
+    device.open()
+    device.close()
+    assert len(ended) == 3, "whoever closes a device has not lost it"
+
+
 def test_a_device_that_does_not_tell_what_it_knows_is_given_less_time_than_a_long_call() -> None:
     """libgphoto2 hangs in `report` if a Canon's answers are noise; an exposure may take two minutes, a report not."""
     config = FakeConfig(report_s=600)

@@ -15,7 +15,7 @@ from service.core.run.state import RunState
 from service.monitor.devices import OpenDevices
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import STALE_S, Snapshot, read_snapshot, write_snapshot
-from service.web.page.run_frame import Banner, robot_banner
+from service.web.page.robot_banner import Banner, robot_banner
 from tests.support.pages.web import web_site
 from tests.support.processes.waiting import until
 from tests.support.record.stepped_clock import SteppedClock
@@ -231,3 +231,39 @@ def test_the_signal_tower_shows_how_the_run_stands(tmp_path: Path, arm: BenchArm
     reporter.attend("working", "spraying", 2)
     reporter.end()
     assert [light.value for light in box.shown] == ["GREEN", "RED", "YELLOW", "GREEN", "RED", "OFF"]
+
+
+def test_of_two_arms_the_one_that_moves_is_told(tmp_path: Path, clock: SteppedClock) -> None:
+    """The first one stands, and the banner said that the robot stands still."""
+    first, second = BenchArm(clock=clock), BenchArm(clock=clock)
+    for arm in (first, second):
+        arm.open()
+    bench = Bench(tmp_path, {"first": first, "second": second}, clock)
+    second.move_joints(np.array([0.9, 0.4, 0.5, 0.0, 3.0, 0.0]), speed_rad_s=1.0, acceleration_rad_s2=1.0)
+    second.dawdle()
+    bench.reporter.attend("working", "capture", 1)
+    assert (bench.told.robot, bench.told.robot_name) == ("moving", "second")
+    first.safety = SafetyState.PROTECTIVE_STOP
+    bench.reporter.attend("asking", "capture", 1)
+    assert (bench.told.robot, bench.told.robot_name) == ("protective_stop", "first")
+
+
+def test_what_a_device_told_before_it_was_closed_is_not_its_present_state(
+    tmp_path: Path, clock: SteppedClock
+) -> None:
+    boxes = {"box": BenchLightbox(clock=clock)}
+    devices = OpenDevices(lightboxes=boxes)
+    reporter = Reporter(tmp_path, RUN, lambda: devices, BenchRig().camera_named, clock=clock)
+    reporter.attend("working", "capture", 1)
+    assert read_snapshot(tmp_path, RUN, clock.utc_s()).light_lux == 812.0
+    devices = OpenDevices()
+    reporter.attend("asking", "capture", 1)
+    told = read_snapshot(tmp_path, RUN, clock.utc_s())
+    assert (told.light_lux, told.temperature_c) == (None, None)
+
+
+def test_a_computer_that_is_too_busy_is_said_to_be(active: RunState) -> None:
+    told = {"doing": "working", "robot": "standing", "attended_utc_s": NOW_S - 40, "what": "planning the motion"}
+    waits = banner(active, **told, robot_utc_s=NOW_S, starved_s=30)
+    assert "planning the motion, for 40 s, of which it waited 30 s for a processor" in waits.text
+    assert "for a processor" not in banner(active, **told, robot_utc_s=NOW_S, starved_s=1).text

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import ItemTicked, OperatorAction, RunAborted
+from service.core.records.events import DeviceOpened, DeviceTrouble, ItemTicked, OperatorAction, RunAborted
 from service.monitor.snapshot import Message, Snapshot, write_snapshot
 from service.people.roles import ROLES, Role
 from tests.support.pages.web import WebSite, web_site
@@ -60,6 +60,63 @@ def test_a_page_and_its_parts_say_the_same(web: WebSite, run_id: str) -> None:
     for part, alone in parts.items():
         strip = lambda text: re.sub(r"\s+|\d{4}-\d\d-\d\d[T ][\d:.+Z]*|UTC", "", text)  # noqa: E731
         assert strip(alone) in strip(page), part
+
+
+def test_who_has_looked_at_a_lost_arm_says_so_on_any_page_and_ends_what_was_shown(web: WebSite, run_id: str) -> None:
+    web.store.record(
+        run_id,
+        [
+            DeviceOpened(device="robot", report={"identity": {"kind": "robot"}}),
+            DeviceTrouble(device="robot", error="DeviceUnavailableError", message="died", connection="died"),
+        ],
+        actor="runner",
+    )
+    seq = web.store.head(run_id)
+    technician, auditor = web.browser("technician"), web.browser("auditor")
+    words = "The connection to robot was lost at"
+    for address in (f"/runs/{run_id}", f"/runs/{run_id}/capture", "/"):
+        page = technician.get(address).text
+        assert words in page, address
+        assert "Nothing has needed it so far" not in page
+        assert "I have looked: robot stands still" in page
+        assert "I have looked" not in auditor.get(address).text
+    where = f"/runs/{run_id}/robot-seen"
+    assert auditor.send_form(where, device="robot", lost_seq=seq).status_code == 403
+    for stale in (0, seq - 1):
+        assert technician.send_form(where, device="robot", lost_seq=stale).status_code == 409
+    assert words in technician.get(f"/runs/{run_id}").text
+    assert technician.send_form(where, device="robot", lost_seq=seq).status_code == 303
+    page = technician.get(f"/runs/{run_id}").text
+    assert "looked at it at" in page
+    assert "I have looked" not in page
+    (event,) = [event for event in web.store.events(run_id) if event.payload.kind == "robot_seen"]
+    assert event.actor == web.account("technician")
+
+
+def test_an_arm_that_nobody_has_looked_at_outlasts_its_run(web: WebSite, run_id: str) -> None:
+    trouble = DeviceTrouble(device="robot", error="DeviceUnavailableError", message="died", connection="died")
+    web.store.record(run_id, [trouble, RunAborted(reason="enough")], actor="runner")
+    browser, seq = web.browser("technician"), web.store.head(run_id) - 1
+    assert "Robot: take it as moving." in browser.get("/").text
+    assert "The run has ended. The connection to robot was lost at" in browser.get(f"/runs/{run_id}").text
+    assert browser.send_form(f"/runs/{run_id}/robot-seen", device="robot", lost_seq=seq).status_code == 303
+    assert "Robot: take it as moving." not in browser.get("/").text
+    assert "It drives no robot any more." in browser.get(f"/runs/{run_id}").text
+
+
+def test_a_page_from_before_a_loss_confirms_no_motion(web: WebSite, run_id: str) -> None:
+    """Whoever confirms a motion says to have looked at the arm, so the question must have said so."""
+    browser = web.browser("technician")
+    web.take_control(run_id, browser)
+    web.store.record(run_id, [OperatorAction(action="skip", step="fixation", reason="done before")], actor="grace")
+    seen = web.store.head(run_id)
+    trouble = DeviceTrouble(device="robot", error="DeviceUnavailableError", message="died", connection="died")
+    web.store.record(run_id, [trouble], actor="runner")
+    for seen_seq, status in ((seen, 409), (seen + 1, 303)):
+        sent = browser.send_form(
+            f"/runs/{run_id}/actions", verb="confirm", step="capture", attempt=1, seen_seq=seen_seq
+        )
+        assert sent.status_code == status
 
 
 def test_two_screens_show_the_same_ticks(web: WebSite, run_id: str) -> None:

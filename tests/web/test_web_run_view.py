@@ -13,19 +13,25 @@ from hypothesis import strategies as st
 from service.core.gates.verdict import quantity
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.events import (
+    DeviceOpened,
+    DeviceTrouble,
     ItemTicked,
+    LeaveLapsed,
     OperatorVerb,
     SessionStarted,
     StepFailed,
     StepMeasured,
     StepPassed,
     StepRetried,
+    ViewpointFailed,
 )
 from service.core.run.decide import AskOperator, decide, evaluate_gates
 from service.core.run.fold import fold
+from service.core.run.tries import tries_words
+from service.core.text.clock_time import time_here
 from service.monitor.snapshot import Message, Snapshot
 from service.steps import params_models
-from service.web.page.run_frame import robot_banner
+from service.web.page.robot_banner import robot_banner
 from service.web.page.run_words import limit, measure_name, planned_views
 from service.web.run.figures import duration, view_intervals_s
 from service.web.run.view import run_view
@@ -203,6 +209,29 @@ def test_paused_is_shown_only_once_the_robot_stands_still() -> None:
     assert silent.key == "unknown"
 
 
+@pytest.mark.parametrize(
+    ("robot", "words"),
+    [
+        ("standing", "The robot stands still."),
+        ("not_connected", "The robot is not connected."),
+        ("unknown", "The robot does not answer: take it as moving."),
+        ("protective_stop", "The robot reports: protective stop."),
+    ],
+)
+def test_a_paused_run_says_of_its_robot_what_is_known(robot: str, words: str) -> None:
+    """It said that the robot stands still when nobody knew."""
+    log = advance_to(DEMO, "viewpoint_capture_1")
+    log.append(DeviceOpened(device="ur", report={"identity": {"kind": "robot"}}))
+    log.act("pause")
+    told = Snapshot.model_validate({"doing": "paused", "robot": robot})
+    question = view_of(log, told).question
+    assert (question.paused, question.standing) == (f"Paused. {words}", robot == "standing")
+    log.append(DeviceTrouble(device="ur", error="DeviceUnavailableError", message="died", connection="died"))
+    lost = view_of(log, told).question
+    assert not lost.standing
+    assert robot == "protective_stop" or "Take the robot as moving" in lost.paused
+
+
 def test_a_dead_runner_offers_to_go_on() -> None:
     log = advance_to(DEMO, "ct_hand_over_out")
     view = view_of(log, Snapshot(), driven=False)
@@ -223,6 +252,55 @@ def test_after_a_restart_the_robot_waits_for_a_confirmation_that_is_held() -> No
     assert (view.mode, view.question.asked_anew) == ("ask", True)
     assert view.question.main is not None
     assert (view.question.main.verb, view.question.main.hold) == ("confirm", True)
+
+
+def test_a_confirmation_that_no_longer_holds_says_why_it_is_asked_for_again() -> None:
+    log = advance_to(DEMO, "viewpoint_capture_1")
+    while log.state.phase != "running":
+        go(log, "on")
+    assert log.state.leave is not None
+    log.append(LeaveLapsed(leave_seq=log.state.leave.seq, idle_s=93, limit_s=60, why="b001 failed twice: no file"))
+    view = view_of(log)
+    assert (view.mode, view.question.asked_anew) == ("ask", True)
+    assert "for 93 s there was no visible progress, in which the run waited for this: b001 failed twice" in (
+        view.question.lapsed
+    )
+    assert view.question.main is not None
+    assert (view.question.main.verb, view.question.main.hold) == ("confirm", True)
+    log.confirm()
+    assert view_of(log).question.lapsed == ""
+
+
+def test_what_is_tried_again_by_itself_is_said_by_the_step_and_the_banner() -> None:
+    log = advance_to(DEMO, "viewpoint_capture_1")
+    while log.state.phase != "running":
+        go(log, "on")
+    step, attempt = log.state.current, log.state.step.attempt
+    why, message = "DeviceTimeoutError", "no file within 46 s [camera]. Look at the camera"
+    failed = ViewpointFailed(step=step, attempt=attempt, viewpoint="b001", error=why, message=message, skipped=False)
+    log.append(failed)
+    log.append(failed)
+    said = "b001 failed twice: no file within 46 s; third try since 00:00:00 UTC, by itself"
+    assert view_of(log).tries == said
+    for robot in ("moving", "standing", "not_connected"):
+        snapshot = Snapshot(at_utc_s=1.8e9, doing="working", robot=robot)
+        words = tries_words(log.protocol, log.state, time_here)
+        assert f"{said}." in robot_banner(log.state, snapshot, 1.8e9, driven=True, tries=words).text
+    log.append(StepFailed(step=step, attempt=attempt, error=why, message=message, recovery="retry"))
+    assert "third try at 00:00:01 UTC" in view_of(log).tries
+    log.append(StepRetried(step=step, attempt=attempt + 1, why="DeviceTimeoutError: no file within 46 s"))
+    assert "third try since" in view_of(log).tries
+    log.capture(["b001"])
+    assert view_of(log).tries == ""
+
+
+def test_who_lets_a_lost_arm_move_reads_what_that_says() -> None:
+    log = advance_to(DEMO, "viewpoint_capture_1")
+    log.append(DeviceOpened(device="ur", report={"identity": {"kind": "robot"}}))
+    log.append(SessionStarted(resumed=True, software={}, host="h", pid=1))
+    main = view_of(log).question.main
+    assert main is not None
+    assert main.note.startswith("You say with it that you have looked at ur, whose connection was lost.")
 
 
 def test_the_time_left_is_measured_and_never_across_a_restart() -> None:

@@ -102,6 +102,8 @@ class Motion(Record):
     speed_rad_s: Positive = 0.5  # of the fastest joint
     acceleration_rad_s2: Positive = 0.5  # of the fastest joint
     dwell_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.5  # between standing still and the exposure
+    # How long a confirmation lets the arm set out without visible progress; then it is asked for again.
+    confirmed_for_s: Positive = 60.0
 
 
 class Settle(Record):

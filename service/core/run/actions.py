@@ -57,8 +57,8 @@ def capture_refusal(protocol: Protocol, state: RunState, step: str, attempt: int
 
 
 def needs_leave(protocol: Protocol, state: RunState) -> bool:
-    """Whether a person must confirm again before the robot moves, because the runner was restarted."""
-    return state.restarted and protocol.step(state.current).moves_robot
+    """Whether a person must confirm again before the robot moves: the runner was restarted, or the leave lapsed."""
+    return (state.restarted or state.lapse is not None) and protocol.step(state.current).moves_robot
 
 
 def redo_moves(protocol: Protocol, state: RunState, step: str) -> bool:

@@ -20,8 +20,10 @@ from service.core.run.actions import (
     redoable_steps,
     unmet_requirements,
 )
+from service.core.run.connections import lost_arms
 from service.core.run.fold import advance, fold, initial_state
-from service.core.run.state import Deviation, JobState, Note, RunState, StepState, Superseded
+from service.core.run.state import Deviation, JobState, Lapse, Note, RunState, StepState, Superseded
+from service.core.text.clock_time import time_utc
 
 __all__ = [
     "AbortRun",
@@ -135,7 +137,7 @@ def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - 
         case "ready":
             return _decide_ready(protocol, state)
         case "running" if needs_leave(protocol, state):
-            return _ask(protocol, state, "confirm", _what_goes_on(protocol.step(now.step), now))
+            return _ask(protocol, state, "confirm", _what_goes_on(protocol.step(now.step), state))
         case "running":
             return RunStep(now.step, now.attempt, begin=False)
         case "checking":
@@ -150,12 +152,23 @@ def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - 
             return FinishRun(len(state.deviations))
 
 
-def _what_goes_on(step: Step, now: StepState) -> str:
-    kept = {0: "it had taken no image yet", 1: "its image is kept"}
-    images = kept.get(len(now.captured), f"its {len(now.captured)} images are kept")
+def _what_goes_on(step: Step, state: RunState) -> str:
+    taken = len(state.step.captured)
+    images = {0: "it had taken no image yet", 1: "its image is kept"}.get(taken, f"its {taken} images are kept")
+    if state.lapse is not None and not state.restarted:
+        happened = f"{lapsed_words(state.lapse)} ({step.title}; {images})"
+    else:
+        happened = f"The program that drove the robot ended during this step ({step.title}); {images}"
+    check = "Check that nothing has changed and nobody is within reach; the robot moves as soon as you confirm"
+    return f"{happened}. {check}"
+
+
+def lapsed_words(lapse: Lapse) -> str:
+    """Why a confirmation no longer holds."""
+    waited = f", in which the run waited for this: {lapse.why}" if lapse.why else ""
     return (
-        f"The program that drove the robot ended during this step ({step.title}); {images}. "
-        "Check that nothing has changed and nobody is within reach; the robot moves as soon as you confirm"
+        f"The confirmation of {lapse.by} no longer lets the robot move: for {lapse.idle_s:.0f} s there was no "
+        f"visible progress{waited}. It holds for {lapse.limit_s:.0f} s"
     )
 
 
@@ -194,7 +207,8 @@ def _decide_recovering(protocol: Protocol, state: RunState) -> Decision:
         return _ask(protocol, state, "recovery", f"{found}: {failed}" + (f". {advice}" if advice else ""))
     why = f"{now.failure.error}: {now.failure.message}"
     if anew and now.failure.recovery == "retry":
-        return _ask(protocol, state, "recovery", f"{why}. The robot moves again as soon as you confirm")
+        lapsed = f". {lapsed_words(state.lapse)}" if state.lapse is not None and not state.restarted else ""
+        return _ask(protocol, state, "recovery", f"{why}{lapsed}. The robot moves again as soon as you confirm")
     match now.failure.recovery:
         case "retry":
             return Retry(now.step, now.attempt + 1, why, step.recovery.wait_s)
@@ -209,5 +223,11 @@ def _ask(protocol: Protocol, state: RunState, for_: Literal["confirm", "sign", "
     unticked = state.phase == "recovering" and len(state.step.ticked) < len(items)
     checklist = items if for_ == "confirm" or unticked else ()
     options = allowed_actions(protocol, state)
+    missing = lost_arms(state) if "confirm" in options and protocol.step(state.current).moves_robot else {}
+    for name, loss in missing.items():
+        text += (
+            f". Look at {name} first: the connection to it was lost at {time_utc(loss.since_utc)}, {loss.how}; it "
+            "counts as moving until somebody has looked, which you say with your confirmation"
+        )
     signed = record_to_sign(protocol, state)
     return AskOperator(state.current, for_, text, checklist, options, signed, ways_on(protocol, state))

@@ -22,9 +22,11 @@ from service.core.records.events import (
     JobEnqueued,
     JobFailed,
     JobFinished,
+    LeaveLapsed,
     OperatorAction,
     RecordCorrected,
     RegionDrawn,
+    RobotSeen,
     RunAborted,
     RunCompleted,
     RunReleased,
@@ -41,6 +43,7 @@ from service.core.records.events import (
     ViewpointCaptured,
     ViewpointFailed,
 )
+from service.core.run.effects.arms import device_opened, device_trouble, leave_lapsed, robot_seen
 from service.core.run.effects.jobs import job_ended, job_enqueued
 from service.core.run.effects.people import (
     action_refused,
@@ -52,7 +55,6 @@ from service.core.run.effects.people import (
 )
 from service.core.run.effects.place import impossible
 from service.core.run.effects.runs import (
-    device_trouble,
     files_kept,
     run_aborted,
     run_completed,
@@ -106,7 +108,7 @@ def advance(protocol: Protocol, state: RunState, event: Event) -> RunState:
     handler = _HANDLERS.get(type(event.payload))
     if handler is None:
         raise impossible(event, "it belongs to the site, not to a run")
-    return replace(handler(protocol, state, event, event.payload), seq=event.seq)
+    return replace(handler(protocol, state, event, event.payload), seq=event.seq, at_utc=event.at_utc)
 
 
 def _no_effect(protocol: Protocol, state: RunState, event: Event, p: object) -> RunState:
@@ -116,8 +118,9 @@ def _no_effect(protocol: Protocol, state: RunState, event: Event, p: object) -> 
 _HANDLERS: Mapping[type[Any], Callable[[Protocol, RunState, Event, Any], RunState]] = {
     RunStarted: run_started,
     SessionStarted: session_started,
-    DeviceOpened: _no_effect,
+    DeviceOpened: device_opened,
     DeviceTrouble: device_trouble,
+    LeaveLapsed: leave_lapsed,
     StepStarted: step_started,
     FilesKept: files_kept,
     StepNote: step_note,
@@ -139,6 +142,7 @@ _HANDLERS: Mapping[type[Any], Callable[[Protocol, RunState, Event, Any], RunStat
     RunAborted: run_aborted,
     ActionRefused: action_refused,
     ItemTicked: item_ticked,
+    RobotSeen: robot_seen,
     NoteTaken: _no_effect,
     ControlTaken: control_taken,
     RecordCorrected: record_corrected,
@@ -153,6 +157,8 @@ _DETAILS: frozenset[type[Any]] = frozenset(
         SessionStarted,
         DeviceOpened,
         DeviceTrouble,
+        LeaveLapsed,
+        RobotSeen,
         FilesKept,
         StepNote,
         CaptureAsked,

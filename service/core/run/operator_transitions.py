@@ -9,6 +9,7 @@ from service.core.gates.acceptance import describe_accepted, failed_gates
 from service.core.protocol.models import Protocol
 from service.core.records.events import Event, OperatorAction
 from service.core.run.actions import refuse
+from service.core.run.effects.arms import all_seen
 from service.core.run.lifecycle import redo
 from service.core.run.state import AcceptedDeviation, DeviationKind, Leave, RunState, StepState
 from service.core.run.state_transitions import UNMEASURED, change, deviate, go, pass_on, supersede
@@ -26,7 +27,7 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
         )
     match p.action:
         case "confirm":
-            return _confirm(_let_move(state, event), event, p)
+            return _confirm(_let_move(protocol, state, event), event, p)
         case "sign":
             return change(state, state.current, signed=True, signed_by=event.actor)
         case "accept":
@@ -45,7 +46,7 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
         case "pause":
             return go(protocol, state, "pause")
         case "resume":
-            return go(protocol, _let_move(state, event), "resume")
+            return go(protocol, _let_move(protocol, state, event), "resume")
         case "redo" if p.viewpoint is not None:
             return replace(_redo_viewpoint(protocol, state, event, p.viewpoint, p.reason), last_redo_seq=event.seq)
         case "redo":
@@ -53,8 +54,10 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
             return replace(_redo_step(protocol, state, event, target, p.reason), last_redo_seq=event.seq)
 
 
-def _let_move(state: RunState, event: Event) -> RunState:
-    return replace(state, restarted=False, leave=Leave(event.seq, event.actor))
+def _let_move(protocol: Protocol, state: RunState, event: Event) -> RunState:
+    state = replace(state, restarted=False, lapse=None, leave=Leave(event.seq, event.actor))
+    state = change(state, state.current, tries=None)
+    return all_seen(state, event) if protocol.step(state.current).moves_robot else state
 
 
 def _confirm(state: RunState, event: Event, p: OperatorAction) -> RunState:

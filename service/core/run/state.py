@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from service.core.jobs.priorities import WAITED
 from service.core.records.events import ArtefactRef, ComputedBy, GateVerdict, Identified, RegionDrawn, Uncertainty
+from service.core.run.connections import ArmConnection
 from service.core.run.lifecycle import Phase
 from service.core.run.noted import MOTION_PLAN, Mending, NotedMotionPlan
 from service.core.text.counts import counted
@@ -72,6 +73,17 @@ class Failure:
     error: str
     message: str
     recovery: Literal["retry", "ask", "abort"]
+    at_utc: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FailedTries:
+    """What failed last in a step and has not succeeded since, while nobody has decided anything."""
+
+    what: str  # a viewpoint; "": the work of the step as a whole
+    times: int
+    message: str
+    at_utc: str  # of the last time
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +124,7 @@ class StepState:
     passed_sha256: str = ""  # of the step_passed event: what the signature of an irreversible step binds
     passed_seq: int = 0
     failure: Failure | None = None
+    tries: FailedTries | None = None
     failures: int = 0  # consecutive failures without a captured viewpoint or a confirmation in between
     # Viewpoints, notes and jobs are kept by a retry and cleared by a redo.
     captured: Mapping[str, int] = field(default_factory=dict[str, int])  # viewpoint → seq of its event
@@ -199,6 +212,17 @@ class Leave:
 
 
 @dataclass(frozen=True, slots=True)
+class Lapse:
+    """A leave to move that is over because nothing visible came of it for too long, until somebody gives another."""
+
+    seq: int  # of the event
+    by: str  # who had given it
+    idle_s: float
+    limit_s: float
+    why: str  # what the run had waited for; "" if it is not known
+
+
+@dataclass(frozen=True, slots=True)
 class Correction:
     """A recorded RecordCorrected with its sequence number and the person who made it."""
 
@@ -229,6 +253,7 @@ class RunState:
     steps: Mapping[str, StepState]
     status: Status = "active"
     seq: int = 0  # of the last event; 0: nothing recorded yet
+    at_utc: str = ""  # of the last event
     run_id: str = ""
     operator: str = ""
     simulated: bool = False
@@ -237,6 +262,8 @@ class RunState:
     sessions: int = 0
     restarted: bool = False  # a new process drives the run, and nobody has confirmed or resumed since
     leave: Leave | None = None  # the newest one in this session; each arm takes it once
+    lapse: Lapse | None = None  # of the leave, if nobody has given another since
+    arms: Mapping[str, ArmConnection] = field(default_factory=dict[str, ArmConnection])  # by name in rig.yaml
     stop_reason: str = ""
     # The one list of what departed from the protocol: whoever counts or lists deviations takes it whole. A gate that
     # failed, a device that failed and a corrected value are none by themselves: what a person did about it is.

@@ -61,7 +61,7 @@ class BoardLooks:
             if not left:
                 return
             self.context.progress("looking for the board", len(jobs) - left, len(jobs))
-            self.context.wait(0.05)
+            self.context.wait_for_results(0.05)
 
     def of(self, step: str) -> list[SearchedBoardImage]:
         """Every valid image of a step that has been searched, with what was found."""

@@ -266,7 +266,7 @@ class LiveAnalysis:
                 self.context.note("live_numbers_late", images=left)
                 return
             self.context.progress("analysing the last images", len(waiting) - left, len(waiting))
-            self.context.wait(0.1)
+            self.context.wait_for_results(0.1)
 
     def _tell(self) -> None:
         for kind, describe in _DESCRIBED.items():

@@ -52,19 +52,23 @@ def move_and_settle(
 ) -> SettleReport:
     """Move to joints (N,) and return when the pose stream is quiet. `meanwhile` is called after the motion has begun.
 
-    Raises SafetyStopError, DeviceTimeoutError (the arm is stopped), StepInterruptedError (the arm stands still).
+    Raises SafetyStopError, DeviceTimeoutError (the arm is stopped), StepInterruptedError (the arm stands still; it
+    did not set out if the confirmation was too long ago).
     """
-    try:
-        robot.move_joints(target_rad, speed_rad_s=limits.speed_rad_s, acceleration_rad_s2=limits.acceleration_rad_s2)
-        meanwhile()
-        return _wait_settled(context, robot, limits, criteria)
-    except StepInterruptedError:
-        _stand_still(context, robot, criteria)
-        raise
-    except BaseException:  # also for defects and Ctrl-C, because the arm would move on unsupervised
-        with suppress(DeviceError):
-            robot.stop()
-        raise
+    with context.motion():
+        try:
+            robot.move_joints(
+                target_rad, speed_rad_s=limits.speed_rad_s, acceleration_rad_s2=limits.acceleration_rad_s2
+            )
+            meanwhile()
+            return _wait_settled(context, robot, limits, criteria)
+        except StepInterruptedError:
+            _stand_still(context, robot, criteria)
+            raise
+        except BaseException:  # also for defects and Ctrl-C, because the arm would move on unsupervised
+            with suppress(DeviceError):
+                robot.stop()
+            raise
 
 
 def require_there(robot_name: str, joints_rad: Array, sent_rad: Array, *, step: str) -> None:

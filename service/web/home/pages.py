@@ -16,6 +16,7 @@ from service.core.errors import OrthocaptureError
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
 from service.core.records.entered import RunAbout
 from service.core.records.events import RunStarted
+from service.core.run.connections import lost_arms
 from service.core.run.decide import AskOperator, decide
 from service.core.run.state import RunState
 from service.people.approvals import ProtocolStanding, difference, standing_of
@@ -23,7 +24,8 @@ from service.steps import params_models
 from service.store.files.space_used import forecast_of
 from service.store.records import RunRow
 from service.web.page.rendering import render
-from service.web.page.run_frame import driven_frames, robot_banner
+from service.web.page.robot_banner import robot_banner
+from service.web.page.run_frame import driven_frames
 from service.web.page.run_words import stopped_words
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
@@ -164,11 +166,12 @@ def _line(site: Site, row: RunRow) -> RunLine:
     from service.monitor.snapshot import read_snapshot  # noqa: PLC0415
 
     robot, standing, why = "", ("", ""), ""
-    if not state.terminal:
+    if not state.terminal or lost_arms(state):  # an arm that nobody has looked at outlasts its run
         now_utc_s = site.store.clock.utc_s()
         snapshot, driven = read_snapshot(site.data, row.run_id, now_utc_s), site.launcher.driven(row.run_id)
         robot = robot_banner(state, snapshot, now_utc_s, driven=driven).title
-        standing, why = _standing(log.protocol, state, driven=driven)
+        if not state.terminal:
+            standing, why = _standing(log.protocol, state, driven=driven)
     return RunLine(
         run_id=row.run_id,
         title=log.protocol.title,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from datetime import datetime
 from functools import partial
 from itertools import takewhile
 from typing import TYPE_CHECKING, Any, cast
@@ -20,8 +19,10 @@ if TYPE_CHECKING:
     from service.audit.record.event_rows import EventRow
 
 from service.core.records.entered import RunAbout, about_rows
+from service.core.text.clock_time import local_time
 from service.core.text.counts import counted
-from service.web.page.run_frame import LOST, driven_frames
+from service.web.page.robot_banner import LOST
+from service.web.page.run_frame import driven_frames
 
 _FOLDERS = (
     "audit",
@@ -45,18 +46,6 @@ TEMPLATES = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-
-
-def local_time(at_utc: str) -> str:
-    """A recorded time on the clock of this machine and its site: `10:12:03 CET`; "" where that is UTC itself."""
-    try:
-        there = datetime.fromisoformat(at_utc).astimezone()
-    except ValueError:
-        return ""
-    if not there.utcoffset():
-        return ""
-    day = f"{there:%Y-%m-%d} " if f"{there:%Y-%m-%d}" != at_utc[:10] else ""
-    return f"{day}{there:%H:%M:%S} {there.tzname()}"
 
 
 def kept_in_a_row(rows: Sequence[EventRow], start: int) -> int:

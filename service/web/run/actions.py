@@ -20,12 +20,15 @@ from service.core.records.events import (
     JobFailed,
     JobFinished,
     OperatorAction,
+    Payload,
     RecordedView,
+    RobotSeen,
     SessionStarted,
     StepNote,
 )
 from service.core.recovery.reasons import full_reason
 from service.core.run.actions import needs_leave, redo_moves, refuse
+from service.core.run.connections import connected_arms, lost_arms
 from service.core.run.state import RunState
 from service.people.approvals import approve, standing_of
 from service.people.authorisation import Identity, identity_for
@@ -45,22 +48,19 @@ router = APIRouter(tags=["acting"])
 Short = Annotated[str, Form(max_length=200)]
 Words = Annotated[str, Form(max_length=2000)]
 Number = Annotated[int, Form(ge=0, le=2**31)]
-<<<<<<< HEAD
 DECIDE_AGAIN = "Close the form, read what the page shows now, and decide again; nothing was done"
-=======
 _WITHOUT_CONTROL = ("pause", "sign", "accept")
->>>>>>> h36-release
 # Events that change nothing on the page on which the person decided.
 _HARMLESS = (
     NoteTaken,
     ActionRefused,
     ControlTaken,
     DeviceOpened,
-    DeviceTrouble,
     ItemTicked,
     JobEnqueued,
     JobFailed,
     JobFinished,
+    RobotSeen,
     SessionStarted,
     StepNote,
     RecordedView,
@@ -141,6 +141,27 @@ def tick(
     return back_to(run_id)
 
 
+@router.post("/runs/{run_id}/robot-seen", name="robot_seen", dependencies=[Depends(requires("operate"))])
+def robot_seen(
+    site: CurrentSite, person: SignedInPerson, run_id: RunId, device: Short, lost_seq: Number
+) -> RedirectResponse:
+    """Record that the person has looked at an arm whose connection was lost. Nothing moves by it.
+
+    It needs no control of the run: whoever stands where the arm can be seen says it.
+    """
+    log = site.run(run_id)
+    loss = lost_arms(log.state).get(device)
+    left_alone = device in connected_arms(log.state) and not site.launcher.driven(run_id)
+    if (loss is None and not left_alone) or lost_seq != (0 if loss is None else loss.seq):
+        raise IllegalTransitionError(
+            f"the page was out of date: that is not how it stands with {device} any more",
+            where=device,
+            remedy="Read what the banner says now; nothing was recorded",
+        )
+    site.store.record(run_id, [RobotSeen(device=device, lost_seq=lost_seq)], actor=person.account)
+    return back_to(run_id)
+
+
 @router.post(
     "/runs/{run_id}/actions", name="act", dependencies=[Depends(requires("operate", while_locked=("pause",)))]
 )
@@ -218,7 +239,7 @@ def _require_current(log: RunRecord, step: str, attempt: int, seen_seq: int) -> 
     """A page that shows an earlier question must not answer a later one."""
     state = log.state
     since = (event.payload for event in log.events[seen_seq:])
-    if (step, attempt) != (state.current, state.step.attempt) or not all(isinstance(p, _HARMLESS) for p in since):
+    if (step, attempt) != (state.current, state.step.attempt) or not all(map(_harmless, since)):
         raise _out_of_date(state)
 
 
@@ -239,6 +260,13 @@ def _require_same_redo(log: RunRecord, form: ActionForm) -> None:
     else:
         return
     raise IllegalTransitionError(what, where=form.step, remedy=DECIDE_AGAIN)
+
+
+def _harmless(payload: Payload) -> bool:
+    """Whether an event leaves the page as it was; the loss of an arm is to be read before it is confirmed."""
+    if isinstance(payload, DeviceTrouble):
+        return payload.connection in ("", "refused")
+    return isinstance(payload, _HARMLESS)
 
 
 def _out_of_date(state: RunState) -> IllegalTransitionError:

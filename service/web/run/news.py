@@ -76,11 +76,7 @@ def _signed_in(site: Site, token: str) -> Person | None:
 
 
 def newest(site: Site, run_id: str) -> tuple[int, int]:
-<<<<<<< HEAD
-    """The last event, and a number that changes with the runner's reports, its silence, and who has control.
-=======
     """The last event, and a number that changes with the runner's reports, its silence, control, and a coat's age.
->>>>>>> h36-release
 
     Who asks for control, and whether that was refused, are no events of the run: they are rows of the site.
     """

@@ -13,8 +13,11 @@ from service.core.protocol.models import Protocol, Step
 from service.core.records.events import Event, ItemTicked, OperatorAction, OperatorVerb
 from service.core.recovery.ways_on import WayOn, takes_words
 from service.core.run.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
-from service.core.run.decide import AskOperator, decide
+from service.core.run.connections import lost_arms
+from service.core.run.decide import AskOperator, decide, lapsed_words
 from service.core.run.state import RunState
+from service.core.run.tries import tries_words
+from service.core.text.clock_time import time_here
 from service.dataset.registrations import evaluated
 from service.monitor.snapshot import STOPS, Snapshot
 from service.web.page.run_words import (
@@ -97,6 +100,7 @@ def run_view(
         progress=capture_progress(protocol, state, log.events),
         readings=readings(snapshot, space, clock_readings(log.events)),
         working=(snapshot.what, snapshot.done, snapshot.total) if snapshot.doing == "working" else ("", 0, 0),
+        tries=tries_words(protocol, state, time_here),
         deviations=tuple(reversed(state.deviations)),
         news=tuple((m.at_utc, m.text) for m in reversed(snapshot.messages)),
         to_come=tuple(to_come),
@@ -134,7 +138,9 @@ def _question(log: RecordOfRun, snapshot: Snapshot, decision: object, mode: str,
         options=_options(decision, state),
         can_pause=mode not in ("ended", "died", "paused") and may_operate,
         asked_anew=needs_leave(protocol, state) and mode in ("ask", "more", "recover"),
-        standing=snapshot.doing == "paused" and snapshot.robot != "moving",
+        lapsed=sentence(lapsed_words(state.lapse)) if state.lapse is not None and not state.restarted else "",
+        standing=snapshot.doing == "paused" and snapshot.robot == "standing" and not lost_arms(state),
+        paused=_paused_words(state, snapshot),
         more=_more(state) if mode == "more" else None,
         trouble=None if mode == "more" else _trouble(protocol, state, decision),
         ways=_ways(decision, mode),
@@ -143,6 +149,18 @@ def _question(log: RecordOfRun, snapshot: Snapshot, decision: object, mode: str,
         redos=() if state.terminal else tuple(_redo(protocol, state, s) for s in redoable_steps(protocol, state)),
         skip_overrides=bool(state.step.verdicts) and not state.step.gates_passed,
     )
+
+
+def _paused_words(state: RunState, snapshot: Snapshot) -> str:
+    """How it stands with a paused run and its robot; what is not known to stand still is not said to."""
+    if snapshot.doing != "paused" or snapshot.robot == "moving":
+        return "Pausing… the robot may still move."
+    if lost_arms(state):
+        return "Paused. Take the robot as moving: nobody has looked since its connection was lost."
+    if snapshot.robot in STOPS:
+        return f"Paused. The robot reports: {snapshot.robot.replace('_', ' ')}."
+    told = {"standing": "The robot stands still.", "not_connected": "The robot is not connected."}
+    return f"Paused. {told.get(snapshot.robot, 'The robot does not answer: take it as moving.')}"
 
 
 def _mode(state: RunState, decision: object, *, driven: bool) -> str:
@@ -222,6 +240,10 @@ def _main(protocol: Protocol, state: RunState, decision: object, mode: str, *, s
     main = _wanted(protocol, state, decision, mode)
     if main is not None and main.hold and stopped:
         return replace(main, enabled=False, why_not="The robot is stopped. Clear the stop at the robot first.")
+    lost = lost_arms(state)
+    if main is not None and main.hold and lost:
+        look = f"You say with it that you have looked at {' and '.join(lost)}, whose connection was lost."
+        return replace(main, note=f"{look} {main.note}")
     return main
 
 

@@ -206,8 +206,11 @@ class Question:
         main: the one large button; None if there is nothing to press.
         options: further actions.
         can_pause: whether this person can pause the run.
-        asked_anew: the program that drove the robot has ended, so nothing moves before somebody confirms again.
-        standing: the run is paused and the robot stands still.
+        asked_anew: the program that drove the robot has ended, or the confirmation was too long ago, so nothing moves
+            before somebody confirms again.
+        lapsed: why the confirmation no longer holds; "" where the program has ended.
+        standing: the run is paused and the robot is known to stand still.
+        paused: how it stands with a paused run and its robot, in words.
         more: what the step asks for in its normal course; None for nothing, or where something went wrong.
         trouble: why the run is stopped; None if it is not.
         ways: what can be done about that, the recommended one first.
@@ -221,8 +224,10 @@ class Question:
     options: tuple[OperatorVerb, ...]
     can_pause: bool
     asked_anew: bool
+    lapsed: str
     standing: bool
     more: StepMore | None
+    paused: str
     trouble: StepTrouble | None
     ways: tuple[Choice, ...]
     signature: SignedContent | None
@@ -252,6 +257,7 @@ class RunView:
     progress: CaptureProgress
     readings: tuple[Reading, ...]
     working: tuple[str, int, int]
+    tries: str  # what failed and is tried again by itself, in words; "" for nothing
     deviations: tuple[Deviation, ...]
     news: tuple[tuple[str, str], ...]
     to_come: tuple[str, ...]  # results that are still being computed, with the time left

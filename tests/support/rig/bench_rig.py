@@ -41,7 +41,7 @@ from service.core.run.state import RunState
 from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, LensSection, OpticsSection
 from service.runner.operator import AnswerBy
-from service.steps.context import FurtherCamera, LeaveToMove, StationLayout
+from service.steps.context import ConnectionEnd, FurtherCamera, LeaveToMove, StationLayout
 from service.store.durable_effects import Clock, SystemClock
 from tests.support.rig.bench_lightbox import BenchLightbox
 
@@ -178,6 +178,7 @@ class BenchCamera:
     connected: bool = False
     opened: int = 0
     exposures: int = 0
+    arrivals_s: list[float] = field(default_factory=list[float])  # monotonic time of each image that arrived
     applied: CameraSettings | None = None
     # Presses of its own button that were not collected yet; not None: settings to which the dials were turned.
     pressed: list[CameraSettings | None] = field(default_factory=list[CameraSettings | None])
@@ -215,6 +216,7 @@ class BenchCamera:
         path = folder / f"DSC{self.exposures:05d}.JPG"
         assert cv2.imwrite(str(path), picture)
         self.clock.sleep(EXPOSURE_S)
+        self.arrivals_s.append(self.clock.monotonic_s())
         data = path.read_bytes()
         jpeg = CapturedFile(path, path.name, hashlib.sha256(data).hexdigest(), len(data), "image/jpeg")
         return CapturedImage(
@@ -252,6 +254,7 @@ class BenchRig:
     card: Camera | None = None  # instead of it: a camera without a cable
     box: BenchLightbox | None = field(default_factory=BenchLightbox)
     further: tuple[FurtherCamera, ...] = ()
+    ended: list[ConnectionEnd] = field(default_factory=list[ConnectionEnd])  # of which the runner is told next
     _on_open: Callable[[str, DeviceReport], None] | None = None
 
     def keep_time(self, clock: Clock) -> None:
@@ -315,6 +318,10 @@ class BenchRig:
 
     def watch(self, on_open: Callable[[str, DeviceReport], None], before_open: Callable[[str], None]) -> None:
         self._on_open = on_open
+
+    def ended_connections(self) -> tuple[ConnectionEnd, ...]:
+        ended, self.ended = tuple(self.ended), []
+        return ended
 
     def reopen(self, device: Device) -> None:
         device.close()

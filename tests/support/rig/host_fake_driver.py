@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from drivers.errors import SafetyStopError
+from drivers.errors import DeviceUnavailableError, SafetyStopError
 from drivers.interfaces import Array, Device, DeviceIdentity, DeviceReport
 from drivers.plugin import DriverConfig, DriverSpec
 
@@ -37,6 +37,7 @@ class Fake(Device, Protocol):
     def hang(self, seconds: float) -> None: ...
     def hear(self, count: int) -> None: ...
     def refuse(self) -> None: ...
+    def lose_link(self) -> None: ...
     def blunder(self) -> None: ...
     def unpicklable(self) -> object: ...
     def talk(self) -> None: ...
@@ -83,6 +84,9 @@ class FakeDriver:
 
     def crash_later(self, delay_s: float) -> None:
         subprocess.Popen([sys.executable, "-c", f"import os,time; time.sleep({delay_s}); os.kill({os.getpid()}, 11)"])
+
+    def lose_link(self) -> None:
+        raise DeviceUnavailableError("the controller does not answer", where="here")
 
     def hang(self, seconds: float) -> None:
         if self._config.hangs is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from service.core.protocol.models import parse_protocol
+from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import OperatorAction, ViewpointCaptured
 from service.core.run.fold import fold
 from service.core.run.state import RunState
@@ -83,6 +83,11 @@ class Bench:
         clock = self.store.clock
         assert isinstance(clock, SteppedClock)
         return clock
+
+    @property
+    def protocol(self) -> Protocol:
+        """The recorded protocol."""
+        return recorded_run(self.store, self.run_id)[0]
 
     def run(self) -> RunState:
         """Run one runner process to its end."""

@@ -17,11 +17,13 @@ from service.core.records.events.operator import (
     OperatorAction,
     RecordCorrected,
     RegionDrawn,
+    RobotSeen,
     RunReleased,
 )
 from service.core.records.events.run import (
     DeviceOpened,
     DeviceTrouble,
+    LeaveLapsed,
     RunAborted,
     RunCompleted,
     RunStarted,
@@ -59,6 +61,7 @@ Payload = Annotated[
     | SessionStarted
     | DeviceOpened
     | DeviceTrouble
+    | LeaveLapsed
     | StepStarted
     | StepNote
     | FilesKept
@@ -79,6 +82,7 @@ Payload = Annotated[
     | RunCompleted
     | RunAborted
     | ItemTicked
+    | RobotSeen
     | NoteTaken
     | ControlTaken
     | RecordCorrected

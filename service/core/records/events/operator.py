@@ -47,6 +47,14 @@ class ItemTicked(Record):
     ticked: bool
 
 
+class RobotSeen(Record):
+    """A person has looked at an arm whose connection was lost: it stands still, and nobody is within its reach."""
+
+    kind: Literal["robot_seen"] = "robot_seen"
+    device: str  # name in rig.yaml
+    lost_seq: int = 0  # of the event that told of the loss; 0: the program had ended, which no event told yet
+
+
 class ControlTaken(Record):
     """From now on only one screen may act on the run; the others may only watch."""
 

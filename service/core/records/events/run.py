@@ -62,6 +62,18 @@ class DeviceTrouble(Record):
     error: str
     message: str
     data_safe: bool = True
+    # How the connection to an arm ended with it, or that none could be made; "" where it did not end.
+    connection: Literal["", "died", "stalled", "broken", "refused"] = ""
+
+
+class LeaveLapsed(Record):
+    """A person's confirmation that the robot may move is over: nothing visible came of it for too long."""
+
+    kind: Literal["leave_lapsed"] = "leave_lapsed"
+    leave_seq: int  # of the event that gave it
+    idle_s: float  # without visible progress since then, or since the last progress
+    limit_s: float  # of the protocol: motion.confirmed_for_s
+    why: str = ""  # what the run had waited for, in words; "" if it is not known
 
 
 class RunCompleted(Record):

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 from service.core.protocol.models import Protocol
 from service.core.records.events import (
-    DeviceTrouble,
     Event,
     FilesKept,
     RunAborted,
@@ -15,8 +14,9 @@ from service.core.records.events import (
     SessionStarted,
 )
 from service.core.run.actions import needs_leave
+from service.core.run.effects.arms import connections_ended
 from service.core.run.effects.place import impossible, is_void, triggered, without_effect
-from service.core.run.state import RunState, Trouble
+from service.core.run.state import RunState
 from service.core.run.state_transitions import change
 
 
@@ -36,15 +36,11 @@ def run_started(protocol: Protocol, state: RunState, event: Event, p: RunStarted
 
 
 def session_started(protocol: Protocol, state: RunState, event: Event, p: SessionStarted) -> RunState:
-    """The runner began or resumed; a resumed run needs a new leave to move."""
+    """The runner began or resumed; a resumed run needs a new leave to move, and its arms count as moving."""
+    state = connections_ended(state, event) if p.resumed else state
     state = replace(state, sessions=state.sessions + 1, restarted=p.resumed, leave=None if p.resumed else state.leave)
     # Whoever lets the robot move again must check again: the ticks were made before the program ended.
     return change(state, state.current, ticked=()) if needs_leave(protocol, state) else state
-
-
-def device_trouble(protocol: Protocol, state: RunState, event: Event, p: DeviceTrouble) -> RunState:
-    """List a device's trouble."""
-    return replace(state, troubles=(*state.troubles, Trouble(event.seq, p.device, p.error, p.message)))
 
 
 def files_kept(protocol: Protocol, state: RunState, event: Event, p: FilesKept) -> RunState:

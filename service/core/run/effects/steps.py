@@ -19,7 +19,7 @@ from service.core.records.events import (
 )
 from service.core.run.actions import unmet_requirements
 from service.core.run.effects.place import impossible, is_void, is_void_now, triggered, without_effect
-from service.core.run.state import Failure, Note, RunState
+from service.core.run.state import FailedTries, Failure, Note, RunState
 from service.core.run.state_transitions import UNMEASURED, change, pass_on, seconds_between
 
 
@@ -66,6 +66,7 @@ def step_measured(protocol: Protocol, state: RunState, event: Event, p: StepMeas
         uncertainties=p.uncertainties,
         computed_by=p.computed_by,
         failures=0,
+        tries=None,
         worked_s=worked_s(state, event),
     )
 
@@ -74,8 +75,12 @@ def step_failed(protocol: Protocol, state: RunState, event: Event, p: StepFailed
     """Keep why a step failed."""
     if is_void_now(state, event, p.step, p.attempt):
         return without_effect(state, event)
-    failure = Failure(event.seq, p.error, p.message, p.recovery)
-    changes = {"failure": failure, "failures": state.step.failures + 1, "worked_s": worked_s(state, event)}
+    failure = Failure(event.seq, p.error, p.message, p.recovery, event.at_utc)
+    failures = state.step.failures + 1
+    tries = state.step.tries
+    if tries is None or tries.message != p.message:  # else it is the failure of a viewpoint, told before
+        tries = FailedTries("", failures, p.message, event.at_utc)
+    changes = {"failure": failure, "failures": failures, "tries": tries, "worked_s": worked_s(state, event)}
     return triggered(protocol, state, event, "failed", **changes)
 
 

@@ -8,7 +8,7 @@ from service.core.protocol.models import Protocol
 from service.core.records.events import CaptureAsked, Event, RecordedView, ViewImported, ViewpointFailed
 from service.core.run.effects.place import is_void_now, require_running, without_effect
 from service.core.run.persistent_map import put
-from service.core.run.state import RunState
+from service.core.run.state import FailedTries, RunState
 from service.core.run.state_transitions import change, deviate, seconds_between, supersede
 
 _VIEWS_TIMED = 30  # number of latest views whose median gap estimates the time per view
@@ -47,6 +47,7 @@ def view_added(protocol: Protocol, state: RunState, event: Event, p: RecordedVie
         captured=put(now.captured, p.viewpoint, event.seq),
         skipped_viewpoints=tuple(name for name in now.skipped_viewpoints if name != p.viewpoint),
         failures=0,
+        tries=None,
     )
 
 
@@ -68,8 +69,10 @@ def viewpoint_failed(protocol: Protocol, state: RunState, event: Event, p: Viewp
     require_running(state, event)
     now = state.step
     counts = put(now.viewpoint_failures, p.viewpoint, now.viewpoint_failures.get(p.viewpoint, 0) + 1)
-    given_up = now.skipped_viewpoints
+    given_up, tries = now.skipped_viewpoints, now.tries
     if p.skipped and p.viewpoint not in given_up:
         given_up = (*given_up, p.viewpoint)
         state = deviate(state, event, "viewpoint_skipped", p.step, f"{p.viewpoint} given up: {p.message}")
-    return change(state, p.step, viewpoint_failures=counts, skipped_viewpoints=given_up)
+    if not p.skipped:
+        tries = FailedTries(p.viewpoint, counts[p.viewpoint], p.message, event.at_utc)
+    return change(state, p.step, viewpoint_failures=counts, skipped_viewpoints=given_up, tries=tries)

@@ -1,0 +1,273 @@
+"""The robot banner: what every page of a run says of its robots; what is not known is shown as unknown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Literal
+
+from service.core.run.connections import Loss, connected_arms, lost_arms
+from service.core.run.state import RunState
+from service.core.text.clock_time import time_here
+from service.monitor.snapshot import STALE_S, Snapshot
+
+Tone = Literal["moving", "standing", "paused", "unknown", "stop"]
+NOT_THE_STOP = "This screen is not the emergency stop."
+_TAKE_IT = "Robot: take it as moving."
+_FROM_OUTSIDE = "If it moves, press the emergency stop."
+_AS_MOVING = "It counts as moving until a person has looked: stay outside of its reach."
+_AT_THE_ROBOT = "This software cannot clear a stop; a person does it at the robot, and nothing moves again by itself."
+
+
+@dataclass(frozen=True, slots=True)
+class LookAt:
+    """An arm that a person is asked to look at, and the event that this answers."""
+
+    arm: str  # name in rig.yaml
+    lost_seq: int
+
+
+@dataclass(frozen=True, slots=True)
+class Banner:
+    """The state of the robot, in words."""
+
+    key: str  # moving, standing, paused, pausing, protective_stop …
+    tone: Tone
+    icon: str
+    title: str
+    text: str
+    remedy: str = ""  # what a person does at the robot
+    assertive: bool = False  # screen readers interrupt for it
+    look: tuple[LookAt, ...] = ()  # what a person can say here to have looked at
+
+
+LOST = Banner(
+    "unknown",
+    "unknown",
+    "unknown",
+    "Robots: unknown.",
+    f"The connection to the service is lost. Take every robot as moving. {NOT_THE_STOP}",
+)
+
+
+def robot_banner(state: RunState, snapshot: Snapshot, now_utc_s: float, *, driven: bool, tries: str = "") -> Banner:
+    """What to say of the robot; what is not known for certain is shown as unknown.
+
+    Args:
+        state: of the run.
+        snapshot: the last word of the program that drives it.
+        now_utc_s: now, in seconds since the epoch.
+        driven: whether that program runs.
+        tries: what failed and is tried again by itself, in words; "" for nothing.
+    """
+    lost = lost_arms(state)
+    banner = _present(state, snapshot, now_utc_s, tries, driven=driven)
+    if not lost:
+        return banner
+    look = tuple(LookAt(name, loss.seq) for name, loss in lost.items())
+    words = " ".join(_loss_words(name, loss) for name, loss in lost.items())
+    if banner.tone in ("stop", "moving") or banner.key == "pausing":
+        return replace(banner, text=f"{banner.text} {words} {_AS_MOVING}", look=look)
+    ended = "The run has ended. " if state.terminal else ""
+    now = _now_words(snapshot) if driven and not state.terminal else ""
+    text = f"{ended}{words} {now}{_AS_MOVING} {_FROM_OUTSIDE} {NOT_THE_STOP}"
+    return Banner("lost", "unknown", "unknown", _TAKE_IT, text, assertive=True, look=look)
+
+
+def _loss_words(name: str, loss: Loss) -> str:
+    since = time_here(loss.since_utc)
+    return f"The connection to {name} was lost at {since}, {loss.how}; nobody has looked at it since."
+
+
+def _now_words(snapshot: Snapshot) -> str:
+    """What the program says now, beside a loss that nobody has looked at."""
+    told = {"standing": "It reports now that it stands still. ", "not_connected": "It is not connected now. "}
+    busy = busy_words(snapshot)
+    return told.get(snapshot.robot, "") + (f"Now: {busy}. " if busy else "")
+
+
+def _present(  # noqa: PLR0911 - one return a case
+    state: RunState, snapshot: Snapshot, now_utc_s: float, tries: str, *, driven: bool
+) -> Banner:
+    """What to say of the robot as if every loss of a connection had been seen to."""
+    if snapshot.doing in ("unknown", "ended") and not driven and connected_arms(state) and _left(state, snapshot):
+        return _left_alone(state, snapshot)
+    if state.terminal:
+        return Banner("ended", "standing", "end", "The run has ended.", "It drives no robot any more.")
+    if snapshot.doing in ("unknown", "ended"):
+        return _silent(snapshot, now_utc_s, driven=driven)
+    if snapshot.doing == "starting" and connected_arms(state):
+        text = f"The program that drove it has ended, and starts again. {_AS_MOVING} {NOT_THE_STOP}"
+        return Banner("lost", "unknown", "unknown", _TAKE_IT, text)
+    if snapshot.doing == "starting":
+        text = f"It has moved nothing yet, and asks before it does. {NOT_THE_STOP}"
+        return Banner("starting", "standing", "open", "The program that drives the robot is starting.", text)
+    if snapshot.robot_silent_s > STALE_S and snapshot.robot != "not_connected":
+        return _not_heard_of(snapshot)
+    stop = _STOPS.get(snapshot.robot)
+    if stop is not None:
+        return stop
+    if snapshot.robot == "moving":
+        return _moving(state, snapshot, tries)
+    if snapshot.robot == "not_connected":
+        return _not_connected(state, snapshot, tries)
+    if state.paused:
+        if snapshot.doing == "paused":
+            return Banner(
+                "paused", "paused", "pause", "Paused. The robot stands still.", "It moves only after Resume."
+            )
+        return Banner("pausing", "paused", "pause", "Pausing…", "The robot may still move. Wait for Paused.")
+    if snapshot.doing != "working":
+        return Banner("standing", "standing", "standing", "The robot stands still.", NOT_THE_STOP)
+    text = f"{_again(tries)}{_busy(snapshot)}It may move at any moment."
+    return Banner("standing", "standing", "standing", "The robot stands still.", text)
+
+
+def _again(tries: str) -> str:
+    return f"{tries}. " if tries else ""
+
+
+def _not_connected(state: RunState, snapshot: Snapshot, tries: str) -> Banner:
+    """No arm is connected: never yet, not any more, or because it could not be."""
+    title = "Paused. The robot is not connected." if state.paused else "Robot not connected."
+    if connected_arms(state):
+        text = f"It was connected, and is being connected again. Take it as moving. {NOT_THE_STOP}"
+        return Banner("unknown", "unknown", "unknown", title, text)
+    said: list[str] = []
+    for name, arm in state.arms.items():
+        if arm.seen_utc:
+            lost, seen = time_here(arm.lost_utc), time_here(arm.seen_utc)
+            said.append(f"The connection to {name} was lost at {lost}; {arm.seen_by} looked at it at {seen}.")
+        if arm.refused_utc:
+            said.append(f"{name} could not be connected at {time_here(arm.refused_utc)}: {arm.refused_why}.")
+    busy = busy_words(snapshot)
+    now = f" Now: {busy}." if busy else ""
+    why = " ".join(said) or "Nothing has needed it so far."
+    text = f"{_again(tries)}{why}{now} Its own pendant can still move it."
+    return Banner("not_connected", "paused" if state.paused else "standing", "open", title, text)
+
+
+def _left(state: RunState, snapshot: Snapshot) -> bool:
+    """Whether the program that drove the run ended without closing its connections in an orderly way at the end."""
+    return not state.terminal or (snapshot.doing == "unknown" and snapshot.at_utc_s > 0)
+
+
+def _left_alone(state: RunState, snapshot: Snapshot) -> Banner:
+    """The program ended while arms were connected; that is not in the record before it starts again."""
+    arms = connected_arms(state)
+    at_utc = datetime.fromtimestamp(snapshot.at_utc_s, UTC).isoformat() if snapshot.at_utc_s else state.at_utc
+    ended = "The run has ended. " if state.terminal else ""
+    text = (
+        f"{ended}The program that drove {' and '.join(arms)} does not run; it was last heard from at "
+        f"{time_here(at_utc)}, and nobody has looked since. {_AS_MOVING} {_FROM_OUTSIDE} {NOT_THE_STOP}"
+    )
+    look = tuple(LookAt(name, 0) for name in arms)
+    return Banner("lost", "unknown", "unknown", _TAKE_IT, text, assertive=True, look=look)
+
+
+def busy_words(snapshot: Snapshot) -> str:
+    """What the program is doing, and for how long; "" if it does not take long.
+
+    A call without a description of its own is described by the work it belongs to, so that a hang is visible.
+    """
+    if snapshot.lasting:
+        return f"{snapshot.activity}, for {snapshot.activity_s:.0f} s{_starved(snapshot)}"
+    if snapshot.quiet_s > STALE_S:
+        what = snapshot.what or "something that it does not report"
+        return f"{what}, for {snapshot.quiet_s:.0f} s{_starved(snapshot)}"
+    return ""
+
+
+def _starved(snapshot: Snapshot) -> str:
+    """That the computer is too busy, where that is a good part of the time."""
+    if snapshot.starved_s < max(1.0, 0.2 * snapshot.quiet_s):
+        return ""
+    return f", of which it waited {snapshot.starved_s:.0f} s for a processor"
+
+
+def _busy(snapshot: Snapshot) -> str:
+    words = busy_words(snapshot)
+    if not words:
+        return "A step is under way. "
+    hangs = " It hears no button before that is done." if snapshot.quiet_s > STALE_S else ""
+    return f"Now: {words}.{hangs} "
+
+
+def _not_heard_of(snapshot: Snapshot) -> Banner:
+    text = (
+        f"It has not been heard of for {snapshot.robot_silent_s:.0f} s, in which the program that drives it is at: "
+        f"{busy_words(snapshot) or 'its work'}. Look at the robot. {NOT_THE_STOP}"
+    )
+    return Banner("unknown", "unknown", "unknown", "Robot: unknown.", text)
+
+
+def _silent(snapshot: Snapshot, now_utc_s: float, *, driven: bool) -> Banner:
+    if driven:
+        title = "Robot: unknown."
+        since = f" for {snapshot.age_s(now_utc_s):.0f} s" if snapshot.at_utc_s else " yet"
+        last = f" The last word was: {snapshot.activity}." if snapshot.activity else ""
+        text = f"The program that drives it has not told anything{since}.{last} Look at the robot."
+    else:
+        title, text = "Robot: unknown.", "The program that drives it does not run. Look at the robot."
+    return Banner("unknown", "unknown", "unknown", title, f"{text} {NOT_THE_STOP}")
+
+
+def _moving(state: RunState, snapshot: Snapshot, tries: str) -> Banner:
+    if state.paused or snapshot.doing in ("pausing", "paused"):
+        return Banner("pausing", "paused", "pause", "Pausing…", "The robot still moves. Wait for Paused.")
+    speed = "" if snapshot.speed_fraction is None else f" Speed slider {snapshot.speed_fraction:.0%}."
+    now = f" Now: {busy_words(snapshot)}." if busy_words(snapshot) else ""
+    text = f"Stay outside of its reach. {_again(tries)}{speed.strip()}{now} {NOT_THE_STOP}"
+    return Banner("moving", "moving", "moving", "The robot moves.", " ".join(text.split()))
+
+
+_STOPS: dict[str, Banner] = {
+    "emergency_stop": Banner(
+        "emergency_stop",
+        "stop",
+        "stop",
+        "Emergency stop.",
+        "The robot is stopped and without power. What was captured is safe.",
+        "Make sure that nobody is in danger and find out why it was pressed. Then, at the robot: release the "
+        "emergency stop button, confirm on the teach pendant, switch the arm on and release its brakes. "
+        + _AT_THE_ROBOT,
+        assertive=True,
+    ),
+    "protective_stop": Banner(
+        "protective_stop",
+        "stop",
+        "stop",
+        "Protective stop.",
+        "The robot stopped itself: it touched something, or a limit was near. What was captured is safe.",
+        "Look at what it touched and clear its path. Check that specimen, spheres and camera have not moved. Then, "
+        "on the teach pendant: wait 5 s and choose Enable robot. " + _AT_THE_ROBOT,
+        assertive=True,
+    ),
+    "safeguard_stop": Banner(
+        "safeguard_stop",
+        "stop",
+        "stop",
+        "Safeguard stop.",
+        "A door, a light curtain or a scanner holds the robot. What was captured is safe.",
+        "Leave the guarded area, close it and reset the safeguard at the robot. " + _AT_THE_ROBOT,
+        assertive=True,
+    ),
+    "fault": Banner(
+        "fault",
+        "stop",
+        "stop",
+        "The robot reports a fault.",
+        "It does not move. What was captured is safe.",
+        "Read the log on the teach pendant and do what it asks for; restart the arm there. " + _AT_THE_ROBOT,
+        assertive=True,
+    ),
+    "unknown": Banner(
+        "unknown",
+        "unknown",
+        "unknown",
+        "Robot: unknown.",
+        f"It does not answer. Take it as moving and stay outside of its reach. {NOT_THE_STOP}",
+        "Check that the controller is switched on and its network cable is in. The software goes on asking it.",
+        assertive=True,
+    ),
+}
