@@ -14,7 +14,7 @@ from service.audit.export.exports import Exports, What
 from service.audit.export.folder_zip import zip_chunks
 from service.audit.export.formats import Formats
 from service.audit.export.wanted import WantedExport
-from service.core.errors import ConfigurationError
+from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.gates.release import refuse_data_set, refuse_export, refuse_release
 from service.core.records.data_set import FIRST_VERSION, LONGEST_NAME, VERSION, DataSetStatement
 from service.core.records.events import RunReleased
@@ -191,8 +191,17 @@ def start_format_export(
 
 
 @router.post("/runs/{run_id}/exports/stop", name="stop_export", dependencies=_EXPORT)
-def stop_export(exports: CurrentExports, run_id: RunId) -> RedirectResponse:
-    """Stop the export that is running. What a format has written so far stays, so that it can go on."""
+def stop_export(
+    exports: CurrentExports, run_id: RunId, since_utc: Annotated[str, Form(max_length=64)]
+) -> RedirectResponse:
+    """Stop the export that the page showed, by when it began. What a format has written so far stays."""
+    running = exports.state(run_id)
+    if running is not None and running.pending and running.since_utc != since_utc:
+        raise IllegalTransitionError(
+            f"another export runs by now, which {running.by} has begun",
+            where=run_id,
+            remedy="Read what the page shows now and decide again; nothing was done",
+        )
     if exports.stop(run_id):
         exports.wait(run_id, _STOPPING_S)
     return _back(run_id)
