@@ -8,7 +8,10 @@ from contextlib import contextmanager
 import pytest
 from playwright.sync_api import Browser, Route, expect
 
-from service.core.records.events import OperatorAction, StepFailed, StepNote, StepStarted
+from service.core.gates.verdict import evaluate_gates
+from service.core.protocol.models import parse_protocol
+from service.core.records.events import OperatorAction, StepFailed, StepMeasured, StepNote, StepPassed, StepStarted
+from service.steps import params_models
 from service.store.store import Store
 from tests.support.pages.at_the_table import STANDING, at_the_table, record
 from tests.support.pages.browser import Screen, Served, screen, served
@@ -17,6 +20,7 @@ from tests.support.pages.web import password_of, web_site
 from tests.support.record.core import EYE
 from tests.support.recorded.calibrated_run import begin_calibrated_run, capture
 from tests.support.runs.attended import attended
+from tests.support.runs.bench_run import PROTOCOL
 
 pytestmark = [pytest.mark.timeout(300)]
 LATER_MS = 20_000
@@ -195,3 +199,29 @@ def test_who_asks_for_control_and_who_refuses_it_is_said_without_a_reload(server
         lost = mine.page.get_by_text("Emmy Noether took over control of this run from you", exact=True)
         expect(lost).to_be_visible(timeout=LATER_MS)
         expect(mine.page.get_by_text("Reason: “the specimen dries”")).to_be_visible()
+
+
+@pytest.mark.slow
+def test_a_verdict_stays_until_it_was_seen_although_the_next_step_has_begun(server: Served, browser: Browser) -> None:
+    protocol = parse_protocol(PROTOCOL.encode(), params_models(), name="bench.yaml").protocol
+    measures = {gate.measure: float(gate.min or 0.0) for gate in protocol.step("capture").gates}
+    with at_the_table(server, browser) as (tablet, run_id):
+        page = tablet.page
+        record(server, run_id, skip("fixation"), OperatorAction(action="confirm", step="capture"))
+        record(server, run_id, StepStarted(step="capture", attempt=1))
+        measured = StepMeasured(step="capture", attempt=1, measures=measures)
+        judged = evaluate_gates(protocol.step("capture"), 1, measures, frozenset())
+        record(server, run_id, measured, judged, StepPassed(step="capture", attempt=1))
+        expect(page.get_by_role("heading", name="Spray", level=1)).to_be_visible(timeout=LATER_MS)
+        verdict = page.get_by_role("region", name="Judged meanwhile")
+        expect(verdict).to_contain_text("Capture: passed")
+        expect(verdict).to_contain_text("Viewpoints captured 3 (at least 3")
+        page.reload()
+        expect(verdict).to_be_visible()
+        verdict.get_by_role("button", name="Seen").click()
+        expect(verdict).to_be_hidden()
+        note = StepNote(step="spraying", attempt=1, note="looked at", data={})
+        page.evaluate("document.addEventListener('page-changed', () => { document.body.dataset.changed = ''; })")
+        record(server, run_id, note)
+        expect(page.locator("body[data-changed]")).to_be_attached(timeout=LATER_MS)
+        expect(verdict).to_be_hidden()

@@ -213,8 +213,17 @@ def start_format_export(
 
 
 @router.post("/runs/{run_id}/exports/stop", name="stop_export", dependencies=_REPORT)
-def stop_export(exports: CurrentExports, person: SignedInPerson, run_id: RunId) -> RedirectResponse:
-    """Stop the export that is running. What a format has written so far stays, so that it can go on."""
+def stop_export(
+    exports: CurrentExports, person: SignedInPerson, run_id: RunId, since_utc: Annotated[str, Form(max_length=64)]
+) -> RedirectResponse:
+    """Stop the export that the page showed, by when it began. What a format has written so far stays."""
+    running = exports.state(run_id)
+    if running is not None and running.pending and running.since_utc != since_utc:
+        raise IllegalTransitionError(
+            f"another export runs by now, which {running.by} has begun",
+            where=run_id,
+            remedy="Read what the page shows now and decide again; nothing was done",
+        )
     if not _may_stop(exports, person, run_id):
         raise NotAllowedError("somebody else has begun this export", where=run_id)
     if exports.stop(run_id):

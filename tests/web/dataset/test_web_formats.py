@@ -234,7 +234,11 @@ def test_hostile_names_are_words_on_the_page(web: WebSite, run: str, supervisor:
 def test_a_running_export_is_stopped(web: WebSite, run: str, supervisor: Browser) -> None:
     assert ask(supervisor, run, "hdf5") == 303
     assert ask(supervisor, run, "hdf5") == 409, "one at a time"  # and it does not take away the first one's request
-    while not supervisor.send_form(f"/runs/{run}/exports/stop").is_error and web.app.state.exports.state(run).pending:
+    exports, stop = web.app.state.exports, f"/runs/{run}/exports/stop"
+    shown = exports.state(run).since_utc
+    another = supervisor.send_form(stop, since_utc="2026-11-23T12:00:00.000000Z")
+    assert another.status_code == 409, "the page was about another export, which has ended since"
+    while not supervisor.send_form(stop, since_utc=shown).is_error and exports.state(run).pending:
         pass  # until the process is there to be stopped
     page = page_of(web, supervisor, run)
     state = web.app.state.exports.state(run)

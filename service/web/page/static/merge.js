@@ -26,7 +26,7 @@ const merging = (() => {
   // A finger that went down on one control does not press another one that the page has put there meanwhile.
   document.addEventListener("click", (event) => {
     const control = controlAt(event.target instanceof Element ? event.target : null);
-    if (!event.detail || !control || !pressed || control === pressed.control) return;
+    if (!event.detail || !control || !pressed || performance.now() - pressed.over > CLICK_MS || control === pressed.control) return;
     event.preventDefault();
     event.stopImmediatePropagation();
   }, true);
