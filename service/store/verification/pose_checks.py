@@ -1,4 +1,4 @@
-"""Whether the pose of each recorded view fits the joints recorded with it: a tool that was changed unseen shows here."""
+"""Whether the pose of each recorded view fits the joints recorded with it: a tool changed unseen shows here.
 
 Only arms whose controllers report the pose of the tool are judged. Others report the flange, whatever the tool.
 """
