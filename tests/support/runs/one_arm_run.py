@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.host.hosted_device import HostedDevice
-from drivers.interfaces import Camera, Device, Lightbox
+from drivers.interfaces import Camera, Device, Lightbox, RobotArm
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import OperatorAction, StepFailed, ViewpointCaptured
 from service.core.run.decide import AskOperator
@@ -82,6 +82,12 @@ class OneArm(Station):
         super().__init__(load_rig(path))
         self.shutter = BenchCamera(picture=slowly(arm))
         self.shutter.open()
+        self.on_robot: Callable[[], None] = lambda: None  # called when a step takes the open arm, as before a motion
+
+    def robot(self, station: str) -> RobotArm:
+        arm = super().robot(station)
+        self.on_robot()
+        return arm
 
     def camera(self) -> Camera:
         return self.shutter
