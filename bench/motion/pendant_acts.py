@@ -199,7 +199,7 @@ def main(run_one: Callable[[str, str, int], Outcome] = sweep_one) -> None:
     text = "\n".join([
         f"# What acts at the pendant do to a capture, {today}", "",
         f"`python -m bench.motion.pendant_acts`, revision {commit()}. Three views; the act once, at the second one. "
-        "*After*: from the act to the event that names it, which comes when the arm was opened anew (push) or stopped. "
+        "*After*: from the act to the event that names it, when the arm was opened anew (push) or has stopped. "
         "*Worst*: pose of a view that counts, from where the arm was. *Wrong*: images that count with a pose that is "
         f"off by more than {mm(WRONG_M):g} mm or {deg(WRONG_RAD):.2g}°. *Other tool*: images that count while the "
         "controller held another tool or payload than the rig's.", "",

@@ -9,7 +9,7 @@ from collections.abc import Generator
 import numpy as np
 import pytest
 
-from drivers.errors import LeaveNeededError, ToolChangedError
+from drivers.errors import DeviceRefusedError, LeaveNeededError, ToolChangedError
 from drivers.interfaces import RobotArm, SettleCriteria
 from service.core.geometry import inverse
 from tests.support.arms.ur_driver import (
@@ -151,3 +151,20 @@ def test_a_program_ended_at_the_pendant_holds_the_arm(robot: RobotArm, act: str)
     for _ in range(2):
         with pytest.raises(LeaveNeededError, match="ended at the controller"):
             move(robot, turned(robot, 0.01))
+
+
+def test_a_foreign_program_is_neither_commanded_nor_ended(robot: RobotArm) -> None:
+    """The driver waited for its answer until its process was killed."""
+    restored(robot)
+    pendant(HOST, "program other.urp")
+    wait_for(lambda: not robot.state().program_running)
+    wait_for(lambda: robot.state().program_running)
+    let_move(robot)
+    for _ in range(2):
+        with pytest.raises(DeviceRefusedError, match="another program runs at the controller"):
+            move(robot, turned(robot, 0.01))
+    assert robot.state().program_running
+    pendant(HOST, "stop")
+    wait_for(lambda: not robot.state().program_running)
+    let_move(robot)
+    travel(robot, turned(robot, 0.01))

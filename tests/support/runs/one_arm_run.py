@@ -57,6 +57,7 @@ steps:
         - station: station_1
           prefix: v
           arcs: [{tilt_deg: 20, azimuth_from_deg: -40, azimuth_to_deg: 40, count: 3, distance_m: 0.5}]
+    gates: [{measure: moved_during_exposure, max: 0}]
     recovery: {retries: 2, wait_s: 0}
 """
 VIEWS = ["v001", "v002", "v003"]
