@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -27,7 +28,6 @@ from service.core.records.events import OperatorAction, StepFailed, ViewpointCap
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.core.units import deg, mm
-from service.monitor.snapshot import Doing
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.arms.arm_watch import ArmWatch
@@ -49,6 +49,7 @@ ACTS = {
 MOMENTS = ("before motion", "in motion", "settling", "exposing", "between views")
 WRONG_M, WRONG_RAD = 0.0001, 0.0002  # a tenth of a millimetre: more than standing still allows
 _SLIDER_BACK_S = 5.0
+_LOOK_S = 0.002
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,13 +77,17 @@ class Act:
     def __init__(self, run: OneArmRun, arm: ArmWatch, host: str, act: str, moment: str) -> None:
         self._run, self._arm, self._host = run, arm, host
         self._act, self._moment = act, moment
-        self._moved = False
         self.done_s: float | None = None  # host time.monotonic()
         shutter = run.station.shutter
         shutter.on_capture = lambda number: self._at("exposing") if number == 2 else None
         run.station.on_robot = self._take
         run.operator.on_show = self._show
-        run.operator.on_attend = self._attend
+        self._ended = threading.Event()
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def end(self) -> None:
+        """Leave the pendant."""
+        self._ended.set()
 
     def _at(self, moment: str) -> None:
         if self.done_s is None and moment == self._moment:
@@ -99,20 +104,21 @@ class Act:
         if what == "viewpoints" and self._run.station.shutter.exposures == 1:
             self._at("between views")
 
-    def _attend(self, _doing: Doing) -> None:
-        """Called many times a second while the run waits for anything."""
-        if self._run.station.shutter.exposures == 1:
-            speed = self._arm.now.speed_rad_s
-            self._moved = self._moved or speed > 0.2
-            if speed > 0.2:
-                self._at("in motion")
-            elif self._moved and speed == 0.0:
-                self._at("settling")
-        # A slider at 0 is set back by somebody who wonders why nothing moves.
-        late = self.done_s is not None and time.monotonic() - self.done_s > _SLIDER_BACK_S
-        if self._act == "slider to 0 %" and late:
-            pendant(self._host, "slider 100")
-            self._act = ""
+    def _watch(self) -> None:
+        """Look at the arm, and at the slider, which is set back from 0 by somebody who wonders why nothing moves."""
+        moved = False
+        while not self._ended.wait(_LOOK_S):
+            if self._run.station.shutter.exposures == 1:
+                speed = self._arm.now.speed_rad_s
+                if speed > 0.2:
+                    self._at("in motion")
+                elif moved and speed == 0.0:
+                    self._at("settling")
+                moved = moved or speed > 0.2
+            late = self.done_s is not None and time.monotonic() - self.done_s > _SLIDER_BACK_S
+            if self._act == "slider to 0 %" and late:
+                pendant(self._host, "slider 100")
+                self._act = ""
 
 
 def sweep_one(act: str, moment: str, number: int) -> Outcome:
@@ -132,6 +138,7 @@ def sweep_one(act: str, moment: str, number: int) -> Outcome:
 
         run.answers(*[confirm] * 4)
         status = run.drive().status
+        doing.end()
         events = store.events(run.run_id)
         failed = [(e.monotonic_s, e.payload.error) for e in events if isinstance(e.payload, StepFailed)]
         moved = [
