@@ -50,6 +50,7 @@ MOMENTS = ("before motion", "in motion", "settling", "exposing", "between views"
 WRONG_M, WRONG_RAD = 0.0001, 0.0002  # a tenth of a millimetre: more than standing still allows
 _SLIDER_BACK_S = 5.0
 _LOOK_S = 0.002
+_DONE_S = 0.2  # of the controller's time, in which every act is over
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,11 +99,13 @@ class Act:
         """Called when the arm is about to be sent to a view."""
         if self._run.station.shutter.exposures == 1:
             self._at("before motion")
+            self._arm.pass_s(_DONE_S)
 
     def _show(self, what: str) -> None:
         """Called after a view, its image still in memory."""
         if what == "viewpoints" and self._run.station.shutter.exposures == 1:
             self._at("between views")
+            self._arm.pass_s(_DONE_S)
 
     def _watch(self) -> None:
         """Look at the arm, and at the slider, which is set back from 0 by somebody who wonders why nothing moves."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import time
 from collections.abc import Generator
 
 import numpy as np
@@ -99,12 +98,11 @@ def test_a_tool_changed_at_rest_is_refused_by_name_and_set_again(robot: RobotArm
     assert before.payload == PAYLOAD
     pendant(HOST, TCP)
     wait_for(lambda: any("the tool centre point was changed" in said for said in robot.report().problems))
-    now_s = time.monotonic()
     for refused in (
         lambda: move(robot, turned(robot, 0.1)),
         lambda: robot.solve_ik(before.T_base_flange, before.joints_rad),
         lambda: robot.settle(SettleCriteria()),
-        lambda: robot.samples(now_s - 1.0, now_s),
+        lambda: robot.samples(before.monotonic_s - 1.0, before.monotonic_s),
         lambda: robot.let_move("Ada", before.monotonic_s),
     ):
         with pytest.raises(ToolChangedError, match="the tool centre point was changed"):

@@ -14,7 +14,7 @@ from service.core.records.events import PAYLOAD, ArtefactRef
 from service.store.events import ROOT, canonical_parsed, event_sha256_of_text, parse_canonical, references
 from service.store.files.artefacts import record_sha256
 from service.store.records import SITE
-from service.store.verification.pose_checks import PoseFacts
+from service.store.verification.pose_checks import PoseFacts, ReportedPose
 
 Rows = Sequence[Mapping[str, Any]]
 _REF_COLUMNS = tuple(ArtefactRef.model_fields)
@@ -119,9 +119,10 @@ class ChainFacts:
         if kind in _SIGNED_AT_ONCE:
             self.to_sign.append((seq, kind))
         if kind == "viewpoint_captured":
-            self.poses.look(seq, payload)
+            place = (payload["step"], payload["viewpoint"], payload["station"])
+            self.poses.look(seq, ReportedPose(*place, payload["joints_rad"], payload["T_base_flange"]))
         elif kind == "device_opened":
-            self.poses.open(payload)
+            self.poses.open(payload["device"], payload["report"])
         elif kind == "key_changed":
             self.key_changes.append((seq, payload))
         elif kind == "account_changed" or (kind == "sign_in_recorded" and payload["screen"]):

@@ -5,9 +5,9 @@ Only arms whose controllers report the pose of the tool are judged. Others repor
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from service.core.equipment.recorded_devices import recorded_report
 from service.core.units import deg, mm
@@ -15,7 +15,16 @@ from service.core.units import deg, mm
 if TYPE_CHECKING:
     from service.core.arms.model import ArmModel
 
-_VIEW = ("step", "viewpoint", "station")
+
+@dataclass(frozen=True, slots=True)
+class ReportedPose:
+    """What a viewpoint_captured event holds of a view's place: its name, and where the controller had the arm."""
+
+    step: str
+    viewpoint: str
+    station: str
+    joints_rad: Sequence[float]  # (N,)
+    T_base_flange: Sequence[Sequence[float]]  # (4, 4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,28 +51,28 @@ class PoseFacts:
     _away: dict[int, AwayView] = field(default_factory=dict[int, AwayView])
     _last: dict[tuple[str, ...], int] = field(default_factory=dict[tuple[str, ...], int])  # view → its newest event
 
-    def open(self, payload: Mapping[str, Any]) -> None:
-        """Add a device_opened event."""
+    def open(self, device: str, report: object) -> None:
+        """Add a device_opened event: the device's name in rig.yaml, and its DeviceReport as plain data."""
         from service.core.arms.known import known_arm  # noqa: PLC0415 - searches for plug-ins
 
-        identity = recorded_report(payload["report"]).identity
+        identity = recorded_report(report).identity
         if identity.kind == "robot":
             arm = known_arm(identity.model)
-            self._arms[payload["device"]] = arm if arm is not None and arm.family == "universal_robot" else None
+            self._arms[device] = arm if arm is not None and arm.family == "universal_robot" else None
 
-    def look(self, seq: int, payload: Mapping[str, Any]) -> None:
+    def look(self, seq: int, view: ReportedPose) -> None:
         """Add a viewpoint_captured event."""
-        self._last[tuple(payload[name] for name in _VIEW)] = seq
+        self._last[view.step, view.viewpoint, view.station] = seq
         if not self._arms or None in self._arms.values():
             return
         import numpy as np  # noqa: PLC0415 - which few verifications need
 
         from service.core.arms.flange import FITS_M, FITS_RAD, apart, flange_pose  # noqa: PLC0415
 
-        joints, pose = np.array(payload["joints_rad"], dtype=float), np.array(payload["T_base_flange"], dtype=float)
+        joints, pose = np.array(view.joints_rad, dtype=float), np.array(view.T_base_flange, dtype=float)
         gaps = [apart(flange_pose(a, joints), pose) for a in self._arms.values() if a and a.axes == len(joints)]
         if gaps and not any(gap[0] <= FITS_M and gap[1] <= FITS_RAD for gap in gaps):
-            self._away[seq] = AwayView(seq, payload["viewpoint"], *min(gaps))
+            self._away[seq] = AwayView(seq, view.viewpoint, *min(gaps))
 
     def findings(self, run_id: str) -> tuple[list[AwayView], list[str]]:
         """Views whose newest image has a wrong pose, and notes on those that were taken again since."""
