@@ -65,7 +65,7 @@ def in_force(run: OneArmRun) -> list[ViewpointCaptured]:
 
 @pytest.mark.parametrize("moment", [pytest.param("in motion", marks=pytest.mark.slow), "exposing"])
 def test_an_arm_that_was_pushed_is_asked_about(tmp_path: Path, store: Store, moment: str) -> None:
-    with arm_at(84, *SPEED_UP) as (host, arm):
+    with arm_at(88, *SPEED_UP) as (host, arm):
         run = OneArmRun(store, tmp_path, host, arm)
         do(lambda: pendant(host, PUSH), run, arm, moment)
         run.answers(looks_for(0.2, arm, "joint 3 of robot stands 0.050 rad from where it was sent"))
@@ -93,7 +93,7 @@ def test_a_tool_that_was_changed_is_asked_about_and_set_again(
     tmp_path: Path, store: Store, act: str, moment: str, words: str
 ) -> None:
     """Each later pose was wrong by as much, with all verdicts true."""
-    with arm_at(85, *SPEED_UP) as (host, arm):
+    with arm_at(89, *SPEED_UP) as (host, arm):
         run = OneArmRun(store, tmp_path, host, arm)
         do(lambda: pendant(host, act), run, arm, moment)
         run.answers(looks_for(0.2, arm, words))

@@ -29,7 +29,7 @@ FIELDS = [
     "actual_q", "target_qd", "actual_TCP_pose", "tcp_offset", "payload", "payload_cog", "target_speed_fraction",
     "runtime_state", "robot_mode", "safety_mode",
 ]  # fmt: skip
-HOST = address(53)
+HOST = address(87)
 TCP = "tcp 0.01 0.02 0.2 0 0 0.1"
 
 
