@@ -212,7 +212,8 @@ def main(run_one: Callable[[str, str, int], Outcome] = sweep_one) -> None:
         "*After*: from the act to the event that names it, when the arm was opened anew (push) or has stopped. "
         "*Worst*: pose of a view that counts, from where the arm was. *Wrong*: images that count with a pose that is "
         f"off by more than {mm(WRONG_M):g} mm or {deg(WRONG_RAD):.2g}°. *Other tool*: images that count while the "
-        "controller held another tool or payload than the rig's.", "",
+        "controller held another tool or payload than the rig's. A slight push ends within the 5 mrad that count as "
+        "arrived; where the speed slider stands, the page says beside the robot's state.", "",
         "| act | moment | noticed as | after, s | asked | images | worst, mm | wrong | other tool | run |",
         "|---|---|---|---:|---:|---:|---:|---:|---:|---|", *table(outcomes), "",
         f"Images with a wrong pose: {wrong} of {images}.",
