@@ -53,6 +53,10 @@ class ArmDepartedError(DeviceError):
     """The arm does not stand where it was sent: somebody or something moved it."""
 
 
+class ToolChangedError(DeviceError):
+    """The tool centre point or the payload that the controller holds was changed by somebody else."""
+
+
 class UnreachablePoseError(DeviceError):
     """The controller has no joint solution for this pose."""
 

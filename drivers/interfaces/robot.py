@@ -54,6 +54,8 @@ class RobotSample:
     T_base_flange: Transform  # as reported by the controller, with the tool offset removed
     tcp_speed_m_s: float
     safety: SafetyState
+    T_flange_tcp: Transform | None = None  # (4, 4), the tool that the controller held; None: it does not tell
+    payload: Payload | None = None  # that the controller reckoned with; None: it does not tell
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +110,8 @@ class RobotArm(Device, Protocol):
     def let_move(self, confirmed_by: str, not_before_monotonic_s: float) -> None:
         """Permit motion after a person has checked the arm and confirmed; clears stops that are over.
 
+        A tool or payload that somebody else has changed is set again as by `configure`.
+
         The permission is needed after `open`, after any safety stop in the stream, and after the controller's program
         ended unexpectedly. The caller must have the person's confirmation on record.
 
@@ -116,7 +120,8 @@ class RobotArm(Device, Protocol):
             not_before_monotonic_s: host time.monotonic() shortly before the person confirmed.
 
         Raises:
-            SafetyStopError, LeaveNeededError: a stop, or an unexpected end of the program, after that time.
+            SafetyStopError, LeaveNeededError, ToolChangedError: a stop, an unexpected end of the program, or a
+                change of the tool, after that time.
         """
         ...
 
@@ -132,6 +137,8 @@ class RobotArm(Device, Protocol):
         """Return the buffered samples (at least the last 10 s) between two host times, oldest first.
 
         Reading samples does not count as supervising the arm: a moving arm that is only observed this way is stopped.
+
+        Raises ToolChangedError once the tool was changed, until a person has confirmed.
         """
         ...
 

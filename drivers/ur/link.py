@@ -20,6 +20,7 @@ VENDOR_ERRORS = (RuntimeError, ValueError, TypeError)
 _LONGEST_SERIAL = 20
 _LONGEST_LINE = 1000  # limit for dashboard answers, which are less than a tenth as long
 _REMEDY = "Check that this address is that of a Universal Robots controller, then restart it"
+_E_SERIES = ("UR3", "UR5", "UR10", "UR16")  # whose letter the dashboard leaves out; larger arms have none
 MINIMUM_VERSION = {3: (3, 15), 5: (5, 10)}  # the first with get_inverse_kin_has_solution()
 
 
@@ -121,7 +122,8 @@ def read_facts(dashboard: library.Dashboard, host: str, timeout_s: float) -> Con
     if version[0] >= 5:  # CB3 has no local mode
         with vendor(host, "asking for remote control"):
             remote = dashboard.isInRemoteControl()
-    return ControllerFacts(f"{model}{'e' if version[0] >= 5 else ''}", serial, software, version, remote)
+    letter = "e" if version[0] >= 5 and model in _E_SERIES else ""
+    return ControllerFacts(f"{model}{letter}", serial, software, version, remote)
 
 
 def _questions(host: str, *questions: str, timeout_s: float) -> list[str]:

@@ -18,7 +18,6 @@ from drivers.errors import (
     DeviceError,
     DeviceFaultError,
     DeviceRefusedError,
-    DeviceTimeoutError,
     SafetyStopError,
     UnreachablePoseError,
 )
@@ -37,16 +36,16 @@ from drivers.ur import UrConfig
 from drivers.ur import vendor as library
 from drivers.ur.link import VENDOR_ERRORS, ControllerFacts, connect_dashboard, probe, read_facts, vendor
 from drivers.ur.samples import PLAYING, RESTART, VARIABLES, SampleReader, joint_values, joints_for, opened, robot_mode
-from drivers.ur.script import ControlScript, wait
+from drivers.ur.script import ControlScript
+from drivers.ur.tool import SET_ELSEWHERE, read_back
 from drivers.ur.watchdog import Watchdog
+from service.core.arms.known import known_arm
 from service.core.geometry import from_rotation_vector, inverse, to_rotation_vector
 
 DRIVER_VERSION = "1"
-READ_BACK_S = 1.0
 TOOL_CHANGE_S = 0.05  # by the controller's clock, until a new tool shows in the stream
 LONGEST_RINGING_S = 10.0  # how far back the end of the last motion is searched for
 MOTION_START_S = 0.06  # until the target velocity of a new motion shows in the stream
-_SET_ELSEWHERE = "Check on the pendant whether another program sets it, end that program, then try again"
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -71,6 +70,7 @@ class UrRobot:
             newest=self._newest,
         )
         self._script = ControlScript(config, self._latch, self._watchdog)
+        self._configured: tuple[Payload, Transform] | None = None  # the tool as this driver set it
         self._tool_read = 0  # value of ControlScript.sent when the tool was last read
 
     # --- device ------------------------------------------------------------------------------------------
@@ -88,9 +88,10 @@ class UrRobot:
         # An earlier client's script in another register range would block the control constructor for minutes.
         with vendor(self._where, "stopping the running program"):
             dashboard.stop()
-        variables = [*VARIABLES, *(["payload"] if facts.version >= (5, 6) else [])]
+        self._configured = None
+        self._samples.tool.start(known_arm(facts.model))
         with vendor(self._where, "connecting the receive interface"):
-            self._samples.read_from(library.receive(self._config.host, STREAM_HZ, variables))
+            self._samples.read_from(library.receive(self._config.host, STREAM_HZ, list(VARIABLES)))
         self._stream = PoseStream(
             self._samples.read,
             stale_after_s=self._config.stale_after_s,
@@ -100,6 +101,7 @@ class UrRobot:
         self._stream.await_first(self._config.connect_timeout_s)
         if not (self._obstacle() or self._latch.stop):
             self._perform("starting the control script", lambda _: None)  # sends the script and reads the tool
+            self._streaming().clear()  # of poses that were computed without it
         return self._identity()
 
     def heartbeat(self, sent_monotonic_s: float) -> None:
@@ -141,7 +143,7 @@ class UrRobot:
                 f"The speed slider stands at {100 * state.speed_fraction:.0f} %: motions take longer. "
                 "Set it to 100 % on the pendant"
             )
-        tcp = to_rotation_vector(self._samples.T_flange_tcp)
+        tcp = to_rotation_vector(self._samples.tool.T_flange_tcp)
         return DeviceReport(
             identity=self._identity(),
             clock_offset_s=self._streaming().clock_offset_s(),
@@ -167,13 +169,21 @@ class UrRobot:
     def let_move(self, confirmed_by: str, not_before_monotonic_s: float) -> None:
         """Permit motion after a person's confirmation; clears stops that ended before `not_before_monotonic_s`.
 
-        Raises SafetyStopError or LeaveNeededError if a stop is active or was seen after that time.
+        A tool that was changed elsewhere is set again. Raises SafetyStopError, LeaveNeededError or ToolChangedError
+        if a stop is active, or for what was seen after that time; DeviceError if the tool cannot be set.
         """
         sample = self._streaming().next()
         if not sample.safety.may_move:
             raise self._safety_error(sample)
+        changed = self._latch.changed
         self._latch.let_move(confirmed_by, not_before_monotonic_s)
         self._watchdog.arrive()
+        if changed is not None and self._configured is not None:
+            try:
+                self.configure(*self._configured)
+            except DeviceError as error:
+                self._latch.change(f"the tool was changed, and could not be set again: {error}")
+                raise
 
     def configure(self, payload: Payload, T_flange_tcp: Transform) -> None:
         """Set the payload and the tool centre point (4, 4, metres) and verify both by reading them back.
@@ -189,24 +199,28 @@ class UrRobot:
                 raise self._refusal(f"the controller did not accept the payload of {payload.mass_kg:g} kg")
             self._read_tool(control)
 
-        self._perform("setting payload and tool", set_both)
-        # The stream lags behind the answer: poses of the previous tool can still arrive.
-        settled_s = self._streaming().latest().controller_time_s + TOOL_CHANGE_S
-        while self._streaming().next().controller_time_s < settled_s:
-            pass
+        tool = self._samples.tool
+        with tool.changing():
+            self._perform("setting payload and tool", set_both)
+            # The stream lags behind the answer: poses of the previous tool can still arrive.
+            settled_s = self._streaming().latest().controller_time_s + TOOL_CHANGE_S
+            while self._streaming().next().controller_time_s < settled_s:
+                pass
+            receive = opened(self._samples.receive, self._where)
+            read_back(
+                lambda: abs(receive.getPayload() - payload.mass_kg) < 1e-6,
+                f"payload of {payload.mass_kg:g} kg",
+                self._where,
+            )
         self._streaming().clear()
-        difference = inverse(self._samples.T_flange_tcp) @ T_flange_tcp - np.eye(4)
+        difference = inverse(tool.T_flange_tcp) @ T_flange_tcp - np.eye(4)
         if float(np.max(np.abs(difference))) > 1e-6:
             raise DeviceFaultError(
                 "the tool centre point reads back differently from what was set",
                 where=self._where,
-                remedy=_SET_ELSEWHERE,
+                remedy=SET_ELSEWHERE,
             )
-        if opened(self._facts, self._where).version >= (5, 6):
-            receive = opened(self._samples.receive, self._where)
-            self._read_back(
-                lambda: abs(receive.getPayload() - payload.mass_kg) < 1e-6, f"payload of {payload.mass_kg:g} kg"
-            )
+        self._configured = (payload, np.asarray(T_flange_tcp, dtype=np.float64))
 
     def state(self) -> RobotState:
         """Return the newest sample with the controller's modes. Raises DeviceUnavailableError if it is stale."""
@@ -223,6 +237,7 @@ class UrRobot:
 
     def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
         """Return the buffered samples between two host times, oldest first; does not count as supervising the arm."""
+        self._raise_if_changed()
         return self._streaming().between(start_monotonic_s, end_monotonic_s)
 
     def solve_ik(self, T_base_flange: Transform, near_rad: Array) -> Array:
@@ -235,7 +250,7 @@ class UrRobot:
 
         def ask(control: library.Control) -> Array:
             try:
-                return joints_for(control, T_base_flange, self._samples.T_flange_tcp, near, self._where)
+                return joints_for(control, T_base_flange, self._samples.tool.T_flange_tcp, near, self._where)
             except (UnreachablePoseError, DeviceFaultError):
                 self._raise_unless_running(control)  # a script that ended is why
                 raise
@@ -263,10 +278,11 @@ class UrRobot:
     def is_moving(self) -> bool:
         """Return whether the last motion is still under way.
 
-        Raises the SafetyStopError or LeaveNeededError that interrupted it, or DeviceUnavailableError if the stream is
-        stale.
+        Raises the SafetyStopError, LeaveNeededError or ToolChangedError that interrupted it, or
+        DeviceUnavailableError if the stream is stale.
         """
         self._watchdog.attend()
+        self._raise_if_changed()
         if self._driven(self._streaming().latest()) or time.monotonic() - self._motion_started_s < MOTION_START_S:
             return True
         if self._script.moves():
@@ -295,6 +311,7 @@ class UrRobot:
     def settle(self, criteria: SettleCriteria) -> SettleReport:
         """Judge the last window of the pose stream against the criteria. Returns at once; meant to be polled."""
         self._watchdog.attend()
+        self._raise_if_changed()
         stream = self._streaming()
         now_s = stream.latest().monotonic_s
         report = judge(stream.between(now_s - criteria.window_s, now_s), criteria)
@@ -362,7 +379,7 @@ class UrRobot:
         if len(pose) != 6:
             self._raise_unless_running(control)
             raise DeviceFaultError("the tool centre point cannot be read back", where=self._where, remedy=RESTART)
-        self._samples.T_flange_tcp = from_rotation_vector(np.array(pose))
+        self._samples.tool.state(from_rotation_vector(np.array(pose)))
         self._tool_read = self._script.sent
 
     def _begin(self, what: str, start: Callable[[library.Control], bool]) -> None:
@@ -387,13 +404,6 @@ class UrRobot:
         if not control.isProgramRunning():
             raise self._refusal("the control script ended")
 
-    def _read_back(self, agrees: Callable[[], bool], what: str) -> None:
-        with vendor(self._where, f"reading back the {what}"):
-            try:
-                wait(agrees, READ_BACK_S, what, self._where)
-            except DeviceTimeoutError:
-                raise DeviceFaultError(
-                    f"the {what} reads back differently from what was set",
-                    where=self._where,
-                    remedy=_SET_ELSEWHERE,
-                ) from None
+    def _raise_if_changed(self) -> None:
+        if changed := self._latch.changed:
+            raise changed

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -15,10 +16,11 @@ from drivers.errors import (
     DeviceUnavailableError,
     UnreachablePoseError,
 )
-from drivers.interfaces import Array, RobotSample, Transform
+from drivers.interfaces import Array, Payload, RobotSample, Transform
 from drivers.ur import vendor as library
 from drivers.ur.safety import safety_state
-from service.core.geometry import from_rotation_vector, inverse, to_rotation_vector
+from drivers.ur.tool import ToolWatch
+from service.core.geometry import from_rotation_vector, to_rotation_vector
 
 RESTART = "Restart the controller; see the log of the pendant if it happens again"
 PLAYING = 2  # runtime_state
@@ -33,6 +35,8 @@ VARIABLES = (
     "robot_mode",
     "runtime_state",
     "target_speed_fraction",
+    "payload",
+    "payload_cog",
 )
 _ROBOT_MODES = {
     -1: "NO_CONTROLLER",
@@ -55,16 +59,7 @@ class SampleReader:
         self._latch = latch
         self._controller_time_s = -1.0  # of the last sample
         self.receive: library.Receive | None = None  # None while the arm is not connected
-        self.T_flange_tcp = np.eye(4)
-
-    @property
-    def T_flange_tcp(self) -> Transform:
-        """The tool centre point (4, 4) as the controller states it."""
-        return self._T_flange_tcp
-
-    @T_flange_tcp.setter
-    def T_flange_tcp(self, T_flange_tcp: Transform) -> None:
-        self._T_flange_tcp, self._T_tcp_flange = T_flange_tcp, inverse(T_flange_tcp)
+        self.tool = ToolWatch(latch)
 
     def read_from(self, receive: library.Receive) -> None:
         """Read from a new connection."""
@@ -81,24 +76,33 @@ class SampleReader:
             before_s = receive.getTimestamp()
             if before_s == self._controller_time_s:
                 return None
-            sample = self._take(receive, before_s)
+            sample, payload = _take(receive, before_s)
             if receive.getTimestamp() == before_s:
                 self._controller_time_s = before_s
                 self._latch.see(sample.safety, sample.monotonic_s)
-                return sample
+                return self._of_flange(sample, payload)
         return None
 
-    def _take(self, receive: library.Receive, controller_time_s: float) -> RobotSample:
-        return RobotSample(
-            controller_time_s=controller_time_s,
-            monotonic_s=time.monotonic(),
-            joints_rad=np.array(receive.getActualQ()),
-            joint_velocities_rad_s=np.array(receive.getActualQd()),
-            target_velocities_rad_s=np.array(receive.getTargetQd()),
-            T_base_flange=from_rotation_vector(np.array(receive.getActualTCPPose())) @ self._T_tcp_flange,
-            tcp_speed_m_s=math.hypot(*receive.getActualTCPSpeed()[:3]),
-            safety=safety_state(receive.getSafetyStatusBits()),
-        )
+    def _of_flange(self, sample: RobotSample, payload: Payload) -> RobotSample:
+        """A sample that holds the pose of the tool's centre point, with that of the flange instead, and the tool."""
+        T_base_flange = self.tool.flange(sample.joints_rad, sample.T_base_flange, payload)
+        return replace(sample, T_base_flange=T_base_flange, T_flange_tcp=self.tool.T_flange_tcp, payload=payload)
+
+
+def _take(receive: library.Receive, controller_time_s: float) -> tuple[RobotSample, Payload]:
+    """A sample with the pose of the tool's centre point, and the payload."""
+    x, y, z = receive.getPayloadCog()
+    sample = RobotSample(
+        controller_time_s=controller_time_s,
+        monotonic_s=time.monotonic(),
+        joints_rad=np.array(receive.getActualQ()),
+        joint_velocities_rad_s=np.array(receive.getActualQd()),
+        target_velocities_rad_s=np.array(receive.getTargetQd()),
+        T_base_flange=from_rotation_vector(np.array(receive.getActualTCPPose())),
+        tcp_speed_m_s=math.hypot(*receive.getActualTCPSpeed()[:3]),
+        safety=safety_state(receive.getSafetyStatusBits()),
+    )
+    return sample, Payload(receive.getPayload(), (x, y, z))
 
 
 def robot_mode(receive: library.Receive) -> str:

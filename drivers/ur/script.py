@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator
 
 from drivers.arm.latch import Latch
 from drivers.arm.stream import STREAM_HZ
-from drivers.errors import DeviceError, DeviceTimeoutError, DeviceUnavailableError
+from drivers.errors import DeviceError, DeviceRefusedError, DeviceTimeoutError, DeviceUnavailableError
 from drivers.ur import UrConfig
 from drivers.ur import vendor as library
 from drivers.ur.link import vendor
@@ -32,6 +32,7 @@ class ControlScript:
         self._latch, self._watchdog = latch, watchdog
         self._control: library.Control | None = None
         self._abandoned: list[library.Control] = []  # kept so that their destructors never run
+        self._coming = False  # it was sent again, and was not seen to run yet
         self.sent = 0  # number of times the script was sent
 
     @contextlib.contextmanager
@@ -54,7 +55,9 @@ class ControlScript:
         with self._watchdog.commanding(), vendor(self._where, "starting the control script"):
             self._control = control = library.control(self._config.host, STREAM_HZ)
             self.sent += 1
+            self._coming = True
             self._watchdog.guard(control)
+            self._coming = False
         return control
 
     def _running(self) -> library.Control:
@@ -67,12 +70,21 @@ class ControlScript:
             self._watchdog.look()
             if stop := self._latch.stop:
                 raise stop
-            if not control.isProgramRunning():
+            runs = control.isProgramRunning()
+            if runs and not (self._watchdog.guarding or self._coming):
+                raise DeviceRefusedError(
+                    "another program runs at the controller",
+                    where=self._where,
+                    remedy="End it on the pendant, then try again",
+                )
+            if not runs:
                 _LOG.info("%s: the control script had ended and is sent again", self._where)
+                self._coming = True
                 control.reuploadScript()
                 wait(control.isProgramRunning, SCRIPT_START_S, "the control script to start", self._where)
                 self.sent += 1
             self._watchdog.guard(control)
+            self._coming = False
         return control
 
     @property

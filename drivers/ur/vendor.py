@@ -45,6 +45,7 @@ class Receive(Connection, Protocol):
     def getRuntimeState(self) -> int: ...  # noqa: D102
     def getTargetSpeedFraction(self) -> float: ...  # noqa: D102
     def getPayload(self) -> float: ...  # noqa: D102
+    def getPayloadCog(self) -> list[float]: ...  # noqa: D102
 
 
 class AsyncStatus(Protocol):

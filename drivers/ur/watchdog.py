@@ -76,6 +76,11 @@ class Watchdog:
             self._control = control
             self._lapsed = False
 
+    @property
+    def guarding(self) -> bool:
+        """Whether a control script is guarded: it runs, as far as is known."""
+        return self._control is not None
+
     def release(self) -> None:
         """Stop guarding the script, because it is about to be ended on purpose."""
         with self._commands:

@@ -31,6 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--world", default="", metavar="HOST:PORT", help="world socket that receives the joints")
     parser.add_argument("--local", action="store_true", help="start in local control; SIGUSR1 switches to remote")
     parser.add_argument("--arm", default="robot", help="name of the arm in the world and in fault plans")
+    parser.add_argument(
+        "--pendant-port", type=int, default=30090, help="port for what a person does at the pendant (pendant.py)"
+    )
     add_patience(parser)
 
 
@@ -62,12 +65,13 @@ def serve(args: argparse.Namespace) -> None:
     if args.world:
         host, _, port = args.world.rpartition(":")
         world = WorldLink((host, int(port)), args.arm)
-    server = Server(controller, args.host, world)
+    server = Server(controller, args.host, world, args.pendant_port)
     announce(
         host=args.host,
         rtde=f"{args.host}:{RTDE_PORT}",
         dashboard=f"{args.host}:{DASHBOARD_PORT}",
         script=f"{args.host}:{SCRIPT_PORT}",
+        pendant=f"{args.host}:{args.pendant_port}",
         model=args.model,
         version=args.version,
         serial=controller.serial,

@@ -13,7 +13,7 @@ import numpy as np
 from simulators.faults import Fault, FaultPlan
 from simulators.ur_controller import fields, kinematics
 from simulators.ur_controller.kinematics import Array, Model
-from simulators.ur_controller.motion import Motion, MotionError
+from simulators.ur_controller.motion import Hand, Motion, MotionError
 
 _LOG = logging.getLogger(__name__)
 
@@ -115,6 +115,8 @@ class Controller:
         self._pending_fault: tuple[float, Fault] | None = None
         self.stream_fault: Fault | None = None  # for the server: a motion that also breaks the stream
         self._ring: tuple[float, Array] | None = None
+        self._hand: Hand | None = None  # somebody pushes the arm
+        self._pushed = np.zeros(6)  # from the path of the motion under way
         self._place_tool()
 
     # --- cycle -------------------------------------------------------------------------------------------
@@ -129,6 +131,8 @@ class Controller:
         if self._pending_fault is not None and self.time_s >= self._pending_fault[0]:
             fault, self._pending_fault = self._pending_fault[1], None
             self.emergency_stop(fault) if fault.kind == "emergency_stop" else self.protective_stop(fault.kind)
+        if self._hand is not None:
+            self._give_way(self._hand, dt_s)
         if self.motion is not None:
             self._move(dt_s)
         elif self._ring is not None:
@@ -139,7 +143,7 @@ class Controller:
     @property
     def busy(self) -> bool:
         """Whether anything but the clock changes from cycle to cycle, or will at a planned time."""
-        return self.motion is not None or self._ring is not None or self._pending_fault is not None
+        return any(v is not None for v in (self.motion, self._ring, self._pending_fault, self._hand))
 
     def _move(self, dt_s: float) -> None:
         assert self.motion is not None
@@ -151,15 +155,24 @@ class Controller:
             return
         if self.motion.done and np.any(self.target_qdd):
             self._ring = (self.time_s, -RING_AMPLITUDE_S2 * self.target_qdd)
-        if not self.within_limits(self.motion.q):
+        if not self.within_limits(self.motion.q + self._pushed):
             self.protective_stop("a joint reached its limit")
             return
-        self.target_q = self.motion.q
+        self.target_q = self.motion.q + self._pushed
         self.target_qd, self.target_qdd = self.motion.qd * scale, self.motion.qdd * scale
         self.actual_q, self.actual_qd = self.target_q, self.target_qd
         if self.motion.done:
             self.motion = None
         self._place_tool()
+
+    def _give_way(self, hand: Hand, dt_s: float) -> None:
+        """Let the hand turn the joints for dt_s."""
+        step = hand.advance(dt_s)
+        self._hand = None if hand.done else hand
+        self._pushed, self.target_q = self._pushed + step, self.target_q + step
+        if self.motion is None and self._ring is None:
+            self.actual_q, self.actual_qd = self.target_q, np.zeros(6) if hand.done else step / max(dt_s, 1e-6)
+            self._place_tool()
 
     def _swing(self) -> None:
         assert self._ring is not None
@@ -213,14 +226,23 @@ class Controller:
         elif fault is not None:
             delay_s = float(fault.value) if isinstance(fault.value, (int, float)) else 0.15
             self._pending_fault = (self.time_s + delay_s, fault)
-        self.motion = motion
-        self._ring = None
+        self.replace(motion)
         return True
 
     def replace(self, motion: Motion) -> None:
         """Change the current motion (stop, new speed target); fault plans do not count this as a motion."""
         self.motion = motion
         self._ring = None
+        self._pushed = np.zeros(6)  # it begins where the arm is
+
+    def push(self, by_rad: Array, seconds: float) -> None:
+        """Turn the joints (6,) by hand, evenly over some time; the arm gives way."""
+        self._hand = Hand(by_rad, seconds)
+
+    def set_speed(self, fraction: float) -> None:
+        """Move the speed slider."""
+        self.speed_fraction = min(1.0, max(0.0, fraction))
+        self.generation += 1
 
     def halt(self) -> None:
         """Stop within this cycle."""
@@ -333,7 +355,7 @@ class Controller:
             elif name.startswith("input_double_register_"):
                 self.inputs.doubles[int(name[22:])] = value[0]
         if written.get("speed_slider_mask", (0,))[0]:
-            self.speed_fraction = min(1.0, max(0.0, written.get("speed_slider_fraction", (1.0,))[0]))
+            self.set_speed(written.get("speed_slider_fraction", (1.0,))[0])
         for group, shift, width in (("standard", 0, 8), ("configurable", 8, 8), ("tool", 16, 2)):
             mask = int(written.get(f"{group}_digital_output_mask", (0,))[0]) & ((1 << width) - 1)
             bits = int(written.get(f"{group}_digital_output", (0,))[0])
@@ -378,4 +400,5 @@ class Controller:
             "payload": (self.payload_kg,),
             "payload_cog": tuple(self.payload_cog_m),
             "payload_inertia": tuple(self.payload_inertia),
+            "tcp_offset": tuple(self.tcp_pose_m),
         }

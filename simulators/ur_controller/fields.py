@@ -65,6 +65,8 @@ _LATER: dict[str, tuple[str, Version, Version]] = {
     "payload": ("DOUBLE", (3, 11), (5, 5)),
     "payload_cog": ("VECTOR3D", (3, 11), (5, 5)),
     "payload_inertia": ("VECTOR6D", (3, 15), (5, 11)),
+    # Not in the guide: the maker's client library has it since these versions (its pull request 110).
+    "tcp_offset": ("VECTOR6D", (3, 12), (5, 5)),
     "ft_raw_wrench": ("VECTOR6D", NEVER, (5, 9)),
     "actual_current_as_torque": ("VECTOR6D", NEVER, (5, 23)),
 }

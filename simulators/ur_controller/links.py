@@ -1,4 +1,4 @@
-"""The controller's ends of its connections: an RTDE client, a dashboard client, and a client of the script port."""
+"""The controller's ends of its connections: RTDE, dashboard, script port, and the pendant's hand."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from simulators.connection import Connection
 from simulators.serve import SimulatorError
 from simulators.ur_controller import rtde_codec as codec
 from simulators.ur_controller.dashboard import WELCOME, Dashboard
+from simulators.ur_controller.pendant import Pendant
 from simulators.ur_controller.program import ScriptReader
 
 if TYPE_CHECKING:
@@ -184,6 +185,22 @@ class LineLink(Link):
             self.send(f"{self._dashboard.answer(line)}\n".encode())
             if line.lower() in ("quit", "shutdown"):
                 self.dead = True
+
+
+class PendantLink(Link):
+    """One who acts for a person at the pendant."""
+
+    def __init__(self, connection: socket.socket, server: Server) -> None:
+        super().__init__(connection)
+        self._pendant = Pendant(server.controller, server.interpreter)
+        self._rest = b""
+
+    def receive(self, data: bytes) -> None:
+        """Carry out complete lines."""
+        *lines, rest = (self._rest + data).split(b"\n")
+        self._rest = rest[-LONGEST_LINE:]
+        for raw in lines:
+            self.send(f"{self._pendant.carry_out(raw.decode('utf-8', 'replace'))}\n".encode())
 
 
 class ScriptLink(Link):

@@ -1,4 +1,4 @@
-"""Motions of the arm that advance in time: trapezoidal in joint or tool space, speed, servo and stop."""
+"""Motions of the arm that advance in time: trapezoidal in joint or tool space, speed, servo, stop, by hand."""
 
 from __future__ import annotations
 
@@ -198,6 +198,25 @@ class Servo:
         qd = np.clip((self.target - self.q) / self._lag_s, -3.14, 3.14)
         self.qdd = (qd - self.qd) / dt_s
         self.q, self.qd = self.q + qd * dt_s, qd
+
+
+class Hand:
+    """A hand that turns the joints (6,) evenly over some time, whatever else moves them."""
+
+    def __init__(self, by_rad: Array, seconds: float) -> None:
+        self._left_s = max(seconds, 1e-3)
+        self._speed_rad_s = by_rad / self._left_s
+
+    def advance(self, dt_s: float) -> Array:
+        """How far the joints are turned within dt_s, (6,)."""
+        part_s = min(dt_s, self._left_s)
+        self._left_s -= part_s
+        return self._speed_rad_s * part_s
+
+    @property
+    def done(self) -> bool:
+        """Whether the hand has let go."""
+        return self._left_s <= 0.0
 
 
 class Path:

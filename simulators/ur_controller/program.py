@@ -13,6 +13,7 @@ _LOG = logging.getLogger(__name__)
 _WRITE = re.compile(r"\bwrite_output_integer_register\(\s*(\d+)\s*(?:\+\s*(\d+)\s*)?,\s*(-?\d+)\s*\)")
 _SCRIPT_ERRORS = (ValueError, IndexError, ArithmeticError)  # raised for a text that is not a valid program
 _LONGEST_SCRIPT = 1 << 20  # characters
+_OPENS_S = 0.5  # in which a person opens a program on the pendant, none running
 _OTHER_S = 0.1  # time for which an uninterpreted program appears to run
 
 
@@ -88,6 +89,13 @@ class Interpreter:
         self._c = controller
         self._program: ControlProgram | OtherProgram | PendantProgram | None = None
         self.loaded = ""
+        self._foreign_at_s: float | None = None  # when the program that a person has opened begins
+
+    def run_foreign(self, name: str) -> None:
+        """End the program, open this file on the pendant, and start it."""
+        self.stop()
+        self.loaded = name
+        self._foreign_at_s = self._c.time_s + _OPENS_S
 
     def load(self, text: str) -> None:
         """Start a program in place of the current one, if the robot may move."""
@@ -131,6 +139,9 @@ class Interpreter:
 
     def step(self) -> None:
         """Run one cycle of the program, if one is running."""
+        if self._foreign_at_s is not None and self._c.time_s >= self._foreign_at_s:
+            self._foreign_at_s = None
+            self.play()
         if self._program is None or self._c.runtime is Runtime.PAUSED:
             return
         if self._c.runtime is not Runtime.PLAYING:  # a safety stop ended it

@@ -1,4 +1,4 @@
-"""The controller's three ports in one thread, with their clients, and its link to the world."""
+"""The controller's ports in one thread, with their clients, and its link to the world."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from simulators.connection import accept
 from simulators.serve import SimulatorError, Termination, listening
 from simulators.ur_controller import fields
 from simulators.ur_controller.controller import Controller
-from simulators.ur_controller.links import EARLY_S, LineLink, Link, RtdeLink, ScriptLink
+from simulators.ur_controller.links import EARLY_S, LineLink, Link, PendantLink, RtdeLink, ScriptLink
 from simulators.ur_controller.program import Interpreter
 from simulators.world_link import WorldLink
 
@@ -24,9 +24,9 @@ LONGEST_REST_S = 0.008
 
 
 class Server:
-    """Listens on the three ports and advances the controller in real time."""
+    """Listens on the three ports and the pendant's, and advances the controller in real time."""
 
-    def __init__(self, controller: Controller, host: str, world: WorldLink | None) -> None:
+    def __init__(self, controller: Controller, host: str, world: WorldLink | None, pendant_port: int) -> None:
         self.controller = controller
         self.interpreter = Interpreter(controller)
         self.output_types = fields.outputs(controller.version)
@@ -42,6 +42,7 @@ class Server:
         self._listen(host, RTDE_PORT, lambda s: RtdeLink(s, self))
         self._listen(host, DASHBOARD_PORT, lambda s: LineLink(s, self))
         self._listen(host, SCRIPT_PORT, lambda s: ScriptLink(s, self))
+        self._listen(host, pendant_port, lambda s: PendantLink(s, self))
 
     def _listen(self, host: str, port: int, make: Callable[[socket.socket], Link]) -> None:
         try:

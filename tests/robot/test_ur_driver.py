@@ -149,7 +149,7 @@ def test_refused_payload_leaves_a_usable_arm(robot: RobotArm) -> None:
 
 @pytest.mark.parametrize("version", ["3.15", "5.25"])
 def test_other_versions(version: str) -> None:
-    model = "UR10" if version == "3.15" else "UR5e"
+    model = "UR10" if version == "3.15" else "UR20"
     host = address(58)
     with simulated_ur(host, "--version", version, "--model", model, "--speed-up", SPEED_UP), opened(host) as arm:
         assert arm.report().identity.model == model

@@ -100,7 +100,7 @@ def test_stopped_and_continued(victim: str) -> None:
 def test_a_program_that_lives_but_no_longer_looks_at_its_moving_arm() -> None:
     with moving(72, hangs=True, unattended_s=0.8) as (_, arm), Lateness() as lateness:
         comes_to_rest(arm, arm.mark(), lateness, 0.8 + AT_REST_WITHIN_S)
-        assert arm.now.joint_rad < GOAL_RAD - 0.5, "it was stopped on its way"
+        assert arm.now.joints_rad[0] < GOAL_RAD - 0.5, "it was stopped on its way"
 
 
 def test_a_short_lapse_at_rest_needs_nobody() -> None:

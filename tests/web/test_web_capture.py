@@ -258,8 +258,8 @@ def test_a_certificate_names_lens_hash_chain_and_what_ends_it(shown: BrowsedRun)
     page = shown.words("calibration/certificate")
     log = shown.site.site.run(shown.run)
     state = log.state.steps["calibration"]
-    for said in ("L-17", "B-4", "UR10e", "20231", "Simulated", "f/22", state.artefacts[0].sha256, state.passed_sha256,
-                 f"event {state.passed_seq}", "until the first of these"):  # fmt: skip
+    for said in ("L-17", "B-4", "Bench arm", "20231", "Simulated", "f/22", state.artefacts[0].sha256,
+                 state.passed_sha256, f"event {state.passed_seq}", "until the first of these"):  # fmt: skip
         assert said in page, said
     assert "None" not in page
 

@@ -18,6 +18,7 @@ NEEDS_A_PERSON = frozenset(
         "SafetyStopError",
         "LeaveNeededError",
         "ArmDepartedError",
+        "ToolChangedError",
         "DeviceStorageFullError",
         "IntegrityError",
         "ImagesSpoiltError",

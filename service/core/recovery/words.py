@@ -16,6 +16,7 @@ REMEDIES: Mapping[str, str] = {
     "SafetyStopError": "Check the robot and the people around it, then clear the stop at the robot",
     "LeaveNeededError": "Check that the robot stands as it should and nobody is within its reach",
     "ArmDepartedError": "Look at what moved the robot; from where it stands now its motions are planned anew",
+    "ToolChangedError": "Ask who changed the tool or the payload at the pendant; the rig's own are set again",
     "UnreachablePoseError": "Move the obstacle, or the robot's base, so that the robot can reach the pose",
     "ReleasedElsewhereError": "Press the camera's own button, or connect a camera that the software can release",
     "StaleImageError": "Check the camera: it delivered an earlier image instead of a new one",

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypedDict
 
 import numpy as np
 
@@ -44,6 +45,14 @@ class Shot:
     image_kind: str
     ringing_s: float
     further: tuple[FurtherImage, ...] = ()
+
+
+class _Tool(TypedDict):
+    """The fields of ViewpointCaptured that say which tool the controller held."""
+
+    T_flange_tcp: Matrix4 | None
+    payload_kg: float | None
+    payload_centre_m: tuple[float, float, float] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,10 +190,21 @@ def _captured(context: StepContext, shot: Shot, refs: Sequence[ArtefactRef]) -> 
         controller_time_s=pose.controller_time_s,
         clock_offset_s=pose.clock_offset_s,
         ringing_s=shot.ringing_s,
+        **_tool(shot.window[-1]),
         camera=camera_record(image),
         environment=shot.environment,
         verdicts=shot.verdicts,
     )
+
+
+def _tool(sample: RobotSample) -> _Tool:
+    """The tool that the controller held, as the event has it; it is the same in every sample of an exposure."""
+    tool, payload = sample.T_flange_tcp, sample.payload
+    return {
+        "T_flange_tcp": None if tool is None else _rows(tool),
+        "payload_kg": None if payload is None else payload.mass_kg,
+        "payload_centre_m": None if payload is None else payload.centre_of_gravity_m,
+    }
 
 
 def expose_when_free(context: StepContext, camera: Camera, folder: Path, *, was_busy: bool = False) -> CapturedImage:

@@ -14,6 +14,7 @@ from service.core.records.events import PAYLOAD, ArtefactRef
 from service.store.events import ROOT, canonical_parsed, event_sha256_of_text, parse_canonical, references
 from service.store.files.artefacts import record_sha256
 from service.store.records import SITE
+from service.store.verification.pose_checks import PoseFacts, ReportedPose
 
 Rows = Sequence[Mapping[str, Any]]
 _REF_COLUMNS = tuple(ArtefactRef.model_fields)
@@ -76,6 +77,7 @@ class ChainFacts:
         default_factory=dict[int, int]
     )  # of `to_sign`: seq → signed before this seq
     first: Mapping[str, Any] | None = None
+    poses: PoseFacts = field(default_factory=PoseFacts)
     backwards: list[tuple[int, float]] = field(
         default_factory=list[tuple[int, float]]
     )  # seq, s before the one before
@@ -116,7 +118,12 @@ class ChainFacts:
             self.to_sign_before.setdefault(self.to_sign[-1][0], seq)
         if kind in _SIGNED_AT_ONCE:
             self.to_sign.append((seq, kind))
-        if kind == "key_changed":
+        if kind == "viewpoint_captured":
+            place = (payload["step"], payload["viewpoint"], payload["station"])
+            self.poses.look(seq, ReportedPose(*place, payload["joints_rad"], payload["T_base_flange"]))
+        elif kind == "device_opened":
+            self.poses.open(payload["device"], payload["report"])
+        elif kind == "key_changed":
             self.key_changes.append((seq, payload))
         elif kind == "account_changed" or (kind == "sign_in_recorded" and payload["screen"]):
             self.people.append((payload, at_utc))

@@ -229,10 +229,13 @@ class _SignatureCheck:
             *stamped,
             *(fault for fault in self.stamps_differ if fault.run_id == run and not stamped),
         ]
+        away, notes_of_poses = facts.poses.findings(run)
+        faults += [Fault(run, view.seq, "", str(view)) for view in away]
         _, note = signatures.unsigned(run, signed, len(facts.sha256_at))
         return faults, [
             *notes,
             *facts.backwards_notes(run),
+            *notes_of_poses,
             *signatures.late_signatures(run, signed, facts),
             *([note] if note else []),
         ]

@@ -15,11 +15,11 @@ LONGEST_STEP_S = 0.05  # longest gap that counts; in a longer one the simulator 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """One sample: the controller's time, the speed of the fastest driven joint, whether a program runs."""
+    """One sample: the controller's time, the speed of the fastest driven joint, the joints, if a program runs."""
 
     time_s: float
     speed_rad_s: float
-    joint_rad: float
+    joints_rad: tuple[float, ...]
     program_runs: bool
 
 
@@ -73,7 +73,11 @@ class ArmWatch:
 
     def way_rad(self, since: int) -> float:
         """How far the first joint has moved since a mark."""
-        return abs(self.now.joint_rad - self._seen[since - 1].joint_rad)
+        return abs(self.now.joints_rad[0] - self._seen[since - 1].joints_rad[0])
+
+    def joints_at(self, time_s: float) -> tuple[float, ...]:
+        """The joints in the sample that is nearest to a time of the controller."""
+        return min(self._seen, key=lambda sample: abs(sample.time_s - time_s)).joints_rad
 
     def _run(self) -> None:
         with contextlib.suppress(OSError):
@@ -81,7 +85,7 @@ class ArmWatch:
                 data = self._client.data()
                 speed_rad_s = max(abs(v) for v in data["target_qd"])
                 runs = data["runtime_state"] == (2,)
-                self._seen.append(Seen(data["timestamp"][0], speed_rad_s, data["actual_q"][0], runs))
+                self._seen.append(Seen(data["timestamp"][0], speed_rad_s, data["actual_q"], runs))
 
 
 @contextlib.contextmanager

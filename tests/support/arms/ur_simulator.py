@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import socket
 from collections.abc import Generator
 
 from tests.support.rig.patience import PATIENCE_S
@@ -22,3 +23,12 @@ def simulated_ur(host: str, *options: str, patience_s: float = PATIENCE_S) -> Ge
     words = ("--host", host, "--parent", str(os.getpid()), "--patience", str(patience_s))
     with simulator("ur", *words, *options) as running:
         yield running.ready
+
+
+def pendant(host: str, *orders: str) -> None:
+    """Do what a person does at the pendant, or with a hand on the arm (simulators/ur_controller/pendant.py)."""
+    with socket.create_connection((host, 30090), timeout=90) as connection, connection.makefile("rw") as lines:
+        for order in orders:
+            lines.write(order + "\n")
+            lines.flush()
+            assert lines.readline().strip() == "ok", order

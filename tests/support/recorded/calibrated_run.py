@@ -90,7 +90,7 @@ def begin_calibrated_run(site: WebSite, known: Mapping[str, Uncertainty] | None 
     loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="calibrated.yaml")
     store = site.store
     run_id = start_run(store, loaded, load_rig(rig), operator="grace", auto_confirm=False)
-    identity = {"kind": "robot", "model": "UR10e", "serial": "20231"}
+    identity = {"kind": "robot", "model": "Bench arm", "serial": "20231"}
     store.record(run_id, [DeviceOpened(device="robot", report={"identity": identity})], actor="runner")
     store.record(run_id, [StepStarted(step="calibration", attempt=1)], actor="runner")
     session, result, measures = _calibrated()

@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 import trimesh
 
+from service.core.arms.flange import flange_pose
+from service.core.arms.known import arm_model
 from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import (
@@ -70,6 +72,8 @@ steps:
 """
 
 
+_JOINTS_RAD = (0.0,) * 6
+_STRETCHED = tuple(map(tuple, flange_pose(arm_model("UR10e"), np.array(_JOINTS_RAD)).tolist()))
 _ERROR = "best_mean_radial_error_mm"
 T_SCAN_CAMERA = [[0.0, -1.0, 0.0, 0.25], [1.0, 0.0, 0.0, -0.125], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.0, 1.0]]
 REGISTRATION = """\
@@ -244,10 +248,10 @@ class _Writer:
             viewpoint=viewpoint,
             station="station_1",
             artefacts=(ref,),
-            T_base_flange=EYE,
+            T_base_flange=_STRETCHED,
             pose_sigma_m=2e-6,
             pose_sigma_rad=1e-6,
-            joints_rad=(0.0,) * 6,
+            joints_rad=_JOINTS_RAD,
             pose_samples=10,
             trigger_monotonic_s=1.0,
             arrival_monotonic_s=2.0,

@@ -52,6 +52,9 @@ class ViewpointCaptured(RecordedView):
     clock_offset_s: float  # controller time minus host monotonic
     further: tuple[FurtherExposure, ...] = ()  # of the rig's further cameras that exposed here
     ringing_s: float = 0.0  # how long the arm swung after the commanded motion; a loose mount shows here
+    T_flange_tcp: Matrix4 | None = None  # the tool that the controller held; None: it did not tell
+    payload_kg: float | None = None  # that the controller reckoned with
+    payload_centre_m: tuple[float, float, float] | None = None  # its centre of gravity in the flange frame
 
 
 class ViewImported(RecordedView):
