@@ -114,6 +114,7 @@ class MainAction:
     hold: bool = False
     enabled: bool = True
     why_not: str = ""
+    recommended: bool = True  # False where the table of ways recommends another one
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +214,7 @@ class RunView:
     status: str  # active, paused, completed, aborted
     mode: str  # ask, sign, recover, work, paused, died, ended
     headline: str  # news for screen readers when it changes
+    tab: str  # title of the page
     current: str
     attempt: int
     steps: tuple[StepLine, ...]
