@@ -13,12 +13,9 @@ from pydantic import BaseModel, Field
 
 from service.audit.runs.search import RESULT_WORDS, RESULTS, RunSearch, find_runs
 from service.core.errors import OrthocaptureError
-from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
+from service.core.protocol.models import LoadedProtocol, load_protocol
 from service.core.records.entered import RunAbout
 from service.core.records.events import RunStarted
-from service.core.run.connections import lost_arms
-from service.core.run.decide import AskOperator, decide
-from service.core.run.state import RunState
 from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
 from service.store.files.space_used import forecast_of
@@ -26,7 +23,7 @@ from service.store.records import RunRow
 from service.web.page.rendering import render
 from service.web.page.robot_banner import robot_banner
 from service.web.page.run_frame import driven_frames
-from service.web.page.run_words import stopped_words
+from service.web.page.run_standing import run_standing
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
@@ -170,8 +167,8 @@ def _line(site: Site, row: RunRow) -> RunLine:
         now_utc_s = site.store.clock.utc_s()
         snapshot, driven = read_snapshot(site.data, row.run_id, now_utc_s), site.launcher.driven(row.run_id)
         robot = robot_banner(state, snapshot, now_utc_s, driven=driven).title
-        if not state.terminal:
-            standing, why = _standing(log.protocol, state, driven=driven)
+        stands = run_standing(log.protocol, state, driven=driven, robot=snapshot.robot)
+        standing, why = (stands.word, stands.tone), stands.why
     return RunLine(
         run_id=row.run_id,
         title=log.protocol.title,
@@ -188,22 +185,6 @@ def _line(site: Site, row: RunRow) -> RunLine:
         why=why,
         about=root.about or RunAbout() if isinstance(root := log.events[0].payload, RunStarted) else RunAbout(),
     )
-
-
-def _standing(protocol: Protocol, state: RunState, *, driven: bool) -> tuple[tuple[str, str], str]:
-    """The state of a run that has not ended, as a word and its tone; and the reason if it is stopped."""
-    if not driven:
-        return ("Stopped", "stop"), "the program that drives it does not run → open it and go on"
-    if state.paused:
-        return ("Paused", "attention"), ""
-    question = decide(protocol, state)
-    if not isinstance(question, AskOperator):
-        return ("Under way", "now"), ""
-    if state.step.in_course is not None:
-        return ("Waits for a confirmation", "attention"), state.step.in_course.title
-    if question.for_ == "recovery":
-        return ("Stopped", "stop"), stopped_words(protocol, state, question)
-    return ("Waits for a signature" if question.for_ == "sign" else "Waits for a confirmation", "attention"), ""
 
 
 def startable_of(name: str, site: Site) -> StartableProtocol:

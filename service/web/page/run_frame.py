@@ -5,21 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from service.core.errors import OrthocaptureError
-from service.core.protocol.models import Protocol
 from service.core.records.events import RunStarted
 from service.core.records.import_list import imported_sentence
-from service.core.run.connections import lost_arms
-from service.core.run.decide import AskOperator, decide
-from service.core.run.state import RunState
 from service.core.run.tries import tries_words
 from service.core.text.clock_time import time_here
-from service.monitor.snapshot import STOPS, Snapshot, Standing, read_snapshot
+from service.monitor.snapshot import Standing, read_snapshot
 from service.people.control import Control
 from service.run_record import RunRecord
 from service.steps.coats import Coat, coats
 from service.store.durable_effects import moment_of
 from service.web.page.robot_banner import NOT_THE_STOP, Banner, robot_banner
-from service.web.page.run_words import stopped_words
+from service.web.page.run_standing import run_standing
 from service.web.site import Site
 
 
@@ -69,6 +65,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
     now_utc_s = site.store.clock.utc_s()
     holder = Control(site.store).holder(run_id)
     driven, snapshot = site.launcher.driven(run_id), read_snapshot(site.data, run_id, now_utc_s)
+    stands = run_standing(log.protocol, log.state, driven=driven, robot=snapshot.robot)
     return RunFrame(
         run_id=run_id,
         name=run_id,
@@ -80,7 +77,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
         live=not log.state.terminal,
         pausable=log.state.status == "active" and driven,
         asked=(holder.screen, holder.asked_by_name),
-        attention=_attention(log.protocol, log.state, snapshot, driven=driven),
+        attention=Attention(stands.key, stands.alert),
         banner=robot_banner(
             log.state, snapshot, now_utc_s, driven=driven, tries=tries_words(log.protocol, log.state, time_here)
         ),
@@ -99,33 +96,6 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
 def coats_of(site: Site, log: RunRecord) -> tuple[Coat, ...]:
     """The coats of a run whose clocks run now."""
     return coats(log.protocol, log.state, moment_of(site.store.clock))
-
-
-def _attention(  # noqa: PLR0911 - one return a case
-    protocol: Protocol, state: RunState, snapshot: Snapshot, *, driven: bool
-) -> Attention:
-    """The state of a run for alerts on other pages. It is read from the record, so a dead runner is reported too."""
-    if state.terminal:
-        return Attention("ended", f"The run is {state.status}.")
-    if not driven:
-        return Attention("stopped", "The program that drives the robot does not run.")
-    if snapshot.robot in STOPS:
-        return Attention("stopped", f"The robot reports: {snapshot.robot.replace('_', ' ')}.")
-    if lost_arms(state):
-        return Attention("stopped", "The connection to the robot was lost, and nobody has looked at it since.")
-    if state.paused:
-        return Attention("waits", "The run is paused.")
-    question = decide(protocol, state)
-    if not isinstance(question, AskOperator):
-        return Attention()
-    title = protocol.step(question.step).title
-    wanted = state.step.in_course
-    if wanted is not None:
-        return Attention("waits", f"{title}: {wanted.title[:1].lower()}{wanted.title[1:]}.")
-    if question.for_ == "recovery":
-        return Attention("stopped", f"{title}: {stopped_words(protocol, state, question)}.")
-    due = "a signature is due" if question.for_ == "sign" else "your confirmation is awaited"
-    return Attention("waits", f"{title}: {due}.")
 
 
 def driven_frames(site: Site, *, but: str = "") -> list[RunFrame]:

@@ -10,16 +10,17 @@ from service.core.equipment.disk_space import Forecast
 from service.core.gates.acceptance import acceptors, demanded_role, failed_gates
 from service.core.gates.dependence import dependent_steps, depends_on
 from service.core.protocol.models import Protocol, Step
-from service.core.records.events import Event, ItemTicked, OperatorAction, OperatorVerb
+from service.core.records.events import Event, FilesKept, ItemTicked, OperatorAction, OperatorVerb, RecordedView
 from service.core.recovery.ways_on import WayOn, takes_words
 from service.core.run.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
 from service.core.run.connections import lost_arms
-from service.core.run.decide import AskOperator, decide, lapsed_words
+from service.core.run.decide import AskOperator, lapsed_words
 from service.core.run.state import RunState
 from service.core.run.tries import tries_words
 from service.core.text.clock_time import time_here
 from service.dataset.registrations import evaluated
 from service.monitor.snapshot import STOPS, Snapshot
+from service.web.page.run_standing import run_standing
 from service.web.page.run_words import (
     count,
     drawing_of,
@@ -78,8 +79,8 @@ def run_view(
     """
     protocol, state = log.protocol, log.state
     shown = show if show in state.steps else state.current
-    decision = decide(protocol, state)
-    mode = _mode(state, decision, driven=driven)
+    stands = run_standing(protocol, state, driven=driven, robot=snapshot.robot)
+    decision, mode = stands.decision, stands.mode
     stopped = mode == "recover"
     unused = unused_count(state, log.events, shown)
     return RunView(
@@ -88,7 +89,8 @@ def run_view(
         seq=state.seq,
         status=state.status,
         mode=mode,
-        headline=_headline(protocol, state, mode, decision),
+        headline=stands.headline,
+        tab=_tab(protocol, state, shown, mode),
         current=state.current,
         attempt=state.step.attempt,
         steps=tuple(_line(protocol, state, step, shown, stopped=stopped) for step in protocol.steps),
@@ -142,7 +144,7 @@ def _question(log: RecordOfRun, snapshot: Snapshot, decision: object, mode: str,
         standing=snapshot.doing == "paused" and snapshot.robot == "standing" and not lost_arms(state),
         paused=_paused_words(state, snapshot),
         more=_more(state) if mode == "more" else None,
-        trouble=None if mode == "more" else _trouble(protocol, state, decision),
+        trouble=None if mode == "more" else _trouble(log, decision),
         ways=_ways(decision, mode),
         signature=_signature(protocol, state),
         acceptance=_acceptance(protocol, state),
@@ -161,35 +163,6 @@ def _paused_words(state: RunState, snapshot: Snapshot) -> str:
         return f"Paused. The robot reports: {snapshot.robot.replace('_', ' ')}."
     told = {"standing": "The robot stands still.", "not_connected": "The robot is not connected."}
     return f"Paused. {told.get(snapshot.robot, 'The robot does not answer: take it as moving.')}"
-
-
-def _mode(state: RunState, decision: object, *, driven: bool) -> str:
-    if state.terminal:
-        return "ended"
-    if not driven:
-        return "died"
-    if state.paused:
-        return "paused"
-    if isinstance(decision, AskOperator):
-        asked = {"confirm": "ask", "sign": "sign", "recovery": "recover"}[decision.for_]
-        return asked if state.step.in_course is None else "more"
-    return "work"
-
-
-def _headline(protocol: Protocol, state: RunState, mode: str, decision: object) -> str:
-    title = protocol.step(state.current).title
-    if mode == "recover" and isinstance(decision, AskOperator):
-        return f"{title}. Stopped: {stopped_words(protocol, state, decision)}."
-    if mode == "more" and state.step.in_course is not None:
-        return f"{title}: {state.step.in_course.title}."
-    return {
-        "ended": f"The run is {state.status}.",
-        "died": "The program that drives the robot has stopped. Everything captured is safe.",
-        "paused": f"Paused at: {title}.",
-        "ask": f"Now: {title}. Your confirmation is awaited.",
-        "sign": f"{title}: a signature is due.",
-        "work": f"Working: {title}.",
-    }[mode]
 
 
 def _line(protocol: Protocol, state: RunState, step: Step, shown: str, *, stopped: bool) -> StepLine:
@@ -275,10 +248,14 @@ def _again(protocol: Protocol, state: RunState, decision: object) -> MainAction 
     if not isinstance(decision, AskOperator) or "confirm" not in decision.options:
         return None
     note = "What was captured is kept; only what is missing is done."
-    first = next((way for way in decision.ways if way.available), None)
-    mends = first is not None and first.verb == "confirm" and state.step.mend
-    text = f"Try again: {way_words(state, first)}" if mends and first is not None else "Try again"
-    return MainAction("confirm", text, note + (" The robot moves." if moves else ""), hold=moves)
+    ways = [way for way in decision.ways if way.available]
+    again = next((way for way in ways if way.verb == "confirm"), None)
+    recommended = bool(ways) and ways[0] == again
+    named = again is not None and (state.step.mend is not None or not recommended)
+    text = f"Try again: {way_words(state, again)}" if named and again is not None else "Try again"
+    note += " The robot moves." if moves else ""
+    note = note if recommended else f"Not what is recommended. {note}"
+    return MainAction("confirm", text, note, hold=moves, recommended=recommended)
 
 
 def _options(decision: object, state: RunState) -> tuple[OperatorVerb, ...]:
@@ -298,12 +275,26 @@ def _more(state: RunState) -> StepMore | None:
     )
 
 
-def _trouble(protocol: Protocol, state: RunState, decision: object) -> StepTrouble | None:
+def _tab(protocol: Protocol, state: RunState, shown: str, mode: str) -> str:
+    """The title of the page in the browser's tab."""
+    return f"Run {state.status}" if mode == "ended" and shown == state.current else protocol.step(shown).title
+
+
+def _photographs(events: Sequence[Event]) -> int:
+    """The photographs in the record: views, those that were replaced too, and others that a camera gave."""
+    views = sum(isinstance(event.payload, RecordedView) for event in events)
+    kept = (event.payload for event in events if isinstance(event.payload, FilesKept))
+    return views + sum(ref.kind == "layout_image" for files in kept for ref in files.artefacts)
+
+
+def _trouble(log: RecordOfRun, decision: object) -> StepTrouble | None:
+    protocol, state = log.protocol, log.state
     if not isinstance(decision, AskOperator) or decision.for_ != "recovery":
         return None
     step, now = protocol.step(state.current), state.step
-    images = sum(len(there.captured) for there in state.steps.values())
-    safe = f"Yes. {count(images, 'image is', 'images are')} recorded, and every result so far."
+    images = _photographs(log.events)
+    recorded = f"{count(images, 'photograph is', 'photographs are')} recorded, and every result so far"
+    safe = f"Yes. {recorded if images else 'Everything so far is recorded'}."
     advice = now.mend.advice if now.mend is not None else ""
     short = stopped_words(protocol, state, decision)
     if now.failure is not None:

@@ -131,6 +131,7 @@ class MainAction:
     hold: bool = False
     enabled: bool = True
     why_not: str = ""
+    recommended: bool = True  # False where the table of ways recommends another one
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,6 +247,7 @@ class RunView:
     status: str  # active, paused, completed, aborted
     mode: str  # ask, sign, more, recover, work, paused, died, ended
     headline: str  # news for screen readers when it changes
+    tab: str  # title of the page
     current: str
     attempt: int
     steps: tuple[StepLine, ...]

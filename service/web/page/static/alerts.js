@@ -8,7 +8,10 @@
   const TONES = { waits: [660, 880], stopped: [880, 440, 880, 440], ended: [440, 550, 660] }; // Hz
   const TONE_S = 0.22;
   const button = document.getElementById("alerts");
-  const title = document.title;
+  const loaded = document.title;
+  const named = () => document.querySelector("[data-title]")?.dataset.title; // the step may be another one by now
+  const first = named();
+  const titled = () => (first && named() ? loaded.replace(first, named()) : loaded);
   let audio = null;
   const chosen = () => localStorage.getItem(KEY) === "on";
   const standings = () => new Map([...document.querySelectorAll("[data-attention]")].map((e) => [e.dataset.of, [e.dataset.attention, e.dataset.words]]));
@@ -46,7 +49,7 @@
     }
     known = now;
     const told = [...now.values()].find(([standing]) => standing === "stopped") || [...now.values()].find(([standing]) => standing === "waits");
-    document.title = told ? `${WORDS[told[0]]}: ${told[1]} · ${title}` : title;
+    document.title = told ? `${WORDS[told[0]]}: ${told[1]} · ${titled()}` : titled();
   }
   button.addEventListener("click", async () => {
     localStorage.setItem(KEY, chosen() ? "off" : "on");

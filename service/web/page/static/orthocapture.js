@@ -174,6 +174,9 @@
     offline = true;
     cancelHold();
     body.classList.add("offline");
+    const told = [...document.querySelectorAll("[data-attention]")];
+    const ended = Boolean(body.dataset.run) && told.length > 0 && told.every((run) => run.dataset.attention === "ended");
+    by("connection-lost").querySelector("[data-goes-on]").hidden = ended;
     by("connection-lost").hidden = false;
     setControls(true);
   }

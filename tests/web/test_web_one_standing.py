@@ -1,0 +1,155 @@
+"""Every state of a run, on every page, for every role: one model of how it stands gives all words, and they agree."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from html import unescape
+from pathlib import Path
+
+import pytest
+
+from service.core.records.events import FilesKept, OperatorAction, RecordedView
+from service.core.recovery.ways_on import ways_on
+from service.people.roles import ROLES, Role, may
+from service.web.page.run_standing import RunStanding, run_standing
+from tests.support.pages.browsed_run import words
+from tests.support.pages.shown_site import ShownSite, shown_site
+from tests.support.pages.web import Browser, WebSite, web_site
+
+_PAGES = ("", "/capture", "/scene", "/calibration", "/dataset")
+_STATES = (
+    "listing", "moving", "signing", "failed", "acceptable", "held", "calibrated", "completed", "paused", "died",
+    "aborted",
+)  # fmt: skip
+_MODES = {"ask", "sign", "recover", "work", "paused", "died", "ended"}
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Runs in every state, each by the name of its state."""
+
+    web: WebSite
+    runs: dict[str, str]
+
+    def stands(self, which: str) -> RunStanding:
+        log = self.web.site.run(self.runs[which])
+        return run_standing(log.protocol, log.state, driven=self.web.site.launcher.driven(log.run_id))
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
+    recorded: ShownSite = shown_site(tmp_path_factory.mktemp("stands"))
+    folder = Path(shutil.copytree(recorded.folder, tmp_path_factory.mktemp("stands") / "site"))
+    with web_site(folder) as web:
+        runs = {name: str(getattr(recorded, name)) for name in _STATES[:8]}
+        runs |= {name: web.begin_run().run_id for name in ("paused", "died", "aborted")}
+        for run_id in (*recorded.under_way, runs["paused"]):
+            web.site.launcher.start(run_id)
+        for name, verb in (("paused", "pause"), ("aborted", "abort")):
+            web.store.record(
+                runs[name], [OperatorAction.model_validate({"action": verb, "reason": "x"})], actor="ada"
+            )
+        yield Shown(web, runs)
+
+
+def test_the_states_are_all_there(shown: Shown) -> None:
+    assert {shown.stands(which).mode for which in _STATES} >= _MODES - {"work"}
+
+
+@pytest.mark.parametrize("role", ROLES)
+@pytest.mark.parametrize("which", _STATES)
+def test_all_pages_tell_the_same(shown: Shown, which: str, role: Role) -> None:
+    stands, run_id = shown.stands(which), shown.runs[which]
+    browser = shown.web.browser(role)
+    pages = {page: browser.get(f"/runs/{run_id}{page}").text for page in _PAGES}
+    for page, html in pages.items():
+        alert = re.search(rf'data-attention="(\w+)" data-words="([^"]*)" data-of="{run_id}"', html)
+        assert alert is not None, page
+        assert (alert[1], unescape(alert[2])) == (stands.key, stands.alert), page
+        goes_on = re.search(r"<span data-goes-on( hidden)?>", html)
+        assert goes_on is not None
+        assert bool(goes_on[1]) == (stands.mode == "ended"), page  # nothing goes on in a run that has ended
+    _listed(browser, run_id, stands)
+    _guided(pages[""], stands, role)
+    _counted(shown, pages[""], which)
+
+
+def _listed(browser: Browser, run_id: str, stands: RunStanding) -> None:
+    """What the first page says of the run."""
+    home = browser.get("/").text
+    if stands.mode == "ended":
+        (row,) = [row for row in home.split("<tr") if f'href="/runs/{run_id}"' in row]
+        assert stands.word.lower() in words(row).lower()
+        return
+    (row,) = [item for item in home.split("<li") if f'href="/runs/{run_id}"' in item and "<h3>" in item]
+    assert stands.word in words(row)
+    assert stands.why in words(row)
+
+
+def _guided(page: str, stands: RunStanding, role: Role) -> None:
+    """What the guided screen says, and what it offers."""
+    assert unescape(re.findall(r'data-news="([^"]*)"', page)[-1]).startswith(stands.headline)
+    title = re.search(r"<title>(.*?) · ", page)
+    tab = re.search(r'data-title="([^"]*)"', page)
+    assert title is not None
+    assert tab is not None
+    assert title[1] == tab[1]
+    if stands.mode == "ended":
+        assert tab[1].startswith("Run ")
+        assert "decides on the next action" not in page
+    if not may(role, "operate"):
+        assert "Take control to act" not in page
+
+
+def _counted(shown: Shown, page: str, which: str) -> None:
+    """The numbers of photographs on one page are those of the record."""
+    run_id = shown.runs[which]
+    log = shown.web.site.run(run_id)
+    payloads = [event.payload for event in log.events]
+    taken = sum(isinstance(payload, RecordedView) for payload in payloads)
+    kept = [ref for payload in payloads if isinstance(payload, FilesKept) for ref in payload.artefacts]
+    taken += sum(ref.kind == "layout_image" for ref in kept)
+    said = words(page)
+    safe = re.search(r"Is the data safe Yes\. (?:(\d+) photographs? (?:is|are) recorded|Everything so far)", said)
+    assert ("Is the data safe" in said) == (safe is not None)
+    if safe is not None:
+        assert int(safe[1] or 0) == taken
+    step = re.search(r"This step (\d+) of (\d+)", said)
+    notice = re.search(r"(\d+) of (\d+) images of this step are in the record", said)
+    if step is not None and notice is not None:
+        assert step.groups() == notice.groups()
+
+
+@pytest.mark.parametrize("which", ["failed", "acceptable"])
+def test_only_what_is_recommended_is_blue(shown: Shown, which: str) -> None:
+    """The large button is the recommended way, or it says that it is not and stands back."""
+    run_id = shown.runs[which]
+    log = shown.web.site.run(run_id)
+    first = next(way for way in ways_on(log.protocol, log.state) if way.available)
+    browser = shown.web.browser("technician")
+    shown.web.take_control(run_id, browser)
+    page = browser.get(f"/runs/{run_id}").text
+    row = page[page.index("Recommended") :].split("</tr>", 1)[0]
+    main = re.search(r'<form class="main-action".*?<button class="target ([^"]*)"', page, re.DOTALL)
+    assert main is not None
+    assert ("primary" in main[1]) == (first.verb == "confirm")
+    assert ('class="button primary"' in row) == (first.verb != "confirm")
+    assert ("Not what is recommended." in page) == (first.verb != "confirm")
+    shown.web.people.sign_out(browser.person)
+
+
+def test_nobody_is_told_that_they_themselves_decide_somewhere_else(shown: Shown) -> None:
+    """On another screen of the person in control, the page says You; on that of somebody else, the name."""
+    run_id = shown.runs["listing"]
+    first, second = shown.web.browser("technician"), shown.web.browser("technician")
+    shown.web.take_control(run_id, first)
+    mine, others = (
+        words(browser.get(f"/runs/{run_id}").text) for browser in (second, shown.web.browser("supervisor"))
+    )
+    assert "You decide on the next action, on your other screen" in mine
+    assert "Grace Hopper decides" not in mine
+    assert "Grace Hopper decides on the next action" in others
+    shown.web.people.sign_out(first.person)
