@@ -11,6 +11,7 @@ from weakref import WeakValueDictionary
 
 from fastapi import Depends, Request
 
+from service.core.run.expected import EarlierTimes
 from service.people.sessions import People
 from service.rig import Rig, RigDevice
 from service.run_record import RunFollower, RunRecord
@@ -62,6 +63,7 @@ class Site:
     sealed_seq: int = 0  # last event of the site's chain that is known to be signed
     streams: OpenStreams = field(default_factory=OpenStreams)
     runs: OpenedRuns = field(init=False)
+    _step_times: dict[str, EarlierTimes] = field(init=False, default_factory=dict[str, EarlierTimes])
 
     def __post_init__(self) -> None:
         self.runs = OpenedRuns(self._first_read)
@@ -69,6 +71,14 @@ class Site:
     def run(self, run_id: str) -> RunRecord:
         """A run's record as of now. Raises UnknownRunError, IntegrityError."""
         return self.runs.now(run_id)
+
+    def step_times(self, run_id: str) -> EarlierTimes:
+        """How long the steps took in the runs before this one; read once. Raises UnknownRunError, StoreError."""
+        if run_id not in self._step_times:
+            from service.monitor.step_times import read_step_times  # noqa: PLC0415 - of runs under way only
+
+            self._step_times[run_id] = read_step_times(self.store, run_id)
+        return self._step_times[run_id]
 
     def protocol_files(self) -> list[Path]:
         """Protocols that can be started."""

@@ -8,7 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import DeviceOpened, DeviceTrouble, ItemTicked, OperatorAction, RunAborted
+from service.core.records.events import (
+    DeviceOpened,
+    DeviceTrouble,
+    ItemTicked,
+    OperatorAction,
+    RunAborted,
+    StepStarted,
+)
 from service.monitor.snapshot import Message, Snapshot, write_snapshot
 from service.people.roles import ROLES, Role
 from tests.support.pages.web import WebSite, web_site
@@ -242,3 +249,21 @@ def test_ticks_of_others_reach_the_confirmation(web: WebSite, run_id: str) -> No
     web.store.record(run_id, ticks, actor="grace")
     actions = browser.get(f"/runs/{run_id}/parts/actions").text
     assert "disabled" not in actions
+
+
+def test_the_step_says_how_long_it_takes_on_this_site(web: WebSite) -> None:
+    web.begin_run().run()
+    run_id = web.begin_run().run_id
+    web.site.launcher.start(run_id)
+    browser = web.browser("technician")
+    page = browser.get(f"/runs/{run_id}").text
+    assert "(one earlier run on this site)." in page
+    assert "Work left: about" in page
+    action = OperatorAction(action="skip", step="fixation", reason="done before")
+    web.store.record(run_id, [action, OperatorAction(action="confirm", step="capture")], actor="grace")
+    web.store.record(run_id, [StepStarted(step="capture", attempt=1)], actor="runner")
+    tell(web, run_id, doing="working", robot="standing")
+    page = browser.get(f"/runs/{run_id}").text
+    assert re.search(
+        r"Usually \d+ s \(one earlier run on this site\); begun at \d\d:\d\d:\d\d UTC, so until about", page
+    )

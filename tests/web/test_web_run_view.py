@@ -26,6 +26,7 @@ from service.core.records.events import (
     ViewpointFailed,
 )
 from service.core.run.decide import AskOperator, decide, evaluate_gates
+from service.core.run.expected import duration
 from service.core.run.fold import fold
 from service.core.run.tries import tries_words
 from service.core.text.clock_time import time_here
@@ -33,7 +34,7 @@ from service.monitor.snapshot import Message, Snapshot
 from service.steps import params_models
 from service.web.page.robot_banner import robot_banner
 from service.web.page.run_words import limit, measure_name, planned_views
-from service.web.run.figures import duration, view_intervals_s
+from service.web.run.figures import view_intervals_s
 from service.web.run.view import run_view
 from service.web.run.view_records import RunView, Viewer
 from tests.support.record.core import Log

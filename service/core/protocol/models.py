@@ -168,6 +168,8 @@ class StepFields(Record):
     irreversible: bool = False  # whether nothing before it can be done again afterwards
     cannot_be_undone: str = ""  # what a person reads before an irreversible step: a sentence
     requires: tuple[str, ...] = ()  # earlier steps that must not have been skipped
+    # How long the work usually takes, in seconds; used until this site has measured it. None: not known.
+    takes_s: Positive | None = None
     recovery: Recovery = Recovery()  # what happens when the work fails
     simulated_hands: tuple[HandAction, ...] = ()  # ignored on a real rig
 

@@ -16,6 +16,7 @@ from service.core.errors import OrthocaptureError
 from service.core.protocol.models import LoadedProtocol, load_protocol
 from service.core.records.entered import RunAbout
 from service.core.records.events import RunStarted
+from service.core.run.connections import lost_arms
 from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
 from service.store.files.space_used import forecast_of
@@ -167,8 +168,9 @@ def _line(site: Site, row: RunRow) -> RunLine:
         now_utc_s = site.store.clock.utc_s()
         snapshot, driven = read_snapshot(site.data, row.run_id, now_utc_s), site.launcher.driven(row.run_id)
         robot = robot_banner(state, snapshot, now_utc_s, driven=driven).title
-        stands = run_standing(log.protocol, state, driven=driven, robot=snapshot.robot)
-        standing, why = (stands.word, stands.tone), stands.why
+        if not state.terminal:
+            stands = run_standing(log.protocol, state, driven=driven, robot=snapshot.robot)
+            standing, why = (stands.word, stands.tone), stands.why
     return RunLine(
         run_id=row.run_id,
         title=log.protocol.title,

@@ -81,10 +81,9 @@ def _driven(protocol: Protocol, state: RunState, decision: Decision, title: str)
         return RunStanding("work", decision, "works", "Under way", "now", "", "", f"Working: {title}.")
     wanted = state.step.in_course
     if wanted is not None:
-        told, word = f"{title}: {wanted.title[:1].lower()}{wanted.title[1:]}.", "Waits for a confirmation"
-        return RunStanding(
-            "more", decision, "waits", word, "attention", wanted.title, told, f"{title}: {wanted.title}."
-        )
+        word, why = "Waits for a confirmation", wanted.title
+        told, headline = f"{title}: {why[:1].lower()}{why[1:]}.", f"{title}: {why}."
+        return RunStanding("more", decision, "waits", word, "attention", why, told, headline)
     if decision.for_ == "recovery":
         why = stopped_words(protocol, state, decision)
         told, headline = f"{title}: {why}.", f"{title}. Stopped: {why}."

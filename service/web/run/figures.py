@@ -12,6 +12,7 @@ from service.core.equipment.disk_space import Forecast, size_words
 from service.core.gates.verdict import figure
 from service.core.protocol.models import Gate, Protocol, Step
 from service.core.records.events import Event, GateVerdict, RecordedView, SessionStarted
+from service.core.run.expected import duration
 from service.core.run.state import RunState, StepState
 from service.monitor.snapshot import Snapshot
 from service.web.page.run_words import gate_word, limit, measure_name, planned_views
@@ -125,14 +126,6 @@ def _left(each_s: float | None, views: int) -> str:
     if views <= 0:
         return "none"
     return "measuring" if each_s is None else duration(each_s * views)
-
-
-def duration(seconds: float) -> str:
-    """`40 s`, `12 min`, `1 h 05 min`."""
-    if seconds < 90:
-        return f"{max(round(seconds / 5) * 5, 5)} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
 def readings(

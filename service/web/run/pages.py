@@ -116,6 +116,8 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         show=step,
         to_come=[left.text for left in results_to_come(log)],
         space=None if log.state.terminal else forecast_of(site.store, log.protocol, log.state),
+        earlier={} if log.state.terminal else site.step_times(run_id),
+        now_utc=site.store.clock.utc_now().isoformat(),
     )
     looking_back = bool(step) and view.shown.id != view.current
     role = view.question.acceptance.role if view.question.acceptance else ""

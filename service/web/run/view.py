@@ -15,6 +15,7 @@ from service.core.recovery.ways_on import WayOn, takes_words
 from service.core.run.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
 from service.core.run.connections import lost_arms
 from service.core.run.decide import AskOperator, lapsed_words
+from service.core.run.expected import EarlierTimes, away_words, run_words, step_words, work_words
 from service.core.run.state import RunState
 from service.core.run.tries import tries_words
 from service.core.text.clock_time import time_here
@@ -55,6 +56,8 @@ from service.web.run.view_records import (
     Viewer,
 )
 
+NOT_MEASURED: EarlierTimes = {}
+
 
 def run_view(
     log: RecordOfRun,
@@ -65,6 +68,8 @@ def run_view(
     show: str = "",
     to_come: Sequence[str] = (),
     space: Forecast | None = None,
+    earlier: EarlierTimes = NOT_MEASURED,
+    now_utc: str = "",
 ) -> RunView:
     """The page of a run that has begun.
 
@@ -76,6 +81,8 @@ def run_view(
         show: step to look at; the current one if it is "" or unknown.
         to_come: what is still being computed, in words.
         space: forecast of what the run will still write; None if it is not known.
+        earlier: how long the steps took in earlier runs.
+        now_utc: the time of the page; "" where none is to be compared with it.
     """
     protocol, state = log.protocol, log.state
     shown = show if show in state.steps else state.current
@@ -95,13 +102,15 @@ def run_view(
         attempt=state.step.attempt,
         steps=tuple(_line(protocol, state, step, shown, stopped=stopped) for step in protocol.steps),
         passed=sum(step.phase == "passed" for step in state.steps.values()),
-        shown=_shown(protocol, state, protocol.step(shown), stopped=stopped, unused=unused),
+        shown=_shown(protocol, state, protocol.step(shown), earlier, stopped=stopped, unused=unused),
         judged=() if state.terminal else tuple(_judged(protocol, state, log.events)),
         question=_question(log, snapshot, decision, mode, may_operate=viewer.may_operate),
         viewer=viewer,
         progress=capture_progress(protocol, state, log.events),
         readings=readings(snapshot, space, clock_readings(log.events)),
         working=(snapshot.what, snapshot.done, snapshot.total) if snapshot.doing == "working" else ("", 0, 0),
+        takes=_takes(protocol, state, earlier, now_utc),
+        work_left=run_words(protocol, state, earlier, now_utc) if now_utc else "",
         tries=tries_words(protocol, state, time_here),
         deviations=tuple(reversed(state.deviations)),
         news=tuple((m.at_utc, m.text) for m in reversed(snapshot.messages)),
@@ -131,6 +140,13 @@ def _judged(protocol: Protocol, state: RunState, events: Sequence[Event]) -> Ite
 
 def _decides(act: OperatorAction) -> bool:
     return act.action in _DECIDED and not act.automatic
+
+
+def _takes(protocol: Protocol, state: RunState, earlier: EarlierTimes, now_utc: str) -> tuple[str, ...]:
+    if not now_utc:
+        return ()
+    words = (said(protocol, state, earlier, now_utc, time_here) for said in (work_words, away_words))
+    return tuple(line for line in words if line)
 
 
 def _question(log: RecordOfRun, snapshot: Snapshot, decision: object, mode: str, *, may_operate: bool) -> Question:
@@ -174,7 +190,9 @@ def _line(protocol: Protocol, state: RunState, step: Step, shown: str, *, stoppe
     return StepLine(step.id, step.title, word, tone, icon, step.id == shown, there.phase != "pending")
 
 
-def _shown(protocol: Protocol, state: RunState, step: Step, *, stopped: bool, unused: int) -> StepView:
+def _shown(
+    protocol: Protocol, state: RunState, step: Step, earlier: EarlierTimes, *, stopped: bool, unused: int
+) -> StepView:
     now = state.steps[step.id]
     checks = tuple(ChecklistItem(item, item in now.ticked) for item in step.checklist)
     undone = step.irreversible and now.phase != "passed"
@@ -206,6 +224,7 @@ def _shown(protocol: Protocol, state: RunState, step: Step, *, stopped: bool, un
         ended_utc=now.ended_utc,
         table=evaluated(protocol, state) if step.gives == "accuracy" and now.result else (),
         depends=depends_on(protocol, state, step.id),
+        usual=step_words(protocol, state, step, earlier),
     )
 
 

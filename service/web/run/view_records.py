@@ -118,6 +118,7 @@ class StepView:
     started_utc: str
     ended_utc: str
     table: Sequence[Row]  # of an evaluation
+    usual: str  # how long it usually takes; "" if that is not known, or it is done
     depends: tuple[AcceptedGate, ...]  # figures accepted outside their limits that this step depends on
 
 
@@ -259,6 +260,8 @@ class RunView:
     progress: CaptureProgress
     readings: tuple[Reading, ...]
     working: tuple[str, int, int]
+    takes: tuple[str, ...]  # how long the work usually takes, and until when nobody is needed
+    work_left: str  # how long the rest of the run usually takes; "" if that is not known
     tries: str  # what failed and is tried again by itself, in words; "" for nothing
     deviations: tuple[Deviation, ...]
     news: tuple[tuple[str, str], ...]

@@ -1,0 +1,134 @@
+"""How long the work of a step usually takes, until when nobody is needed, and from when on that is not normal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from statistics import median
+
+from service.core.protocol.models import Protocol, Step
+from service.core.recovery.ways_on import planned_views, view_s
+from service.core.run.actions import needs_leave
+from service.core.run.state import RunState
+
+_TOO_LONG = 1.5  # times what is usual, and longer than ever before
+_SHORT_S = 20.0  # nobody leaves for less
+EarlierTimes = Mapping[str, Sequence[float]]  # step → seconds that its work took in earlier runs of this site
+
+
+@dataclass(frozen=True, slots=True)
+class UsualTime:
+    """How long the work of a step usually takes, and from where that is known."""
+
+    seconds: float
+    longest_s: float
+    source: str  # in words that stand in brackets
+
+
+def usual_time(protocol: Protocol, state: RunState, step: Step, earlier: EarlierTimes) -> UsualTime | None:
+    """From earlier runs of this site; before the first, from the protocol or the time for a view; None: not known."""
+    known = earlier.get(step.id, ())
+    if known:
+        runs = f"{len(known)} earlier runs" if len(known) > 1 else "one earlier run"
+        return UsualTime(median(known), max(known), f"{runs} on this site")
+    if step.takes_s is not None:
+        return UsualTime(step.takes_s, step.takes_s, "by the protocol")
+    each_s, views = view_s(protocol, state, step), planned_views(step)
+    if each_s is None or not views:
+        return None
+    return UsualTime(each_s * views, each_s * views, f"{views} views")
+
+
+def work_words(
+    protocol: Protocol, state: RunState, earlier: EarlierTimes, now_utc: str, clock: Callable[[str], str]
+) -> str:
+    """How long the work under way usually takes, and whether it has taken too long; "" while none is under way."""
+    now = state.step
+    if state.status != "active" or now.phase != "running" or needs_leave(protocol, state) or not now.work_began_utc:
+        return ""
+    step = protocol.step(now.step)
+    if step.by_hand:  # as long as the person takes
+        return ""
+    began = datetime.fromisoformat(now.work_began_utc)
+    usual = usual_time(protocol, state, step, earlier)
+    if usual is None:
+        return f"Begun at {clock(now.work_began_utc)}; how long it takes is not known yet on this site."
+    until_utc = (began + timedelta(seconds=usual.seconds)).isoformat()
+    took_s = (datetime.fromisoformat(now_utc) - began).total_seconds()
+    said = f"Usually {duration(usual.seconds)} ({usual.source}); begun at {clock(now.work_began_utc)}"
+    if took_s > max(_TOO_LONG * usual.seconds, usual.longest_s):
+        longest = duration(usual.longest_s)
+        most = "" if usual.longest_s == usual.seconds else f", and longer than ever before ({longest})"
+        return (
+            f"{said}. That is {duration(took_s)} ago{most}: not normal any more. Look at what the banner says it "
+            "waits for, at that device, and whether a worker computes."
+        )
+    return f"{said}, so until about {clock(until_utc)}."
+
+
+def away_words(
+    protocol: Protocol, state: RunState, earlier: EarlierTimes, now_utc: str, clock: Callable[[str], str]
+) -> str:
+    """Until when nobody is asked for anything, if all goes as usual; "" if somebody is needed now or before long."""
+    now = state.step
+    if state.status != "active" or now.phase not in ("running", "checking") or needs_leave(protocol, state):
+        return ""
+    if protocol.step(now.step).by_hand:
+        return ""
+    at = datetime.fromisoformat(now_utc)
+    left_s, unknown = 0.0, ""
+    for step in protocol.steps[protocol.index(now.step) :]:
+        here = step.id == now.step
+        if not here and step.begins_confirmed:
+            break
+        usual = usual_time(protocol, state, step, earlier)
+        if usual is None:
+            unknown = step.title
+            break
+        began = datetime.fromisoformat(now.work_began_utc) if here and now.work_began_utc else at
+        left_s += max(0.0, usual.seconds - (at - began).total_seconds()) if here else usual.seconds
+        if step.sign:
+            break
+    if left_s < _SHORT_S:
+        return ""
+    until = clock((at + timedelta(seconds=left_s)).isoformat())
+    least = f"at least until about {until}: how long “{unknown}” takes is not known" if unknown else f"until {until}"
+    return f"You can leave {least}. A fault asks for you earlier: switch alerts on."
+
+
+def step_words(protocol: Protocol, state: RunState, step: Step, earlier: EarlierTimes) -> str:
+    """How long a step that is still to be done usually takes; "" where that is not known, or the step is done."""
+    usual = usual_time(protocol, state, step, earlier)
+    if state.terminal or usual is None or state.steps[step.id].phase == "passed":
+        return ""
+    return f"Usually takes {duration(usual.seconds)} ({usual.source})."
+
+
+def run_words(protocol: Protocol, state: RunState, earlier: EarlierTimes, now_utc: str) -> str:
+    """How long the work that is left of a run usually takes, without the times for which it waits for people."""
+    if state.terminal:
+        return ""
+    left_s, known = 0.0, 0
+    left = [step for step in protocol.steps if state.steps[step.id].phase != "passed"]
+    for step in left:
+        usual = usual_time(protocol, state, step, earlier)
+        if usual is None:
+            continue
+        known += 1
+        now = state.steps[step.id]
+        began = now.work_began_utc if now.phase == "running" else ""
+        done = datetime.fromisoformat(now_utc) - datetime.fromisoformat(began) if began else timedelta()
+        left_s += max(0.0, usual.seconds - done.total_seconds())
+    if not known:
+        return ""
+    part = "" if known == len(left) else f", of {known} of the {len(left)} steps left"
+    return f"Work left{part}: about {duration(left_s)}, and the time for which the run waits for people."
+
+
+def duration(seconds: float) -> str:
+    """`40 s`, `12 min`, `1 h 05 min`."""
+    if seconds < 90:
+        return f"{max(round(seconds / 5) * 5, 5)} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
