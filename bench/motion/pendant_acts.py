@@ -14,7 +14,7 @@ import json
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -36,6 +36,7 @@ from tests.support.rig.bench_rig import answer
 from tests.support.runs.one_arm_run import VIEWS, OneArmRun, arm_at
 
 ACTS = {
+    "program": "program other.urp",
     "push": "push 0 0 0.05 0 0 0 0.1",
     "slight push": "push 0 0 0.004 0 0 0 0.1",
     "free drive": "freedrive 0 0 0.05 0 0 0 0.1",
@@ -44,7 +45,6 @@ ACTS = {
     "payload": "payload 3 0 0 0.08",
     "slider to 30 %": "slider 30",
     "slider to 0 %": "slider 0",
-    "program": "program other.urp",
 }
 MOMENTS = ("before motion", "in motion", "settling", "exposing", "between views")
 WRONG_M, WRONG_RAD = 0.0001, 0.0002  # a tenth of a millimetre: more than standing still allows
@@ -137,6 +137,8 @@ def sweep_one(act: str, moment: str, number: int) -> Outcome:
 
         def confirm(question: AskOperator, _state: RunState) -> OperatorAction:
             asked.append(question.text)
+            if "another program runs" in question.text:
+                pendant(host, "stop")  # as the question says
             return answer(question, "confirm")
 
         run.answers(*[confirm] * 4)
@@ -192,23 +194,12 @@ def table(outcomes: Sequence[Outcome]) -> list[str]:
     ]
 
 
-def main(run_one: Callable[[str, str, int], Outcome] = sweep_one) -> None:
-    """Sweep, print, and record if asked."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--act", choices=tuple(ACTS), action="append", help="only this one; may be repeated")
-    parser.add_argument("--moment", choices=MOMENTS, action="append", help="only this one; may be repeated")
-    parser.add_argument("--record", action="store_true", help="write the results to bench/results")
-    options = parser.parse_args()
-    outcomes: list[Outcome] = []
-    for act in options.act or ACTS:
-        for moment in options.moment or MOMENTS:
-            outcomes.append(run_one(act, moment, 1 + len(outcomes)))
-            print(*table(outcomes[-1:]), flush=True)
-    today = datetime.now(UTC).date().isoformat()
+def text(outcomes: Sequence[Outcome], today: str, measured: str) -> str:
+    """The results as a page."""
     wrong, images = sum(o.wrong for o in outcomes), sum(o.images for o in outcomes)
-    text = "\n".join([
+    return "\n".join([
         f"# What acts at the pendant do to a capture, {today}", "",
-        f"`python -m bench.motion.pendant_acts`, revision {commit()}. Three views; the act once, at the second one. "
+        f"`python -m bench.motion.pendant_acts`, revision {measured}. Three views; the act once, at the second one. "
         "*After*: from the act to the event that names it, when the arm was opened anew (push) or has stopped. "
         "*Worst*: pose of a view that counts, from where the arm was. *Wrong*: images that count with a pose that is "
         f"off by more than {mm(WRONG_M):g} mm or {deg(WRONG_RAD):.2g}°. *Other tool*: images that count while the "
@@ -218,11 +209,27 @@ def main(run_one: Callable[[str, str, int], Outcome] = sweep_one) -> None:
         "|---|---|---|---:|---:|---:|---:|---:|---:|---|", *table(outcomes), "",
         f"Images with a wrong pose: {wrong} of {images}.",
     ]) + "\n"  # fmt: skip
-    if options.record:
-        data = {"commit": commit(), "machine": machine(), "outcomes": [asdict(o) for o in outcomes]}
-        (RESULTS / f"pendant_acts-{today}.json").write_text(json.dumps(data, indent=1) + "\n")
-        (RESULTS / f"pendant_acts-{today}.md").write_text(text)
-    print(text)
+
+
+def main() -> None:
+    """Sweep, print, and record if asked, after each run: a sweep that is cut short has told what it found."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--act", choices=tuple(ACTS), action="append", help="only this one; may be repeated")
+    parser.add_argument("--moment", choices=MOMENTS, action="append", help="only this one; may be repeated")
+    parser.add_argument("--record", action="store_true", help="write the results to bench/results")
+    options = parser.parse_args()
+    outcomes: list[Outcome] = []
+    today = datetime.now(UTC).date().isoformat()
+    measured = commit()
+    for act in options.act or ACTS:
+        for moment in options.moment or MOMENTS:
+            outcomes.append(sweep_one(act, moment, 1 + len(outcomes)))
+            print(*table(outcomes[-1:]), flush=True)
+            if options.record:
+                data = {"commit": measured, "machine": machine(), "outcomes": [asdict(o) for o in outcomes]}
+                (RESULTS / f"pendant_acts-{today}.json").write_text(json.dumps(data, indent=1) + "\n")
+                (RESULTS / f"pendant_acts-{today}.md").write_text(text(outcomes, today, measured))
+    print(text(outcomes, today, measured))
 
 
 if __name__ == "__main__":
