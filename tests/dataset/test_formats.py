@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import importlib.util
 import json
@@ -207,6 +208,9 @@ def says_simulated(path: Path) -> bool:
     if path.suffix == ".npz":
         with np.load(path) as arrays:
             return bool(arrays["simulated"])
+    if path.suffix == ".csv":
+        with path.open(encoding="utf-8") as table:
+            return {row["simulated"] for row in csv.DictReader(table)} == {"true"}
     return b"simulated" in path.read_bytes().lower()
 
 

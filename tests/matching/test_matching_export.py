@@ -87,7 +87,6 @@ def test_relative_poses_agree_with_those_of_the_views(dataset: DataSet, folder: 
         C = relative_covariance(T[0], T[1], dataset.pose_errors[np.ix_(rows_of, rows_of)])
         assert pair["covariance"] is not None
         assert np.abs(np.array(pair["covariance"]) - C).max() < 1e-18
-        assert row["simulated"] == "true"
         assert float(row["sigma_mm"]) == pytest.approx(1e3 * np.sqrt(np.trace(C[:3, :3])))
         assert pair["difficulty"] in CLASSES
 
