@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import importlib.util
+import json
 import re
 import subprocess
 import sys
@@ -156,6 +158,10 @@ def test_hdf5_holds_image_depth_and_pose(dataset: DataSet, tmp_path: Path) -> No
     assert specification.loader is not None
     loader: Any = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(loader)
+    with h5py.File(folder / "data.h5") as file:
+        for split, names in dataset.splits.named().items():
+            assert loader.Views(folder, split).names == list(names)
+            assert file[f"splits/{split}"].dtype.kind == "S", "a split without views is text, too"  # type: ignore[union-attr]
     sparse, shown = loader.Views(folder, "train"), scene()
     views = {view.name: view for view in dataset.views}
     assert list(sparse.names) == list(dataset.splits.train)
@@ -175,11 +181,18 @@ def test_hdf5_holds_image_depth_and_pose(dataset: DataSet, tmp_path: Path) -> No
 
 
 def test_trimesh_reads_the_gltf_with_its_cameras(dataset: DataSet, tmp_path: Path) -> None:
-    loaded = trimesh.load_scene(written(dataset, "gltf", tmp_path) / "scene.glb")
+    file = written(dataset, "gltf", tmp_path) / "scene.glb"
+    loaded, content = trimesh.load_scene(file), file.read_bytes()
+    cameras = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])["cameras"]
+    lenses = [camera["perspective"] for camera in cameras]
     (mesh,) = loaded.geometry.values()
     assert np.abs(mesh.bounds - scene().mesh.bounds).max() < 1e-7
     assert mesh.volume == pytest.approx(scene().mesh.volume, rel=1e-5)
-    for view in dataset.views:
+    for view, lens in zip(dataset.views, lenses, strict=True):
+        camera, depth_m = view.camera, dataset.pixels.depth_m(view)
+        assert lens["yfov"] == pytest.approx(2 * np.arctan2(camera.height / 2, camera.fy))
+        assert lens["aspectRatio"] == pytest.approx(camera.width / camera.height * camera.fy / camera.fx)
+        assert 0 < lens["znear"] < 0.5 * depth_m[depth_m > 0].min()
         pose = np.asarray(loaded.graph.get(view.name)[0])
         assert np.abs(pose[:3, :3] @ np.diag([1, -1, -1]) - view.T_world_camera[:3, :3]).max() < 1e-6
         assert np.abs(pose[:3, 3] - view.T_world_camera[:3, 3]).max() < 1e-6
@@ -195,6 +208,9 @@ def says_simulated(path: Path) -> bool:
     if path.suffix == ".npz":
         with np.load(path) as arrays:
             return bool(arrays["simulated"])
+    if path.suffix == ".csv":
+        with path.open(encoding="utf-8") as table:
+            return {row["simulated"] for row in csv.DictReader(table)} == {"true"}
     return b"simulated" in path.read_bytes().lower()
 
 
@@ -213,6 +229,18 @@ def test_a_simulated_data_set_says_so_in_every_file_that_can(dataset: DataSet, t
     assert heard
     assert [path.name for path in heard if not says_simulated(path)] == []
     assert document(folder / "splits.json")["dense"] == [view.name for view in dataset.views]
+
+
+@pytest.mark.parametrize("name", ["bop", "eth3d", "plain"])
+def test_a_mesh_says_only_of_a_simulated_data_set_that_it_is(dataset: DataSet, tmp_path: Path, name: str) -> None:
+    real = dataclasses.replace(dataset, simulated=False)
+    for exported, said in ((dataset, [f"comment {dataset.mark}".encode()]), (real, [])):
+        folder = tmp_path / str(exported.simulated)
+        folder.mkdir()
+        (mesh,) = written(exported, name, folder).rglob("*.ply")
+        head = mesh.read_bytes().partition(b"end_header\n")[0].splitlines()
+        assert [line for line in head if line.startswith(b"comment")] == said
+        assert not trimesh.load_mesh(mesh).is_empty
 
 
 @pytest.mark.parametrize("name", sorted(NAMES))

@@ -85,6 +85,11 @@ def test_neus2_sees_the_solid_in_its_cube_and_its_meshes_come_back(dataset: Data
     image = picture(folder / stated["frames"][0]["file_path"])
     assert image.shape[2] == 4
     assert set(np.unique(image[..., 3])) == {0, 255}
+    # Its pixels have their corners at integers.
+    for frame, view in zip(stated["frames"], pinholes.views, strict=True):
+        pose = ngp_matrix(stated, np.array(frame["transform_matrix"]))
+        seen = (cube - pose[:, 3]) @ pose[:, :3] @ np.array(frame["intrinsic_matrix"])[:3, :3].T
+        assert np.abs(seen[:, :2] / seen[:, 2:] - 0.5 - truth_px(view)).max() < 0.01
 
 
 def _meeting(dataset: DataSet, stated: Any, corner: int) -> Array:

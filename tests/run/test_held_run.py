@@ -21,7 +21,7 @@ from service.store.store import Store
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 
 NOTE = StepNote(step="fixation", attempt=1, note="seen")
-NOBODY = Authority(url="http://127.0.0.1:1/tsa", certificates=Path("none.pem"))
+NOBODY = Authority(url="http://127.0.0.1:1/tsa", certificates=Path("none.pem"), timeout_s=1.0)
 
 
 @pytest.fixture

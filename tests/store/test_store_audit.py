@@ -7,6 +7,7 @@ import random
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing, suppress
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from service.cli.evidence.audit import audit_app
 from service.core.errors import OrthocaptureError, StoreError
 from service.core.records.events import StepNote
 from service.store.database.engine import database_path
+from service.store.durable_effects import utc_text
 from service.store.errors import UnknownRunError
 from service.store.events import event_sha256
 from service.store.records import SITE, NewArtefact, NewJob
@@ -132,6 +134,17 @@ def test_tampering_with_the_database_is_named(data: Path, name: str) -> None:
     assert fault is not None
     assert (fault.run_id, fault.seq) == (RUN, seq)
     assert said in fault.what
+
+
+@pytest.mark.parametrize(("second", "said"), [(4.9, 0), (5.1, 1)])
+def test_a_run_whose_row_is_a_few_seconds_from_its_first_event_was_made_by_an_older_version(
+    data: Path, second: float, said: int
+) -> None:
+    """It read the clock twice."""
+    ((first_utc,),) = rows(data, f"SELECT at_utc FROM events WHERE seq = 1 AND run_id = '{RUN}'")
+    row_utc = datetime.fromisoformat(str(first_utc)) - timedelta(seconds=second)
+    tamper(data, f"UPDATE runs SET created_utc = '{utc_text(row_utc)}' WHERE run_id = '{RUN}'")
+    assert len([fault for fault in verify(data).faults if "that it was made at" in fault.what]) == said
 
 
 def test_an_altered_row_is_named_with_the_file_that_it_is_about(data: Path) -> None:

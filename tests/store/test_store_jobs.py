@@ -15,6 +15,7 @@ import pytest
 
 from service.core.errors import DataError, StoreError
 from service.core.records.events import JobFailed, JobFinished, StepNote
+from service.store.durable_effects import SystemClock
 from service.store.errors import LeaseHeldError, LeaseLostError
 from service.store.queue.leases import ProcessIdentity, RunLease
 from service.store.records import NewArtefact, NewJob
@@ -71,8 +72,10 @@ def test_a_job_from_claim_to_finish(store: Store) -> None:
     assert event.payload.artefacts == (ref,)
     (done,) = store.jobs(run)
     assert (done.state, done.ended_seq) == ("finished", event.seq)
-    with pytest.raises(LeaseLostError, match="no longer"):
+    with pytest.raises(LeaseLostError, match=r"no longer this worker's \(finished, worker w\)"):
         store.finish_job(job, measures={}, duration_s=1.0)
+    with pytest.raises(LeaseLostError, match=r"no longer this worker's \(gone\)"):  # the database is an older copy
+        store.finish_job(replace(job, job_id="unknown"), measures={}, duration_s=1.0)
     assert store.claim_job("w", 10) is None
 
 
@@ -170,8 +173,9 @@ def test_one_runner_drives_a_run(store: Store, clock: SteppedClock, monkeypatch:
     with monkeypatch.context() as elsewhere:  # on another host only the time is known
         elsewhere.setattr(socket, "gethostname", lambda: "the other computer")
         first = store.lease(run, "runner 1", 10)
-    with pytest.raises(LeaseHeldError, match="runner 1"):
+    with pytest.raises(LeaseHeldError, match="runner 1") as refused:
         store.lease(run, "runner 2", 10)
+    assert "wait 10 s after it" in refused.value.remedy
     clock.passed_s = 9
     first.renew()
     clock.passed_s = 18
@@ -202,7 +206,7 @@ def test_a_runner_that_lives_keeps_its_run_whatever_the_clock_says(store: Store,
 
 
 def test_a_lease_is_renewed_by_itself_also_after_a_store_that_failed(
-    store: Store, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch
+    store: Store, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     run = start_run(store)
     renewals: list[float] = []
@@ -222,6 +226,9 @@ def test_a_lease_is_renewed_by_itself_also_after_a_store_that_failed(
 
     with store.lease(run, "runner", 30.0):
         until(renewed, "the lease is not renewed again", every_s=0.01)
+    assert [r.getMessage() for r in caplog.records if run in r.getMessage()] == [
+        f"the lease of {run} was not renewed: the disk is full"
+    ]
 
 
 HOLDER = """
@@ -273,3 +280,9 @@ def test_a_process_is_known_by_its_host_its_boot_its_number_and_its_start() -> N
     assert replace(this, pid=2**22 + 1).life() == "dead"  # beyond the largest that Linux gives
     assert replace(this, host="another").life() == "unknown"
     assert replace(this, host="another", boot="another").life() == "unknown"
+
+
+def test_a_host_that_names_no_boot_claims_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A name that all boots share would let times of two boots be compared."""
+    monkeypatch.setattr("service.store.durable_effects._BOOT_ID", tmp_path / "none")
+    assert SystemClock().boot() == ""

@@ -126,6 +126,8 @@ def test_the_tests_that_reach_a_line_are_chosen_and_changed_files_are_added_whol
         ["tests/core/test_gate.py::test_limit"]
     ]
     assert reach.selected("gates", GATES, noted) == []
+    rules = "service/core/protocol/rules.py"  # has no function, so that no test is known to reach it
+    assert [one.tests for one in reach.selected("gates", rules, 3)] == [("test_limit",)]
     (whole,) = reach.selected("gates", GATES, 8)  # a constant: whatever reaches the file
     assert whole.tests == ("test_limit",)
     (tmp_path / "tests/core/test_new.py").write_text(TEST)

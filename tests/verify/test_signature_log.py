@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import rfc8785
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from typer.testing import CliRunner
 
 from service.cli.main import app
@@ -18,7 +23,7 @@ from service.store.database.engine import database_path
 from service.store.records import SITE
 from service.store.signatures.log import NAME, read_log
 from service.store.signatures.log_copy import bring_up_to_date, keep_elsewhere
-from service.store.signatures.signing import checkpoint, rotate_key
+from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.stepped_clock import SteppedClock
@@ -170,6 +175,20 @@ def test_a_database_put_back_as_it_was_shows(data: Path, tmp_path: Path) -> None
         left.unlink()
     shutil.copy(copy, database_path(data))
     assert any("is no longer here: what it signed was removed" in fault for fault in faults(data))
+
+
+def test_each_line_is_signed_with_its_place_and_its_purpose_in_canonical_json(data: Path) -> None:
+    """What an auditor has who reads the log without this software, and what lines of earlier versions have."""
+    with Store.open(data) as store:
+        keys = {one.key_id: Ed25519PublicKey.from_public_bytes(one.public_key) for one in public_keys(store)}
+    previous = "0" * 64
+    for number, raw in enumerate((data / NAME).read_bytes().splitlines(keepends=True), 1):
+        line = json.loads(raw)
+        signature = base64.b64decode(line.pop("signature"))
+        assert (line["number"], line["previous_sha256"]) == (number, previous)
+        signed = rfc8785.dumps({**line, "purpose": "orthocapture signature log v1"})
+        keys[line["key_id"]].verify(signature, signed)
+        previous = hashlib.sha256(raw).hexdigest()
 
 
 def test_the_log_follows_the_key(data: Path) -> None:

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import random
+import re
 import shutil
 import struct
 import zipfile
@@ -129,7 +130,11 @@ FORGERIES: dict[str, tuple[str, Callable[[list[dict[str, Any]]], Any], str]] = {
         "was signed once",
     ),
     "account": ("site_events.jsonl", lambda r: r[-1].update(actor="Eve"), "its content was altered"),
-    "device of a file": ("artefacts.jsonl", lambda r: r[1].update(device="phone"), "the row was altered"),
+    "device of a file": (
+        "artefacts.jsonl",
+        lambda r: r[1].update(device="phone"),
+        "rig.yaml of event 1: the row was altered",
+    ),
     "row left out": ("artefacts.jsonl", lambda r: r.pop(3), "has no row"),
     "job": ("jobs.jsonl", lambda r: r[0].update(arguments={}), "differs from its event"),
     "job's state": ("jobs.jsonl", lambda r: r[0].update(state="failed"), "is failed, but event"),
@@ -153,6 +158,8 @@ def test_forged_records_are_named_and_cannot_be_signed(unpacked: Path, name: str
     seal(unpacked)
     found = check(unpacked)
     assert any(said in fault for fault in found), found
+    files = {path.relative_to(unpacked).as_posix() for path in unpacked.rglob("*")}
+    assert [fault for fault in found if re.split("[,:]", fault)[0] not in files] == []
     assert "manifest.json, manifest.sig: the signature is not valid: the manifest was altered" in found
 
 

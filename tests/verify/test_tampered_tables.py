@@ -46,7 +46,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert job is not None
         ref = store.put_bytes(b"{}", kind="result", media_type="application/json", original_name="result.json")
         store.finish_job(job, measures={}, duration_s=1.0, artefacts=[NewArtefact(ref, "worker 1")])
-        timestamp(store, checkpoint(store, run), Authority(authority.url, authority.certificates))
+        timestamp(store, checkpoint(store, run), Authority(authority.url, authority.certificates, 30))
         ada = people.person(people.sign_in("ada", password_of("ada")), idle_lock_s=1e9, deliberate=False)
         assert ada is not None
         people.accounts.invite(ada, "marie", "Marie Curie", "technician")

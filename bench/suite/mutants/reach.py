@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.suite.mutants.recorder import functions
-from bench.suite.mutants.subjects import OWN_TESTS, TESTS
+from bench.suite.mutants.subjects import OWN_TESTS, TESTS, sources
 
 RECORD = Path("bench/suite/mutants/reached.json")
 WHOLE_FILE_S = 3.0  # assumed of a test file whose tests were not recorded
@@ -66,6 +66,9 @@ class Reach:
         """
         name = next((name for first, _body, last, name in functions(self._tree / file) if first <= line <= last), "")
         recorded = self._reached.get(file, {})
+        if not recorded:  # no function is known: the rest of the subject uses what it defines
+            of_subject = (self._reached.get(other, {}) for other in sources(self._tree)[subject])
+            recorded = {"": sorted({n for of in of_subject for numbers in of.values() for n in numbers})}
         numbers: Iterable[int] = recorded[name] if name in recorded else {n for of in recorded.values() for n in of}
         by_file: dict[str, list[str]] = {}
         for test in (self._tests[n] for n in numbers):

@@ -104,7 +104,7 @@ def make_record(folder: Path) -> Record:
     with time_stamp_authority(folder / "tsa") as authority, Store.open(folder / "data", files=files) as store:
         people = People(store, QUICK_HASHES)
         _start(store, folder, people)
-        run_id = _complete_run(store, folder, Authority(authority.url, authority.certificates))
+        run_id = _complete_run(store, folder, Authority(authority.url, authority.certificates, 10.0))
         _people_act(store, people, run_id)
         (first_key,) = (folder / "data" / "keys").glob("*.pem")
         first = first_key.read_bytes()

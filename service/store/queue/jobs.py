@@ -94,9 +94,9 @@ def started(connection: Connection, run_id: str) -> dict[str, str]:
 class JobChoice:
     """Which jobs a worker may claim; None allows every kind, every run, every lane."""
 
-    kinds: Collection[str] | None = None
-    run_id: str | None = None
-    lane: Lane | None = None
+    kinds: Collection[str] | None
+    run_id: str | None
+    lane: Lane | None
 
     def condition(self) -> ColumnElement[bool]:
         """The choice as a condition on the rows of `jobs`."""

@@ -159,7 +159,7 @@ def acquire(database: Database, clock: Clock, ids: IdSource, *, run_id: str, hol
         if row is not None:
             if is_live(row, now):
                 here = row.host == socket.gethostname()
-                left_s = max(0.0, row.until_utc_s - now)
+                left_s = row.until_utc_s - now
                 raise LeaseHeldError(
                     f"another process drives this run: {row.holder}",
                     where=f"process {row.pid} on {row.host}",

@@ -49,7 +49,7 @@ class Authority:
 
     url: str
     certificates: Path
-    timeout_s: float = 10.0
+    timeout_s: float
 
 
 def stamped_bytes(checkpoint: Checkpoint) -> bytes:

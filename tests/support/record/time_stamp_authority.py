@@ -17,6 +17,8 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+LONGEST_REPLY = 1 << 20  # that is read
+
 _CONFIGURATION = """\
 [tsa]
 default_tsa = here
@@ -37,7 +39,7 @@ class TimeStampAuthority:
 
     url: str
     certificates: Path
-    behaviour: str = "good"  # good, silent, asleep, dripping, garbage, replay, html
+    behaviour: str = "good"  # good, silent, asleep, dripping, garbage, replay, html, long
     asked: int = 0
     first: bytes = b""
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -102,7 +104,12 @@ def time_stamp_authority(folder: Path) -> Generator[TimeStampAuthority]:
                 answer = reply(folder, query)
                 authority.first = authority.first or answer
             kind = "text/html" if authority.behaviour == "html" else "application/timestamp-reply"
-            content = {"garbage": b"\x30\x03\x02\x01\x00", "replay": authority.first}.get(authority.behaviour, answer)
+            other = {
+                "garbage": b"\x30\x03\x02\x01\x00",
+                "replay": authority.first,
+                "long": answer + bytes(LONGEST_REPLY),
+            }
+            content = other.get(authority.behaviour, answer)
             if authority.behaviour == "silent":
                 return
             if authority.behaviour == "asleep":
