@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
+from service.cli.main import app
 from service.core.records.events import (
     DeviceOpened,
     DeviceTrouble,
@@ -199,6 +202,17 @@ def test_while_it_is_connected_again_nobody_is_told_that_nothing_needed_it() -> 
     banner = shown(driving().state, robot="not_connected")
     assert "Take it as moving" in banner.text
     assert banner.tone == "unknown"
+
+
+def test_the_command_line_says_it_too(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL)
+    bench.store.record(bench.run_id, [opened(), trouble("died")], actor="runner")
+    at_utc = bench.store.events(bench.run_id)[-1].at_utc
+    said = CliRunner().invoke(app, ["status", bench.run_id, "--data", str(bench.data)]).output
+    assert "robot counts as moving until a person has looked" in said
+    plain = CliRunner().invoke(app, ["status", bench.run_id, "--data", str(bench.data), "--json"]).output
+    moving = json.loads(plain)["counts_as_moving"]
+    assert moving == {"robot": {"since_utc": at_utc, "how": "when its driver's process ended (died of SIGKILL)"}}
 
 
 def test_other_devices_are_no_arms() -> None:

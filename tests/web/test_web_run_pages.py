@@ -14,6 +14,7 @@ from service.core.records.events import (
     ItemTicked,
     OperatorAction,
     RunAborted,
+    SessionStarted,
     StepStarted,
 )
 from service.monitor.snapshot import Message, Snapshot, write_snapshot
@@ -123,6 +124,24 @@ def test_a_page_from_before_a_loss_confirms_no_motion(web: WebSite, run_id: str)
         sent = browser.send_form(
             f"/runs/{run_id}/actions", verb="confirm", step="capture", attempt=1, seen_seq=seen_seq
         )
+        assert sent.status_code == status
+
+
+@pytest.mark.parametrize("verb", ["confirm", "resume"])
+def test_a_page_from_before_a_restart_lets_no_arm_move_that_was_connected_then(
+    web: WebSite, run_id: str, verb: str
+) -> None:
+    browser = web.browser("technician")
+    web.take_control(run_id, browser)
+    arm = DeviceOpened(device="robot", report={"identity": {"kind": "robot"}})
+    web.store.record(run_id, [OperatorAction(action="skip", step="fixation", reason="done before")], actor="grace")
+    web.store.record(run_id, [arm], actor="runner")
+    if verb == "resume":
+        web.store.record(run_id, [OperatorAction(action="pause")], actor="grace")
+    seen = web.store.head(run_id)
+    web.store.record(run_id, [SessionStarted(resumed=True, software={}, host="h", pid=2)], actor="runner")
+    for seen_seq, status in ((seen, 409), (seen + 1, 303)):
+        sent = browser.send_form(f"/runs/{run_id}/actions", verb=verb, step="capture", attempt=1, seen_seq=seen_seq)
         assert sent.status_code == status
 
 

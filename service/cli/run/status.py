@@ -22,7 +22,10 @@ from service.core.gates.verdict import Standing, describe, standing
 from service.core.records.entered import about_rows
 from service.core.records.events import GateVerdict
 from service.core.recovery.ways_on import takes_words, ways_on
+from service.core.run.connections import lost_arms
 from service.core.run.state import RunState, StepState
+from service.core.run.tries import tries_words
+from service.core.text.clock_time import time_utc
 from service.jobs.capture import live_summary, live_view
 from service.run_record import read_log, results_to_come
 from service.run_start import recorded_run
@@ -59,6 +62,11 @@ def status_command(
         phase = "skipped" if now.skipped else now.phase.replace("_", " ")
         table.add_row(step.id, phase, str(now.attempt), str(len(now.captured) or ""), escape(gates))
     print_table(table)
+    for arm, loss in lost_arms(state).items():
+        since = f"the connection to it was lost at {time_utc(loss.since_utc)}, {loss.how}"
+        console.print(f"{escape(arm)} counts as moving until a person has looked: {escape(since)}")
+    if words := tries_words(protocol, state):
+        console.print(f"trying again: {escape(words)}")
     for name, entered in about_rows(root.about):
         console.print(f"{name}: {escape(entered)}")
     for coat in aging:
@@ -94,6 +102,9 @@ def status_record(run_id: str, state: RunState) -> dict[str, Any]:
         "status": state.status,
         "current": state.current,
         "deviations": [d.text for d in state.deviations],
+        "counts_as_moving": {
+            arm: {"since_utc": loss.since_utc, "how": loss.how} for arm, loss in lost_arms(state).items()
+        },
         "steps": {
             name: {
                 "phase": s.phase,

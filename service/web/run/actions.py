@@ -20,7 +20,6 @@ from service.core.records.events import (
     JobFailed,
     JobFinished,
     OperatorAction,
-    Payload,
     RecordedView,
     RobotSeen,
     SessionStarted,
@@ -56,6 +55,7 @@ _HARMLESS = (
     ActionRefused,
     ControlTaken,
     DeviceOpened,
+    DeviceTrouble,
     ItemTicked,
     JobEnqueued,
     JobFailed,
@@ -231,6 +231,8 @@ def _require_shown(log: RunRecord, form: ActionForm) -> None:
     """Refuse what a person decided about something else than what there is now."""
     if form.verb in ("confirm", "sign", "skip", "accept", "resume"):
         _require_current(log, form.step, form.attempt, form.seen_seq)
+    if form.verb in ("confirm", "resume"):
+        _require_losses_seen(log, form.seen_seq)
     if form.verb == "redo":
         _require_same_redo(log, form)
 
@@ -239,7 +241,7 @@ def _require_current(log: RunRecord, step: str, attempt: int, seen_seq: int) -> 
     """A page that shows an earlier question must not answer a later one."""
     state = log.state
     since = (event.payload for event in log.events[seen_seq:])
-    if (step, attempt) != (state.current, state.step.attempt) or not all(map(_harmless, since)):
+    if (step, attempt) != (state.current, state.step.attempt) or not all(isinstance(p, _HARMLESS) for p in since):
         raise _out_of_date(state)
 
 
@@ -262,11 +264,11 @@ def _require_same_redo(log: RunRecord, form: ActionForm) -> None:
     raise IllegalTransitionError(what, where=form.step, remedy=DECIDE_AGAIN)
 
 
-def _harmless(payload: Payload) -> bool:
-    """Whether an event leaves the page as it was; the loss of an arm is to be read before it is confirmed."""
-    if isinstance(payload, DeviceTrouble):
-        return payload.connection in ("", "refused")
-    return isinstance(payload, _HARMLESS)
+def _require_losses_seen(log: RunRecord, seen_seq: int) -> None:
+    """Whoever lets the robot move says to have looked at an arm whose connection was lost, so the page said so."""
+    moves = log.protocol.step(log.state.current).moves_robot
+    if moves and any(loss.seq > seen_seq for loss in lost_arms(log.state).values()):
+        raise _out_of_date(log.state)
 
 
 def _out_of_date(state: RunState) -> IllegalTransitionError:
