@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 from service.core.gates.verdict import quantity
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.events import (
+    ArtefactRef,
     DeviceOpened,
     DeviceTrouble,
+    FilesKept,
     ItemTicked,
     LeaveLapsed,
     OperatorVerb,
@@ -346,3 +348,20 @@ def test_numbers_have_units_and_limits_words() -> None:
     assert quantity(None, "mm") == "not measured"
     assert limit(None, 0.5, "px") == "at most 0.5 px"
     assert [duration(s) for s in (7, 100, 3900)] == ["5 s", "2 min", "1 h 05 min"]
+
+
+def test_photographs_of_the_layout_count_as_recorded() -> None:
+    """They are no views, and a page that says "0 images are recorded" beside them is not believed."""
+    log = advance_to(DEMO, "layout_check")
+    go(log, "on")
+    log.begin()
+    image = ArtefactRef(
+        sha256="0" * 64, size_bytes=1, media_type="image/jpeg", kind="layout_image", original_name="L.JPG"
+    )
+    for number in range(2):
+        kept = image.model_copy(update={"sha256": f"{number:064x}"})
+        log.append(FilesKept(step="layout_check", attempt=1, device="camera", note="one", artefacts=(kept,)))
+    go(log, "fail")
+    trouble = view_of(log).question.trouble
+    assert trouble is not None
+    assert trouble.safe == "Yes. 2 photographs are recorded, and every result so far."
