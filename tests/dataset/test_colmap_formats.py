@@ -35,6 +35,21 @@ def test_pycolmap_projects_points_to_their_pixels(
             assert picture.size == (camera.width, camera.height)
 
 
+@pytest.mark.parametrize("name", ["colmap", "colmap-binary"])
+@pytest.mark.parametrize("term", ["k3", "k4", "k5", "k6"])
+def test_a_lens_with_more_terms_has_them_all_in_the_model(
+    dataset: DataSet, tmp_path: Path, name: str, term: str
+) -> None:
+    view = dataset.views[0]
+    bent = dataclasses.replace(view, camera=dataclasses.replace(view.camera, **{term: 0.01}))
+    folder = written(dataclasses.replace(dataset, views=(bent, *dataset.views[1:])), name, tmp_path)
+    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+    (image,) = (image for image in model.images.values() if image.name == view.file)
+    assert model.cameras[image.camera_id].model.name == "FULL_OPENCV"
+    pixels = np.array([image.project_point(point) for point in corners()])
+    assert np.abs(pixels - 0.5 - truth_px(bent)).max() < 0.01
+
+
 @pytest.mark.parametrize("name", ["colmap", "colmap-binary", "colmap-pinhole"])
 def test_a_model_of_cameras_alone_has_no_points(dataset: DataSet, tmp_path: Path, name: str) -> None:
     """An invented point would count as measured for whoever triangulates from these poses."""

@@ -97,6 +97,10 @@ def test_bop_model_projects_to_the_depth_image(dataset: DataSet, pinholes: DataS
     cameras, poses = (document(scene_folder / f"scene_{name}.json") for name in ("camera", "gt"))
     model = trimesh.load_mesh(folder / "models" / "obj_000001.ply", process=False)
     info = document(folder / "models" / "models_info.json")["1"]
+    lens, camera = document(folder / "camera.json"), pinholes.views[0].camera
+    assert [lens[key] for key in ("fx", "fy", "cx", "cy")] == [camera.fx, camera.fy, camera.cx, camera.cy]
+    assert (lens["width"], lens["height"]) == (camera.width, camera.height)
+    assert {of_view["depth_scale"] for of_view in cameras.values()} == {lens["depth_scale"]}
     assert info["diameter"] == pytest.approx(
         max(np.linalg.norm(a - b) for a in model.vertices for b in model.vertices), rel=1e-9
     )

@@ -46,7 +46,11 @@ def test_enqueueing_twice_gives_the_first_job_and_appends_nothing(store: Store) 
     first = enqueue(store, run, JOB, actor="runner")
     again = enqueue(store, run, NewJob("registration", "register", 1, "register-1", {"other": 1}), actor="runner")
     assert again == first
-    assert [event.payload.kind for event in store.events(run)] == ["run_started", "job_enqueued"]
+    note = StepNote(step="register", attempt=1, note="n")
+    events = store.record(run, [note], actor="runner", jobs=[JOB, replace(JOB, idempotency_key="register-2")])
+    assert [event.payload.kind for event in events] == ["step_note", "job_enqueued"]
+    assert store.events(run)[-2:] == events
+    assert [event.payload.kind for event in store.events(run)][:-2] == ["run_started", "job_enqueued"]
     other_run = start_run(store)
     assert enqueue(store, other_run, JOB, actor="runner").job_id != first.job_id
 

@@ -21,7 +21,7 @@ from service.rig import load_rig
 from service.run_start import signature_copy
 from service.store.database.engine import database_path
 from service.store.records import SITE
-from service.store.signatures.log import NAME, read_log
+from service.store.signatures.log import NAME, SignatureLog, read_log
 from service.store.signatures.log_copy import bring_up_to_date, keep_elsewhere
 from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
@@ -272,6 +272,18 @@ def test_a_signature_whose_line_a_crash_prevented_is_written_down_with_the_next(
     assert any("is not in signatures.jsonl yet" in note for note in verify(data).notes)
     sign_again(data)
     assert verify(data).notes == ()
+
+
+def test_only_the_newest_signatures_may_lack_their_line(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each signature writes down those that a crash left out, so that an older one without a line was taken out."""
+    really = SignatureLog.add
+    with monkeypatch.context() as patched:
+        patched.setattr(SignatureLog, "add", lambda *_: None)
+        sign_again(data)
+        assert faults(data) == []
+        patched.setattr(SignatureLog, "add", lambda log, every, key: really(log, every[-1:], key))
+        sign_again(data)
+    assert any(f"its signature is not in {NAME}" in fault for fault in faults(data)), faults(data)
 
 
 def test_a_passed_step_that_is_followed_by_another_has_its_signature(data: Path) -> None:

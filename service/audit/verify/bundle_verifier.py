@@ -786,9 +786,7 @@ def ed25519_fits(raw: bytes, signature: bytes, message: bytes) -> bool:
 
 def in_use(item: Mapping[str, Any], key: Mapping[str, Any]) -> bool:
     """Whether a key was in use when an item was signed. A key's last act is to sign the key that replaces it."""
-    at, replaced = item.get("site_seq"), key["replaced_seq"]
-    if not isinstance(at, int):
-        return False
+    at, replaced = item["site_seq"], key["replaced_seq"]
     if replaced is None or at < replaced:
         return bool(at >= key["seq"])
     return bool(item.get("run_id") == SITE and item.get("seq") == at == replaced)
