@@ -298,13 +298,14 @@ def test_the_decisive_events_alone_lead_to_the_same_end_and_deviations() -> None
     log.begin()
     log.append(StepNote(step="capture", attempt=1, note="planned", data={}))
     log.append(failure(log))
-    log.append(StepRetried(step="capture", attempt=1, why="the policy"))
+    log.append(StepRetried(step="capture", attempt=2, why="the policy"))
     log.capture(["a", "b", "c"])
     log.measure(**GOOD)
     log.act("confirm", step="scan")  # refused
     log.accept()
     log.do()
     log.do(rms_mm=0.05)
+    log.do()
     log.append(RunCompleted(deviations=len(log.state.deviations)))
     decisive = [event for event in log.events if event.payload.kind in DECISIVE_EVENTS]
     assert {event.payload.kind for event in log.events} - set(DECISIVE_EVENTS) == {"step_note"}
