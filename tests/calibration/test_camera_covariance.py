@@ -94,7 +94,9 @@ def test_camera_json_is_read_for_it(tmp_path: Path) -> None:
     found = read_camera_covariance(path)
     assert found is not None
     assert sum((c.cx - CAMERA.cx) ** 2 for c in found.deviations(CAMERA)) == pytest.approx(4.0)
-    for wrong in ({"parameters": ["fx"], "matrix": [[1, 2]]}, {"parameters": ["zoom"], "matrix": [[1]]}, []):
+    # The size of the image is exact: it is no parameter that a calibration could determine.
+    unknown = ({"parameters": [name], "matrix": [[1]]} for name in ("zoom", "width", "height"))
+    for wrong in ({"parameters": ["fx"], "matrix": [[1, 2]]}, *unknown, []):
         path.write_text(json.dumps({**CAMERA.record(), "covariance": wrong}))
         with pytest.raises(DataError, match="not a square matrix"):
             read_camera_covariance(path)

@@ -236,6 +236,15 @@ def test_an_uncertainty_of_pixels_is_one_of_places_at_the_distance(distance_m: f
     assert ((ratio > 0.9) & (ratio < 1.3)).all()
 
 
+def test_projection_uncertainty_counts_each_view_in_whatever_order_they_were_taken() -> None:
+    views = _random_views(6, 0)
+    first, second = (
+        projection_uncertainty(calibrate_intrinsics(taken, BOARD, SIZE, model="pinhole"), 0.8, columns=3, rows=3)
+        for taken in (views, views[::-1])
+    )
+    assert np.allclose(first.sigma_px, second.sigma_px, rtol=1e-4)
+
+
 def test_projection_uncertainty_is_the_spread_of_projections_over_calibrations() -> None:
     """Each calibrated camera is moved to fit the boards, as happens when its pose is estimated."""
     projected: list[Array] = []

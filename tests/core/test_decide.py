@@ -36,7 +36,7 @@ from service.core.run.decide import (
     initial_state,
 )
 from service.core.run.effects.place import is_void
-from service.core.run.fold import RUN_EVENTS, kind_of
+from service.core.run.fold import DECISIVE_EVENTS, RUN_EVENTS, advance, kind_of
 from service.core.run.state import Status
 from tests.support.record.core import GOOD, TOY, Log, captured, toy_protocol
 from tests.support.record.core_log import at_capture, at_scan, failure, refused
@@ -291,3 +291,27 @@ def test_every_kind_of_event_is_folded_unless_it_belongs_to_the_sites_chain() ->
     recorded = get_args(get_args(Payload)[0]) or get_args(Payload)
     left = {payload.__module__ for payload in recorded if kind_of(payload) not in RUN_EVENTS}
     assert left == {site.__name__}
+
+
+def test_the_decisive_events_alone_lead_to_the_same_end_and_deviations() -> None:
+    log = at_capture()
+    log.begin()
+    log.append(StepNote(step="capture", attempt=1, note="planned", data={}))
+    log.append(failure(log))
+    log.append(StepRetried(step="capture", attempt=2, why="the policy"))
+    log.capture(["a", "b", "c"])
+    log.measure(**GOOD)
+    log.act("confirm", step="scan")  # refused
+    log.accept()
+    log.do()
+    log.do(rms_mm=0.05)
+    log.do()
+    log.append(RunCompleted(deviations=len(log.state.deviations)))
+    decisive = [event for event in log.events if event.payload.kind in DECISIVE_EVENTS]
+    assert {event.payload.kind for event in log.events} - set(DECISIVE_EVENTS) == {"step_note"}
+    state = initial_state(log.protocol)
+    for event in decisive:
+        state = advance(log.protocol, replace(state, seq=event.seq - 1), event)
+    assert state.status == "completed"
+    assert (state.machine_state, state.deviations) == (log.state.machine_state, log.state.deviations)
+    assert state.deviations

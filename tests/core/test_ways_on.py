@@ -18,6 +18,8 @@ from drivers.errors import DeviceFaultError
 from service.cli.main import app
 from service.core import errors as core_errors
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
+from service.core.protocol.models import parse_protocol
+from service.core.protocol.step_params import StepParams
 from service.core.records.events import OperatorAction, OperatorVerb, StepNote
 from service.core.recovery.policy import NEEDS_A_PERSON
 from service.core.recovery.ways_on import WayOn, takes_words, view_s, ways_on
@@ -28,7 +30,7 @@ from service.runner.operator import AnswerBy
 from service.steps import step_kinds
 from service.steps.context import StepContext, StepOutcome
 from service.steps.measures import Count, MeasureRecord
-from tests.support.record.core import GOOD, Log, toy_protocol
+from tests.support.record.core import GOOD, KINDS, Log, toy_protocol
 from tests.support.record.core import TOY as TOY_TEXT
 from tests.support.record.core_log import at_capture, at_spray, failure
 from tests.support.rig.bench_rig import ScriptedOperator
@@ -294,6 +296,33 @@ def test_each_way_says_what_is_lost_by_it(images: int, again: str, afresh: str |
     assert loses["confirm"] == again
     assert loses.get("redo") == afresh
     assert loses["skip"] == "Its result does not count. These cannot begin: Spray. Not judged later: rms_mm."
+
+
+class UsingParams(StepParams):
+    """Uses earlier steps."""
+
+    of: list[str]
+
+
+def test_ways_that_are_refused_for_one_reason_are_told_as_one_with_the_titles_whole() -> None:
+    """Beyond an irreversible step, none of those before it can be redone."""
+    text = TOY_TEXT.replace("title: Capture", "title: 'Views: first set'").replace(
+        "title: Fix", "title: 'Bench: fix'"
+    )
+    text = text.replace(
+        "  - id: scan\n    kind: checklist\n", "  - id: scan\n    kind: using\n    params: {of: [fix_it, capture]}\n"
+    )
+    log = Log(parse_protocol(text.encode(), {**KINDS, "using": UsingParams}, name="lab.yaml").protocol)
+    log.do()
+    log.do(**GOOD)
+    log.do()
+    assert log.state.current == "scan"
+    log.begin()
+    log.measure(rms_mm=0.5)
+    refused = [way for way in ways_on(log.protocol, log.state) if not way.available]
+    assert len({way.why_not for way in refused}) == len(refused) > 1
+    (redo,) = (way for way in refused if way.verb == "redo")
+    assert redo.words == "Do an earlier step again: Views: first set, Bench: fix"
 
 
 def test_half_of_an_irreversible_step_may_be_done_again_and_nothing_is_lost() -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import pytest
 
 from service.core.records.events import ControlTaken
-from service.people.control import Control, Holder
+from service.people.control import Control
 from service.people.errors import AccountError, ControlError, NotAllowedError
 from service.people.person import Person
 from service.people.sessions import People
@@ -58,7 +58,8 @@ def room(tmp_path: Path) -> Generator[Room]:
 
 def test_nobody_has_control_until_somebody_takes_it(room: Room) -> None:
     grace, emmy = room.screen("grace"), room.screen("emmy")
-    assert room.control.holder(room.run) == Holder()
+    nobody = room.control.holder(room.run)
+    assert astuple(nobody) == ("", "", "", False, "", "", 0.0)
     with pytest.raises(ControlError, match="no screen"):
         room.control.require(room.run, grace)
     room.control.take(room.run, grace)

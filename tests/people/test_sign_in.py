@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from contextlib import closing
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 
 import pytest
@@ -11,12 +11,13 @@ from argon2 import PasswordHasher
 from argon2.low_level import Type
 from hypothesis import given
 from hypothesis import strategies as st
+from sqlalchemy import Connection
 
 from service.core.records.events import SignInRecorded
 from service.people.credentials.tries import failed_tries
 from service.people.errors import NotSignedInError, PinRefusedError
 from service.people.sessions import People, wait_after_s
-from service.store.database.engine import database_path
+from service.store.database.engine import Database, database_path
 from tests.support.pages.web import PIN, password_of
 from tests.support.record.office import IDLE_S, Office, refused
 
@@ -177,6 +178,22 @@ def test_an_idle_screen_locks_and_its_pin_opens_it(office: Office) -> None:
     assert opened
     assert not opened.locked
     assert office.outcomes("grace")[-3:] == ["screen_locked", "refused", "screen_unlocked"]
+
+
+def test_a_screen_that_is_signed_out_while_it_locks_is_nobodys(
+    office: Office, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    token, person = office.enter("grace")
+    office.clock.passed_s = IDLE_S
+    writing = Database.writing
+
+    def after_a_sign_out(self: Database) -> AbstractContextManager[Connection]:
+        monkeypatch.undo()
+        office.people.sign_out(person)
+        return writing(self)
+
+    monkeypatch.setattr(Database, "writing", after_a_sign_out)
+    assert office.person(token, deliberate=True) is None
 
 
 def test_five_wrong_pins_end_the_sign_in(office: Office) -> None:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.poses.files.camera_files import read_camera_json, read_spheres_json, write_camera_json
+from service.compute.poses.files.pose_covariance import write_pose_covariance
 from service.compute.poses.files.pose_files import (
     read_poses,
     write_poses_csv,
@@ -57,6 +58,19 @@ def test_csv_and_transforms_round_trip(poses: dict[str, Transform], tmp_path: Pa
     _assert_same(read_poses(tmp_path / "poses.csv"), poses)
     write_transforms_json(tmp_path / "transforms.json", CAMERA, poses)
     _assert_same(read_poses(tmp_path / "transforms.json"), poses)
+
+
+def test_the_file_of_covariances_holds_each_under_its_image_with_its_unit(tmp_path: Path) -> None:
+    path = tmp_path / "pose_covariance.json"
+    each = np.arange(72.0).reshape(2, 6, 6)
+    write_pose_covariance(path, ["a1.jpg", "b2.jpg"], each, "model")
+    document = json.loads(path.read_text(encoding="utf-8"))
+    assert document["position_unit"] == "model"
+    assert len(document["order"]) == 6
+    assert {name: np.array(C).tolist() for name, C in document["covariance"].items()} == {
+        "a1.jpg": each[0].tolist(),
+        "b2.jpg": each[1].tolist(),
+    }
 
 
 def test_colmap_text_round_trip_and_convention(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

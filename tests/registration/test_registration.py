@@ -172,3 +172,55 @@ def test_two_markers_are_refused() -> None:
     few = [Assignment({d: m for d, m in a.markers.items() if m < 2}, a.T_camera_scan) for a in assignments]
     with pytest.raises(ComputeError, match="do not determine"):
         solve(made, outlines, few)
+
+
+def test_a_station_that_keeps_two_markers_once_false_outlines_are_left_out_is_refused() -> None:
+    """Two markers leave the station's base free to turn about the line through them."""
+    made = scene(7, seed=0)
+    outlines, assignments = problem(made, 0.1)
+    for i in (5, 6):
+        right = {d: m for d, m in assignments[i].markers.items() if m in (2, 3)}
+        outlines[i] += false_outlines(made.camera, 2, seed=i)
+        false = {len(outlines[i]) - 2: 0, len(outlines[i]) - 1: 1}
+        assignments[i] = Assignment(right | false, assignments[i].T_camera_scan)
+    with pytest.raises(ComputeError, match=r"station 2 has only . markers whose outlines agree with one another"):
+        register(
+            outlines,
+            assignments,
+            PosedImages(made.T_world_camera, made.camera, groups=[1, 1, 1, 1, 1, 2, 2]),
+            ScanSpheres(REGISTRATION_M, RADIUS_M),
+        )
+
+
+@pytest.mark.parametrize("cost", ["sampson", "algebraic"])
+def test_every_cost_weighs_the_outlines_against_the_errors_of_the_poses(cost: Cost) -> None:
+    """The answers differ by less than their stated error, though the costs have different units."""
+    made = scene(6, seed=0)
+    outlines, assignments = problem(made, 0.1)
+    rng = np.random.default_rng(0)
+    off = [transform(Rotation.from_rotvec(rng.normal(size=3) * 1e-3), rng.normal(size=3) * 5e-4) for _ in range(6)]
+    moved = Scene(made.T_world_scan, made.T_world_camera @ np.array(off), made.camera)
+    cone, other = (solve(moved, outlines, assignments, each) for each in ("cone", cost))
+    e = (other.T_world_scan - cone.T_world_scan)[:3, 3]
+    assert e @ np.linalg.solve(cone.covariance[:3, :3], e) < 1.0
+    sigma_m, _ = cone.pose_sigma
+    assert np.abs(other.T_scan_camera_refined - cone.T_scan_camera_refined)[:, :3, 3].max() < sigma_m
+
+
+def test_where_the_poses_tell_nothing_the_refined_covariance_does_not_depend_on_them() -> None:
+    made = scene(5, seed=0)
+    outlines, assignments = problem(made, 0.1)
+    sigmas: list[np.ndarray] = []
+    for size in (0.0, 2.0):  # up to 2 cm and 5 degrees
+        poses = np.array([perturbed(T, 100 * i, size) for i, T in enumerate(made.T_world_camera)])
+        result = register(
+            outlines,
+            assignments,
+            PosedImages(poses, made.camera),
+            ScanSpheres(REGISTRATION_M, RADIUS_M),
+            RegistrationSettings(pose_covariance="free"),
+        )
+        R = result.T_world_scan[:3, :3]
+        in_scan = R.T @ result.refined_covariance[:3, :3] @ R / result.outline_factor
+        sigmas.append(np.sqrt(np.diag(in_scan)))
+    assert np.allclose(sigmas[0], sigmas[1], rtol=0.05)

@@ -192,3 +192,12 @@ def test_units_of_the_unknowns_do_not_matter_and_an_unknown_without_information_
     flat = np.diag([4.0, 0.0])
     assert np.allclose(solve_symmetric(flat, np.array([8.0, 0.0])), [2.0, 0.0])
     assert np.allclose(inverse_symmetric(flat), np.diag([0.25, 0.0]))
+
+
+def test_what_rounding_leaves_of_a_difference_is_not_taken_for_information() -> None:
+    """Only the sum of two unknowns is determined; with a little more, their difference is as well."""
+    by_rounding, determined = (np.array([[1.0, 1.0 - rest], [1.0 - rest, 1.0]]) for rest in (8e-15, 1e-12))
+    assert np.allclose(inverse_symmetric(by_rounding), 0.25, rtol=1e-6)
+    assert np.allclose(solve_symmetric(by_rounding, np.array([2.0, 0.0])), 0.5, rtol=1e-6)
+    assert inverse_symmetric(determined)[0, 0] == pytest.approx(5e11, rel=0.01)
+    assert solve_symmetric(determined, np.array([2.0, 0.0]))[0] == pytest.approx(1e12, rel=0.01)

@@ -238,6 +238,25 @@ def test_close_closes_the_device_and_ends_the_child(tmp_path: Path) -> None:
         device.double(np.ones(1))
 
 
+def test_a_driver_that_does_not_close_is_waited_for_for_seconds_and_then_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A program that ends waits for it; libraries need a few seconds for a device that has gone."""
+    device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=300, name="stuck")
+    pid = int(device.open().serial)
+    waited_s: list[float] = []
+
+    def no_answer(_line: heartbeat.Line, timeout_s: float) -> bool:
+        waited_s.append(timeout_s)
+        return False
+
+    monkeypatch.setattr(heartbeat.Line, "poll", no_answer)
+    device.close()
+    assert len(waited_s) == 1
+    assert 5 < waited_s[0] < 30
+    assert not psutil.pid_exists(pid)
+
+
 def test_calls_before_open_are_refused() -> None:
     device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=30, name="early")
     with pytest.raises(DeviceUnavailableError, match="not opened yet"):

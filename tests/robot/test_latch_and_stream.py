@@ -249,6 +249,12 @@ def test_it_rings_until_the_last_loud_sample(loud: dict[str, float]) -> None:
     assert ringing_s(after, CRITERIA) == 0.0, "not back to the motion"
 
 
+@pytest.mark.parametrize("loud", [{"joint": 0.001}, {"joint": -0.001}, {"tcp": 0.0002}])
+def test_an_arm_at_a_limit_of_the_speeds_still_rings_and_has_not_settled(loud: dict[str, float]) -> None:
+    assert not judge([*window(), sample(100.5, **loud)], CRITERIA).settled
+    assert ringing_s([sample(100.0, target=0.1), sample(100.2, **loud), sample(100.3)], CRITERIA) > 0.1
+
+
 # --- the heartbeat between two programs ------------------------------------------------------------------
 
 

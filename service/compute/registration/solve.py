@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -42,7 +41,6 @@ from service.core.geometry import Array, inverse
 _ROUNDS = 8
 _REWEIGHTED = 3  # times, in the approach to the answer
 _STEPS = 25
-_SHORTEST = 1e-3  # share of a step
 _CONVERGED = 1e-10  # decrement: a hundred-thousandth of a standard deviation
 _DEFAULT = RegistrationSettings()
 
@@ -127,7 +125,6 @@ class _Iterate:
         dx: (n,) step of the common unknowns.
         poses: (N, 6) pose errors after the whole step.
         decrement: of the objective by the step, if the problem were linear.
-        share: of a step, by which the state was reached.
     """
 
     state: State
@@ -136,7 +133,6 @@ class _Iterate:
     dx: Array
     poses: Array
     decrement: float
-    share: float
 
 
 def _descend(problem: Problem, start: State, weighting: _Weighting, cost: Cost) -> _Iterate:
@@ -150,7 +146,7 @@ def _descend(problem: Problem, start: State, weighting: _Weighting, cost: Cost) 
     """
     prior = problem.prior()
 
-    def at(state: State, share: float = 1.0) -> _Iterate:
+    def at(state: State) -> _Iterate:
         rows = linearise(problem, state, cost)
         blocks = _blocks(problem, rows, weighting.outlines)
         m = marginalise(blocks, weighting.pose_root, weighting.factor)
@@ -161,12 +157,12 @@ def _descend(problem: Problem, start: State, weighting: _Weighting, cost: Cost) 
         g = m.g + prior @ held
         dx = -solve_symmetric(m.H + prior, g)
         poses = pose_errors(blocks, m, dx, weighting.factor)
-        return _Iterate(state, rows, objective, dx, poses, float(-g @ dx), share)
+        return _Iterate(state, rows, objective, dx, poses, float(-g @ dx))
 
     def candidate(here: _Iterate, share: float) -> _Iterate:
         before = here.state.poses
         poses = here.poses if share == 1.0 else before + share * (here.poses - before)
-        return at(here.state.moved(problem, share * here.dx, poses), share)
+        return at(here.state.moved(problem, share * here.dx, poses))
 
     return halved_gauss_newton(
         at(start),
@@ -178,13 +174,7 @@ def _descend(problem: Problem, start: State, weighting: _Weighting, cost: Cost) 
 
 
 def _gain(here: _Iterate, there: _Iterate) -> float:
-    """Decrease of the objective; growth by rounding alone does not count.
-
-    The shortest step is taken even if the objective grows: from a bad start, the way may lead over a rise. So is the
-    last one, whose decrease may be smaller than the objective's rounding.
-    """
-    if there.share < _SHORTEST or here.decrement < _CONVERGED:
-        return math.inf
+    """Decrease of the objective; growth by rounding alone does not count."""
     return here.objective * (1 + 1e-9) + 1e-9 - there.objective
 
 

@@ -12,6 +12,7 @@ from service.core.geometry import Array, Transform, align_points, apply
 from service.core.units import mm
 
 _MIRROR = np.array([-1.0, 1.0, 1.0])
+_LEAST = 4  # spheres that agree: three lie in a plane, and agree with a mirror image too
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,15 +52,15 @@ def match_constellations(a: Array, b: Array, tolerance_m: float = 2e-3) -> Const
     """
     proper = _best(a, b, tolerance_m)
     mirrored = _best(a, b * _MIRROR, tolerance_m)
-    count, count_mirrored = _count(proper), _count(mirrored)
-    if count_mirrored >= 4 and count_mirrored > count:
+    count_mirrored = _count(mirrored)
+    if count_mirrored > _count(proper):
         raise ComputeError(
             f"the two sphere constellations are mirror images ({count_mirrored} spheres agree only when mirrored)",
             remedy="One mesh has an axis negated: export it again, or correct the orientation of the CT series",
         )
-    if count < 4:
+    if not proper:
         raise ComputeError(
-            f"only {count} of {len(a)} and {len(b)} spheres agree within {mm(tolerance_m):.1f} mm, 4 are needed",
+            f"no {_LEAST} of {len(a)} and {len(b)} spheres agree within {mm(tolerance_m):.1f} mm",
             remedy="Check that both are of the same specimen, the units of both meshes, and that the spheres did not "
             "move between the scans",
         )
@@ -96,19 +97,19 @@ def _count(solutions: list[Pairs]) -> int:
 
 
 def _best(a: Array, b: Array, tolerance: float) -> list[Pairs]:
-    """The largest consistent assignment, and all different ones of the same size."""
+    """The largest consistent assignment of at least four, and all different ones of the same size."""
     found: dict[Pairs, float] = {}
-    size = 3
+    size = _LEAST
     for ta, tb in _triangles(a, b, tolerance):
         T, _ = align_points(a[ta], b[tb])
         pairs, _ = _assign(a, apply(T, b), 2 * tolerance)
-        if len(pairs) < max(size, 4):
+        if len(pairs) < size:
             continue
         # The proposing triangle's noise is amplified over the whole scene: refit before judging.
         rows, columns = (np.array(side) for side in zip(*pairs, strict=True))
         refitted, _ = align_points(a[rows], b[columns])
         pairs, error = _assign(a, apply(refitted, b), tolerance)
-        if len(pairs) >= max(size, 4):
+        if len(pairs) >= size:
             if len(pairs) > size:
                 found.clear()
             size = len(pairs)

@@ -150,9 +150,10 @@ def assemble(
         ComputeError: too few outlines or markers.
     """
     members = [(i, j, m) for i, a in enumerate(assignments) for j, m in sorted(a.markers.items())]
-    if len(members) < 3 or len({m for _, _, m in members}) < 3:
+    markers = {m for _, _, m in members}
+    if len(markers) < 3:
         raise ComputeError(
-            f"{len(members)} outlines of {len({m for _, _, m in members})} markers do not determine a registration",
+            f"{len(members)} outlines of {len(markers)} markers do not determine a registration",
             remedy="Use images in which at least four registration spheres are visible",
         )
     groups, camera = images.stations, images.camera
