@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from sqlalchemy import Connection, select
@@ -18,7 +18,6 @@ from service.store.store import Store
 
 UNANSWERED_S = 60.0  # after this time a locked screen that does not answer may lose control
 _NOBODY_ASKS: Mapping[str, str | float] = {"asked_by_screen": "", "asked_by_account": "", "asked_utc_s": 0.0}
-_NOT_REFUSED: Mapping[str, str | float] = {"refused_screen": "", "refused_by_account": "", "refused_utc_s": 0.0}
 _DECIDE_AGAIN = "Read what the page shows now and decide again; nothing was done"
 
 
@@ -37,8 +36,7 @@ class Holder:
     asked_by_account: str = ""
     asked_by_name: str = ""
     asked_utc_s: float = 0.0
-    refused_screen: str = ""  # that asked last and was refused; until it asks again, or control changes
-    refused_by_name: str = ""
+    refused_screen: str = ""  # that asked last and was refused; until somebody asks again, or control changes
     refused_utc_s: float = 0.0
 
 
@@ -134,7 +132,6 @@ class Control:
                 asked_utc_s=holder.asked_utc_s
                 if holder.asked_by_screen == person.screen
                 else self._store.clock.utc_s(),
-                **(_NOT_REFUSED if holder.refused_screen == person.screen else {}),
             )
 
     def answer(self, run_id: str, person: Person, *, grant: bool, shown: str | None = None) -> None:
@@ -154,14 +151,7 @@ class Control:
                 reason = f"asked for; granted by {person.account}"
                 self._record(connection, run_id, asker.account, holder.asked_by_screen, holder, "handed_over", reason)
             else:
-                self._write(
-                    connection,
-                    run_id,
-                    **_NOBODY_ASKS,
-                    refused_screen=holder.asked_by_screen,
-                    refused_by_account=person.account,
-                    refused_utc_s=self._store.clock.utc_s(),
-                )
+                self._write(connection, run_id, asked_utc_s=-self._store.clock.utc_s())
             if grant and asker is None:
                 ended = ControlError("the screen that asked is signed out", where=run_id, remedy="You keep control")
             else:
@@ -186,18 +176,17 @@ class Control:
         session = connection.execute(_valid(row.screen, self._store.clock.utc_s())).one_or_none()
         if session is None:
             return Holder()
-        return Holder(
-            screen=row.screen,
-            account=row.account,
-            full_name=session.full_name,
-            locked=bool(session.locked),
+        holder = Holder(
+            screen=row.screen, account=row.account, full_name=session.full_name, locked=bool(session.locked)
+        )
+        if row.asked_utc_s < 0:
+            return replace(holder, refused_screen=row.asked_by_screen, refused_utc_s=-row.asked_utc_s)
+        return replace(
+            holder,
             asked_by_screen=row.asked_by_screen,
             asked_by_account=row.asked_by_account,
             asked_by_name=_full_name(connection, row.asked_by_account),
             asked_utc_s=row.asked_utc_s,
-            refused_screen=row.refused_screen,
-            refused_by_name=_full_name(connection, row.refused_by_account),
-            refused_utc_s=row.refused_utc_s,
         )
 
     def _give(
@@ -229,11 +218,10 @@ class Control:
             screen=screen,
             account=account if screen else "",
             **_NOBODY_ASKS,
-            **_NOT_REFUSED,
         )
 
     def _write(self, connection: Connection, run_id: str, **values: object) -> None:
-        nobody = {"screen": "", "account": "", **_NOBODY_ASKS, **_NOT_REFUSED}
+        nobody = {"screen": "", "account": "", **_NOBODY_ASKS}
         connection.execute(
             insert(control)
             .values(run_id=run_id, **{**nobody, **values})

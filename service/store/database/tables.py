@@ -228,7 +228,7 @@ sessions = Table(
     sqlite_strict=True,
 )
 
-# Which screen may act on a run, which one asks for control, and which one was refused it last.
+# Which screen may act on a run, and which one asks for control or was refused it.
 control = Table(
     "control",
     metadata,
@@ -237,9 +237,6 @@ control = Table(
     Column("account", Text, nullable=False),
     Column("asked_by_screen", Text, nullable=False),
     Column("asked_by_account", Text, nullable=False),
-    Column("asked_utc_s", REAL, nullable=False),
-    Column("refused_screen", Text, nullable=False, server_default=""),
-    Column("refused_by_account", Text, nullable=False, server_default=""),
-    Column("refused_utc_s", REAL, nullable=False, server_default="0"),
+    Column("asked_utc_s", REAL, nullable=False),  # negative: that was refused, at the time without the sign
     sqlite_strict=True,
 )

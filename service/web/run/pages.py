@@ -181,7 +181,7 @@ def _viewer(site: Site, person: Person, log: RunRecord) -> Viewer:
         asked_by=holder.asked_by_name,
         asked_by_screen=holder.asked_by_screen,
         asked_by_me=bool(holder.asked_by_screen) and holder.asked_by_screen == person.screen,
-        refused_by=holder.refused_by_name if refused else "",
+        refused_by=holder.full_name if refused else "",
         refused_utc=utc_text(datetime.fromtimestamp(holder.refused_utc_s, UTC)) if refused else "",
         taken_over_by="" if lost is None else names.get(lost[0].actor, lost[0].actor),
         taken_over_utc="" if lost is None else lost[0].at_utc,
