@@ -296,7 +296,8 @@ def test_runs_are_found_by_what_people_said_of_them(web: WebSite) -> None:
     assert find(q="KNEE teaching") == [knee]
     assert find(q="liquid") == [spine]
     assert find(q="balgrist") == [knee, spine]
-    assert find(q="bench ada") == [done]
+    drawn = [run for run in (knee, spine) if "ada" in run]  # a run's name ends in random letters
+    assert find(q="bench ada") == [done, *drawn]
     assert find(q="numpy") == []  # the software's packages are not the subject of a run
     assert find(result="aborted") == [spine]
     assert find(result="completed") == [done]
