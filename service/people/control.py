@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import Any, Literal
 
 from sqlalchemy import Connection, select
 from sqlalchemy.dialects.sqlite import insert
 
 from service.core.records.events import ControlTaken
+from service.core.records.moments import age_s
 from service.people.errors import ControlError, NotAllowedError
 from service.people.person import Person
 from service.people.rows import SESSION_S, require_reason
@@ -64,7 +66,7 @@ class Control:
             unanswered = (
                 holder.locked
                 and holder.asked_by_screen == person.screen
-                and self._store.clock.utc_s() - holder.asked_utc_s >= UNANSWERED_S
+                and age_s(holder.asked_utc_s, self._store.clock.utc_s(), if_set_back_s=0.0) >= UNANSWERED_S
             )
             if not holder.screen:
                 self._give(connection, run_id, person, holder, "free", "")
@@ -102,8 +104,9 @@ class Control:
             holder = self._holder(connection, run_id)
             if not holder.screen or holder.screen == person.screen:
                 raise ControlError("there is nobody to ask", where=run_id, remedy="Take control; it is free")
-            recent = self._store.clock.utc_s() - holder.asked_utc_s < UNANSWERED_S
-            if holder.asked_by_screen not in ("", person.screen) and recent:
+            now = self._store.clock.utc_s()
+            waited_s = age_s(holder.asked_utc_s, now, if_set_back_s=inf)
+            if holder.asked_by_screen not in ("", person.screen) and waited_s < UNANSWERED_S:
                 raise ControlError(
                     f"{holder.asked_by_account} has just asked", where=run_id, remedy="Wait for the answer"
                 )
@@ -112,10 +115,8 @@ class Control:
                 run_id,
                 asked_by_screen=person.screen,
                 asked_by_account=person.account,
-                # Asking again does not restart the waiting time.
-                asked_utc_s=holder.asked_utc_s
-                if holder.asked_by_screen == person.screen
-                else self._store.clock.utc_s(),
+                # Asking again does not restart the waiting time, unless that is not known: the clock was set back.
+                asked_utc_s=holder.asked_utc_s if holder.asked_by_screen == person.screen and waited_s < inf else now,
             )
 
     def answer(self, run_id: str, person: Person, *, grant: bool) -> None:

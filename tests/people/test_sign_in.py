@@ -179,6 +179,32 @@ def test_an_idle_screen_locks_and_its_pin_opens_it(office: Office) -> None:
     assert office.outcomes("grace")[-3:] == ["screen_locked", "refused", "screen_unlocked"]
 
 
+def test_a_screen_locks_when_its_idle_time_is_not_known_since_the_clock_was_set_back(office: Office) -> None:
+    token, _ = office.enter("grace")
+    office.clock.set_utc(-4.0)  # as much as a time server corrects now and then
+    steady = office.person(token, deliberate=True)
+    assert steady
+    assert not steady.locked
+    office.clock.set_utc(-3600.0)
+    locked = office.person(token, deliberate=True)
+    assert locked
+    assert locked.locked
+    office.people.unlock(locked, PIN)
+    office.clock.passed_s += 1
+    opened = office.person(token, deliberate=True)
+    assert opened
+    assert not opened.locked
+
+
+def test_a_clock_that_is_set_back_makes_no_account_wait_longer_than_the_longest(office: Office) -> None:
+    for _ in range(5):
+        refused(lambda: office.people.sign_in("grace", "wrong"))
+    office.clock.set_utc(-3600.0)
+    refused(lambda: office.people.sign_in("grace", password_of("grace")))
+    office.clock.passed_s += 900
+    office.enter("grace")
+
+
 def test_five_wrong_pins_end_the_sign_in(office: Office) -> None:
     token, person = office.enter("grace")
     office.people.lock(person)

@@ -8,8 +8,12 @@ import subprocess
 import sys
 from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 
-from service.core.records.events import ArtefactRef, LeftoversRemoved
+import pytest
+from psutil import boot_time
+
+from service.core.records.events import ArtefactRef, LeftoversRemoved, SessionStarted
 from service.store.files.leftovers import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.store import Store
@@ -124,6 +128,22 @@ def test_what_a_worker_at_work_may_still_record_stays(tmp_path: Path) -> None:
         ref = put_image(store, "v1")
         must_stay(store)
         must_record(store, run, ref)
+
+
+def test_what_a_runner_may_still_record_stays_though_the_clock_was_set_forward(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The boot, and with it the start of every process, then seems later than the files."""
+    later = SimpleNamespace(boot_time=lambda: boot_time() + 3600.0)
+    with Store.open(tmp_path, SteppedClock.from_now()) as store:
+        run = start_run(store)
+        started = SessionStarted(resumed=False, software={}, host="here", pid=1)
+        store.record(run, [started], actor="runner")
+        with store.lease(run, "a runner", 30.0):
+            ref = put_image(store, "v1")
+            monkeypatch.setattr("service.store.files.leftovers.psutil", later)
+            must_stay(store)
+            must_record(store, run, ref)
 
 
 def must_stay(store: Store) -> None:

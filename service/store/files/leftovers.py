@@ -18,7 +18,7 @@ from sqlalchemy import Connection, select
 
 from service.core.errors import StoreError
 from service.core.records.events import LeftoversRemoved
-from service.store.database.tables import artefacts, jobs, leases
+from service.store.database.tables import artefacts, event_index, events, jobs, leases
 from service.store.durable_effects import utc_text
 from service.store.files.artefacts import TEMPORARY, alone_with, hash_file, relative_path
 from service.store.queue.leases import identity_of, is_live
@@ -140,12 +140,30 @@ def _judged(
 def _oldest_writer(connection: Connection, now_utc_s: float) -> tuple[float, str]:
     """Start time (s, UTC) and name of the oldest process that holds a run or a job here; infinity if none does."""
     oldest = (float("inf"), "")
-    held = [(row, row.holder) for row in connection.execute(select(leases))]
-    held += [(row, row.worker) for row in connection.execute(select(jobs).where(jobs.c.state == "running"))]
-    for row, name in held:
+    held = [
+        (row, row.holder, _last_start_utc(connection, row.run_id)) for row in connection.execute(select(leases)).all()
+    ]
+    running = select(jobs).where(jobs.c.state == "running")
+    held += [(row, row.worker, row.started_utc) for row in connection.execute(running)]
+    for row, name, recorded_utc in held:
         if is_live(row, now_utc_s):
             there = identity_of(row).life() == "lives"
             # The start of a process on another host is not known, so nothing is removed while it may run.
             begun_s = psutil.boot_time() + row.process_started_s if there else 0.0
+            # If the clock was set forward since, the boot seems later than the files that the process has written.
+            if recorded_utc:
+                begun_s = min(begun_s, datetime.fromisoformat(recorded_utc).timestamp())
             oldest = min(oldest, (begun_s, str(name)))
     return oldest
+
+
+def _last_start_utc(connection: Connection, run_id: str) -> str:
+    """When a runner last began to work on the run, as it was recorded then; "" if none has."""
+    started = (
+        select(events.c.at_utc)
+        .join(event_index, (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq))
+        .where(event_index.c.run_id == run_id, event_index.c.kind == "session_started")
+        .order_by(events.c.seq.desc())
+        .limit(1)
+    )
+    return str(connection.execute(started).scalar() or "")
