@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any, Literal
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, Row, select
 from sqlalchemy.dialects.sqlite import insert
 
 from service.core.records.events import ControlTaken
@@ -66,7 +66,7 @@ class Control:
             unanswered = (
                 holder.locked
                 and holder.asked_by_screen == person.screen
-                and age_s(holder.asked_utc_s, self._store.clock.utc_s(), if_set_back_s=0.0) >= UNANSWERED_S
+                and self._store.ages.at_least_s(holder.asked_utc_s) >= UNANSWERED_S
             )
             if not holder.screen:
                 self._give(connection, run_id, person, holder, "free", "")
@@ -105,18 +105,21 @@ class Control:
             if not holder.screen or holder.screen == person.screen:
                 raise ControlError("there is nobody to ask", where=run_id, remedy="Take control; it is free")
             now = self._store.clock.utc_s()
-            waited_s = age_s(holder.asked_utc_s, now, if_set_back_s=inf)
-            if holder.asked_by_screen not in ("", person.screen) and waited_s < UNANSWERED_S:
+            set_back = age_s(holder.asked_utc_s, now, if_set_back_s=inf) == inf
+            answer_due = not set_back and self._store.ages.at_least_s(holder.asked_utc_s) < UNANSWERED_S
+            if holder.asked_by_screen not in ("", person.screen) and answer_due:
                 raise ControlError(
                     f"{holder.asked_by_account} has just asked", where=run_id, remedy="Wait for the answer"
                 )
+            # Asking again does not restart the waiting time, unless that is not known: the clock was set back.
+            asked_s = holder.asked_utc_s if holder.asked_by_screen == person.screen and not set_back else now
+            self._store.ages.begin(asked_s)
             self._write(
                 connection,
                 run_id,
                 asked_by_screen=person.screen,
                 asked_by_account=person.account,
-                # Asking again does not restart the waiting time, unless that is not known: the clock was set back.
-                asked_utc_s=holder.asked_utc_s if holder.asked_by_screen == person.screen and waited_s < inf else now,
+                asked_utc_s=asked_s,
             )
 
     def answer(self, run_id: str, person: Person, *, grant: bool) -> None:
@@ -127,7 +130,7 @@ class Control:
                 raise ControlError("this screen does not have control", where=run_id, remedy="Read the page again")
             if not holder.asked_by_screen:
                 raise ControlError("nobody asks for control any more", where=run_id, remedy="Nothing has to be done")
-            asker = connection.execute(_valid(holder.asked_by_screen, self._store.clock.utc_s())).one_or_none()
+            asker = self._valid(connection, holder.asked_by_screen)
             if grant and asker is not None:
                 reason = f"asked for; granted by {person.account}"
                 self._record(connection, run_id, asker.account, holder.asked_by_screen, holder, "handed_over", reason)
@@ -154,7 +157,7 @@ class Control:
         row = connection.execute(select(control).where(control.c.run_id == run_id)).one_or_none()
         if row is None or not row.screen:
             return Holder()
-        session = connection.execute(_valid(row.screen, self._store.clock.utc_s())).one_or_none()
+        session = self._valid(connection, row.screen)
         if session is None:
             return Holder()
         return Holder(
@@ -166,6 +169,15 @@ class Control:
             asked_by_account=row.asked_by_account,
             asked_utc_s=row.asked_utc_s,
         )
+
+    def _valid(self, connection: Connection, screen: str) -> Row[Any, Any, Any, Any] | None:
+        """The sign-in on a screen, unless it has ended."""
+        row = connection.execute(
+            select(sessions.c.account, sessions.c.locked, sessions.c.created_utc_s, accounts.c.full_name)
+            .join(accounts, sessions.c.account == accounts.c.account)
+            .where(sessions.c.screen == screen, accounts.c.state == "active")
+        ).one_or_none()
+        return None if row is None or self._store.ages.at_most_s(row.created_utc_s) >= SESSION_S else row
 
     def _give(
         self,
@@ -207,18 +219,6 @@ class Control:
             .values(run_id=run_id, **{**nobody, **values})
             .on_conflict_do_update(index_elements=["run_id"], set_=values)
         )
-
-
-def _valid(screen: str, now_s: float) -> Any:
-    return (
-        select(sessions.c.account, sessions.c.locked, accounts.c.full_name)
-        .join(accounts, sessions.c.account == accounts.c.account)
-        .where(
-            sessions.c.screen == screen,
-            sessions.c.created_utc_s > now_s - SESSION_S,
-            accounts.c.state == "active",
-        )
-    )
 
 
 def _require_operator(person: Person) -> None:

@@ -32,6 +32,7 @@ from service.people.rows import (
     plain_name,
     record_change,
     record_sign_in,
+    to_account,
     to_person,
 )
 from service.store.database.tables import accounts, sessions
@@ -91,6 +92,7 @@ class People:
                     "csrf": new_token(),
                     "created_utc_s": now,
                 }
+                self._store.ages.begin(now)
                 connection.execute(insert(sessions).values(**session, seen_utc_s=now, locked=0, pin_failures=0))
                 self._reset_failures(connection, row, password)
                 outcome = SignInRecorded(account=row.account, outcome="signed_in", screen=screen, address=address)
@@ -138,13 +140,10 @@ class People:
             if row is not None and usable:
                 failures = get_account(connection, name).failures + 1  # another process may count too
                 wait_s = wait_after_s(failures)
-                connection.execute(
-                    update(accounts)
-                    .where(accounts.c.account == name)
-                    .values(
-                        failures=failures, locked_until_utc_s=self._store.clock.utc_s() + wait_s if wait_s else 0.0
-                    )
-                )
+                until_s = self._store.clock.utc_s() + wait_s if wait_s else 0.0
+                self._store.ages.begin(until_s)
+                counted = {"failures": failures, "locked_until_utc_s": until_s}
+                connection.execute(update(accounts).where(accounts.c.account == name).values(**counted))
                 waits = wait_s > 0
             # An unknown name is not recorded, because it may be a password typed into the wrong field.
             outcome = SignInRecorded(
@@ -170,7 +169,7 @@ class People:
             with self._store.database.writing() as connection:
                 cut = {"locked_until_utc_s": now + LONGEST_WAIT_S}
                 connection.execute(update(accounts).where(accounts.c.account == row.account).values(**cut))
-        return row.locked_until_utc_s > now
+        return self.accounts.has_to_wait(to_account(row))
 
     def _require_unchanged(self, connection: Connection, row: Row[Any]) -> None:
         """Raise AccountJustChangedError if the account has changed since its password was checked."""
@@ -205,18 +204,19 @@ class People:
             row = self._session(connection, token)
         if row is None:
             return None
-        if row.state != "active" or now - row.created_utc_s >= SESSION_S:
+        if row.state != "active" or self._store.ages.at_most_s(row.created_utc_s) >= SESSION_S:
             with self._store.database.writing() as connection:
                 self._end(connection, token)
             return None
         # After the clock was set back nobody knows how long the screen was idle; the PIN says that a person is there.
-        idle_s = age_s(row.seen_utc_s, now, if_set_back_s=inf)
+        idle_s = max(age_s(row.seen_utc_s, now, if_set_back_s=inf), self._store.ages.at_most_s(row.seen_utc_s))
         if not row.locked and idle_s >= idle_lock_s:
             with self._store.database.writing() as connection:
                 self._lock(connection, row.account, row.screen, actor=SERVICE)
             with self._store.database.reading() as connection:
                 row = self._session(connection, token)
         elif deliberate and not row.locked and idle_s >= 1.0:
+            self._store.ages.begin(now)
             with self._store.database.writing() as connection:
                 connection.execute(update(sessions).where(sessions.c.screen == row.screen).values(seen_utc_s=now))
         return None if row is None else to_person(row)

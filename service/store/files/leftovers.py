@@ -21,7 +21,7 @@ from service.core.records.events import LeftoversRemoved
 from service.store.database.tables import artefacts, event_index, events, jobs, leases
 from service.store.durable_effects import utc_text
 from service.store.files.artefacts import TEMPORARY, alone_with, hash_file, relative_path
-from service.store.queue.leases import identity_of, is_live
+from service.store.queue.leases import identity_of
 from service.store.store import Store
 
 USUAL_AGE_S = 3600.0  # an import or export that has just begun holds no lease yet
@@ -117,7 +117,7 @@ def _judged(
     connection: Connection, found: Collection[tuple[Path, float, int]], min_age_s: float, now_utc_s: float
 ) -> list[Leftover]:
     recorded = set(connection.execute(select(artefacts.c.sha256)).scalars())
-    begun_s, writer = _oldest_writer(connection, now_utc_s)
+    begun_s, writer = _oldest_writer(connection)
     judged: list[Leftover] = []
     for path, changed_s, size in found:
         part = path.suffix == ".part"
@@ -137,7 +137,7 @@ def _judged(
     return judged
 
 
-def _oldest_writer(connection: Connection, now_utc_s: float) -> tuple[float, str]:
+def _oldest_writer(connection: Connection) -> tuple[float, str]:
     """Start time (s, UTC) and name of the oldest process that holds a run or a job here; infinity if none does."""
     oldest = (float("inf"), "")
     held = [
@@ -146,10 +146,10 @@ def _oldest_writer(connection: Connection, now_utc_s: float) -> tuple[float, str
     running = select(jobs).where(jobs.c.state == "running")
     held += [(row, row.worker, row.started_utc) for row in connection.execute(running)]
     for row, name, recorded_utc in held:
-        if is_live(row, now_utc_s):
-            there = identity_of(row).life() == "lives"
+        # The end of a lease shows nothing here: this host's clock may have been set forward.
+        if (life := identity_of(row).life()) != "dead":
             # The start of a process on another host is not known, so nothing is removed while it may run.
-            begun_s = psutil.boot_time() + row.process_started_s if there else 0.0
+            begun_s = psutil.boot_time() + row.process_started_s if life == "lives" else 0.0
             # If the clock was set forward since, the boot seems later than the files that the process has written.
             if recorded_utc:
                 begun_s = min(begun_s, datetime.fromisoformat(recorded_utc).timestamp())
