@@ -12,8 +12,10 @@ from types import SimpleNamespace
 
 import pytest
 from psutil import boot_time
+from sqlalchemy import update
 
 from service.core.records.events import ArtefactRef, LeftoversRemoved, SessionStarted
+from service.store.database.tables import leases
 from service.store.files.leftovers import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.store import Store
@@ -144,6 +146,22 @@ def test_what_a_runner_may_still_record_stays_though_the_clock_was_set_forward(
             monkeypatch.setattr("service.store.files.leftovers.psutil", later)
             must_stay(store)
             must_record(store, run, ref)
+
+
+def test_what_a_process_on_another_host_may_still_record_stays_though_its_lease_seems_over(tmp_path: Path) -> None:
+    """The clock of this host may have been set forward."""
+    clock = SteppedClock.from_now()
+    with Store.open(tmp_path, clock) as store:
+        run = start_run(store)
+        lease = store.lease(run, "a runner", 30.0)
+        with store.database.writing() as connection:
+            connection.execute(update(leases).values(host="another"))
+        ref = put_image(store, "v1")
+        clock.set_utc(3600.0)
+        must_stay(store)
+        lease.release()
+        assert [one.stays for one in leftovers(store, min_age_s=0)] == [""]
+        must_record(store, run, ref)
 
 
 def must_stay(store: Store) -> None:
