@@ -19,7 +19,7 @@ from sqlalchemy import Connection, select
 from service.core.errors import StoreError
 from service.core.records.events import LeftoversRemoved
 from service.store.database.tables import artefacts, event_index, events, jobs, leases
-from service.store.durable_effects import utc_text
+from service.store.durable_effects import Clock, utc_text
 from service.store.files.artefacts import TEMPORARY, alone_with, hash_file, relative_path
 from service.store.queue.leases import identity_of
 from service.store.store import Store
@@ -57,7 +57,8 @@ def leftovers(store: Store, *, min_age_s: float = USUAL_AGE_S) -> list[Leftover]
     try:
         found = list(_candidates(store.artefact_folder))
         with store.database.reading() as connection:
-            return _judged(connection, found, min_age_s, store.clock.utc_s())
+            set_forward_s = _set_forward_s(connection, store.clock)
+            return _judged(connection, found, min_age_s, store.clock.utc_s() - set_forward_s)
     except OSError as error:
         raise _refused(error) from error
 
@@ -114,7 +115,7 @@ def _candidates(folder: Path) -> list[tuple[Path, float, int]]:
 
 
 def _judged(
-    connection: Connection, found: Collection[tuple[Path, float, int]], min_age_s: float, now_utc_s: float
+    connection: Connection, found: Collection[tuple[Path, float, int]], min_age_s: float, earliest_now_utc_s: float
 ) -> list[Leftover]:
     recorded = set(connection.execute(select(artefacts.c.sha256)).scalars())
     begun_s, writer = _oldest_writer(connection)
@@ -131,10 +132,25 @@ def _judged(
         )
         if changed_s >= begun_s:
             one = replace(one, stays=f"{writer} was already running when it was written and may still record it")
-        elif now_utc_s - changed_s < min_age_s:
-            one = replace(one, stays=f"it is younger than {min_age_s / 60:g} minutes")
+        elif earliest_now_utc_s - changed_s < min_age_s:
+            one = replace(one, stays=f"it is, or may be, younger than {min_age_s / 60:g} minutes")
         judged.append(one)
     return judged
+
+
+def _set_forward_s(connection: Connection, clock: Clock) -> float:
+    """By how much UTC has gone on farther than the monotonic clock since the newest event of any run; 0 if it has not.
+
+    So much younger a file may be than it seems. Where the host was restarted since, this is 0 or makes files stay.
+    """
+    newest = select(events.c.at_utc, events.c.monotonic_s).join(
+        event_index, (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq)
+    )
+    last = connection.execute(newest.order_by(event_index.c.position.desc()).limit(1)).first()
+    passed_s = 0.0 if last is None else clock.monotonic_s() - last.monotonic_s
+    if last is None or passed_s < 0:
+        return 0.0
+    return max(0.0, clock.utc_s() - datetime.fromisoformat(last.at_utc).timestamp() - passed_s)
 
 
 def _oldest_writer(connection: Connection) -> tuple[float, str]:
