@@ -132,6 +132,20 @@ def test_what_a_worker_at_work_may_still_record_stays(tmp_path: Path) -> None:
         must_record(store, run, ref)
 
 
+def test_what_is_young_stays_though_the_clock_was_set_forward(tmp_path: Path) -> None:
+    clock = SteppedClock.from_now()
+    with Store.open(tmp_path, clock) as store:
+        start_run(store)
+        crash_left(store, "v1")
+        clock.set_utc(2 * USUAL_AGE_S)
+        (young,) = leftovers(store)
+        assert "may be, younger" in young.stays
+        clock.passed_s += USUAL_AGE_S + 60.0
+        assert [one.stays for one in leftovers(store)] == [""]
+        clock.reboot(600.0)
+        assert [one.stays for one in leftovers(store)] == [""]
+
+
 def test_what_a_runner_may_still_record_stays_though_the_clock_was_set_forward(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

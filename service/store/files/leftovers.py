@@ -132,7 +132,7 @@ def _judged(
         )
         if changed_s >= begun_s:
             one = replace(one, stays=f"{writer} was already running when it was written and may still record it")
-        elif earliest_now_utc_s - changed_s < min_age_s:
+        elif min_age_s > 0 and earliest_now_utc_s - changed_s < min_age_s:
             one = replace(one, stays=f"it is, or may be, younger than {min_age_s / 60:g} minutes")
         judged.append(one)
     return judged
