@@ -1,9 +1,9 @@
 """Clock faults × every duration that a gate or a timer judges (`python -m bench.motion.clock_faults`).
 
 Each row begins a wait in a data folder on a host of its own, lets a fault of the host's clocks happen in the middle,
-and asks the program's own code what it allows then. The true duration decides whether that is right. What errs may err
-on the safe side only. Durations that one process measures by the monotonic clock are not in the table: no fault of the
-table but sleep changes them, and while the host sleeps nothing is driven.
+and asks the program's own code what it allows then. The true duration decides whether that is right; what errs may
+err on the safe side only. Durations that one process measures by the monotonic clock alone are not in the table: of
+the faults only sleep changes them, and while the host sleeps nothing is driven.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _LOOKS = re.compile(
 _STAMP = "a time that is recorded, named or shown; nothing is judged by it"
 _FIGURE = "an estimate or a figure for people; it is never negative, and nothing waits for it"
 _CHANGE = "whether a file has changed, by its time being another one"
-#: Every file that looks at UTC, at a file's time or at the boot's: the row that tries what it judges, or why none does.
+#: Every file that looks at UTC, at a file's time or at the boot's: the row that tries what it judges, or why not.
 PLACES = {
     "drivers/dicom_folder/folder.py": _CHANGE,
     "drivers/genicam/__init__.py": "released_images has nothing to leave out: each image was asked for",
@@ -141,8 +141,8 @@ def main() -> None:
     counted = ", ".join(f"{verdicts[name]} {name}" for name in ("right", "safe side", "WRONG"))
     text = "\n".join([
         f"# What faults of the host's clocks do to durations, {today}", "",
-        f"`python -m bench.motion.clock_faults`, revision {revision}: {len(DURATIONS)} durations × {len(FAULTS)} faults, "
-        f"{len(rows)} rows: {counted}.", "",
+        f"`python -m bench.motion.clock_faults`, revision {revision}: {len(DURATIONS)} durations × {len(FAULTS)} "
+        f"faults, {len(rows)} rows: {counted}.", "",
         table(rows), "",
         "Every place that looks at UTC, at a file's time or at the boot's:", "",
         "| place | tried by, or why not |", "|---|---|",
