@@ -174,7 +174,7 @@ def _export(world: World, true_s: float, *, new: bool) -> Seen:
     def export() -> None:
         balls = [trimesh.creation.icosphere(2, 6.0).apply_translation(centre) for centre in _CENTRES_MM]
         trimesh.util.concatenate(balls).export(path)
-        os.utime(path, (world.clock.utc_s(),) * 2)
+        os.utime(path, (world.clock.utc_s(), world.clock.utc_s()))
 
     def confirm(question: AskOperator, _state: RunState) -> OperatorAction:
         world.wake(true_s / 2)
@@ -225,7 +225,7 @@ def _hung_runner(world: World, true_s: float) -> Seen:
 def _frame(world: World, true_s: float) -> Seen:
     data, run = world.folder / "data", start_run(world.store)
     write_frame(data, run, b"jpeg")
-    os.utime(frame_path(data, run), (world.clock.utc_s(),) * 2)
+    os.utime(frame_path(data, run), (world.clock.utc_s(), world.clock.utc_s()))
     world.wait(true_s)
     site = cast(Site, SimpleNamespace(data=data, store=world.store, run=lambda _run: None))
     shown = live_view(site, run).status_code == 200
@@ -235,7 +235,7 @@ def _frame(world: World, true_s: float) -> Seen:
 def _wanted(world: World, true_s: float) -> Seen:
     data = world.folder / "data"
     ask_for_frames(data, "run")
-    os.utime(data / "monitor" / "run.wanted", (world.clock.utc_s(),) * 2)
+    os.utime(data / "monitor" / "run.wanted", (world.clock.utc_s(), world.clock.utc_s()))
     world.wait(true_s)
     wanted = frames_wanted(data, "run", world.clock.utc_s()) is not None
     return Seen(wanted, "the camera takes frames" if wanted else "the camera takes no frames")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -94,7 +94,7 @@ class World:
 
 
 @contextmanager
-def world(fault: Fault) -> Iterator[World]:
+def world(fault: Fault) -> Generator[World]:
     """A new host with this fault to come; its boots are those of the clock."""
     with TemporaryDirectory(prefix="clocks-") as folder:
         made = World(Path(folder), fault)
