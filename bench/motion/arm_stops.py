@@ -1,0 +1,270 @@
+"""Speed, acceleration and watchdog × every arm: what is allowed, and how soon a simulated arm stands then.
+
+`python -m bench.motion.arm_stops`. First the rule that `protocol check` and the first motion ask judges a grid for
+every known arm. Then every arm that a simulated controller can be moves at the largest speed that is allowed, its
+driver's process is killed, and the controller's own record says when the arm stood. The controller's guard is slowed
+down by a known time, so that a busy machine does not set it off before; that time is taken off what is measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import signal
+import sys
+from collections import Counter
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+
+from pydantic import BaseModel
+
+from bench.machine import RESULTS, commit, machine
+from drivers.interfaces import Abandoned
+from drivers.kuka import KukaConfig
+from drivers.ur import UrConfig
+from service.core.arms.known import known_arms
+from service.core.arms.model import ArmModel
+from service.core.arms.motion_limits import motion_problems
+from service.core.protocol.models import Motion
+from simulators.kuka_controller.kinematics import MODELS as LBRS
+from simulators.ur_controller.kinematics import MODELS as URS
+from tests.support.arms.arm_watch import watched_arm
+from tests.support.arms.kuka_simulator import simulated_kuka
+from tests.support.arms.stubborn import Program
+from tests.support.arms.ur_simulator import address, simulated_ur
+from tests.support.processes.lateness import Lateness
+from tests.support.rig.world_watch import watched_world
+
+SPEEDS_RAD_S = (0.1, 0.25, 0.5, 1.0, 1.2, 1.4, 2.0, 2.2, 3.1, 1000.0)
+ACCELERATIONS_RAD_S2 = (0.5, 1.5, 15.0, 40.0, 1000.0)
+WATCHDOGS_S = (0.1, 0.2, 0.3, 0.5, 1.0)
+RESTS_S = (0.2, 0.45, 0.55, 1.0, 2.0)
+_SLOWED_S = 1.5  # the controller's guard waits so long in the second part
+_ACCELERATION_RAD_S2 = 10.0
+_GOALS_RAD = (2.9, -2.9)
+_OWN_SPEED_REST_S = 5.0  # so generous that only the arm's own speed limits the motion
+_LATE_TIMES = 5  # driver, program, their threads and the controller wake one after the other
+
+
+@dataclass(frozen=True, slots=True)
+class Allowed:
+    """What the rule says of the grid for one arm: how many combinations it allows, and what it refuses."""
+
+    arm: str
+    allowed: int
+    refused: dict[str, int]  # by the fields that are named
+    contradicts: int  # allowed although the arm would rest too late or is too slow, or the other way round
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """One arm whose driver was killed.
+
+    Attributes:
+        arm: its name.
+        speed_rad_s: at which it moved: the largest allowed.
+        noticed_after_s: until the controller ends the motion.
+        rest_within_s: allowed.
+        predicted_s: by the rule, with the assumed braking.
+        measured_s: from the kill until the arm was last driven, the slowing taken off.
+        late_s: by how much a thread of this machine woke too late meanwhile, at worst.
+    """
+
+    arm: str
+    speed_rad_s: float
+    noticed_after_s: float
+    rest_within_s: float
+    predicted_s: float
+    measured_s: float
+    late_s: float
+
+    @property
+    def in_time(self) -> bool:
+        """Whether it stands within the time that is allowed, but for the lateness of this machine."""
+        return self.measured_s <= self.rest_within_s + _LATE_TIMES * self.late_s
+
+
+def refused(arm: ArmModel, speed_rad_s: float, acceleration_rad_s2: float, abandoned: Abandoned) -> tuple[str, ...]:
+    """The fields that the rule names for this motion."""
+    motion = Motion(speed_rad_s=speed_rad_s, acceleration_rad_s2=acceleration_rad_s2)
+    return tuple(sorted({field for field, _ in motion_problems(motion, [arm], abandoned)}))
+
+
+def judge(arm: ArmModel) -> Allowed:
+    """Ask the rule about the whole grid, and compare with the arm's figures themselves."""
+    fields: Counter[str] = Counter()
+    allowed = contradicts = 0
+    for speed, acceleration, watchdog, rest in itertools.product(
+        SPEEDS_RAD_S, ACCELERATIONS_RAD_S2, WATCHDOGS_S, RESTS_S
+    ):
+        named = refused(arm, speed, acceleration, Abandoned(watchdog, rest))
+        fields[" and ".join(named)] += bool(named)
+        allowed += not named
+        stands = watchdog + speed / arm.braking_rad_s2 <= rest + 1e-6
+        can = speed <= float(arm.speeds_rad_s.min()) and acceleration <= arm.acceleration_rad_s2
+        contradicts += (stands and can) != (not named)
+    return Allowed(arm.name, allowed, {name: count for name, count in fields.items() if count}, contradicts)
+
+
+def largest_speed_rad_s(arm: ArmModel, abandoned: Abandoned) -> float:
+    """The largest speed that the rule allows, to a micrometre a second at a metre; 0 if it allows none."""
+    low, high = 0.0, 100.0
+    while high - low > 1e-6:
+        middle = (low + high) / 2
+        low, high = (low, middle) if refused(arm, middle, _ACCELERATION_RAD_S2, abandoned) else (middle, high)
+    return low
+
+
+# --- simulated arms --------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _moving(config: BaseModel, spec: str, speed_rad_s: float) -> Generator[Program]:
+    program = Program(spec, config, _GOALS_RAD, motion=(speed_rad_s, _ACCELERATION_RAD_S2))
+    try:
+        program.next("error")  # nobody has let it move
+        program.let_move("Ada")
+        program.next("moves_to")
+        yield program
+    finally:
+        program.close()
+
+
+def kill_ur(model: str, config: UrConfig, speed_rad_s: float) -> tuple[float, float]:
+    """Kill the driver of a moving arm; returns for how long that moved on, and this machine's worst lateness, s."""
+    joints = ("--initial-joints", f"{_GOALS_RAD[1]},-1.6,1.9,-1.9,-1.57,0")
+    words = ("--model", model, *_joined(joints))
+    with (
+        simulated_ur(config.host, *words, patience_s=_SLOWED_S),
+        watched_arm(config.host) as arm,
+        _moving(config, "drivers.ur:DRIVER", speed_rad_s) as program,
+        Lateness() as lateness,
+    ):
+        arm.wait_moving(0.99 * speed_rad_s)
+        since = arm.mark()
+        program.send(("driver", signal.SIGKILL))
+        arm.wait_stopped()
+        return arm.moved_for_s(since), lateness.worst_s
+
+
+def kill_kuka(model: str, config: KukaConfig, speed_rad_s: float) -> tuple[float, float]:
+    """The same for an arm of KUKA, whose place the simulated world is told."""
+    joints = _joined(("--initial-joints", f"{_GOALS_RAD[1]},0.5,0,-1.4,0,1.2,-1.57"))
+    with watched_world() as watch:
+        words = ("--model", model, "--world", watch.address, *joints)
+        with (
+            simulated_kuka(config.host, *words, patience_s=_SLOWED_S),
+            _moving(config, "drivers.kuka:DRIVER", speed_rad_s) as program,
+            Lateness() as lateness,
+        ):
+            watch.wait_moving(watch.mark(), speed_rad_s / _ACCELERATION_RAD_S2 + 0.1)
+            since_s = watch.mark()
+            program.send(("driver", signal.SIGKILL))
+            watch.wait_resting(since_s)
+            return watch.moved_for_s(since_s), lateness.worst_s
+
+
+def _joined(words: Sequence[str]) -> tuple[str]:
+    """An option with a value that begins with a minus."""
+    return ("=".join(words),)
+
+
+def stop(arm: ArmModel, number: int, *, own_speed: bool) -> Stop:
+    """Kill the driver of this arm at the largest speed of the usual rig file, or at the arm's own largest."""
+    limits = {"rest_within_s": _OWN_SPEED_REST_S} if own_speed else {}
+    host = address(number)
+    config = UrConfig(host=host, **limits) if arm.name in URS else KukaConfig.model_validate({"host": host, **limits})
+    abandoned = config.abandoned
+    speed = largest_speed_rad_s(arm, abandoned)
+    kill = kill_ur(arm.name, config, speed) if isinstance(config, UrConfig) else kill_kuka(arm.name, config, speed)
+    moved_s, late_s = kill
+    predicted_s = abandoned.noticed_after_s + speed / arm.braking_rad_s2
+    # Where only the arm's own speed limits, what is predicted is what has to hold.
+    rest_s = predicted_s if own_speed else abandoned.rest_within_s
+    measured_s = moved_s - (_SLOWED_S - abandoned.noticed_after_s)
+    return Stop(arm.name, speed, abandoned.noticed_after_s, rest_s, predicted_s, measured_s, late_s)
+
+
+# --- results -----------------------------------------------------------------------------------------------------
+
+
+def _speeds(arms: Sequence[ArmModel], rest_s: float) -> list[str]:
+    head = " | ".join(f"watchdog {watchdog:g} s" for watchdog in WATCHDOGS_S)
+    rows = [f"| arm | {head} |", "|---|" + "---:|" * len(WATCHDOGS_S)]
+    for arm in arms:
+        speeds = (largest_speed_rad_s(arm, Abandoned(watchdog, rest_s)) for watchdog in WATCHDOGS_S)
+        rows.append(f"| {arm.name} | {' | '.join(f'{speed:.2f}' if speed > 1e-3 else 'none' for speed in speeds)} |")
+    return rows
+
+
+def report(arms: Sequence[ArmModel], judged: Sequence[Allowed], stops: Sequence[Stop], today: str) -> str:
+    """All results in Markdown."""
+    braking = ", ".join(f"{value:g}" for value in sorted({arm.braking_rad_s2 for arm in arms}))
+    combinations = len(SPEEDS_RAD_S) * len(ACCELERATIONS_RAD_S2) * len(WATCHDOGS_S) * len(RESTS_S)
+    lines = [
+        f"# How fast arms may move, and how soon they stand, {today}", "",
+        f"`python -m bench.motion.arm_stops`, revision {commit()}. Assumed for every arm: a controller that ends a "
+        f"motion brakes with {braking} rad/s². No data sheet says so; it has to be measured on the arm "
+        "(docs/howto/your_hardware.md). The simulated controllers brake with 4 rad/s² (UR) and 6 rad/s² (LBR).", "",
+        f"## What the rule says of {combinations} combinations", "",
+        f"Speeds {SPEEDS_RAD_S} rad/s, accelerations {ACCELERATIONS_RAD_S2} rad/s², watchdogs {WATCHDOGS_S} s, "
+        f"rest_within_s {RESTS_S} s.", "",
+        "| arm | allowed | refused | for | contradicts the arm's figures |", "|---|---:|---:|---|---:|",
+        *[
+            f"| {one.arm} | {one.allowed} | {sum(one.refused.values())} | "
+            f"{', '.join(f'{name}: {count}' for name, count in sorted(one.refused.items()))} | {one.contradicts} |"
+            for one in judged
+        ],
+    ]  # fmt: skip
+    for rest_s in RESTS_S:
+        lines += ["", f"Largest speed in rad/s with rest_within_s = {rest_s:g} s:", "", *_speeds(arms, rest_s)]
+    lines += [
+        "", "## Killed at the largest speed", "",
+        "The driver's process is killed (SIGKILL) while the arm moves. The controllers are simulated, and their guard "
+        f"was slowed down to {_SLOWED_S:g} s. `measured` is from the kill until the arm was last driven, with that "
+        "taken off and the real guard put in its place. The first rows use the usual limits of a rig file; the others "
+        "move as fast as the arm can, and must stand when the rule predicts it.", "",
+        "| arm | speed, rad/s | noticed after | must rest within | measured | lateness of this machine | verdict |",
+        "|---|---:|---:|---:|---:|---:|---|",
+        *[
+            f"| {one.arm} | {one.speed_rad_s:.2f} | {one.noticed_after_s:g} s | {one.rest_within_s:.3f} s | "
+            f"{one.measured_s:.3f} s | {one.late_s:.3f} s | {'in time' if one.in_time else '**LATE**'} |"
+            for one in stops
+        ], "",
+        f"A row is in time if it is so within {_LATE_TIMES} times that lateness.",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Judge, kill, print, and record if asked. Ends with 1 if an arm rests too late or the rule contradicts it."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--arms", nargs="*", help="names of arms that are killed; all by default")
+    parser.add_argument("--record", action="store_true", help="write the results to bench/results")
+    options = parser.parse_args()
+    arms = known_arms()
+    judged = [judge(arm) for arm in arms]
+    tried = [arm for arm in arms if arm.name in {*URS, *LBRS} and options.arms in (None, [arm.name])]
+    stops: list[Stop] = []
+    for own_speed in (False, True):
+        for number, arm in enumerate(tried):
+            stops.append(stop(arm, 100 + number, own_speed=own_speed))
+            print(stops[-1], flush=True)
+    today = datetime.now(UTC).date().isoformat()
+    text = report(arms, judged, stops, today)
+    if options.record:
+        rows = {"judged": [asdict(one) for one in judged], "stops": [asdict(one) for one in stops]}
+        (RESULTS / f"arm_stops-{today}.json").write_text(
+            json.dumps({"commit": commit(), "machine": machine(), **rows}, indent=1) + "\n"
+        )
+        (RESULTS / f"arm_stops-{today}.md").write_text(text)
+    print(text)
+    if any(not one.in_time for one in stops) or any(one.contradicts for one in judged):
+        sys.exit("an arm rests too late, or the rule contradicts the arm's figures")
+
+
+if __name__ == "__main__":
+    main()
