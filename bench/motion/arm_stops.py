@@ -13,6 +13,7 @@ import itertools
 import json
 import signal
 import sys
+import time
 from collections import Counter
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
@@ -46,6 +47,7 @@ _SLOWED_S = 1.5  # the controller's guard waits so long in the second part
 _ACCELERATION_RAD_S2 = 10.0
 _GOALS_RAD = (2.9, -2.9)
 _OWN_SPEED_REST_S = 5.0  # so generous that only the arm's own speed limits the motion
+_LATE = "**LATE**"
 _LATE_TIMES = 5  # driver, program, their threads and the controller wake one after the other
 
 
@@ -65,26 +67,31 @@ class Stop:
 
     Attributes:
         arm: its name.
+        how: the signal that the driver's process was sent.
         speed_rad_s: at which it moved: the largest allowed.
         noticed_after_s: until the controller ends the motion.
-        rest_within_s: allowed.
-        predicted_s: by the rule, with the assumed braking.
-        measured_s: from the kill until the arm was last driven, the slowing taken off.
+        rest_within_s: allowed; where only the arm's own speed limits it, what the rule predicts.
+        by_guard: whether the controller's guard ended the motion; if not, the end of the connection did.
+        measured_s: from the signal until the arm was last driven; what the guard was slowed by is taken off.
         late_s: by how much a thread of this machine woke too late meanwhile, at worst.
     """
 
     arm: str
+    how: str
     speed_rad_s: float
     noticed_after_s: float
     rest_within_s: float
-    predicted_s: float
+    by_guard: bool
     measured_s: float
     late_s: float
 
     @property
-    def in_time(self) -> bool:
-        """Whether it stands within the time that is allowed, but for the lateness of this machine."""
-        return self.measured_s <= self.rest_within_s + _LATE_TIMES * self.late_s
+    def verdict(self) -> str:
+        """Whether it stands within the time that is allowed, or would but for the lateness of this machine."""
+        if self.measured_s <= self.rest_within_s:
+            return "in time"
+        late = self.measured_s > self.rest_within_s + _LATE_TIMES * self.late_s
+        return _LATE if late else "in time but for this machine's lateness"
 
 
 def refused(arm: ArmModel, speed_rad_s: float, acceleration_rad_s2: float, abandoned: Abandoned) -> tuple[str, ...]:
@@ -133,8 +140,8 @@ def _moving(config: BaseModel, spec: str, speed_rad_s: float) -> Generator[Progr
         program.close()
 
 
-def kill_ur(model: str, config: UrConfig, speed_rad_s: float) -> tuple[float, float]:
-    """Kill the driver of a moving arm; returns for how long that moved on, and this machine's worst lateness, s."""
+def kill_ur(model: str, config: UrConfig, speed_rad_s: float, how: signal.Signals) -> tuple[float, float]:
+    """End or suspend the driver of a moving arm; for how long that moved on, and this machine's worst lateness, s."""
     joints = ("--initial-joints", f"{_GOALS_RAD[1]},-1.6,1.9,-1.9,-1.57,0")
     words = ("--model", model, *_joined(joints))
     with (
@@ -144,13 +151,13 @@ def kill_ur(model: str, config: UrConfig, speed_rad_s: float) -> tuple[float, fl
         Lateness() as lateness,
     ):
         arm.wait_moving(0.99 * speed_rad_s)
-        since = arm.mark()
-        program.send(("driver", signal.SIGKILL))
+        since_s = time.monotonic()
+        program.send(("driver", how))
         arm.wait_stopped()
-        return arm.moved_for_s(since), lateness.worst_s
+        return arm.driven_until_s(since_s), lateness.worst_s
 
 
-def kill_kuka(model: str, config: KukaConfig, speed_rad_s: float) -> tuple[float, float]:
+def kill_kuka(model: str, config: KukaConfig, speed_rad_s: float, how: signal.Signals) -> tuple[float, float]:
     """The same for an arm of KUKA, whose place the simulated world is told."""
     joints = _joined(("--initial-joints", f"{_GOALS_RAD[1]},0.5,0,-1.4,0,1.2,-1.57"))
     with watched_world() as watch:
@@ -162,7 +169,7 @@ def kill_kuka(model: str, config: KukaConfig, speed_rad_s: float) -> tuple[float
         ):
             watch.wait_moving(watch.mark(), speed_rad_s / _ACCELERATION_RAD_S2 + 0.1)
             since_s = watch.mark()
-            program.send(("driver", signal.SIGKILL))
+            program.send(("driver", how))
             watch.wait_resting(since_s)
             return watch.moved_for_s(since_s), lateness.worst_s
 
@@ -172,20 +179,22 @@ def _joined(words: Sequence[str]) -> tuple[str]:
     return ("=".join(words),)
 
 
-def stop(arm: ArmModel, number: int, *, own_speed: bool) -> Stop:
-    """Kill the driver of this arm at the largest speed of the usual rig file, or at the arm's own largest."""
+def stop(arm: ArmModel, number: int, how: signal.Signals, *, own_speed: bool) -> Stop:
+    """End or suspend the driver of an arm at the largest speed of the usual rig file, or at the arm's own largest."""
     limits = {"rest_within_s": _OWN_SPEED_REST_S} if own_speed else {}
     host = address(number)
     config = UrConfig(host=host, **limits) if arm.name in URS else KukaConfig.model_validate({"host": host, **limits})
     abandoned = config.abandoned
     speed = largest_speed_rad_s(arm, abandoned)
-    kill = kill_ur(arm.name, config, speed) if isinstance(config, UrConfig) else kill_kuka(arm.name, config, speed)
-    moved_s, late_s = kill
+    if isinstance(config, UrConfig):
+        moved_s, late_s = kill_ur(arm.name, config, speed, how)
+    else:
+        moved_s, late_s = kill_kuka(arm.name, config, speed, how)
     predicted_s = abandoned.noticed_after_s + speed / arm.braking_rad_s2
-    # Where only the arm's own speed limits, what is predicted is what has to hold.
     rest_s = predicted_s if own_speed else abandoned.rest_within_s
-    measured_s = moved_s - (_SLOWED_S - abandoned.noticed_after_s)
-    return Stop(arm.name, speed, abandoned.noticed_after_s, rest_s, predicted_s, measured_s, late_s)
+    by_guard = moved_s > _SLOWED_S
+    measured_s = moved_s - (_SLOWED_S - abandoned.noticed_after_s) if by_guard else moved_s
+    return Stop(arm.name, how.name, speed, abandoned.noticed_after_s, rest_s, by_guard, measured_s, late_s)
 
 
 # --- results -----------------------------------------------------------------------------------------------------
@@ -223,18 +232,21 @@ def report(arms: Sequence[ArmModel], judged: Sequence[Allowed], stops: Sequence[
         lines += ["", f"Largest speed in rad/s with rest_within_s = {rest_s:g} s:", "", *_speeds(arms, rest_s)]
     lines += [
         "", "## Killed at the largest speed", "",
-        "The driver's process is killed (SIGKILL) while the arm moves. The controllers are simulated, and their guard "
-        f"was slowed down to {_SLOWED_S:g} s. `measured` is from the kill until the arm was last driven, with that "
-        "taken off and the real guard put in its place. The first rows use the usual limits of a rig file; the others "
-        "move as fast as the arm can, and must stand when the rule predicts it.", "",
-        "| arm | speed, rad/s | noticed after | must rest within | measured | lateness of this machine | verdict |",
-        "|---|---:|---:|---:|---:|---:|---|",
+        "The driver's process is killed (SIGKILL), or suspended (SIGSTOP), while the arm moves. The controllers are "
+        f"simulated, and their guard was slowed down to {_SLOWED_S:g} s. `measured` is from the signal until the "
+        "arm was last driven; where the guard ended the motion, that time is taken off and the real guard put in its "
+        "place. The first rows use the usual limits of a rig file; the last ones move as fast as the arm can, and "
+        "must stand when the rule predicts it.", "",
+        "| arm | signal | speed, rad/s | noticed after | must rest within | ended by | measured | lateness here | |",
+        "|---|---|---:|---:|---:|---|---:|---:|---|",
         *[
-            f"| {one.arm} | {one.speed_rad_s:.2f} | {one.noticed_after_s:g} s | {one.rest_within_s:.3f} s | "
-            f"{one.measured_s:.3f} s | {one.late_s:.3f} s | {'in time' if one.in_time else '**LATE**'} |"
+            f"| {one.arm} | {one.how} | {one.speed_rad_s:.2f} | {one.noticed_after_s:g} s | "
+            f"{one.rest_within_s:.3f} s | {'guard' if one.by_guard else 'connection'} | {one.measured_s:.3f} s | "
+            f"{one.late_s:.3f} s | {one.verdict} |"
             for one in stops
         ], "",
-        f"A row is in time if it is so within {_LATE_TIMES} times that lateness.",
+        f"This machine's lateness counts {_LATE_TIMES} times: driver, program, their threads and the controller wake "
+        "one after the other.",
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
 
@@ -249,10 +261,10 @@ def main() -> None:
     judged = [judge(arm) for arm in arms]
     tried = [arm for arm in arms if arm.name in {*URS, *LBRS} and options.arms in (None, [arm.name])]
     stops: list[Stop] = []
-    for own_speed in (False, True):
-        for number, arm in enumerate(tried):
-            stops.append(stop(arm, 100 + number, own_speed=own_speed))
-            print(stops[-1], flush=True)
+    tries = ((signal.SIGKILL, False), (signal.SIGSTOP, False), (signal.SIGKILL, True))
+    for (how, own_speed), (number, arm) in itertools.product(tries, enumerate(tried)):
+        stops.append(stop(arm, 100 + number, how, own_speed=own_speed))
+        print(stops[-1], flush=True)
     today = datetime.now(UTC).date().isoformat()
     text = report(arms, judged, stops, today)
     if options.record:
@@ -262,7 +274,7 @@ def main() -> None:
         )
         (RESULTS / f"arm_stops-{today}.md").write_text(text)
     print(text)
-    if any(not one.in_time for one in stops) or any(one.contradicts for one in judged):
+    if any(one.verdict == _LATE for one in stops) or any(one.contradicts for one in judged):
         sys.exit("an arm rests too late, or the rule contradicts the arm's figures")
 
 

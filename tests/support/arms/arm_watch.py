@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Generator
 from dataclasses import dataclass
 
 from tests.support.processes.waiting import until
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
+_NEAR_S = 0.5
 LONGEST_STEP_S = 0.05  # longest gap that counts; in a longer one the simulator was not scheduled
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """One sample: the controller's time, the speed of the fastest driven joint, whether a program runs."""
+    """One sample: when it came, the controller's time, the speed of the fastest driven joint, if a program runs."""
 
+    at_s: float  # host time.monotonic()
     time_s: float
     speed_rad_s: float
     joint_rad: float
@@ -71,6 +74,15 @@ class ArmWatch:
                 last_s = elapsed_s
         return last_s
 
+    def driven_until_s(self, since_s: float) -> float:
+        """Time from a moment of the host (time.monotonic()) until the arm was last driven, on the controller's clock.
+
+        The sample of that moment that was least late on its way tells what the controller's clock showed then.
+        """
+        near = [one for one in self._seen if abs(one.at_s - since_s) < _NEAR_S]
+        shown_s = since_s + max(one.time_s - one.at_s for one in near)
+        return max(one.time_s for one in self._seen if one.speed_rad_s > 0.0) - shown_s
+
     def way_rad(self, since: int) -> float:
         """How far the first joint has moved since a mark."""
         return abs(self.now.joint_rad - self._seen[since - 1].joint_rad)
@@ -81,7 +93,9 @@ class ArmWatch:
                 data = self._client.data()
                 speed_rad_s = max(abs(v) for v in data["target_qd"])
                 runs = data["runtime_state"] == (2,)
-                self._seen.append(Seen(data["timestamp"][0], speed_rad_s, data["actual_q"][0], runs))
+                self._seen.append(
+                    Seen(time.monotonic(), data["timestamp"][0], speed_rad_s, data["actual_q"][0], runs)
+                )
 
 
 @contextlib.contextmanager
