@@ -174,8 +174,10 @@ def allows(act: Callable[[], object]) -> bool:
 
 
 def rows_of(duration: Duration, fault: Fault) -> list[Row]:
-    """Wait for a tenth less and a tenth more than the limit, or as little more as the fault lasts."""
-    waits = dict.fromkeys(max(share * duration.limit_s, fault.true_s + 1.0) for share in (0.9, 1.1))
+    """Wait for a little less and a little more than the limit, or as little more as the fault lasts."""
+    near_s = min(0.1 * duration.limit_s, 600.0)
+    limits_s = (duration.limit_s - near_s, duration.limit_s + near_s)
+    waits = dict.fromkeys(max(limit_s, fault.true_s + 1.0) for limit_s in limits_s)
     return [_row(duration, fault, true_s) for true_s in waits]
 
 

@@ -139,7 +139,7 @@ def _judged(
 
 
 def _set_forward_s(connection: Connection, clock: Clock) -> float:
-    """By how much UTC has gone on farther than the monotonic clock since the newest event of any run; 0 if it has not.
+    """By how much UTC has gone on farther than the monotonic clock since the newest event; 0 if it has not.
 
     So much younger a file may be than it seems. Where the host was restarted since, this is 0 or makes files stay.
     """

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from tests.support.processes.waiting import until
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
-_NEAR_S = 0.5
 LONGEST_STEP_S = 0.05  # longest gap that counts; in a longer one the simulator was not scheduled
 
 
@@ -46,6 +45,10 @@ class ArmWatch:
         """Mark the present moment, for the methods that take `since`."""
         return len(self._seen)
 
+    def samples(self) -> list[Seen]:
+        """All of them."""
+        return list(self._seen)
+
     @property
     def now(self) -> Seen:
         return self._seen[-1]
@@ -73,15 +76,6 @@ class ArmWatch:
             if sample.speed_rad_s > 0.0:
                 last_s = elapsed_s
         return last_s
-
-    def driven_until_s(self, since_s: float) -> float:
-        """Time from a moment of the host (time.monotonic()) until the arm was last driven, on the controller's clock.
-
-        The sample of that moment that was least late on its way tells what the controller's clock showed then.
-        """
-        near = [one for one in self._seen if abs(one.at_s - since_s) < _NEAR_S]
-        shown_s = since_s + max(one.time_s - one.at_s for one in near)
-        return max(one.time_s for one in self._seen if one.speed_rad_s > 0.0) - shown_s
 
     def way_rad(self, since: int) -> float:
         """How far the first joint has moved since a mark."""
