@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 import threading
 from collections.abc import Callable, Mapping
@@ -86,7 +87,8 @@ class Reporter:
     _progress: tuple[str, int, int] = ("", 0, 0)
     _activity: tuple[str, float] = ("", 0.0)
     _newest: Snapshot = field(default_factory=lambda: Snapshot(doing="starting"))
-    _watched: tuple[float, RobotReading] = (0.0, RobotReading())  # time, and the robot's state then
+    _attended_s: float = field(init=False)  # monotonic time of the main loop's last report
+    _watched: tuple[float, RobotReading] = (-math.inf, RobotReading())  # monotonic time, and the robot's state then
     _writing: threading.Lock = field(default_factory=threading.Lock)
     _heartbeat: Heartbeat = field(init=False)
     _moment: _Moment | None = None
@@ -97,11 +99,12 @@ class Reporter:
     _due_s: dict[str, float] = field(default_factory=dict[str, float])
 
     def __post_init__(self) -> None:
+        self._attended_s = self.clock.monotonic_s()
         self._heartbeat = Heartbeat(self.clock, self.beat, self.watch)
 
     def begin(self) -> None:
         """Write twice a second from now on, until `end`."""
-        self._newest = self._newest.model_copy(update={"attended_utc_s": self.clock.utc_s()})
+        self._attended_s = self.clock.monotonic_s()
         self.busy("starting")
         self._heartbeat.begin()
 
@@ -111,7 +114,7 @@ class Reporter:
 
     def busy(self, what: str) -> None:
         """Announce a call of the main loop that may take long."""
-        self._activity = (what, self.clock.utc_s())
+        self._activity = (what, self.clock.monotonic_s())
 
     def tell(self, message: str) -> None:
         """Add one message."""
@@ -138,7 +141,9 @@ class Reporter:
             self._progress = ("", 0, 0)
         self._moment = moment
         devices = self.devices()
-        self._newest = self._snapshot(moment, words, devices)
+        newest = self._snapshot(moment, words, devices)
+        with self._writing:
+            self._newest, self._attended_s = newest, self.clock.monotonic_s()
         self.beat()
         self._tower(devices, self._newest.standing)
         if self.alarm is not None:
@@ -158,11 +163,8 @@ class Reporter:
         for camera in devices.cameras.values():
             if self._due("camera", _CAMERA_S):
                 self._camera = read_camera(camera)
-        now_s = self.clock.utc_s()
         return Snapshot(
-            at_utc_s=now_s,
-            attended_utc_s=now_s,
-            robot_utc_s=now_s,
+            at_utc_s=self.clock.utc_s(),
             pid=getpid(),
             doing="pausing" if moment.doing == "paused" and robot.phase == "moving" else moment.doing,
             step=moment.step,
@@ -184,16 +186,19 @@ class Reporter:
         """Write the last known state with the current time."""
         (what, done, total), (activity, since_s) = self._progress, self._activity
         with self._writing:
-            newest, (watched_s, robot) = self._newest, self._watched
+            newest, attended_s, (watched_s, robot) = self._newest, self._attended_s, self._watched
             if newest.doing == "ended":
                 return
+            now_utc_s = self.clock.utc_s()
+            ahead_s = now_utc_s - self.clock.monotonic_s()  # as of now: the clock may have been set since
             told: dict[str, object] = {
-                "at_utc_s": self.clock.utc_s(), "pid": getpid(), "what": what, "done": done, "total": total,
-                "messages": self._news, "activity": activity, "activity_utc_s": since_s,
+                "at_utc_s": now_utc_s, "pid": getpid(), "what": what, "done": done, "total": total,
+                "messages": self._news, "activity": activity, "activity_utc_s": ahead_s + since_s,
+                "attended_utc_s": ahead_s + attended_s, "robot_utc_s": ahead_s + max(attended_s, watched_s),
                 "starved_s": self._starved_s(),
             }  # fmt: skip
-            if watched_s > newest.robot_utc_s:
-                told |= {"robot_utc_s": watched_s, "robot": robot.phase, "robot_name": robot.name}
+            if watched_s > attended_s:
+                told |= {"robot": robot.phase, "robot_name": robot.name}
             snapshot = newest.model_copy(update=told)
             self._write(lambda: write_snapshot(self.data, self.run_id, snapshot))
 
@@ -204,10 +209,9 @@ class Reporter:
 
     def watch(self) -> None:
         """Read the robot's pose stream while the main loop is in a long call. May block on the robot."""
-        newest = self._newest
-        if self.clock.utc_s() - newest.attended_utc_s < _QUIET_S or newest.doing == "ended":
+        asked_s = self.clock.monotonic_s()
+        if asked_s - self._attended_s < _QUIET_S or self._newest.doing == "ended":
             return
-        asked_s = self.clock.utc_s()
         self._watched = (asked_s, watch_robot(self.devices(), self.clock.monotonic_s()))
 
     def _elsewhere(self) -> str:

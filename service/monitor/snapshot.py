@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import ValidationError
 
 from service.core.records.events import Record
+from service.core.records.moments import age_s
 
 STALE_S = 5.0
 STARTING_S = 120.0  # time to load everything when started, also on a busy machine
@@ -100,8 +101,8 @@ class Snapshot(Record):
         return max(0.0, self.at_utc_s - self.attended_utc_s) if self.attended_utc_s else 0.0
 
     def unattended_s(self, now_utc_s: float) -> float:
-        """Seconds since the main loop's last report, by now."""
-        return now_utc_s - (self.attended_utc_s or self.at_utc_s)
+        """Seconds since the main loop's last report, by now; infinity if the clock was set back since."""
+        return age_s(self.at_utc_s, now_utc_s, if_set_back_s=math.inf) + self.quiet_s
 
     @property
     def robot_silent_s(self) -> float:
@@ -156,7 +157,8 @@ def frames_wanted(data: Path, run_id: str, now_utc_s: float, *, within_s: float 
     """The camera at whose live view somebody has looked within this time, last; "": the first one; None: nobody."""
     path = _path(data, run_id, "wanted")
     try:
-        return path.read_text() if now_utc_s - path.stat().st_mtime < within_s else None
+        age = age_s(path.stat().st_mtime, now_utc_s, if_set_back_s=math.inf)
+        return path.read_text() if age < within_s else None
     except OSError:
         return None
 

@@ -48,6 +48,10 @@ class Accounts:
         with self._store.database.reading() as connection:
             return to_account(get_account(connection, account))
 
+    def has_to_wait(self, account: Account) -> bool:
+        """Whether wrong passwords have closed the account for now; both clocks must say that the wait is over."""
+        return self._store.ages.at_least_s(account.locked_until_utc_s) < 0
+
     # --- one-time links ---
 
     def first_link(self) -> str | None:
@@ -247,6 +251,7 @@ class Accounts:
         change = AccountChanged(account=account, field="link", old="", new=f"valid for {valid_s / 3600:.0f} h")
         made = record_change(self._store, connection, actor, change, stored)
         expires_utc_s = datetime.fromisoformat(made.at_utc).timestamp() + valid_s
+        self._store.ages.begin(expires_utc_s)
         connection.execute(insert(invitations).values(account=account, expires_utc_s=expires_utc_s, used=0, **stored))
         return token
 
@@ -258,10 +263,9 @@ class Accounts:
             select(invitations).where(
                 invitations.c.token_sha256 == token_sha256(token),
                 invitations.c.used == 0,
-                invitations.c.expires_utc_s > self._store.clock.utc_s(),
             )
         ).one_or_none()
-        if row is None:
+        if row is None or self._store.ages.at_most_s(row.expires_utc_s) >= 0:
             raise _no_link()
         if not row.account:
             return Invitation("", "", "administrator")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Any, Literal
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, Row, select
 from sqlalchemy.dialects.sqlite import insert
 
 from service.core.records.events import ControlTaken
+from service.core.records.moments import age_s
 from service.people.errors import ControlError, NotAllowedError
 from service.people.person import Person
 from service.people.rows import SESSION_S, require_reason
@@ -78,7 +80,7 @@ class Control:
             unanswered = (
                 holder.locked
                 and holder.asked_by_screen == person.screen
-                and self._store.clock.utc_s() - holder.asked_utc_s >= UNANSWERED_S
+                and self._store.ages.at_least_s(holder.asked_utc_s) >= UNANSWERED_S
             )
             if not holder.screen:
                 self._give(connection, run_id, person, holder, "free", "")
@@ -118,20 +120,22 @@ class Control:
             if not holder.screen or holder.screen == person.screen:
                 raise ControlError("there is nobody to ask", where=run_id, remedy="Take control; it is free")
             _require_shown(shown, holder, run_id)
-            recent = self._store.clock.utc_s() - holder.asked_utc_s < UNANSWERED_S
-            if holder.asked_by_screen not in ("", person.screen) and recent:
+            now = self._store.clock.utc_s()
+            set_back = age_s(holder.asked_utc_s, now, if_set_back_s=inf) == inf
+            answer_due = not set_back and self._store.ages.at_least_s(holder.asked_utc_s) < UNANSWERED_S
+            if holder.asked_by_screen not in ("", person.screen) and answer_due:
                 raise ControlError(
                     f"{holder.asked_by_name} has just asked", where=run_id, remedy="Wait for the answer"
                 )
+            # Asking again does not restart the waiting time, unless that is not known: the clock was set back.
+            asked_s = holder.asked_utc_s if holder.asked_by_screen == person.screen and not set_back else now
+            self._store.ages.begin(asked_s)
             self._write(
                 connection,
                 run_id,
                 asked_by_screen=person.screen,
                 asked_by_account=person.account,
-                # Asking again does not restart the waiting time.
-                asked_utc_s=holder.asked_utc_s
-                if holder.asked_by_screen == person.screen
-                else self._store.clock.utc_s(),
+                asked_utc_s=asked_s,
             )
 
     def answer(self, run_id: str, person: Person, *, grant: bool, shown: str | None = None) -> None:
@@ -146,7 +150,7 @@ class Control:
                 raise ControlError(
                     f"by now it is {holder.asked_by_name} who asks for control", where=run_id, remedy=_DECIDE_AGAIN
                 )
-            asker = connection.execute(_valid(holder.asked_by_screen, self._store.clock.utc_s())).one_or_none()
+            asker = self._valid(connection, holder.asked_by_screen)
             if grant and asker is not None:
                 reason = f"asked for; granted by {person.account}"
                 self._record(connection, run_id, asker.account, holder.asked_by_screen, holder, "handed_over", reason)
@@ -173,7 +177,7 @@ class Control:
         row = connection.execute(select(control).where(control.c.run_id == run_id)).one_or_none()
         if row is None or not row.screen:
             return Holder()
-        session = connection.execute(_valid(row.screen, self._store.clock.utc_s())).one_or_none()
+        session = self._valid(connection, row.screen)
         if session is None:
             return Holder()
         holder = Holder(
@@ -188,6 +192,15 @@ class Control:
             asked_by_name=_full_name(connection, row.asked_by_account),
             asked_utc_s=row.asked_utc_s,
         )
+
+    def _valid(self, connection: Connection, screen: str) -> Row[Any, Any, Any, Any] | None:
+        """The sign-in on a screen, unless it has ended."""
+        row = connection.execute(
+            select(sessions.c.account, sessions.c.locked, sessions.c.created_utc_s, accounts.c.full_name)
+            .join(accounts, sessions.c.account == accounts.c.account)
+            .where(sessions.c.screen == screen, accounts.c.state == "active")
+        ).one_or_none()
+        return None if row is None or self._store.ages.at_most_s(row.created_utc_s) >= SESSION_S else row
 
     def _give(
         self,
@@ -227,18 +240,6 @@ class Control:
             .values(run_id=run_id, **{**nobody, **values})
             .on_conflict_do_update(index_elements=["run_id"], set_=values)
         )
-
-
-def _valid(screen: str, now_s: float) -> Any:
-    return (
-        select(sessions.c.account, sessions.c.locked, accounts.c.full_name)
-        .join(accounts, sessions.c.account == accounts.c.account)
-        .where(
-            sessions.c.screen == screen,
-            sessions.c.created_utc_s > now_s - SESSION_S,
-            accounts.c.state == "active",
-        )
-    )
 
 
 def _full_name(connection: Connection, account: str) -> str:

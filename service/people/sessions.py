@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping
+from math import inf
 from threading import Lock
 from typing import Any, Literal
 
@@ -11,6 +12,7 @@ from argon2 import PasswordHasher
 from sqlalchemy import Connection, Row, delete, insert, select, update
 
 from service.core.records.events import AccountChanged, SignInRecorded
+from service.core.records.moments import age_s
 from service.people.accounts import Accounts
 from service.people.credentials.badges import Badges
 from service.people.credentials.passwords import Passwords, new_token, token_sha256
@@ -30,6 +32,7 @@ from service.people.rows import (
     plain_name,
     record_change,
     record_sign_in,
+    to_account,
     to_person,
 )
 from service.store.database.tables import accounts, sessions
@@ -89,6 +92,7 @@ class People:
                     "csrf": new_token(),
                     "created_utc_s": now,
                 }
+                self._store.ages.begin(now)
                 connection.execute(insert(sessions).values(**session, seen_utc_s=now, locked=0, pin_failures=0))
                 self._reset_failures(connection, row, password)
                 outcome = SignInRecorded(account=row.account, outcome="signed_in", screen=screen, address=address)
@@ -125,7 +129,7 @@ class People:
         name = plain_name(typed)
         with self._store.database.reading() as connection:
             row = find_account(connection, name)
-        waits = row is not None and row.locked_until_utc_s > self._store.clock.utc_s()
+        waits = row is not None and self._has_to_wait(row)
         usable = row is not None and row.state == "active" and not waits
         hashes = {} if row is None else {"password": row.password_hash, "pin": row.pin_hash, "badge": row.badge_hash}
         stored = str(hashes[known_by]) if usable else ""
@@ -136,13 +140,10 @@ class People:
             if row is not None and usable:
                 failures = get_account(connection, name).failures + 1  # another process may count too
                 wait_s = wait_after_s(failures)
-                connection.execute(
-                    update(accounts)
-                    .where(accounts.c.account == name)
-                    .values(
-                        failures=failures, locked_until_utc_s=self._store.clock.utc_s() + wait_s if wait_s else 0.0
-                    )
-                )
+                until_s = self._store.clock.utc_s() + wait_s if wait_s else 0.0
+                self._store.ages.begin(until_s)
+                counted = {"failures": failures, "locked_until_utc_s": until_s}
+                connection.execute(update(accounts).where(accounts.c.account == name).values(**counted))
                 waits = wait_s > 0
             # An unknown name is not recorded, because it may be a password typed into the wrong field.
             outcome = SignInRecorded(
@@ -157,6 +158,18 @@ class People:
             remedy=f"Check both. After {FREE_FAILURES} wrong {NAMES[known_by]}s in a row an account waits "
             f"{FIRST_WAIT_S:.0f} s, then longer; an administrator can end the wait",
         )
+
+    def _has_to_wait(self, row: Row[Any]) -> bool:
+        """Whether wrong passwords have closed the account for now.
+
+        A wait longer than the longest comes from a clock that was set back since; it is cut to the longest.
+        """
+        now = self._store.clock.utc_s()
+        if row.locked_until_utc_s > now + LONGEST_WAIT_S:
+            with self._store.database.writing() as connection:
+                cut = {"locked_until_utc_s": now + LONGEST_WAIT_S}
+                connection.execute(update(accounts).where(accounts.c.account == row.account).values(**cut))
+        return self.accounts.has_to_wait(to_account(row))
 
     def _require_unchanged(self, connection: Connection, row: Row[Any]) -> None:
         """Raise AccountJustChangedError if the account has changed since its password was checked."""
@@ -191,16 +204,19 @@ class People:
             row = self._session(connection, token)
         if row is None:
             return None
-        if row.state != "active" or now - row.created_utc_s >= SESSION_S:
+        if row.state != "active" or self._store.ages.at_most_s(row.created_utc_s) >= SESSION_S:
             with self._store.database.writing() as connection:
                 self._end(connection, token)
             return None
-        if not row.locked and now - row.seen_utc_s >= idle_lock_s:
+        # After the clock was set back nobody knows how long the screen was idle; the PIN says that a person is there.
+        idle_s = max(age_s(row.seen_utc_s, now, if_set_back_s=inf), self._store.ages.at_most_s(row.seen_utc_s))
+        if not row.locked and idle_s >= idle_lock_s:
             with self._store.database.writing() as connection:
                 self._lock(connection, row.account, row.screen, actor=SERVICE)
             with self._store.database.reading() as connection:
                 row = self._session(connection, token)
-        elif deliberate and not row.locked and now - row.seen_utc_s >= 1.0:
+        elif deliberate and not row.locked and idle_s >= 1.0:
+            self._store.ages.begin(now)
             with self._store.database.writing() as connection:
                 connection.execute(update(sessions).where(sessions.c.screen == row.screen).values(seen_utc_s=now))
         return None if row is None else to_person(row)

@@ -14,6 +14,7 @@ from sqlalchemy import Connection, bindparam, select
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.jobs.priorities import Lane
 from service.core.records.events import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
+from service.store.ages import Ages
 from service.store.database.engine import LOOK, PATIENCE_S, RESTORE, Database, database_path, open_database
 from service.store.database.tables import artefacts, events, heads, runs
 from service.store.durable_effects import Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock
@@ -46,6 +47,7 @@ class Store:
         self._files = files
         self._clock = clock
         self._ids = ids
+        self.ages = Ages(clock)
         self.database_path = path
         self.sound_until: dict[str, tuple[int, str]] = {}  # chain → number and hash of the last event verified
 

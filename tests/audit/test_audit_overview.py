@@ -10,13 +10,17 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from service.audit.overview.devices import clock_offsets
 from service.cli.main import app
-from service.core.records.events import FilesKept, StepStarted
+from service.core.records.events import FilesKept, SessionStarted, StepStarted
 from service.core.text.clock_time import local_time
 from service.store.records import NewArtefact
+from service.store.store import Store
 from tests.support.pages.browsed_run import words
 from tests.support.pages.web import WebSite, web_site
 from tests.support.processes.waiting import until
+from tests.support.record.stepped_clock import SteppedClock
+from tests.support.record.store import captured, put_image, start_run
 from tests.support.recorded.reported_run import record_reported_run
 
 
@@ -155,3 +159,23 @@ def test_what_a_clock_offset_means_stands_beside_it(tmp_path: Path) -> None:
     assert "1279.000 s behind this machine's" in page
     assert "Beyond It sets the times in the device's own files. Order and times of the record do not depend" in page
     assert "a large or negative value is not a fault" in page
+
+
+def test_the_clocks_of_a_step_are_compared_within_one_start_of_the_program(tmp_path: Path) -> None:
+    """The host's monotonic clock begins anew with a boot: over it, neither drift nor duration means anything."""
+    clock = SteppedClock()
+    with Store.open(tmp_path, clock) as store:
+        run = start_run(store)
+        for start in (1, 2):
+            store.record(run, [SessionStarted(resumed=start > 1, software={}, host="h", pid=start)], actor="runner")
+            for number in (1, 2):
+                clock.passed_s += 10.0
+                ref = put_image(store, f"v{start}_{number}")
+                offset_s = 5000.0 - clock.monotonic_s() + clock.passed_s + 0.001 * number
+                view = captured(ref, f"v{start}_{number}", clock_offset_s=offset_s)
+                store.record(run, [view], actor="camera", artefacts=[NewArtefact(ref, "camera")])
+            clock.reboot(600.0)
+        with store.database.reading() as connection:
+            series = clock_offsets(connection, run)
+    assert [(one.start, one.captures, one.over_s) for one in series] == [(1, 2, 10.0), (2, 2, 10.0)]
+    assert [one.drift_s for one in series] == pytest.approx([0.001, 0.001])

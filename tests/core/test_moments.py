@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.core.records.moments import Moment, elapsed
+from service.core.records.moments import Moment, age_s, elapsed
 from service.monitor.snapshot import Snapshot
 from service.steps.kinds.by_hand.timed_application import Result
 
@@ -54,3 +54,11 @@ def test_a_snapshot_from_before_the_clock_was_set_back_is_stale() -> None:
     assert not snapshot.stale(10_000.5)
     assert not snapshot.stale(9_999.5)
     assert snapshot.stale(10_000.0 - 3600.0)
+
+
+@pytest.mark.parametrize(
+    ("now_s", "age"),
+    [(1060.0, 60.0), (1000.0, 0.0), (996.0, 0.0), (900.0, -1.0)],  # the last: the clock was set back
+)
+def test_an_age_by_utc_alone_is_never_negative_and_says_when_it_is_not_known(now_s: float, age: float) -> None:
+    assert age_s(1000.0, now_s, if_set_back_s=-1.0) == age

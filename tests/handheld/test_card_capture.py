@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 
 from drivers.photo_watch import PhotoWatch, PhotoWatchConfig
-from service.core.records.events import CaptureAsked, StepMeasured, ViewHeld, ViewpointFailed
+from service.core.records.events import CaptureAsked, OperatorAction, StepMeasured, ViewHeld, ViewpointFailed
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
 from simulators.hand.technician import follow
-from tests.support.rig.bench_rig import BenchRig
+from tests.support.rig.bench_rig import BenchRig, answer
 from tests.support.rig.card import photograph, put
 from tests.support.runs.bench_run import Bench, begin_run, bench_store
 from tests.support.runs.held_run import MIDDLE_M, STEP, Person, held_run
@@ -30,7 +32,8 @@ class CardPerson(Person):
 
     folder: Path = Path()
     watch: PhotoWatch | None = None
-    began: datetime = field(init=False)  # start of the step, from its first words on
+    began: datetime = field(init=False)  # start of the step by the camera's clock, from its first words on
+    ahead: timedelta = timedelta()  # of the camera's clock before the host's
 
     def read(self, message: str) -> None:
         if not message.startswith("next: "):
@@ -38,12 +41,14 @@ class CardPerson(Person):
         self.rig.card = self.watch  # the robot's calibration images came through the cable
         self.presses += 1
         if self.presses == 1:
-            self.began = self.rig.arm.clock.utc_now()
+            self.began = self.rig.arm.clock.utc_now() + self.ahead
         mishap = self.mishaps.get(self.presses, "")
         if mishap == "copied twice":
             put(self.folder, f"DSC{self.presses - 1:05d} (1).JPG", self.file(self.presses - 1))
         if mishap == "old":
             put(self.folder, "DSC09999.JPG", photograph(99, self.began - timedelta(hours=2)))
+        if mishap == "of the step before":
+            put(self.folder, "DSC09999.JPG", photograph(99, self.began - timedelta(minutes=40)))
         self.grip = follow(message, self.grip, MIDDLE_M)
         self.views.append((self.grip.T_world_camera(), ""))
         put(self.folder, f"DSC{self.presses:05d}.JPG", self.file(self.presses, 400 if mishap == "dial" else 100))
@@ -101,6 +106,23 @@ def test_photographs_of_a_card_become_views_as_those_of_a_cable_do(
     (left_out,) = bench.payloads(ViewpointFailed)
     assert "taken before this step began" in left_out.message
     bench.must_verify()
+
+
+def test_a_host_clock_that_was_set_back_lets_no_older_photograph_in(
+    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    bench, person = card_run(begin, monkeypatch, tmp_path, {3: "of the step before"})
+
+    def set_back(question: AskOperator, _state: RunState) -> OperatorAction:
+        person.ahead = timedelta(hours=1)  # the camera's clock is right
+        bench.clock.set_utc(-3600.0)
+        return answer(question, "confirm")
+
+    bench.script("capture", "confirm", set_back)
+    assert bench.run().status == "completed"
+    assert "DSC09999.JPG" not in [Path(view.found_at).name for view in bench.payloads(ViewHeld)]
+    (left_out,) = bench.payloads(ViewpointFailed)
+    assert "taken before this step began" in left_out.message
 
 
 def test_after_a_restart_nothing_is_taken_twice_and_nothing_is_lost(

@@ -114,6 +114,19 @@ def test_disabling_shuts_out_at_once_and_enabling_lets_in_again(office: Office) 
     office.enter("grace")
 
 
+def test_a_link_lives_no_longer_because_the_clock_was_set_back(office: Office) -> None:
+    _, administrator = office.enter("ada")
+    link = office.people.accounts.invite(administrator, "mary", "Mary Shelley", "auditor")
+    (change,) = [change for change in office.changes("mary") if change[0] == "link"]
+    hours = float(change[2].split()[2])
+    office.clock.set_utc(-3600.0)
+    office.clock.passed_s += 3600 * hours - 1
+    assert office.people.accounts.invitation(link).account == "mary"
+    office.clock.passed_s += 1
+    with pytest.raises(LinkError):
+        office.people.accounts.invitation(link)
+
+
 def test_a_disabled_persons_link_is_void(office: Office) -> None:
     _, administrator = office.enter("ada")
     link = office.people.accounts.invite(administrator, "mary", "Mary Shelley", "auditor")

@@ -137,6 +137,44 @@ def test_a_locked_screen_that_does_not_answer_loses_control(room: Room) -> None:
     assert room.record()[-1] == ("emmy", emmy.screen, "grace", "taken_over")
 
 
+def test_a_request_from_before_the_clock_was_set_back_blocks_nobody_and_its_wait_begins_anew(room: Room) -> None:
+    grace, emmy = room.screen("grace"), room.screen("emmy")
+    room.control.take(room.run, grace)
+    room.people.lock(grace)
+    room.control.ask(room.run, emmy)
+    room.clock.set_utc(-3600.0)
+    with pytest.raises(ControlError):  # nobody knows how long she has waited
+        room.control.take(room.run, emmy)
+    room.control.ask(room.run, emmy)
+    room.clock.passed_s += 61
+    room.control.take(room.run, emmy)
+    assert room.holder() == emmy.screen
+
+
+def test_another_person_may_ask_once_the_clock_was_set_back(room: Room) -> None:
+    grace, emmy, other = room.screen("grace"), room.screen("emmy"), room.screen("emmy")
+    room.control.take(room.run, grace)
+    room.control.ask(room.run, emmy)
+    with pytest.raises(ControlError):
+        room.control.ask(room.run, other)
+    room.clock.set_utc(-3600.0)
+    room.control.ask(room.run, other)
+    assert room.control.holder(room.run).asked_by_screen == other.screen
+
+
+def test_a_clock_that_is_set_forward_shortens_no_wait_for_the_answer(room: Room) -> None:
+    grace, emmy = room.screen("grace"), room.screen("emmy")
+    room.control.take(room.run, grace)
+    room.people.lock(grace)
+    room.control.ask(room.run, emmy)
+    room.clock.set_utc(3600.0)
+    with pytest.raises(ControlError):
+        room.control.take(room.run, emmy)
+    room.clock.passed_s += 60
+    room.control.take(room.run, emmy)
+    assert room.holder() == emmy.screen
+
+
 def test_asking_too_soon_does_not_take_it(room: Room) -> None:
     grace, emmy = room.screen("grace"), room.screen("emmy")
     room.control.take(room.run, grace)

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sqlalchemy import Connection
 
-from service.core.records.events import SignInRecorded
+from service.core.records.events import ServiceStarted, SignInRecorded
 from service.people.credentials.tries import failed_tries
 from service.people.errors import NotSignedInError, PinRefusedError
 from service.people.sessions import People, wait_after_s
@@ -49,6 +49,16 @@ def test_a_sign_in_ends_after_twelve_hours_however_busy(office: Office) -> None:
     office.clock.passed_s = 12 * 3600
     assert office.person(token, deliberate=True) is None
     assert office.outcomes("grace")[-1] == "ended"
+
+
+def test_a_sign_in_lives_no_longer_because_the_clock_was_set_back(office: Office) -> None:
+    token, _ = office.enter("grace")
+    office.clock.passed_s = 6 * 3600.0
+    office.clock.set_utc(-3600.0)
+    office.clock.passed_s = 12 * 3600.0 - 1
+    assert office.person(token) is not None
+    office.clock.passed_s = 12 * 3600.0
+    assert office.person(token) is None
 
 
 def test_sign_ins_that_nobody_came_back_to_end_in_the_record_too(office: Office) -> None:
@@ -146,6 +156,24 @@ def test_a_restart_remembers_who_guessed_from_where(office: Office) -> None:
     assert failed_tries(office.store, 40.0) == []
 
 
+def test_a_restart_after_the_clock_was_set_forward_forgets_no_guess(office: Office) -> None:
+    nothing = {"software": {}, "configuration": {}, "changed": {}, "heads": {}, "clock_jump_s": None}
+    more = {"unsigned_runs": (), "open_runs": (), "host": "here", "pid": 1, "address": "x"}
+    started = ServiceStarted.model_validate({"boot": office.clock.boot(), **nothing, **more})
+    tried = SignInRecorded(account="grace", outcome="refused", address="10.0.0.1")
+    office.store.record_site([started, tried], actor="service")
+    office.clock.set_utc(3600.0)
+    office.clock.passed_s += 50.0
+    office.store.record_site([started], actor="service")
+    ((address, age_s),) = failed_tries(office.store, 60.0)
+    assert (address, age_s) == ("10.0.0.1", pytest.approx(50.0))
+    office.clock.passed_s += 20.0
+    assert failed_tries(office.store, 60.0) == []
+    office.clock.reboot(600.0)  # the monotonic time of another boot tells nothing
+    office.store.record_site([started.model_copy(update={"boot": office.clock.boot()})], actor="service")
+    assert failed_tries(office.store, 60.0) == []
+
+
 def test_hashes_follow_the_parameters_of_today(office: Office, tmp_path: Path) -> None:
     assert PasswordHasher().type is Type.ID
     stronger = People(office.store, PasswordHasher(time_cost=2, memory_cost=16, parallelism=1))
@@ -194,6 +222,42 @@ def test_a_screen_that_is_signed_out_while_it_locks_is_nobodys(
 
     monkeypatch.setattr(Database, "writing", after_a_sign_out)
     assert office.person(token, deliberate=True) is None
+
+
+def test_a_screen_locks_when_its_idle_time_is_not_known_since_the_clock_was_set_back(office: Office) -> None:
+    token, _ = office.enter("grace")
+    office.clock.set_utc(-4.0)  # as much as a time server corrects now and then
+    steady = office.person(token, deliberate=True)
+    assert steady
+    assert not steady.locked
+    office.clock.set_utc(-3600.0)
+    locked = office.person(token, deliberate=True)
+    assert locked
+    assert locked.locked
+    office.people.unlock(locked, PIN)
+    office.clock.passed_s += 1
+    opened = office.person(token, deliberate=True)
+    assert opened
+    assert not opened.locked
+
+
+def test_a_clock_that_is_set_back_makes_no_account_wait_longer_than_the_longest(office: Office) -> None:
+    for _ in range(5):
+        refused(lambda: office.people.sign_in("grace", "wrong"))
+    office.clock.set_utc(-3600.0)
+    refused(lambda: office.people.sign_in("grace", password_of("grace")))
+    office.clock.passed_s += 900
+    office.enter("grace")
+
+
+def test_a_clock_that_is_set_forward_ends_no_wait(office: Office) -> None:
+    for _ in range(5):
+        refused(lambda: office.people.sign_in("grace", "wrong"))
+    office.clock.set_utc(3600.0)
+    refused(lambda: office.people.sign_in("grace", password_of("grace")))
+    assert office.people.accounts.has_to_wait(office.people.accounts.get("grace"))
+    office.clock.passed_s += 31
+    office.enter("grace")
 
 
 def test_five_wrong_pins_end_the_sign_in(office: Office) -> None:

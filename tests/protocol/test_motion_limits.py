@@ -44,6 +44,14 @@ def test_every_arm_has_its_own_limits(arm: ArmModel) -> None:
 
 
 @pytest.mark.parametrize("arm", known_arms(), ids=lambda arm: arm.name)
+def test_no_arm_may_move_faster_than_its_client_library_takes(arm: ArmModel) -> None:
+    """180°/s of a data sheet is more than the 3.14 rad/s of ur_rtde, which refused it in mid-run."""
+    if arm.family == "universal_robot":
+        assert fields(Motion(speed_rad_s=3.141), arm) == ["speed_rad_s"]
+        assert arm.speeds_rad_s.max() <= 3.14
+
+
+@pytest.mark.parametrize("arm", known_arms(), ids=lambda arm: arm.name)
 @pytest.mark.parametrize("watchdog_s", [0.1, 0.2, 0.4, 1.0])
 def test_an_arm_whose_program_died_stands_in_time(arm: ArmModel, watchdog_s: float) -> None:
     """Decision 13: after 0.2 s and 0.25 s from 1 rad/s; a faster motion needs a shorter watchdog."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Generator, Mapping
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -150,6 +151,31 @@ def test_an_arm_that_does_not_answer_holds_nothing_up_and_gets_old(
         arm.free.set()
         bench.reporter.end()
     assert bench.told.doing == "ended"
+
+
+@pytest.mark.parametrize("by_s", [-3600.0, 3600.0])
+def test_a_clock_that_is_set_changes_no_time_for_which_something_lasts(
+    bench: Bench, clock: SteppedClock, by_s: float
+) -> None:
+    bench.reporter.attend("working", "capture", 1)
+    bench.reporter.busy("fetching the photograph")
+    clock.sleep(20.0)
+    clock.set_utc(by_s)
+    clock.sleep(20.0)
+    bench.reporter.beat()
+    told = bench.told
+    assert told.quiet_s == pytest.approx(40.0)
+    assert told.activity_s == pytest.approx(40.0)
+    assert told.unattended_s(clock.utc_s()) == pytest.approx(40.0)
+
+
+def test_a_runner_that_fell_silent_before_the_clock_was_set_back_is_silent(tmp_path: Path, active: RunState) -> None:
+    write_snapshot(tmp_path, RUN, Snapshot(at_utc_s=NOW_S, doing="working", robot="moving"))
+    told = read_snapshot(tmp_path, RUN, NOW_S - 3600.0)
+    assert told.unattended_s(NOW_S - 3600.0) == inf
+    shown = robot_banner(active, told, NOW_S - 3600.0, driven=True)
+    assert shown.key == "unknown"
+    assert "not told anything since the clock was set back" in shown.text
 
 
 def test_an_arm_whose_link_is_dead_is_unknown(bench: Bench, arm: BenchArm, monkeypatch: pytest.MonkeyPatch) -> None:

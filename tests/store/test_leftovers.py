@@ -8,8 +8,14 @@ import subprocess
 import sys
 from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 
-from service.core.records.events import ArtefactRef, LeftoversRemoved
+import pytest
+from psutil import boot_time
+from sqlalchemy import update
+
+from service.core.records.events import ArtefactRef, LeftoversRemoved, SessionStarted
+from service.store.database.tables import leases
 from service.store.files.leftovers import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.store import Store
@@ -123,6 +129,52 @@ def test_what_a_worker_at_work_may_still_record_stays(tmp_path: Path) -> None:
         assert store.claim_job("a worker", 30.0) is not None
         ref = put_image(store, "v1")
         must_stay(store)
+        must_record(store, run, ref)
+
+
+def test_what_is_young_stays_though_the_clock_was_set_forward(tmp_path: Path) -> None:
+    clock = SteppedClock.from_now()
+    with Store.open(tmp_path, clock) as store:
+        start_run(store)
+        crash_left(store, "v1")
+        clock.set_utc(2 * USUAL_AGE_S)
+        (young,) = leftovers(store)
+        assert "may be, younger" in young.stays
+        clock.passed_s += USUAL_AGE_S + 60.0
+        assert [one.stays for one in leftovers(store)] == [""]
+        clock.reboot(600.0)
+        assert [one.stays for one in leftovers(store)] == [""]
+
+
+def test_what_a_runner_may_still_record_stays_though_the_clock_was_set_forward(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The boot, and with it the start of every process, then seems later than the files."""
+    later = SimpleNamespace(boot_time=lambda: boot_time() + 3600.0)
+    with Store.open(tmp_path, SteppedClock.from_now()) as store:
+        run = start_run(store)
+        started = SessionStarted(resumed=False, software={}, host="here", pid=1)
+        store.record(run, [started], actor="runner")
+        with store.lease(run, "a runner", 30.0):
+            ref = put_image(store, "v1")
+            monkeypatch.setattr("service.store.files.leftovers.psutil", later)
+            must_stay(store)
+            must_record(store, run, ref)
+
+
+def test_what_a_process_on_another_host_may_still_record_stays_though_its_lease_seems_over(tmp_path: Path) -> None:
+    """The clock of this host may have been set forward."""
+    clock = SteppedClock.from_now()
+    with Store.open(tmp_path, clock) as store:
+        run = start_run(store)
+        lease = store.lease(run, "a runner", 30.0)
+        with store.database.writing() as connection:
+            connection.execute(update(leases).values(host="another"))
+        ref = put_image(store, "v1")
+        clock.set_utc(3600.0)
+        must_stay(store)
+        lease.release()
+        assert [one.stays for one in leftovers(store, min_age_s=0)] == [""]
         must_record(store, run, ref)
 
 

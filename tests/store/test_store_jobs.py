@@ -198,6 +198,29 @@ def test_one_runner_drives_a_run(store: Store, clock: SteppedClock, monkeypatch:
         store.lease("nowhere", "r", 10)
 
 
+def test_a_runner_on_another_host_keeps_its_run_though_this_clock_was_set_forward(
+    store: Store, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = start_run(store)
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(socket, "gethostname", lambda: "the other computer")
+        first = store.lease(run, "runner 1", 10)
+    clock.set_utc(3600.0)
+
+    def renew_by_its_own_clock(_seconds: float) -> None:
+        clock.set_utc(-3600.0)
+        first.renew()
+        clock.set_utc(3600.0)
+
+    clock.passed_s = 3
+    clock.on_sleep = renew_by_its_own_clock
+    with pytest.raises(LeaseHeldError, match="runner 1"):
+        store.lease(run, "runner 2", 10)
+    store.record(run, [StepNote(step="s", attempt=1, note="n")], actor="runner", lease=first)
+    clock.on_sleep = lambda _seconds: None  # it has died
+    store.lease(run, "runner 2", 10).release()
+
+
 def test_a_runner_that_lives_keeps_its_run_whatever_the_clock_says(store: Store, clock: SteppedClock) -> None:
     run = start_run(store)
     with store.lease(run, "runner 1", 10) as first:

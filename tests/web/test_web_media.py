@@ -139,6 +139,9 @@ def test_live_frames_come_only_while_somebody_asks_and_never_old_ones(shown: Run
     assert answer.headers["cache-control"] == "no-store"
     os.utime(frame_path(data, shown.run), (1.0, 1.0))
     assert shown.browser.get(f"{shown.address}/live-view").status_code == 204
+    assert frames_wanted(data, shown.run, now_utc_s - 3600.0) is None, "the clock was set back"
+    os.utime(frame_path(data, shown.run), (now_utc_s + 3600.0, now_utc_s + 3600.0))
+    assert shown.browser.get(f"{shown.address}/live-view").status_code == 204
 
 
 def test_plotlys_script_is_public_and_kept_by_browsers(shown: RunWithImage) -> None:

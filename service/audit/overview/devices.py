@@ -50,9 +50,10 @@ def bodies_of_run(connection: Connection, run_id: str, opened: Iterable[OpenedDe
 
 @dataclass(frozen=True, slots=True)
 class ClockSeries:
-    """The offset of a device's clock from the host's over a step."""
+    """The offset of a device's clock from the host's over a step, as far as one start of the runner did it."""
 
     step: str
+    start: int  # of the runner in this run, counted from 1
     captures: int
     first_s: float
     last_s: float
@@ -67,14 +68,19 @@ class ClockSeries:
 
 
 def clock_offsets(connection: Connection, run_id: str) -> list[ClockSeries]:
-    """The robot controller's clock minus the host's monotonic one, as every capture recorded it."""
+    """The robot controller's clock minus the host's monotonic one, as every capture recorded it.
+
+    Each start of the runner has a series of its own: the host's monotonic clock begins anew with every boot.
+    """
     rows = connection.execute(
         text(
-            "WITH c AS (SELECT i.step, i.seq, e.monotonic_s AS at, json_extract(e.payload, '$.clock_offset_s') AS o "
-            "FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq "
-            "WHERE i.run_id = :run AND i.kind = 'viewpoint_captured') "
-            "SELECT step, count(*) AS n, min(seq) AS first, max(seq) AS last, min(o) AS low, max(o) AS high, "
-            "max(at) - min(at) AS over FROM c GROUP BY step ORDER BY 3"
+            "WITH i AS (SELECT run_id, seq, step, kind, sum(kind = 'session_started') OVER (ORDER BY seq) AS start "
+            "FROM event_index WHERE run_id = :run AND kind IN ('viewpoint_captured', 'session_started')), "
+            "c AS (SELECT i.step, i.start, i.seq, e.monotonic_s AS at, "
+            "json_extract(e.payload, '$.clock_offset_s') AS o "
+            "FROM i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq WHERE i.kind = 'viewpoint_captured') "
+            "SELECT step, start, count(*) AS n, min(seq) AS first, max(seq) AS last, min(o) AS low, max(o) AS high, "
+            "max(at) - min(at) AS over FROM c GROUP BY step, start ORDER BY min(seq)"
         ),
         {"run": plain(run_id)},
     ).all()
@@ -87,6 +93,7 @@ def clock_offsets(connection: Connection, run_id: str) -> list[ClockSeries]:
     return [
         ClockSeries(
             row.step or "",
+            row.start,
             row.n,
             offsets.get(row.first, 0.0),
             offsets.get(row.last, 0.0),

@@ -1,4 +1,4 @@
-"""Moments in both clocks of the host, and the time between two of them, or why it cannot be told."""
+"""Moments in the clocks of the host, and the time between two of them, or why it cannot be told."""
 
 from __future__ import annotations
 
@@ -50,6 +50,17 @@ def elapsed(earlier: Moment, later: Moment) -> Elapsed:
     if not (earlier.boot and later.boot):
         return Elapsed(None, "the two clocks disagree, and whether the computer was restarted is not recorded")
     return _within_one_boot(utc_s, monotonic_s)
+
+
+def age_s(since_utc_s: float, now_utc_s: float, *, if_set_back_s: float) -> float:
+    """The time in seconds since a moment that was recorded in UTC alone, which is never negative.
+
+    A moment later than now by more than `elapsed` tolerates shows that the clock was set back, so that its age is not
+    known: `if_set_back_s` is then the answer, which the caller chooses on the safe side (infinity ends a sign-in; 0
+    lets nobody claim to have waited).
+    """
+    age = now_utc_s - since_utc_s
+    return if_set_back_s if age < -_AGREE_S else max(0.0, age)
 
 
 def _within_one_boot(utc_s: float, monotonic_s: float) -> Elapsed:

@@ -29,8 +29,8 @@ UNMEASURED: Mapping[str, Any] = {
 
 
 def seconds_between(earlier_utc: str, later_utc: str) -> float:
-    """Seconds from one recorded time (ISO 8601) to another."""
-    return (datetime.fromisoformat(later_utc) - datetime.fromisoformat(earlier_utc)).total_seconds()
+    """Seconds from one recorded time (ISO 8601) to a later one; 0 if the clock was set back in between."""
+    return max(0.0, (datetime.fromisoformat(later_utc) - datetime.fromisoformat(earlier_utc)).total_seconds())
 
 
 def go(protocol: Protocol, state: RunState, trigger: str, **changes: Any) -> RunState:

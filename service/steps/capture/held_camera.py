@@ -159,8 +159,11 @@ class HeldCamera:
 
 def new_images(context: StepContext, camera: Camera, folder: Path) -> tuple[CapturedImage, ...]:
     """Wait a moment for images that were released on the camera during this step and are not recorded yet."""
-    began = datetime.fromisoformat(context.evidence.state().steps[context.step.id].started_utc)
-    images = camera.released_images(folder, _PATIENCE_S, began.timestamp() - _CLOCKS_S)
+    steps = context.evidence.state().steps
+    started, ended = steps[context.step.id].started_utc, max(step.ended_utc for step in steps.values())
+    # After the host's clock was set back, the start would be too early; the end of the step before is not.
+    since_s = datetime.fromisoformat(max(started, ended)).timestamp() - (_CLOCKS_S if started >= ended else 0.0)
+    images = camera.released_images(folder, _PATIENCE_S, since_s)
     # After a restart, a watched folder delivers all photographs again. From a camera, a repeated file is an error.
     return tuple(image for image in images if not (image.found_at and context.evidence.holds(image.jpeg.sha256)))
 

@@ -150,7 +150,7 @@ class _JobTimes:
         if begun is None:
             return expected_s
         gone_s = (datetime.fromisoformat(self.now_utc) - datetime.fromisoformat(begun)).total_seconds()
-        return max(expected_s - gone_s, 0.1 * expected_s)
+        return max(expected_s - max(0.0, gone_s), 0.1 * expected_s)  # negative: the clock was set back
 
     def expected_s(self, kind: str, work: _Work) -> float:
         """Expected duration of a job, from the jobs of its kind in this run if there are any."""

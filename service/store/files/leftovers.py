@@ -18,10 +18,10 @@ from sqlalchemy import Connection, select
 
 from service.core.errors import StoreError
 from service.core.records.events import LeftoversRemoved
-from service.store.database.tables import artefacts, jobs, leases
-from service.store.durable_effects import utc_text
+from service.store.database.tables import artefacts, event_index, events, jobs, leases
+from service.store.durable_effects import Clock, utc_text
 from service.store.files.artefacts import TEMPORARY, alone_with, hash_file, relative_path
-from service.store.queue.leases import identity_of, is_live
+from service.store.queue.leases import identity_of
 from service.store.store import Store
 
 USUAL_AGE_S = 3600.0  # an import or export that has just begun holds no lease yet
@@ -57,7 +57,8 @@ def leftovers(store: Store, *, min_age_s: float = USUAL_AGE_S) -> list[Leftover]
     try:
         found = list(_candidates(store.artefact_folder))
         with store.database.reading() as connection:
-            return _judged(connection, found, min_age_s, store.clock.utc_s())
+            set_forward_s = _set_forward_s(connection, store.clock)
+            return _judged(connection, found, min_age_s, store.clock.utc_s() - set_forward_s)
     except OSError as error:
         raise _refused(error) from error
 
@@ -114,10 +115,10 @@ def _candidates(folder: Path) -> list[tuple[Path, float, int]]:
 
 
 def _judged(
-    connection: Connection, found: Collection[tuple[Path, float, int]], min_age_s: float, now_utc_s: float
+    connection: Connection, found: Collection[tuple[Path, float, int]], min_age_s: float, earliest_now_utc_s: float
 ) -> list[Leftover]:
     recorded = set(connection.execute(select(artefacts.c.sha256)).scalars())
-    begun_s, writer = _oldest_writer(connection, now_utc_s)
+    begun_s, writer = _oldest_writer(connection)
     judged: list[Leftover] = []
     for path, changed_s, size in found:
         part = path.suffix == ".part"
@@ -131,21 +132,54 @@ def _judged(
         )
         if changed_s >= begun_s:
             one = replace(one, stays=f"{writer} was already running when it was written and may still record it")
-        elif now_utc_s - changed_s < min_age_s:
-            one = replace(one, stays=f"it is younger than {min_age_s / 60:g} minutes")
+        elif min_age_s > 0 and earliest_now_utc_s - changed_s < min_age_s:
+            one = replace(one, stays=f"it is, or may be, younger than {min_age_s / 60:g} minutes")
         judged.append(one)
     return judged
 
 
-def _oldest_writer(connection: Connection, now_utc_s: float) -> tuple[float, str]:
+def _set_forward_s(connection: Connection, clock: Clock) -> float:
+    """By how much UTC has gone on farther than the monotonic clock since the newest event; 0 if it has not.
+
+    So much younger a file may be than it seems. Where the host was restarted since, this is 0 or makes files stay.
+    """
+    newest = select(events.c.at_utc, events.c.monotonic_s).join(
+        event_index, (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq)
+    )
+    last = connection.execute(newest.order_by(event_index.c.position.desc()).limit(1)).first()
+    passed_s = 0.0 if last is None else clock.monotonic_s() - last.monotonic_s
+    if last is None or passed_s < 0:
+        return 0.0
+    return max(0.0, clock.utc_s() - datetime.fromisoformat(last.at_utc).timestamp() - passed_s)
+
+
+def _oldest_writer(connection: Connection) -> tuple[float, str]:
     """Start time (s, UTC) and name of the oldest process that holds a run or a job here; infinity if none does."""
     oldest = (float("inf"), "")
-    held = [(row, row.holder) for row in connection.execute(select(leases))]
-    held += [(row, row.worker) for row in connection.execute(select(jobs).where(jobs.c.state == "running"))]
-    for row, name in held:
-        if is_live(row, now_utc_s):
-            there = identity_of(row).life() == "lives"
+    held = [
+        (row, row.holder, _last_start_utc(connection, row.run_id)) for row in connection.execute(select(leases)).all()
+    ]
+    running = select(jobs).where(jobs.c.state == "running")
+    held += [(row, row.worker, row.started_utc) for row in connection.execute(running)]
+    for row, name, recorded_utc in held:
+        # The end of a lease shows nothing here: this host's clock may have been set forward.
+        if (life := identity_of(row).life()) != "dead":
             # The start of a process on another host is not known, so nothing is removed while it may run.
-            begun_s = psutil.boot_time() + row.process_started_s if there else 0.0
+            begun_s = psutil.boot_time() + row.process_started_s if life == "lives" else 0.0
+            # If the clock was set forward since, the boot seems later than the files that the process has written.
+            if recorded_utc:
+                begun_s = min(begun_s, datetime.fromisoformat(recorded_utc).timestamp())
             oldest = min(oldest, (begun_s, str(name)))
     return oldest
+
+
+def _last_start_utc(connection: Connection, run_id: str) -> str:
+    """When a runner last began to work on the run, as it was recorded then; "" if none has."""
+    started = (
+        select(events.c.at_utc)
+        .join(event_index, (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq))
+        .where(event_index.c.run_id == run_id, event_index.c.kind == "session_started")
+        .order_by(events.c.seq.desc())
+        .limit(1)
+    )
+    return str(connection.execute(started).scalar() or "")

@@ -151,13 +151,18 @@ def is_live(row: Row[Any], now_utc_s: float) -> bool:
 
 
 def acquire(database: Database, clock: Clock, ids: IdSource, *, run_id: str, holder: str, seconds: float) -> RunLease:
-    """Take the lease of a run. Raises LeaseHeldError, naming the holder, while another process has it."""
+    """Take the lease of a run. Raises LeaseHeldError, naming the holder, while another process has it.
+
+    A lease of another host that seems to have run out is watched for `seconds` first: this host's clock may have been
+    set forward.
+    """
     token = ids.new_token()
+    silent = _watch(database, clock, run_id, seconds)
     with database.writing() as connection:
         now = clock.utc_s()
         row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
         if row is not None:
-            if is_live(row, now):
+            if is_live(row, now) or (identity_of(row).life() == "unknown" and _renewal(row) != silent):
                 here = row.host == socket.gethostname()
                 left_s = row.until_utc_s - now
                 raise LeaseHeldError(
@@ -173,6 +178,21 @@ def acquire(database: Database, clock: Clock, ids: IdSource, *, run_id: str, hol
             )
         )
     return RunLease(run_id, token, seconds, database, clock)
+
+
+def _watch(database: Database, clock: Clock, run_id: str, seconds: float) -> tuple[str, float] | None:
+    """The lease of another host that has run out by UTC, once the time in which it would be renewed has passed."""
+    with database.reading() as connection:
+        row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
+    if row is None or identity_of(row).life() != "unknown" or clock.utc_s() < row.until_utc_s:
+        return None
+    _log.warning("watching for %.0f s whether %s on %s still drives %s", seconds, row.holder, row.host, run_id)
+    clock.sleep(seconds)
+    return _renewal(row)
+
+
+def _renewal(row: Row[Any]) -> tuple[str, float]:
+    return row.token, row.until_utc_s
 
 
 def check_lease(connection: Connection, lease: RunLease) -> None:

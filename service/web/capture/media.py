@@ -8,6 +8,7 @@ import re
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
+from math import inf
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,7 @@ from sqlalchemy import select
 
 from service.core.errors import OrthocaptureError
 from service.core.records.events import ArtefactRef
+from service.core.records.moments import age_s
 from service.monitor.snapshot import ask_for_frames, frame_path
 from service.notes import NOTE_PHOTOGRAPH
 from service.run_record import RunRecord
@@ -175,13 +177,13 @@ def live_view(site: CurrentSite, run_id: RunId, camera: Annotated[str, Query(max
     path = frame_path(site.data, run_id, camera)
     headers = {"Cache-Control": "no-store"}
     try:
-        age_s = site.store.clock.utc_s() - path.stat().st_mtime
+        frame_s = age_s(path.stat().st_mtime, site.store.clock.utc_s(), if_set_back_s=inf)
         content = path.read_bytes()  # now: it may be replaced while a response is sent piece by piece
     except OSError:
         return Response(status_code=204, headers=headers)
-    if age_s > _STALE_FRAME_S:
+    if frame_s > _STALE_FRAME_S:
         return Response(status_code=204, headers=headers)
-    return Response(content, media_type="image/jpeg", headers=headers | {"X-Frame-Age-S": f"{max(age_s, 0.0):.1f}"})
+    return Response(content, media_type="image/jpeg", headers=headers | {"X-Frame-Age-S": f"{frame_s:.1f}"})
 
 
 def recorded_file(site: Site, run_id: str, sha256: str) -> ArtefactRef:

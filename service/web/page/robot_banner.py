@@ -204,7 +204,9 @@ def _not_heard_of(snapshot: Snapshot) -> Banner:
 def _silent(snapshot: Snapshot, now_utc_s: float, *, driven: bool) -> Banner:
     if driven:
         title = "Robot: unknown."
-        since = f" for {snapshot.age_s(now_utc_s):.0f} s" if snapshot.at_utc_s else " yet"
+        age = snapshot.age_s(now_utc_s)
+        spoke = f" for {age:.0f} s" if age >= 0 else " since the clock was set back"
+        since = spoke if snapshot.at_utc_s else " yet"
         last = f" The last word was: {snapshot.activity}." if snapshot.activity else ""
         text = f"The program that drives it has not told anything{since}.{last} Look at the robot."
     else:

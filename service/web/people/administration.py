@@ -179,12 +179,13 @@ def _refused(request: Request, site: Site, account: str, error: AccountError) ->
 def _list(
     request: Request, site: Site, *, problem: OrthocaptureError | None = None, typed: dict[str, str] | None = None
 ) -> HTMLResponse:
+    accounts = site.people.accounts.all()
     return render(
         request,
         "people/accounts.html.j2",
         status=status_of(problem) if problem else 200,
-        accounts=site.people.accounts.all(),
-        now_s=site.store.clock.utc_s(),
+        accounts=accounts,
+        waits={one.account for one in accounts if site.people.accounts.has_to_wait(one)},
         roles=ROLES,
         problem=problem,
         typed=typed or {"account": "", "full_name": "", "role": "technician"},
@@ -193,7 +194,7 @@ def _list(
 
 def _one(request: Request, site: Site, account: str, *, problem: OrthocaptureError | None = None) -> HTMLResponse:
     shown = site.people.accounts.get(account)
-    waits = shown.locked_until_utc_s > site.store.clock.utc_s()
+    waits = site.people.accounts.has_to_wait(shown)
     return render(
         request,
         "people/account_administration.html.j2",

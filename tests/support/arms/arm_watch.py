@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Generator
 from dataclasses import dataclass
 
@@ -15,8 +16,9 @@ LONGEST_STEP_S = 0.05  # longest gap that counts; in a longer one the simulator 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """One sample: the controller's time, the speed of the fastest driven joint, the joints, if a program runs."""
+    """A sample: when it came, the controller's time, the fastest driven joint's speed, joints, if a program runs."""
 
+    at_s: float  # host time.monotonic()
     time_s: float
     speed_rad_s: float
     joints_rad: tuple[float, ...]
@@ -42,6 +44,10 @@ class ArmWatch:
     def mark(self) -> int:
         """Mark the present moment, for the methods that take `since`."""
         return len(self._seen)
+
+    def samples(self) -> list[Seen]:
+        """All of them."""
+        return list(self._seen)
 
     @property
     def now(self) -> Seen:
@@ -85,7 +91,7 @@ class ArmWatch:
                 data = self._client.data()
                 speed_rad_s = max(abs(v) for v in data["target_qd"])
                 runs = data["runtime_state"] == (2,)
-                self._seen.append(Seen(data["timestamp"][0], speed_rad_s, data["actual_q"], runs))
+                self._seen.append(Seen(time.monotonic(), data["timestamp"][0], speed_rad_s, data["actual_q"], runs))
 
 
 @contextlib.contextmanager

@@ -24,11 +24,21 @@ class Program:
     Args:
         spec, config: the driver.
         goals_rad: between which its first joint moves.
+        motion: its speed (rad/s) and acceleration (rad/s²); the fastest motion of protocols/demo.yaml by default.
         hangs: its main loop hangs once the arm moves.
     """
 
-    def __init__(self, spec: str, config: BaseModel, goals_rad: tuple[float, float], *, hangs: bool = False) -> None:
-        words = (spec, config.model_dump_json(), *map(str, goals_rad), "hangs" if hangs else "lives")
+    def __init__(
+        self,
+        spec: str,
+        config: BaseModel,
+        goals_rad: tuple[float, float],
+        *,
+        motion: tuple[float, float] = (1.0, 1.5),
+        hangs: bool = False,
+    ) -> None:
+        numbers = map(str, (*goals_rad, *motion))
+        words = (spec, config.model_dump_json(), *numbers, "hangs" if hangs else "lives")
         self._process = Forked(
             [sys.executable, "-m", "tests.support.processes.stubborn_program", *words],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,

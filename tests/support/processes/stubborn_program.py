@@ -1,8 +1,8 @@
 """A program that moves an arm back and forth and always tries to continue: a process for tests to kill.
 
-Its arguments are a driver, its configuration as JSON, the values of the first joint between which it moves, and
-whether it `lives` or `hangs`. Each line that it reads is the name of a person who permits motion. It reports its
-observations as lines of JSON.
+Its arguments are a driver, its configuration as JSON, the values of the first joint between which it moves, its
+speed and acceleration, and whether it `lives` or `hangs`. Each line that it reads is the name of a person who permits
+motion. It reports its observations as lines of JSON.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ from drivers.host.hosted_device import HostedDevice, hosted
 from drivers.host.serving import load_spec
 from drivers.interfaces import RobotArm
 
-SPEED_RAD_S, ACCELERATION_RAD_S2 = 1.0, 1.5  # the fastest motion of protocols/demo.yaml
-
 
 def say(**words: object) -> None:
     sys.stdout.write(json.dumps(words) + "\n")
@@ -27,9 +25,10 @@ def say(**words: object) -> None:
 
 
 def main() -> None:
-    spec, given, *goals, how = sys.argv[1:]
+    spec, given, *numbers, how = sys.argv[1:]
     config = load_spec(spec).config.model_validate_json(given)
-    goals_rad, hangs = [float(goal) for goal in goals], how == "hangs"
+    *goals_rad, speed_rad_s, acceleration_rad_s2 = map(float, numbers)
+    hangs = how == "hangs"
     arm = hosted(RobotArm, spec, config, call_timeout_s=60, name="robot")
     arm.open()
     persons: list[tuple[str, float]] = []
@@ -45,7 +44,7 @@ def main() -> None:
                 say(let_by=name)
             target = arm.state().sample.joints_rad.copy()
             target[0] = goals_rad[0]
-            arm.move_joints(target, speed_rad_s=SPEED_RAD_S, acceleration_rad_s2=ACCELERATION_RAD_S2)
+            arm.move_joints(target, speed_rad_s=speed_rad_s, acceleration_rad_s2=acceleration_rad_s2)
             said = None
             say(moves_to=target[0])
             while hangs:  # hang in the main loop; a screen's thread keeps watching the arm

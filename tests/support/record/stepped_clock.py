@@ -64,10 +64,10 @@ class SteppedClock:
         """The name of the present boot; `reboot` begins the next."""
         return f"boot-{self._boots}"
 
-    def reboot(self, off_s: float) -> None:
-        """The host is off for so long, and begins with a new boot and a monotonic clock near zero."""
+    def reboot(self, off_s: float, monotonic_s: float = 20.0) -> None:
+        """The host is off for so long, and begins with a new boot and a monotonic clock of its own."""
         self.set_utc(off_s)
-        self._began_monotonic_s, self._boots = 20.0 - self._passed_s, self._boots + 1
+        self._began_monotonic_s, self._boots = monotonic_s - self._passed_s, self._boots + 1
 
     def set_utc(self, by_s: float) -> None:
         """UTC goes on or back by that, and the monotonic clock does not: the clock is set, or the host slept."""

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Generator
 from dataclasses import dataclass
+from typing import cast
 
 from tests.support.processes.waiting import until
 
@@ -18,10 +19,20 @@ LONGEST_STEP_S = 0.05  # longest gap that counts; in a longer one the simulator 
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """A place, and when it was told: host time.monotonic()."""
+    """A place, when it was told (host time.monotonic()), and the controller's time, which axes do not tell."""
 
     at_s: float
     place: object
+    time_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Joints:
+    """The joints of an arm, when they were told (host time.monotonic()), and the controller's time."""
+
+    at_s: float
+    time_s: float
+    joints_rad: list[float]
 
 
 class WorldWatch:
@@ -55,6 +66,11 @@ class WorldWatch:
                     last_s = elapsed_s
         return last_s
 
+    def joints(self) -> list[Joints]:
+        """What an arm has told."""
+        told = [one for one in self._seen if isinstance(one.place, list)]
+        return [Joints(one.at_s, one.time_s, cast("list[float]", one.place)) for one in told]
+
     def wait_moving(self, since_s: float, for_s: float) -> None:
         """Wait until the device has moved for so long since a mark."""
         until(lambda: self.moved_for_s(since_s) >= for_s, "it moves", every_s=0.02)
@@ -78,7 +94,8 @@ class WorldWatch:
         with contextlib.suppress(OSError), link, link.makefile("r") as lines:
             for line in lines:
                 told = json.loads(line)
-                self._seen.append(_Seen(time.monotonic(), told.get("q") or told.get("T_world_camera")))
+                place = told.get("q") or told.get("T_world_camera")
+                self._seen.append(_Seen(time.monotonic(), place, told.get("t", 0.0)))
 
 
 @contextlib.contextmanager

@@ -17,8 +17,9 @@ _ALLOWED = frozenset(
         ("base", "specimen"), ("base", "spheres"), ("base", "surroundings"),
     }
 )  # fmt: skip
-# Data sheets state no acceleration; the client library takes no more than this (ur_rtde: UR_JOINT_ACCELERATION_MAX).
-_ACCELERATION_RAD_S2 = 40.0
+# The client library takes no more than this (ur_rtde: UR_JOINT_VELOCITY_MAX, UR_JOINT_ACCELERATION_MAX). Data sheets
+# state no acceleration, and for some joints a little more speed: 180°/s, or 360°/s.
+_SPEED_RAD_S, _ACCELERATION_RAD_S2 = 3.14, 40.0
 _BRAKING_RAD_S2 = 4.0  # of a program that was ended; assumed: measure it on the arm (docs/howto/your_hardware.md)
 _BASE_DEPTH_M = 0.10  # pedestal top below the base frame
 
@@ -40,7 +41,7 @@ def universal_robot(
         name: as the controller states it.
         a_m: lengths of upper arm and forearm, negative.
         d_m: offsets 1, 4, 5 and 6.
-        speeds_deg_s: (6,) of the joints.
+        speeds_deg_s: (6,) of the joints, as the data sheet states them.
         payload_kg: on the flange.
         elbow_deg: range of the elbow to each side; all others turn by 360°.
     """
@@ -53,7 +54,7 @@ def universal_robot(
         d_m=np.array([d_m[0], 0, 0, *d_m[1:]]),
         alpha_rad=np.array([half, 0, 0, half, -half, 0]),
         limits_rad=np.radians(limits_deg),
-        speeds_rad_s=np.radians(speeds_deg_s),
+        speeds_rad_s=np.minimum(np.radians(speeds_deg_s), _SPEED_RAD_S),
         acceleration_rad_s2=_ACCELERATION_RAD_S2,
         braking_rad_s2=_BRAKING_RAD_S2,
         links=_links(*a_m, *d_m[1:]),

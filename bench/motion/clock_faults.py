@@ -1,0 +1,161 @@
+"""Clock faults × every duration that a gate or a timer judges (`python -m bench.motion.clock_faults`).
+
+Each row begins a wait in a data folder on a host of its own, lets a fault of the host's clocks happen in the middle,
+and asks the program's own code what it allows then. The true duration decides whether that is right; what errs may
+err on the safe side only. Durations that one process measures by the monotonic clock alone are not in the table: of
+the faults only sleep changes them, and while the host sleeps nothing is driven.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import asdict
+from datetime import UTC, datetime
+
+from bench.machine import REPOSITORY, RESULTS, commit, machine
+from bench.motion.clock_durations import RUN_DURATIONS
+from bench.motion.clock_people import PEOPLE_DURATIONS
+from bench.motion.clock_world import FAULTS, Row, rows_of
+
+DURATIONS = (*RUN_DURATIONS, *PEOPLE_DURATIONS)
+_LOOKS = re.compile(
+    r"utc_s\(|utc_now\(|fromisoformat|st_mtime|st_ctime|getmtime|[^_]elapsed\(|age_s\(|time\.time\(|julianday|"
+    r"_utc_s\b|boot_time"
+)
+_STAMP = "a time that is recorded, named or shown; nothing is judged by it"
+_FIGURE = "an estimate or a figure for people; it is never negative, and nothing waits for it"
+_CHANGE = "whether a file has changed, by its time being another one"
+#: Every file that looks at UTC, at a file's time or at the boot's: the row that tries what it judges, or why not.
+PLACES = {
+    "drivers/dicom_folder/folder.py": _CHANGE,
+    "drivers/genicam/__init__.py": "released_images has nothing to leave out: each image was asked for",
+    "drivers/gphoto/camera.py": "the camera's clock against the host's at one exposure, which is shown",
+    "drivers/interfaces/camera.py": "a photograph of the step",
+    "drivers/meshes/export_watch.py": _CHANGE,
+    "drivers/meshes/mesh_file.py": _CHANGE,
+    "drivers/photo_watch.py": "a photograph of the step",
+    "drivers/photos/photo_file.py": "a photograph of the step",
+    "drivers/photos/photo_folder.py": _CHANGE,
+    "drivers/video.py": "released_images has nothing to leave out: each image was asked for",
+    "service/audit/background/child_process.py": _STAMP,
+    "service/audit/bundle/contents.py": _STAMP,
+    "service/audit/bundle/report.py": _STAMP,
+    "service/audit/export/exports.py": _STAMP,
+    "service/audit/record/starts.py": "by how much UTC was set between two starts of one boot, which is recorded",
+    "service/audit/report/words.py": _FIGURE,
+    "service/audit/runs/comparison.py": _FIGURE,
+    "service/audit/verify/verifications.py": _STAMP,
+    "service/benchmark/shared_parts.py": "the newest of several files",
+    "service/cli/evidence/runs.py": "days that a person asks for",
+    "service/compute/poses/sfm/kept.py": _CHANGE,
+    "service/core/equipment/clocks.py": "offsets of cameras' clocks within one process, which are shown",
+    "service/core/records/moments.py": "age of the coat",
+    "service/core/results/arrival.py": "by how much a result is late; that it is late follows from the run's state",
+    "service/core/run/state_transitions.py": _FIGURE,
+    "service/monitor/alarm.py": _STAMP,
+    "service/monitor/figures.py": _FIGURE,
+    "service/monitor/health.py": "time in which a runner's main loop hangs",
+    "service/monitor/reporter.py": "time in which a runner's main loop hangs",
+    "service/monitor/snapshot.py": "last word of a runner",
+    "service/monitor/worker_sign.py": "a worker's sign of life",
+    "service/people/accounts.py": "life of a one-time link",
+    "service/people/control.py": "wait for a locked screen in control",
+    "service/people/credentials/tries.py": "tries of an address, service restarted",
+    "service/people/person.py": _STAMP,
+    "service/people/rows.py": _STAMP,
+    "service/people/sessions.py": "life of a sign-in",
+    "service/run_record.py": _FIGURE,
+    "service/steps/capture/held_camera.py": "a photograph of the step",
+    "service/steps/kinds/imports/scan_import.py": "an export of the step",
+    "service/steps/poses/time_left.py": _FIGURE,
+    "service/store/ages.py": "life of a sign-in",
+    "service/store/backup/backup.py": _STAMP,
+    "service/store/database/migrations/versions/0001_evidence.py": _STAMP,
+    "service/store/database/migrations/versions/0002_people_and_checkpoints.py": _STAMP,
+    "service/store/database/new_schema.py": _STAMP,
+    "service/store/database/tables.py": _STAMP,
+    "service/store/durable_effects.py": "the clocks themselves",
+    "service/store/events.py": _STAMP,
+    "service/store/files/leftovers.py": "age of an unrecorded file",
+    "service/store/queue/jobs.py": "job's lease, its worker died on another host",
+    "service/store/queue/leases.py": "run's lease, its runner lives on another host",
+    "service/store/records.py": _STAMP,
+    "service/store/signatures/signing.py": _STAMP,
+    "service/store/signatures/timestamps.py": _STAMP,
+    "service/store/store.py": _STAMP,
+    "service/store/verification/chain_checks.py": "times that run backwards within a chain, which the audit notes",
+    "service/store/verification/people_checks.py": "recorded times that must agree",
+    "service/web/capture/media.py": "age of a frame of the live view",
+    "service/web/home/history.py": _STAMP,
+    "service/web/home/pages.py": "last word of a runner",
+    "service/web/home/time_charts.py": _STAMP,
+    "service/web/launch.py": "last word of a runner",
+    "service/web/page/rendering.py": _STAMP,
+    "service/web/page/run_frame.py": "last word of a runner",
+    "service/web/people/account.py": _STAMP,
+    "service/web/people/administration.py": _STAMP,
+    "service/web/run/news.py": "last word of a runner",
+    "service/web/run/pages.py": "last word of a runner",
+    "service/worker/following.py": "by how much a result is late; that it is late follows from the run's state",
+}
+
+
+def places() -> set[str]:
+    """The files that look at UTC, at the time of a file or at that of the boot."""
+    sources = [path for top in ("service", "drivers") for path in (REPOSITORY / top).rglob("*.py")]
+    found = [path for path in sources if _LOOKS.search(path.read_text())]
+    own = REPOSITORY / "service" / "audit" / "verify" / "bundle_verifier.py"  # of a bundle, far from every host
+    return {str(path.relative_to(REPOSITORY)) for path in found if path != own}
+
+
+def table(rows: Iterable[Row]) -> str:
+    """The rows in Markdown."""
+    lines = [
+        "| duration | limit | fault | true | the program took it for | what it did | verdict |",
+        "|---|---:|---|---:|---:|---|---|",
+    ]
+    for row in rows:
+        took = "" if row.took_s is None else f"{row.took_s:.1f} s"
+        lines.append(
+            f"| {row.duration} | {row.limit_s:g} s | {row.fault} | {row.true_s:g} s | {took} | {row.did} | "
+            f"{'**WRONG**' if row.verdict == 'WRONG' else row.verdict} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Try everything, print, and record if asked. Ends with 1 if a row is wrong or a place is not covered."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--record", action="store_true", help="write the results to bench/results")
+    options = parser.parse_args()
+    revision = commit()
+    unknown = sorted(places() ^ PLACES.keys())
+    rows = [row for duration in DURATIONS for fault in FAULTS for row in rows_of(duration, fault)]
+    verdicts = Counter(row.verdict.partition(":")[0] for row in rows)
+    today = datetime.now(UTC).date().isoformat()
+    counted = ", ".join(f"{verdicts[name]} {name}" for name in ("right", "safe side", "WRONG"))
+    text = "\n".join([
+        f"# What faults of the host's clocks do to durations, {today}", "",
+        f"`python -m bench.motion.clock_faults`, revision {revision}: {len(DURATIONS)} durations × {len(FAULTS)} "
+        f"faults, {len(rows)} rows: {counted}.", "",
+        table(rows), "",
+        "Every place that looks at UTC, at a file's time or at the boot's:", "",
+        "| place | tried by, or why not |", "|---|---|",
+        *[f"| {place} | {why} |" for place, why in PLACES.items()],
+    ]) + "\n"  # fmt: skip
+    if options.record:
+        data = {"commit": revision, "machine": machine(), "rows": [asdict(row) for row in rows]}
+        (RESULTS / f"clock_faults-{today}.json").write_text(json.dumps(data, indent=1) + "\n")
+        (RESULTS / f"clock_faults-{today}.md").write_text(text)
+    print(text)
+    if unknown or verdicts["WRONG"]:
+        sys.exit(f"places not covered, or gone: {unknown}; wrong: {verdicts['WRONG']}")
+
+
+if __name__ == "__main__":
+    main()
