@@ -37,10 +37,11 @@ from drivers.kuka.fri.poses import FriPoses
 from drivers.kuka.link import Link
 from drivers.kuka.speeds import Speeds
 from drivers.kuka.wire import JOINTS, State, agree, flange_words, to_abc
+from service.core.arms.flange import flange_pose
 from service.core.arms.known import known_arms
 from service.core.arms.model import ArmModel
 from service.core.geometry import to_rotation_vector
-from service.core.seven_axes import forward, nearest_posture
+from service.core.seven_axes import nearest_posture
 from service.core.units import mm
 
 DRIVER_VERSION = "1"
@@ -174,7 +175,7 @@ class KukaRobot:
         self._fri.await_first(self._config.connect_timeout_s)
 
     def _pose_of(self, joints_rad: Array) -> Transform:
-        return forward(self._arm or self._not_open(), joints_rad)
+        return flange_pose(self._arm or self._not_open(), joints_rad)
 
     def _frame_problems(self, state: State) -> list[str]:
         """Whether the flange is where the joints have it; not asked of a moving arm, as the two are read in turn."""

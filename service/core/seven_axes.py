@@ -1,4 +1,4 @@
-"""Closed-form kinematics of seven-axis arms with a spherical shoulder and wrist: forward, inverse by elbow angle."""
+"""Closed-form inverse kinematics of seven-axis arms with a spherical shoulder and wrist, by elbow angle."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from itertools import product
 
 import numpy as np
 
+from service.core.arms.flange import flange_pose
 from service.core.arms.model import ArmModel
 from service.core.geometry import Array, Transform
 
@@ -17,17 +18,6 @@ _LIMIT_WEIGHT = 10.0  # 10° inside the limit count nothing, at the limit as muc
 _NEAR_SINGULAR_RAD = np.radians(12.0)
 _SINGULAR_WEIGHT = 2.0
 _BENDS = (1, 3, 5)  # shoulder, elbow and wrist: where one is straight, the arm loses a direction
-
-
-def forward(arm: ArmModel, joints_rad: Array) -> Transform:
-    """T_base_flange (4, 4) at joints (7,)."""
-    T_base_link = np.eye(4)
-    for q, d, alpha in zip(joints_rad, arm.d_m, arm.alpha_rad, strict=True):
-        c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
-        T_base_link = T_base_link @ np.array(
-            [[c, -s * ca, s * sa, 0.0], [s, c * ca, -c * sa, 0.0], [0.0, sa, ca, d], [0, 0, 0, 1]]
-        )
-    return T_base_link
 
 
 def postures(arm: ArmModel, T_base_flange: Transform, elbow_angles_rad: Array | None = None) -> Array:
@@ -98,7 +88,7 @@ def _singular_costs(joints_rad: Array, near_rad: Array) -> Array:
 def elbow_angle_rad(arm: ArmModel, joints_rad: Array) -> float:
     """The elbow angle at joints (7,), -π … π."""
     base, _, _, hand = arm.d_m[::2]
-    T = forward(arm, joints_rad)
+    T = flange_pose(arm, joints_rad)
     wrist = T[:3, 3] - hand * T[:3, 2] - np.array([0.0, 0.0, base])
     length = float(np.linalg.norm(wrist))
     if length < _STRAIGHT:

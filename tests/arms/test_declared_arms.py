@@ -22,6 +22,7 @@ from service.compute.planning.motion_plan import (
     best_posture,
     plan_motion,
 )
+from service.core.arms.flange import flange_pose
 from service.core.arms.known import arm_model, known_arms
 from service.core.arms.model import ArmModel
 from service.core.errors import ConfigurationError
@@ -217,3 +218,10 @@ def test_a_scene_is_the_same_for_every_arm_and_an_lbr_errs_by_most_of_a_millimet
 def _one() -> ViewpointSet:
     protocol = load_protocol(PROTOCOL, params_models()).protocol
     return protocol.step("control_capture_1").params_as(viewpoint_capture.Params).viewpoints[0]
+
+
+@EVERY
+def test_one_posture_and_many_are_computed_alike(arm: ArmModel) -> None:
+    q = np.random.default_rng(5).uniform(-2.5, 2.5, (4, arm.axes))
+    for joints, T_base_flange in zip(q, forward(arm, q), strict=True):
+        np.testing.assert_allclose(flange_pose(arm, joints), T_base_flange, atol=1e-12)
