@@ -20,6 +20,7 @@ from service.core.records.events import StepPassed, StepStarted
 from service.rig import load_rig
 from service.run_start import signature_copy
 from service.store.database.engine import database_path
+from service.store.events import canonical
 from service.store.records import SITE
 from service.store.signatures.log import NAME, SignatureLog, read_log
 from service.store.signatures.log_copy import bring_up_to_date, keep_elsewhere
@@ -123,6 +124,13 @@ def alter_a_line(data: Path) -> None:
     (data / NAME).write_bytes((data / NAME).read_bytes().replace(b'"number":2', b'"number": 2', 1))
 
 
+def sign_the_last_line_otherwise(data: Path) -> None:
+    """No line after it holds its hash: only its own signature protects it."""
+    *lines, before, last = (data / NAME).read_bytes().splitlines(keepends=True)
+    other = canonical({**json.loads(last), "signature": json.loads(before)["signature"]}).encode() + b"\n"
+    (data / NAME).write_bytes(b"".join([*lines, before, other]))
+
+
 ATTACKS = [
     forge,
     forge_with_the_site,
@@ -135,6 +143,7 @@ ATTACKS = [
     cut_the_log,
     take_a_line_out,
     alter_a_line,
+    sign_the_last_line_otherwise,
 ]
 
 
