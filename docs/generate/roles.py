@@ -26,8 +26,8 @@ the hash of what was signed, and is an event of the run.
   supervisor; `accept_by: another_supervisor` is one who neither began the run nor confirmed the step. The reason
   is listed with every result, as a deviation. Some measures can never be accepted, such as `moved_during_exposure`.
 - **A release** is given by a supervisor who took no part in the run (`release: second_person` in the protocol).
-  Whoever took control, signed or accepted took part, and is told so before. The evidence is verified first. Nothing
-  but a report can be exported before the release, and that says so.
+  Whoever took control, signed or accepted took part, and is told so before. The evidence is verified first. Before
+  the release nothing but a report can be exported, and that says so.
 - **A protocol** is approved, by its bytes, by the first person who begins a run with it. Changed content under the
   same id and version needs a reason and a password.
 """
