@@ -102,6 +102,7 @@ def _on_pages(web: WebSite, run_id: str, found: tuple[Deviation, ...], *, other:
     if web.site.run(run_id).state.terminal:
         shown = [row for row in read("/").split("<tr") if f"/runs/{run_id}" in row]
         assert any(f'<td class="num">{number}</td>' in row for row in shown)
+        assert browser.send_form(f"/audit/runs/{run_id}/verification", back="exports").status_code == 303
         release = words(read(f"/runs/{run_id}/exports"))
         assert counted(number, "deviation") in release or "You cannot release it" in release
     compared = read(f"/compare?run={run_id}&run={other}")

@@ -59,7 +59,7 @@ def room(tmp_path: Path) -> Generator[Room]:
 def test_nobody_has_control_until_somebody_takes_it(room: Room) -> None:
     grace, emmy = room.screen("grace"), room.screen("emmy")
     nobody = room.control.holder(room.run)
-    assert astuple(nobody) == ("", "", "", False, "", "", 0.0)
+    assert astuple(nobody) == ("", "", "", False, "", "", "", 0.0, "", 0.0)
     with pytest.raises(ControlError, match="no screen"):
         room.control.require(room.run, grace)
     room.control.take(room.run, grace)

@@ -68,7 +68,7 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture protocol check protocols/dry_run.yaml": succeeds,
     "orthocapture doctor --rig rig.yaml": succeeds,
     "orthocapture run protocols/exvivo_spine.yaml --rig rig.yaml --data runs "
-    '--operator "A. Name"': starts_and_is_aborted,
+    '--operator "A. Name" --specimen "Spine 7"': starts_and_is_aborted,
     'orthocapture run protocols/dry_run.yaml --rig rig.yaml --data runs --operator "A. Name"': starts_and_is_aborted,
     "orthocapture resume latest --data runs": asks_and_is_aborted,
     "orthocapture status latest --data runs": succeeds,

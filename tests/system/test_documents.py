@@ -74,10 +74,11 @@ def test_what_the_readme_says_of_a_corrected_arm_is_what_was_measured() -> None:
 
 def test_make_targets_do_what_the_documents_say() -> None:
     """The last line of each target; tests/system/test_demo.py runs the command of `make demo`."""
+    with_realtime = "$(grep -rlwE 'realtime' tests --include='test_*.py')"
     for target, last in (
         ("test", '.venv/bin/pytest -m "not (slow or realtime or packages or whole or sweep)"'),
-        ("test-all", ".venv/bin/pytest -m realtime -n 0"),
-        ("test-drawn", ".venv/bin/pytest -m realtime -n 0"),
+        ("test-all", f".venv/bin/pytest -m realtime -n 0 {with_realtime}"),
+        ("test-drawn", f".venv/bin/pytest -m realtime -n 0 {with_realtime}"),
         ("test-whole", ".venv/bin/pytest -m whole"),
         ("test-sweeps", ".venv/bin/pytest -m sweep"),
         ("marks", ".venv/bin/ruff format --quiet tests"),

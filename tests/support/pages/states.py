@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.records.events import OperatorAction, StepStarted
+from service.core.records.events import DeviceOpened, DeviceTrouble, OperatorAction, StepStarted
 from service.monitor.snapshot import Snapshot, write_snapshot
 from tests.support.pages.at_the_table import left_at
 from tests.support.pages.forms import PageForm, forms_of
@@ -107,6 +107,14 @@ def died(web: WebSite) -> Seen:
     return Seen(web, browser, run)
 
 
+def arm_lost(web: WebSite) -> Seen:
+    run = web.begin_run().run_id
+    opened = DeviceOpened(device="robot", report={"identity": {"kind": "robot"}})
+    lost = DeviceTrouble(device="robot", error="DeviceUnavailableError", message="no answer", connection="died")
+    web.store.record(run, [opened, lost], actor="runner")
+    return at(web, run)
+
+
 def asked_for_control(web: WebSite) -> Seen:
     mine = asked(web)
     other = Seen(web, web.browser("supervisor"), mine.run)
@@ -148,6 +156,7 @@ STATES: tuple[Callable[[WebSite], Seen], ...] = (
     stopped,
     to_sign,
     died,
+    arm_lost,
     asked_for_control,
     looking_on,
     waiting_for_an_answer,

@@ -153,7 +153,7 @@ def test_other_formats_and_options_are_refused(
 def test_only_who_may_export_exports_stops_and_discards(web: WebSite, run: str) -> None:
     posts = {
         "formats": {"form": "colmap"},
-        "stop": {},
+        "stop": {"since_utc": "2026-11-27T00:00:00Z"},
         "unfinished": {"name": "x", "verb": "discard"},
     }
     for role in ("technician", "auditor", "administrator"):

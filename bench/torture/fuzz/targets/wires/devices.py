@@ -55,7 +55,7 @@ def _robot(link: Callable[[socket.socket, Server], Any]) -> Callable[[bytes, Pat
             MODELS["UR10e"], (5, 12), joints=np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0]), serial="20235000",
             faults=FaultPlan(), device="robot", speed_up=1.0,
         )  # fmt: skip
-        server = Server(controller, _HOST, None)
+        server = Server(controller, _HOST, None, 30090)
         ours, theirs = socket.socketpair()
         ours.setblocking(False)
         try:

@@ -151,7 +151,7 @@ def _robot_rig() -> _RobotRig:
         MODELS["UR10e"], (5, 12), joints=np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0]), serial="20235000",
         faults=FaultPlan(), device="robot", speed_up=1.0,
     )  # fmt: skip
-    server = Server(controller, _FAR, None)
+    server = Server(controller, _FAR, None, 30090)
     threading.Thread(target=server.run, args=(_Never(),), daemon=True).start()
     spoilers = [
         _Spoiler((_NEAR, port), (_FAR, port), spoils=port == RTDE_PORT)
