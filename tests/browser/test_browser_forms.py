@@ -61,7 +61,6 @@ def next_image(server: Served, run_id: str, name: str) -> None:
         capture(web, run_id, "capture", name, EYE, shade=int(name[-1]))
 
 
-@pytest.mark.slow
 def test_an_open_redo_stays_about_its_viewpoint_while_images_arrive(server: Served, browser: Browser) -> None:
     with capturing(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -82,7 +81,6 @@ def test_an_open_redo_stays_about_its_viewpoint_while_images_arrive(server: Serv
         expect(page.get_by_label("Reason in your own words")).to_have_value("")
 
 
-@pytest.mark.slow
 def test_a_reason_that_was_typed_for_one_viewpoint_is_not_kept_for_the_next(server: Served, browser: Browser) -> None:
     with capturing(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -96,7 +94,6 @@ def test_a_reason_that_was_typed_for_one_viewpoint_is_not_kept_for_the_next(serv
         expect(page.get_by_label("Reason in your own words")).to_have_value("")
 
 
-@pytest.mark.slow
 def test_a_tap_on_what_must_be_held_says_so(server: Served, browser: Browser) -> None:
     with capturing(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -111,7 +108,6 @@ def test_a_tap_on_what_must_be_held_says_so(server: Served, browser: Browser) ->
         assert [act.action for act in acts(server, run_id) if act.action == "redo"] == []
 
 
-@pytest.mark.slow
 def test_an_open_dialog_stays_when_its_question_is_over_and_what_it_says_is_refused(
     server: Served, browser: Browser
 ) -> None:
@@ -132,7 +128,6 @@ def test_an_open_dialog_stays_when_its_question_is_over_and_what_it_says_is_refu
         expect(page.locator("#dialog-skip")).to_have_count(0)
 
 
-@pytest.mark.slow
 def test_a_hold_ends_when_the_button_comes_to_mean_something_else(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -156,7 +151,6 @@ def test_a_hold_ends_when_the_button_comes_to_mean_something_else(server: Served
         assert [act.action for act in acts(server, run_id)] == ["skip", "confirm", "pause"]
 
 
-@pytest.mark.slow
 def test_what_was_sent_says_so_until_the_answer_comes(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -181,7 +175,6 @@ def test_what_was_sent_says_so_until_the_answer_comes(server: Served, browser: B
         expect(page.get_by_text("Sent…")).to_have_count(0, timeout=LATER_MS)
 
 
-@pytest.mark.slow
 def test_who_asks_for_control_and_who_refuses_it_is_said_without_a_reload(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (mine, run_id), screen(browser, server.url) as other:
         other.sign_in("emmy", password_of("emmy"))
@@ -201,7 +194,6 @@ def test_who_asks_for_control_and_who_refuses_it_is_said_without_a_reload(server
         expect(mine.page.get_by_text("Reason: “the specimen dries”")).to_be_visible()
 
 
-@pytest.mark.slow
 def test_a_verdict_stays_until_it_was_seen_although_the_next_step_has_begun(server: Served, browser: Browser) -> None:
     protocol = parse_protocol(PROTOCOL.encode(), params_models(), name="bench.yaml").protocol
     measures = {gate.measure: float(gate.min or 0.0) for gate in protocol.step("capture").gates}

@@ -62,6 +62,7 @@ def test_other(): pass
     assert "4 passed, 18 deselected" in answer.stdout
 
 
+@pytest.mark.slow
 def test_only_the_body_of_a_test_that_meets_the_clock_runs_again(tmp_path: Path) -> None:
     source = """
 import pytest

@@ -63,6 +63,7 @@ def in_force(run: OneArmRun) -> list[ViewpointCaptured]:
     return list({view.viewpoint: view for view in run.views()}.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", [pytest.param("in motion", marks=pytest.mark.slow), "exposing"])
 def test_an_arm_that_was_pushed_is_asked_about(tmp_path: Path, store: Store, moment: str) -> None:
     with arm_at(88, *SPEED_UP) as (host, arm):
@@ -76,6 +77,7 @@ def test_an_arm_that_was_pushed_is_asked_about(tmp_path: Path, store: Store, mom
     assert all(view.verdicts["still"] for view in in_force(run))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("act", "moment", "words"),
     [

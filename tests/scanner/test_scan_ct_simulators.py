@@ -106,6 +106,7 @@ def test_scanned_spheres_are_where_they_are(sprayed: Scanned, glossy: Scanned) -
             assert 0.035e-3 < fit.rms_m < 0.08e-3
 
 
+@pytest.mark.slow
 def test_the_scan_is_in_a_frame_of_its_own_and_in_millimetres(sprayed: Scanned, glossy: Scanned) -> None:
     assert sprayed.mesh.unit == "mm"
     assert np.linalg.det(sprayed.T_world_scan[:3, :3]) == pytest.approx(1.0)

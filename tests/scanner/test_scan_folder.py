@@ -290,6 +290,7 @@ def test_merging_agrees_with_numpy() -> None:
     assert np.all(np.diff(first) > 0)
 
 
+@pytest.mark.slow
 def test_a_million_faces_are_read_without_a_call_for_each(tmp_path: Path) -> None:
     path = write(tmp_path, "big.ply", trimesh.creation.icosphere(subdivisions=8, radius=150.0))
     meshes: list[ScannedMesh] = []

@@ -89,6 +89,7 @@ def _pages(shown: ShownSite) -> list[str]:
     return [*_PAGES, *(page.format(run) for run in runs for page in _PAGES_OF_A_RUN), *audits]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("role", ROLES)
 def test_a_role_may_what_it_is_offered_and_no_button_leads_where_it_has_nothing(
     web: WebSite, shown: ShownSite, role: Role

@@ -129,6 +129,7 @@ def erring_arm(made: Scene) -> tuple[Array, list[dict[str, Any]], dict[str, Any]
     return T_base_world, reported, mounted | {"arm_correction": record | {"stations": [STATION]}}
 
 
+@pytest.mark.slow
 def test_jobs_go_from_images_to_a_gate_and_a_suggestion(
     store: Store, tmp_path: Path, pictures: tuple[Scene, list[Any]]
 ) -> None:

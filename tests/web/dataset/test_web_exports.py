@@ -198,6 +198,7 @@ def test_an_auditor_makes_and_downloads_report_and_bundle(web: WebSite, run: str
     assert fetched.headers["x-sha256"] == event.payload.sha256
 
 
+@pytest.mark.slow
 def test_exports_made_in_the_terminal_are_on_the_page(web: WebSite, tmp_path: Path) -> None:
     run = record_reported_run(web.folder, person="grace", registered=True)
     data = ("--data", str(web.site.data), "--operator", "emmy", "--password-stdin")
@@ -295,6 +296,7 @@ def test_a_data_set_without_registration_says_why_not(web: WebSite, supervisor: 
     assert "no evaluated registration" in page
 
 
+@pytest.mark.slow
 def test_a_data_set_leaves_with_all_that_belongs_to_it(
     web: WebSite, supervisor: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
