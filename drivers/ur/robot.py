@@ -200,7 +200,7 @@ class UrRobot:
             self._read_tool(control)
 
         tool = self._samples.tool
-        with tool.changing():
+        with tool.changing(payload):
             self._perform("setting payload and tool", set_both)
             # The stream lags behind the answer: poses of the previous tool can still arrive.
             settled_s = self._streaming().latest().controller_time_s + TOOL_CHANGE_S

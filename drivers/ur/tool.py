@@ -72,19 +72,23 @@ class ToolWatch:
             self._stated = True
 
     @contextlib.contextmanager
-    def changing(self) -> Generator[None]:
-        """Let this driver change the tool: nothing is judged meanwhile, and nothing is taken as known if it fails."""
+    def changing(self, payload: Payload) -> Generator[None]:
+        """Let this driver change the tool: nothing is judged meanwhile, and nothing is taken as known if it fails.
+
+        Leave it once the stream shows what was set. The next sample is compared with that, so that no change by
+        somebody else falls between the two.
+        """
         with self._lock:
             self._changing = True
         try:
             yield
         except BaseException:
             with self._lock:
-                self._stated = False
+                self._stated = self._changing = False
+                self._before, self._payload = None, None
             raise
-        finally:
-            with self._lock:
-                self._changing, self._before, self._payload = False, None, None
+        with self._lock:
+            self._changing, self._payload = False, payload
 
     def flange(self, joints_rad: Array, T_base_tcp: Transform, payload: Payload) -> Transform:
         """T_base_flange (4, 4) of a sample; latches the arm if the tool is not that of the sample before."""

@@ -112,16 +112,36 @@ def test_a_changed_payload_holds_the_arm(payload: Payload) -> None:
 
 def test_what_the_driver_changes_itself_is_not_told() -> None:
     arm = Seen()
-    with arm.watch.changing():
-        arm.tool, arm.payload = np.eye(4), Payload(3.0, (0.0, 0.0, 0.0))
+    light = Payload(3.0, (0.0, 0.0, 0.0))
+    with arm.watch.changing(light):
+        arm.tool, arm.payload = np.eye(4), light
         arm.watch.flange(arm.joints_rad, flange_pose(UR10E, arm.joints_rad), arm.payload)
         arm.watch.state(arm.tool)
     arm.sample()
     assert arm.latch.changed is None
-    with pytest.raises(ZeroDivisionError), arm.watch.changing():
+    with pytest.raises(ZeroDivisionError), arm.watch.changing(light):
         raise ZeroDivisionError
     arm.watch.state(T_FLANGE_TCP)
     assert arm.latch.changed is None, "how much of a refused change came about is not known"
+
+
+@pytest.mark.parametrize(
+    ("tool", "payload", "what"),
+    [
+        (T_FLANGE_TCP, Payload(4.0, (0.0, 0.0, 0.08)), "the payload was changed from 3 kg to 4 kg"),
+        (MOVED, Payload(3.0, (0.0, 0.0, 0.08)), "the tool centre point was changed"),
+    ],
+)
+def test_a_change_by_somebody_else_right_after_the_drivers_own_is_told(
+    tool: Transform, payload: Payload, what: str
+) -> None:
+    """No sample came between the two."""
+    arm = Seen()
+    with arm.watch.changing(Payload(3.0, (0.0, 0.0, 0.08))):
+        arm.payload = Payload(3.0, (0.0, 0.0, 0.08))
+        arm.sample()
+    arm.watch.flange(arm.joints_rad, flange_pose(UR10E, arm.joints_rad) @ tool, payload)
+    assert what in str(arm.latch.changed)
 
 
 def test_another_tool_stated_than_before_holds_the_arm() -> None:

@@ -116,7 +116,7 @@ class Technician:
             return
         actions = page.locator(".actions")
         sign = actions.get_by_role("button", name=re.compile("^Sign"))
-        confirm = actions.get_by_role("button", name=re.compile("^Confirm:"))
+        confirm = actions.get_by_role("button", name=re.compile("^(Confirm:|Take photograph)"))
         if sign.count() and sign.is_visible():
             self._sign(sign)
         elif confirm.count() and confirm.is_enabled(timeout=1_000):
@@ -221,7 +221,7 @@ def test_the_auditor_reads_everything_and_changes_nothing(server: Served, browse
         desk.go(f"/runs/{run}/calibration")
         expect(page.get_by_role("table").first).to_be_visible(timeout=ANSWER_MS)
         assert refused(page, f"/runs/{run}/actions", {"verb": "redo", "reason": "no"}) == 403
-        assert refused(page, f"/runs/{run}/exports", {"what": "bundle"}) == 403
+        assert refused(page, f"/runs/{run}/exports", {"what": "dataset"}) == 403
 
 
 def refused(page: Page, path: str, fields: dict[str, str]) -> int:
