@@ -109,6 +109,7 @@ OTHER_PAGES: tuple[tuple[Role, str], ...] = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shown", RUN_PAGES, ids=lambda shown: f"{shown[0].__name__}{shown[1][11:]}")
 def test_every_control_of_a_run_can_be_read_in_every_state(
     page: Page, tmp_path: Path, shown: tuple[Callable[[WebSite], Seen], str]
@@ -120,6 +121,7 @@ def test_every_control_of_a_run_can_be_read_in_every_state(
         assert faults(page) == []
 
 
+@pytest.mark.slow
 def test_every_control_of_a_capture_by_hand_can_be_read_in_every_state(page: Page, tmp_path: Path) -> None:
     with ExitStack() as open_, web_site(tmp_path) as web:
         seen = open_.enter_context(by_hand(tmp_path, web))

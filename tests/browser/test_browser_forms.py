@@ -61,6 +61,7 @@ def next_image(server: Served, run_id: str, name: str) -> None:
         capture(web, run_id, "capture", name, EYE, shade=int(name[-1]))
 
 
+@pytest.mark.slow
 def test_an_open_redo_stays_about_its_viewpoint_while_images_arrive(server: Served, browser: Browser) -> None:
     with capturing(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -81,6 +82,7 @@ def test_an_open_redo_stays_about_its_viewpoint_while_images_arrive(server: Serv
         expect(page.get_by_label("Reason in your own words")).to_have_value("")
 
 
+@pytest.mark.slow
 def test_a_reason_that_was_typed_for_one_viewpoint_is_not_kept_for_the_next(server: Served, browser: Browser) -> None:
     with capturing(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -94,6 +96,7 @@ def test_a_reason_that_was_typed_for_one_viewpoint_is_not_kept_for_the_next(serv
         expect(page.get_by_label("Reason in your own words")).to_have_value("")
 
 
+@pytest.mark.slow
 def test_a_tap_on_what_must_be_held_says_so(server: Served, browser: Browser) -> None:
     with capturing(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -128,6 +131,7 @@ def test_an_open_dialog_stays_when_its_question_is_over_and_what_it_says_is_refu
         expect(page.locator("#dialog-skip")).to_have_count(0)
 
 
+@pytest.mark.slow
 def test_a_hold_ends_when_the_button_comes_to_mean_something_else(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (tablet, run_id):
         page = tablet.page
@@ -175,6 +179,7 @@ def test_what_was_sent_says_so_until_the_answer_comes(server: Served, browser: B
         expect(page.get_by_text("Sent…")).to_have_count(0, timeout=LATER_MS)
 
 
+@pytest.mark.slow
 def test_who_asks_for_control_and_who_refuses_it_is_said_without_a_reload(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (mine, run_id), screen(browser, server.url) as other:
         other.sign_in("emmy", password_of("emmy"))

@@ -249,6 +249,7 @@ def test_a_reason_is_chosen_or_written(server: Served, browser: Browser) -> None
 # --- the keyboard ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_shortcuts_lead_to_everything_and_move_nothing(server: Served, browser: Browser) -> None:
     with at_the_table(server, browser) as (tablet, run_id):
         page = tablet.page

@@ -132,7 +132,6 @@ def test_a_tool_changed_in_motion_is_told_while_it_moves(robot: RobotArm) -> Non
     travel(robot, turned(robot, start - robot.state().sample.joints_rad[0]))
 
 
-@pytest.mark.slow
 def test_a_changed_payload_is_refused_by_name(robot: RobotArm) -> None:
     restored(robot)
     pendant(HOST, "payload 4 0 0 0.08")

@@ -57,6 +57,7 @@ def swept(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return sweep(tmp_path_factory.mktemp("crash"), "--kinds", *rows_to_run(request, "kind"))[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_death_there_leaves_nothing_behind(swept: dict[str, Any], kind: str) -> None:
     process, effect, how = kind.split("/")

@@ -67,6 +67,7 @@ def tried(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return {one["name"]: one for one in sweep(folder, "--only", *rows_to_run(request, "case"))[2]}
 
 
+@pytest.mark.slow
 @pytest.mark.sweep
 @pytest.mark.timeout(1800)  # the first of them waits for the others
 @pytest.mark.parametrize("case", CHOSEN)
@@ -78,6 +79,7 @@ def test_the_case_goes_as_the_table_says(tried: dict[str, dict[str, Any]], case:
     assert differences([as_tried], read_table(DOCUMENT)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.sweep
 @pytest.mark.timeout(400)
 def test_a_store_that_does_not_say_what_to_do_shows(tmp_path: Path) -> None:
