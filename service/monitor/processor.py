@@ -6,6 +6,8 @@ import threading
 import time
 from pathlib import Path
 
+from service.core.units import seconds_of_ns
+
 
 def processor_s() -> float:
     """Seconds that this thread has computed or waited for a processor, as far as the system tells of waits."""
@@ -27,4 +29,4 @@ def waited_s(thread: int) -> float:
 def _scheduled(thread: int) -> tuple[float, float]:
     """Seconds on a processor, and waiting for one, as Linux counts them. Raises OSError."""
     computed_ns, waited_ns, _ = Path(f"/proc/self/task/{thread}/schedstat").read_text().split()
-    return int(computed_ns) / 1e9, int(waited_ns) / 1e9
+    return seconds_of_ns(int(computed_ns)), seconds_of_ns(int(waited_ns))
