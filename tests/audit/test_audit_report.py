@@ -20,9 +20,18 @@ from service.audit.record.run import read_run
 from service.audit.report.blocks import Report
 from service.audit.report.content import report_content
 from service.audit.report.output.html import render_html
+from service.audit.report.sections.course import incidents
 from service.cli.main import app
 from service.core.errors import StoreError
-from service.core.records.events import Event, EvidenceExported, RunReleased
+from service.core.records.events import (
+    DeviceOpened,
+    DeviceTrouble,
+    Event,
+    EvidenceExported,
+    LeaveLapsed,
+    RobotSeen,
+    RunReleased,
+)
 from service.people.accounts import Accounts
 from service.people.credentials.passwords import Passwords
 from service.store.signatures.signing import checkpoint
@@ -30,6 +39,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of
 from tests.support.recorded.reported_run import record_reported_run
+from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
 AT = datetime(2026, 11, 21, 11, 30, tzinfo=UTC)
 
@@ -302,3 +312,19 @@ def test_command_without_a_file_says_what_to_say(folder: Path) -> None:
     answer = CliRunner().invoke(app, ["audit", "report", "--data", str(folder / "data"), "--json"])
     assert answer.exit_code == 1
     assert "--pdf FILE" in json.loads(answer.stdout)["error"]["remedy"]
+
+
+def test_a_lost_arm_who_looked_at_it_and_a_confirmation_that_lapsed_are_listed(tmp_path: Path) -> None:
+    with bench_store(tmp_path / "data") as store:
+        run = begin_run(store, PROTOCOL, tmp_path).run_id
+        opened = DeviceOpened(device="robot", report={"identity": {"kind": "robot"}})
+        lost = DeviceTrouble(device="robot", error="DeviceUnavailableError", message="no answer", connection="died")
+        *_, trouble = store.record(run, [opened, lost], actor="runner")
+        store.record(run, [RobotSeen(device="robot", lost_seq=trouble.seq)], actor="Ada")
+        lapsed = LeaveLapsed(leave_seq=1, idle_s=61.0, limit_s=60.0, why="no file")
+        store.record(run, [lapsed], actor="runner")
+    told = {one.kind: (one.text, one.who) for one in incidents(read_run(tmp_path / "data", "latest"))}
+    assert told["device"] == ("robot: no answer", "runner")
+    assert told["arm looked at"] == ("robot: somebody looked at it after its connection was lost", "Ada")
+    held = "no visible progress for 61 s, a confirmation holds for 60 s: no file"
+    assert told["confirmation lapsed"] == (held, "runner")

@@ -14,8 +14,10 @@ from service.core.gates.verdict import BOUNDS_HOLD, describe_judged
 from service.core.records.events import (
     DeviceTrouble,
     GatesEvaluated,
+    LeaveLapsed,
     OperatorAction,
     RecordCorrected,
+    RobotSeen,
     RunReleased,
     StepFailed,
     ViewpointFailed,
@@ -77,6 +79,11 @@ def _of_event(payload: object) -> Iterator[tuple[str, str, str]]:
             yield "exposure failed", payload.step, f"{payload.viewpoint}: {payload.message}"
         case DeviceTrouble():
             yield "device", "", f"{payload.device}: {payload.message}"
+        case LeaveLapsed():
+            held = f"no visible progress for {payload.idle_s:.0f} s, a confirmation holds for {payload.limit_s:.0f} s"
+            yield "confirmation lapsed", "", f"{held}: {payload.why}" if payload.why else held
+        case RobotSeen():
+            yield "arm looked at", "", f"{payload.device}: somebody looked at it after its connection was lost"
         case RecordCorrected():
             text = f"event {payload.of_seq}, {payload.field}: {payload.old!r} → {payload.new!r}; {payload.reason}"
             yield "correction", "", text
