@@ -93,7 +93,8 @@ def test_an_invitation_is_scanned_or_copied(server: Served, browser: Browser) ->
         code = page.get_by_role("img", name="QR code of the link")
         picture = cv2.imdecode(np.frombuffer(code.screenshot(scale="css"), np.uint8), cv2.IMREAD_COLOR)
         assert picture is not None
-        assert cv2.QRCodeDetector().detectAndDecode(picture)[0] == page.locator("#one-time-link").inner_text()
+        # OpenCV's other detector does not read one link in forty, whoever draws it.
+        assert cv2.QRCodeDetectorAruco().detectAndDecode(picture)[0] == page.locator("#one-time-link").inner_text()
         page.get_by_role("button", name="Copy the link").click()
         expect(page.get_by_text("Copied.")).to_be_visible()
         assert page.evaluate("navigator.clipboard.readText()") == page.locator("#one-time-link").inner_text()
