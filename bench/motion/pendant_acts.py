@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.machine import RESULTS, commit, machine
-from service.core.arms.flange import apart, flange_pose
+from service.core.arms.flange import flange_pose, pose_gap
 from service.core.arms.known import arm_model
 from service.core.records.events import OperatorAction, StepFailed, ViewpointCaptured
 from service.core.run.decide import AskOperator
@@ -177,7 +177,7 @@ def sweep_one(act: str, moment: str, number: int) -> Outcome:
 def _away(view: ViewpointCaptured, arm: ArmWatch) -> tuple[float, float]:
     """How far the recorded pose is from the arm's at that moment, m and rad."""
     was = flange_pose(arm_model("UR10e"), np.array(arm.joints_at(view.controller_time_s)))
-    return apart(was, np.array(view.T_base_flange))
+    return pose_gap(was, np.array(view.T_base_flange))
 
 
 def _has_rigs_tool(view: ViewpointCaptured) -> bool:

@@ -19,7 +19,7 @@ from drivers.errors import DeviceFaultError, DeviceTimeoutError
 from drivers.interfaces import Array, Payload, Transform
 from drivers.ur.link import vendor
 from drivers.ur.script import wait
-from service.core.arms.flange import apart, fits, flange_pose
+from service.core.arms.flange import fits, flange_pose, pose_gap
 from service.core.arms.model import ArmModel
 from service.core.geometry import inverse
 from service.core.units import deg, mm
@@ -65,7 +65,7 @@ class ToolWatch:
     def state(self, T_flange_tcp: Transform) -> None:
         """Take the centre point (4, 4) as the controller states it; another one than before latches the arm."""
         with self._lock:
-            away = apart(self._T_flange_tcp, T_flange_tcp)
+            away = pose_gap(self._T_flange_tcp, T_flange_tcp)
             if self._stated and not self._changing and (away[0] > JUMP_M or away[1] > JUMP_RAD):
                 self._latch.change(f"the tool centre point was changed by {_words(away)}")
             self._use(T_flange_tcp)
@@ -93,12 +93,11 @@ class ToolWatch:
     def flange(self, joints_rad: Array, T_base_tcp: Transform, payload: Payload) -> Transform:
         """T_base_flange (4, 4) of a sample; latches the arm if the tool is not that of the sample before."""
         with self._lock:
-            self._follow(joints_rad, T_base_tcp)
+            by_joints = None if self._arm is None else flange_pose(self._arm, joints_rad)
+            self._follow(joints_rad, T_base_tcp, by_joints)
             T_base_flange = T_base_tcp @ self._T_tcp_flange
             self._weigh(payload)
-            arm = self._arm
-            if arm is not None and self._judging and not fits(arm, joints_rad, T_base_flange):
-                away = apart(flange_pose(arm, joints_rad), T_base_flange)
+            if by_joints is not None and self._judging and not fits(away := pose_gap(by_joints, T_base_flange)):
                 self._latch.change(f"the flange is reported {_words(away)} from where its joints put it")
             return T_base_flange
 
@@ -106,15 +105,16 @@ class ToolWatch:
     def _judging(self) -> bool:
         return self._stated and not self._changing
 
-    def _follow(self, joints_rad: Array, T_base_tcp: Transform) -> None:
-        arm, before = self._arm, self._before
-        seen = T_base_tcp if arm is None else inverse(flange_pose(arm, joints_rad)) @ T_base_tcp
+    def _follow(self, joints_rad: Array, T_base_tcp: Transform, by_joints: Transform | None) -> None:
+        """Compare the tool seen in a sample with that of the sample before; `by_joints`: T_base_flange, if known."""
+        before = self._before
+        seen = T_base_tcp if by_joints is None else inverse(by_joints) @ T_base_tcp
         self._before = (joints_rad, seen)
         if before is None or not self._judging:
             return
         turned_rad = float(np.sum(np.abs(joints_rad - before[0])))
-        away = apart(before[1], seen)
-        if not jumped(away, turned_rad, known=arm is not None):
+        away = pose_gap(before[1], seen)
+        if not jumped(away, turned_rad, known=by_joints is not None):
             return
         self._latch.change(f"the tool centre point was changed by {_words(away)}")
         self._use(self._T_flange_tcp @ inverse(before[1]) @ seen)  # so that poses stay the flange's

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.core.arms.flange import apart, flange_pose
+from service.core.arms.flange import flange_pose, pose_gap
 from service.core.arms.known import arm_model
 from service.core.records.events import ViewpointCaptured
 from service.store.store import Store
@@ -51,7 +51,7 @@ def assert_true_poses(run: OneArmRun, arm: ArmWatch) -> None:
     for view in in_force(run):
         was = np.array(arm.joints_at(view.controller_time_s))
         assert np.allclose(view.joints_rad, was, atol=1e-4)
-        away_m, away_rad = apart(flange_pose(arm_model("UR10e"), was), np.array(view.T_base_flange))
+        away_m, away_rad = pose_gap(flange_pose(arm_model("UR10e"), was), np.array(view.T_base_flange))
         assert away_m < 1e-4, f"{view.viewpoint}: {1e3 * away_m:.1f} mm"
         assert away_rad < 1e-4
         assert np.allclose(view.T_flange_tcp or (), np.eye(4), atol=1e-6)

@@ -12,7 +12,7 @@ from drivers.arm.latch import Latch
 from drivers.errors import ToolChangedError
 from drivers.interfaces import Array, Payload, Transform
 from drivers.ur.tool import JUMP_M, JUMP_RAD, ToolWatch, jumped
-from service.core.arms.flange import FITS_M, FITS_RAD, apart, fits, flange_pose
+from service.core.arms.flange import FITS_M, FITS_RAD, fits, flange_pose, pose_gap
 from service.core.arms.known import arm_model
 from service.core.arms.model import ArmModel
 from service.core.geometry import transform
@@ -52,7 +52,7 @@ class Seen:
         self.joints_rad = self.joints_rad + turn_rad
         T_base_flange = flange_pose(self.is_really, self.joints_rad)
         seen = self.watch.flange(self.joints_rad, T_base_flange @ self.tool, self.payload)
-        assert apart(seen, T_base_flange)[0] < JUMP_M + 0.003
+        assert pose_gap(seen, T_base_flange)[0] < JUMP_M + 0.003
         return seen
 
 
@@ -89,7 +89,7 @@ def test_a_tool_changed_in_motion_is_told_from_the_motion() -> None:
     arm.tool = T_FLANGE_TCP @ MOVED
     arm.sample(0.008)
     assert "changed by 100." in str(arm.latch.changed)
-    assert apart(arm.watch.T_flange_tcp, arm.tool)[0] < 0.001
+    assert pose_gap(arm.watch.T_flange_tcp, arm.tool)[0] < 0.001
 
 
 def test_an_unknown_arm_is_watched_where_it_stands() -> None:
@@ -184,16 +184,16 @@ def test_the_limits_are_as_stated() -> None:
 
 def test_every_published_calibration_fits() -> None:
     worst = max(
-        apart(flange_pose(UR10E, q), flange_pose(CALIBRATED, q))
+        pose_gap(flange_pose(UR10E, q), flange_pose(CALIBRATED, q))
         for q in np.random.default_rng(1).uniform(-2, 2, (50, 6))
     )
     assert 0.003 < worst[0] < FITS_M
     away = flange_pose(UR10E, HOME_RAD)
-    assert fits(UR10E, HOME_RAD, away)
+    assert fits(pose_gap(away, away))
     for change, agrees in (
         (transform(np.eye(3), np.array([0.0, 0.99 * FITS_M, 0.0])), True),
         (transform(np.eye(3), np.array([0.0, 1.01 * FITS_M, 0.0])), False),
         (transform(Rotation.from_euler("y", 0.99 * FITS_RAD), np.zeros(3)), True),
         (transform(Rotation.from_euler("y", 1.01 * FITS_RAD), np.zeros(3)), False),
     ):
-        assert fits(UR10E, HOME_RAD, away @ change) is agrees
+        assert fits(pose_gap(away, away @ change)) is agrees

@@ -37,7 +37,7 @@ def flange_pose(arm: ArmModel, joints_rad: Array) -> Transform:
     return np.array([[r00, r01, r02, x], [r10, r11, r12, y], [r20, r21, r22, z], [0.0, 0.0, 0.0, 1.0]])
 
 
-def apart(T_a: Transform, T_b: Transform) -> tuple[float, float]:
+def pose_gap(T_a: Transform, T_b: Transform) -> tuple[float, float]:
     """Distance (m) and angle (rad) between two poses (4, 4)."""
     turn = T_a[:3, :3].T @ T_b[:3, :3]
     w = (turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])
@@ -45,7 +45,6 @@ def apart(T_a: Transform, T_b: Transform) -> tuple[float, float]:
     return float(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3])), angle_rad
 
 
-def fits(arm: ArmModel, joints_rad: Array, T_base_flange: Transform) -> bool:
-    """Whether a reported flange pose (4, 4) fits the joints (N,) that were reported with it."""
-    distance_m, angle_rad = apart(flange_pose(arm, joints_rad), T_base_flange)
-    return distance_m <= FITS_M and angle_rad <= FITS_RAD
+def fits(gap: tuple[float, float]) -> bool:
+    """Whether a flange that is reported so far (m, rad) from where its joints put it may be there all the same."""
+    return gap[0] <= FITS_M and gap[1] <= FITS_RAD

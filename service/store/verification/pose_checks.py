@@ -67,11 +67,11 @@ class PoseFacts:
             return
         import numpy as np  # noqa: PLC0415 - which few verifications need
 
-        from service.core.arms.flange import FITS_M, FITS_RAD, apart, flange_pose  # noqa: PLC0415
+        from service.core.arms.flange import fits, flange_pose, pose_gap  # noqa: PLC0415
 
         joints, pose = np.array(view.joints_rad, dtype=float), np.array(view.T_base_flange, dtype=float)
-        gaps = [apart(flange_pose(a, joints), pose) for a in self._arms.values() if a and a.axes == len(joints)]
-        if gaps and not any(gap[0] <= FITS_M and gap[1] <= FITS_RAD for gap in gaps):
+        gaps = [pose_gap(flange_pose(a, joints), pose) for a in self._arms.values() if a and a.axes == len(joints)]
+        if gaps and not any(map(fits, gaps)):
             self._away[seq] = AwayView(seq, view.viewpoint, *min(gaps))
 
     def findings(self, run_id: str) -> tuple[list[AwayView], list[str]]:
