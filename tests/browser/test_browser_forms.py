@@ -6,7 +6,7 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 
 import pytest
-from playwright.sync_api import Browser, Route, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.models import parse_protocol
@@ -61,12 +61,16 @@ def next_image(server: Served, run_id: str, name: str) -> None:
         capture(web, run_id, "capture", name, EYE, shade=int(name[-1]))
 
 
+def open_redo_with_a_reason(page: Page) -> None:
+    page.get_by_text("Redo v1_001…").click()
+    page.get_by_label("Reason in your own words").fill("a drape hung into it")
+
+
 @pytest.mark.slow
 def test_an_open_redo_stays_about_its_viewpoint_while_images_arrive(server: Served, browser: Browser) -> None:
     with capturing(server, browser) as (tablet, run_id):
         page = tablet.page
-        page.get_by_text("Redo v1_001…").click()
-        page.get_by_label("Reason in your own words").fill("a drape hung into it")
+        open_redo_with_a_reason(page)
         next_image(server, run_id, "v1_002")
         expect(page.get_by_role("heading", name="v1_002")).to_be_visible(timeout=LATER_MS)
         form = page.locator("details[open] form")
@@ -86,8 +90,7 @@ def test_an_open_redo_stays_about_its_viewpoint_while_images_arrive(server: Serv
 def test_a_reason_that_was_typed_for_one_viewpoint_is_not_kept_for_the_next(server: Served, browser: Browser) -> None:
     with capturing(server, browser) as (tablet, run_id):
         page = tablet.page
-        page.get_by_text("Redo v1_001…").click()
-        page.get_by_label("Reason in your own words").fill("a drape hung into it")
+        open_redo_with_a_reason(page)
         next_image(server, run_id, "v1_002")
         expect(page.get_by_role("heading", name="v1_002")).to_be_visible(timeout=LATER_MS)
         page.get_by_text("Redo v1_001…").click()  # closes it
@@ -100,8 +103,7 @@ def test_a_reason_that_was_typed_for_one_viewpoint_is_not_kept_for_the_next(serv
 def test_a_tap_on_what_must_be_held_says_so(server: Served, browser: Browser) -> None:
     with capturing(server, browser) as (tablet, run_id):
         page = tablet.page
-        page.get_by_text("Redo v1_001…").click()
-        page.get_by_label("Reason in your own words").fill("a drape hung into it")
+        open_redo_with_a_reason(page)
         button = page.get_by_role("button", name="Redo v1_001")
         expect(button).to_contain_text("Hold for 1.5 s.")
         expect(button.locator(".ring")).to_be_visible()

@@ -76,7 +76,6 @@ def away_words(
         return ""
     if protocol.step(now.step).by_hand:
         return ""
-    at = datetime.fromisoformat(now_utc)
     left_s, unknown = 0.0, ""
     for step in protocol.steps[protocol.index(now.step) :]:
         here = step.id == now.step
@@ -86,13 +85,12 @@ def away_words(
         if usual is None:
             unknown = step.title
             break
-        began = datetime.fromisoformat(now.work_began_utc) if here and now.work_began_utc else at
-        left_s += max(0.0, usual.seconds - (at - began).total_seconds()) if here else usual.seconds
+        left_s += _left_s(usual, now.work_began_utc if here else "", now_utc)
         if step.sign:
             break
     if left_s < _SHORT_S:
         return ""
-    until = clock((at + timedelta(seconds=left_s)).isoformat())
+    until = clock((datetime.fromisoformat(now_utc) + timedelta(seconds=left_s)).isoformat())
     least = f"at least until about {until}: how long “{unknown}” takes is not known" if unknown else f"until {until}"
     return f"You can leave {least}. A fault asks for you earlier: switch alerts on."
 
@@ -117,13 +115,19 @@ def run_words(protocol: Protocol, state: RunState, earlier: EarlierTimes, now_ut
             continue
         known += 1
         now = state.steps[step.id]
-        began = now.work_began_utc if now.phase == "running" else ""
-        done = datetime.fromisoformat(now_utc) - datetime.fromisoformat(began) if began else timedelta()
-        left_s += max(0.0, usual.seconds - done.total_seconds())
+        left_s += _left_s(usual, now.work_began_utc if now.phase == "running" else "", now_utc)
     if not known:
         return ""
     part = "" if known == len(left) else f", of {known} of the {len(left)} steps left"
     return f"Work left{part}: about {duration(left_s)}, and the time for which the run waits for people."
+
+
+def _left_s(usual: UsualTime, began_utc: str, now_utc: str) -> float:
+    """The seconds that work usually still takes which began at a time; all of them where that is ""."""
+    if not began_utc:
+        return usual.seconds
+    done = datetime.fromisoformat(now_utc) - datetime.fromisoformat(began_utc)
+    return max(0.0, usual.seconds - done.total_seconds())
 
 
 def duration(seconds: float) -> str:

@@ -16,6 +16,7 @@ NOT_THE_STOP = "This screen is not the emergency stop."
 _TAKE_IT = "Robot: take it as moving."
 _FROM_OUTSIDE = "If it moves, press the emergency stop."
 _AS_MOVING = "It counts as moving until a person has looked: stay outside of its reach."
+_TOLD_NOW = {"standing": "It reports now that it stands still.", "not_connected": "It is not connected now."}
 _AT_THE_ROBOT = "This software cannot clear a stop; a person does it at the robot, and nothing moves again by itself."
 
 
@@ -68,22 +69,34 @@ def robot_banner(state: RunState, snapshot: Snapshot, now_utc_s: float, *, drive
     words = " ".join(_loss_words(name, loss) for name, loss in lost.items())
     if banner.tone in ("stop", "moving") or banner.key == "pausing":
         return replace(banner, text=f"{banner.text} {words} {_AS_MOVING}", look=look)
-    ended = "The run has ended. " if state.terminal else ""
-    now = _now_words(snapshot) if driven and not state.terminal else ""
-    text = f"{ended}{words} {now}{_AS_MOVING} {_FROM_OUTSIDE} {NOT_THE_STOP}"
+    told = _TOLD_NOW.get(snapshot.robot, "")
+    now = (told, _now(snapshot)) if driven and not state.terminal else ()
+    text = _joined(_ended(state), words, *now, _AS_MOVING, _FROM_OUTSIDE, NOT_THE_STOP)
     return Banner("lost", "unknown", "unknown", _TAKE_IT, text, assertive=True, look=look)
+
+
+def _joined(*sentences: str) -> str:
+    """Sentences one after the other, without those that are ""."""
+    return " ".join(filter(None, sentences))
+
+
+def _ended(state: RunState) -> str:
+    return "The run has ended." if state.terminal else ""
+
+
+def _now(snapshot: Snapshot) -> str:
+    """What the program does now, if it takes long."""
+    busy = busy_words(snapshot)
+    return f"Now: {busy}." if busy else ""
+
+
+def _again(tries: str) -> str:
+    return f"{tries}." if tries else ""
 
 
 def _loss_words(name: str, loss: Loss) -> str:
     since = time_here(loss.since_utc)
     return f"The connection to {name} was lost at {since}, {loss.how}; nobody has looked at it since."
-
-
-def _now_words(snapshot: Snapshot) -> str:
-    """What the program says now, beside a loss that nobody has looked at."""
-    told = {"standing": "It reports now that it stands still. ", "not_connected": "It is not connected now. "}
-    busy = busy_words(snapshot)
-    return told.get(snapshot.robot, "") + (f"Now: {busy}. " if busy else "")
 
 
 def _present(  # noqa: PLR0911 - one return a case
@@ -119,12 +132,8 @@ def _present(  # noqa: PLR0911 - one return a case
         return Banner("pausing", "paused", "pause", "Pausing…", "The robot may still move. Wait for Paused.")
     if snapshot.doing != "working":
         return Banner("standing", "standing", "standing", "The robot stands still.", NOT_THE_STOP)
-    text = f"{_again(tries)}{_busy(snapshot)}It may move at any moment."
+    text = _joined(_again(tries), _busy(snapshot), "It may move at any moment.")
     return Banner("standing", "standing", "standing", "The robot stands still.", text)
-
-
-def _again(tries: str) -> str:
-    return f"{tries}. " if tries else ""
 
 
 def _not_connected(state: RunState, snapshot: Snapshot, tries: str) -> Banner:
@@ -140,10 +149,8 @@ def _not_connected(state: RunState, snapshot: Snapshot, tries: str) -> Banner:
             said.append(f"The connection to {name} was lost at {lost}; {arm.seen_by} looked at it at {seen}.")
         if arm.refused_utc:
             said.append(f"{name} could not be connected at {time_here(arm.refused_utc)}: {arm.refused_why}.")
-    busy = busy_words(snapshot)
-    now = f" Now: {busy}." if busy else ""
     why = " ".join(said) or "Nothing has needed it so far."
-    text = f"{_again(tries)}{why}{now} Its own pendant can still move it."
+    text = _joined(_again(tries), why, _now(snapshot), "Its own pendant can still move it.")
     return Banner("not_connected", "paused" if state.paused else "standing", "open", title, text)
 
 
@@ -156,11 +163,11 @@ def _left_alone(state: RunState, snapshot: Snapshot) -> Banner:
     """The program ended while arms were connected; that is not in the record before it starts again."""
     arms = connected_arms(state)
     at_utc = datetime.fromtimestamp(snapshot.at_utc_s, UTC).isoformat() if snapshot.at_utc_s else state.at_utc
-    ended = "The run has ended. " if state.terminal else ""
-    text = (
-        f"{ended}The program that drove {' and '.join(arms)} does not run; it was last heard from at "
-        f"{time_here(at_utc)}, and nobody has looked since. {_AS_MOVING} {_FROM_OUTSIDE} {NOT_THE_STOP}"
+    told = (
+        f"The program that drove {' and '.join(arms)} does not run; it was last heard from at {time_here(at_utc)}, "
+        "and nobody has looked since."
     )
+    text = _joined(_ended(state), told, _AS_MOVING, _FROM_OUTSIDE, NOT_THE_STOP)
     look = tuple(LookAt(name, 0) for name in arms)
     return Banner("lost", "unknown", "unknown", _TAKE_IT, text, assertive=True, look=look)
 
@@ -186,11 +193,10 @@ def _starved(snapshot: Snapshot) -> str:
 
 
 def _busy(snapshot: Snapshot) -> str:
-    words = busy_words(snapshot)
-    if not words:
-        return "A step is under way. "
-    hangs = " It hears no button before that is done." if snapshot.quiet_s > STALE_S else ""
-    return f"Now: {words}.{hangs} "
+    now = _now(snapshot)
+    if not now:
+        return "A step is under way."
+    return _joined(now, "It hears no button before that is done." if snapshot.quiet_s > STALE_S else "")
 
 
 def _not_heard_of(snapshot: Snapshot) -> Banner:
@@ -217,10 +223,9 @@ def _silent(snapshot: Snapshot, now_utc_s: float, *, driven: bool) -> Banner:
 def _moving(state: RunState, snapshot: Snapshot, tries: str) -> Banner:
     if state.paused or snapshot.doing in ("pausing", "paused"):
         return Banner("pausing", "paused", "pause", "Pausing…", "The robot still moves. Wait for Paused.")
-    speed = "" if snapshot.speed_fraction is None else f" Speed slider {snapshot.speed_fraction:.0%}."
-    now = f" Now: {busy_words(snapshot)}." if busy_words(snapshot) else ""
-    text = f"Stay outside of its reach. {_again(tries)}{speed.strip()}{now} {NOT_THE_STOP}"
-    return Banner("moving", "moving", "moving", "The robot moves.", " ".join(text.split()))
+    speed = "" if snapshot.speed_fraction is None else f"Speed slider {snapshot.speed_fraction:.0%}."
+    text = _joined("Stay outside of its reach.", _again(tries), speed, _now(snapshot), NOT_THE_STOP)
+    return Banner("moving", "moving", "moving", "The robot moves.", text)
 
 
 _STOPS: dict[str, Banner] = {

@@ -107,7 +107,7 @@ def run_parts(
 
 
 def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "") -> RunPage:
-    log = site.run(run_id)
+    log, now_utc = site.run(run_id), site.store.clock.utc_now().isoformat()
     view = run_view(
         log,
         read_snapshot(site.data, run_id, site.store.clock.utc_s()),
@@ -117,7 +117,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         to_come=[left.text for left in results_to_come(log)],
         space=None if log.state.terminal else forecast_of(site.store, log.protocol, log.state),
         earlier={} if log.state.terminal else site.step_times(run_id),
-        now_utc=site.store.clock.utc_now().isoformat(),
+        now_utc=now_utc,
     )
     looking_back = bool(step) and view.shown.id != view.current
     role = view.question.acceptance.role if view.question.acceptance else ""
@@ -134,7 +134,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         drawing=drawing(log.protocol.step(view.shown.id)),
         lens_step=_aims(view),
         board_plan=_board_plan(log, view.shown.id),
-        now_utc=site.store.clock.utc_now().isoformat(),
+        now_utc=now_utc,
         depends=accepted_gates(log.protocol, log.state),
         result_table=evaluated(log.protocol, log.state),
         result_note=shared_adjustment_note(log.protocol, log.state),
