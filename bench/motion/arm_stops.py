@@ -298,8 +298,8 @@ def main() -> None:
     judged = [judge(arm) for arm in arms]
     tried = [arm for arm in arms if arm.name in {*URS, *LBRS} and options.arms in (None, [arm.name])]
     stops: list[Stop] = []
-    tries = ((signal.SIGKILL, False), (signal.SIGSTOP, False), (signal.SIGKILL, True))
-    for (how, own_speed), (number, arm) in itertools.product(tries, enumerate(tried)):
+    cases = ((signal.SIGKILL, False), (signal.SIGSTOP, False), (signal.SIGKILL, True))
+    for (how, own_speed), (number, arm) in itertools.product(cases, enumerate(tried)):
         found, tries = stop(arm, 100 + number, how, own_speed=own_speed), 1
         while found.verdict != "in time" and tries < _TRIES:
             tries += 1
