@@ -13,6 +13,8 @@ from service.store.store import Store
 
 _RUNS = 10  # earlier runs that are looked at, the latest ones
 _BEGINS, _ENDS = ("step_started", "step_retried"), "step_measured"
+# A person paused the work or had a part of it done again: such an attempt does not tell how long it takes.
+_INTERRUPTS = ("operator_action", "leave_lapsed")
 
 
 def read_step_times(store: Store, run_id: str) -> EarlierTimes:
@@ -32,19 +34,19 @@ def read_step_times(store: Store, run_id: str) -> EarlierTimes:
         if len(earlier) == _RUNS:
             break
     times: dict[str, list[float]] = {}
-    began: dict[tuple[str, str], datetime] = {}
+    began: dict[str, datetime] = {}
     of_event = (events.c.run_id == event_index.c.run_id) & (events.c.seq == event_index.c.seq)
     found = (
         select(event_index.c.run_id, event_index.c.kind, event_index.c.step, events.c.at_utc)
         .join(events, of_event)
-        .where(event_index.c.run_id.in_(earlier), event_index.c.kind.in_((*_BEGINS, _ENDS)))
+        .where(event_index.c.run_id.in_(earlier), event_index.c.kind.in_((*_BEGINS, _ENDS, *_INTERRUPTS)))
         .order_by(event_index.c.position)
     )
     with store.database.reading() as connection:
         for row in connection.execute(found):
             at = datetime.fromisoformat(row.at_utc)
             if row.kind in _BEGINS:
-                began[row.run_id, row.step] = at
-            elif (since := began.pop((row.run_id, row.step), None)) is not None and at >= since:
+                began[row.run_id] = at
+            elif (since := began.pop(row.run_id, None)) is not None and row.kind == _ENDS and at >= since:
                 times.setdefault(row.step, []).append((at - since).total_seconds())
     return times

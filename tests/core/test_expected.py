@@ -102,6 +102,21 @@ def test_the_times_are_those_of_earlier_runs_of_this_protocol(begin: Callable[[s
     assert times["capture"] == [pytest.approx(30.0, abs=3.0)]
 
 
+def test_an_attempt_that_was_paused_does_not_tell_how_long_it_takes(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL)
+    waits_s = iter([900.0])
+
+    def pause(_exposure: object) -> None:
+        for seconds in waits_s:
+            bench.act("pause")
+            bench.clock.sleep(seconds)
+            bench.act("resume")
+
+    bench.rig.shutter.on_capture = pause
+    assert bench.run().status == "completed"
+    assert set(read_step_times(bench.store, begin(PROTOCOL).run_id)) == {"fixation", "spraying"}
+
+
 def test_no_time_is_told_once_the_figures_are_there() -> None:
     log = at_capture()
     log.begin()
@@ -125,3 +140,14 @@ def test_each_step_and_the_run_have_an_expected_time() -> None:
     assert run_words(log.protocol, log.state, {}, NOW) == ""
     log.act("abort", reason="enough")
     assert run_words(log.protocol, log.state, earlier, NOW) == ""
+
+
+def test_a_pause_is_not_work() -> None:
+    log = capturing()
+    log.act("pause")
+    log.late_s = 1800.0
+    log.act("resume")
+    words = work_words(log.protocol, log.state, {"capture": TEN}, later(34), hhmm)
+    assert words == "Usually 10 min (3 earlier runs on this site); begun at 00:00, so until about 00:40."
+    words = work_words(log.protocol, log.state, {"capture": TEN}, later(47), hhmm)
+    assert "It has worked for 17 min, and longer than ever before" in words

@@ -306,7 +306,7 @@ def test_who_lets_a_lost_arm_move_reads_what_that_says() -> None:
     assert main.note.startswith("You say with it that you have looked at ur, whose connection was lost.")
 
 
-def test_the_time_left_is_measured_and_never_across_a_restart() -> None:
+def test_the_time_left_is_measured_and_never_across_a_restart_or_a_pause() -> None:
     log = advance_to(DEMO, "viewpoint_capture_1")
     assert view_of(log).progress.left == "measuring" or len(view_intervals_s(log.events)) >= 2
     while log.state.phase != "running":
@@ -314,8 +314,13 @@ def test_the_time_left_is_measured_and_never_across_a_restart() -> None:
     log.capture(["v1", "v2"])
     log.append(SessionStarted(resumed=True, software={}, host="h", pid=1))
     log.capture(["v3", "v4"])
+    log.act("pause")
+    log.late_s = 600.0
+    log.act("resume")
+    log.capture(["v5"])
     assert view_intervals_s(log.events, "viewpoint_capture_1") == [1.0, 1.0]  # the log's clock: one second per event
-    assert view_of(log).progress.step_left == duration(4.0)
+    assert max(log.state.view_gaps_s) < 1.0
+    assert view_of(log).progress.step_left == duration(3.0)
 
 
 def test_irreversible_steps_warn_and_bind_the_figures_that_release_them() -> None:

@@ -9,6 +9,11 @@ _AGREE_S = 5.0  # by which the two clocks may differ over any time: UTC is stepp
 _AGREE_SHARE = 0.001  # and of the time that has passed: UTC is slewed by up to 500 ppm
 
 
+def seconds_between(earlier_utc: str, later_utc: str) -> float:
+    """Seconds from one recorded time (ISO 8601) to a later one; 0 if the clock was set back in between."""
+    return max(0.0, (datetime.fromisoformat(later_utc) - datetime.fromisoformat(earlier_utc)).total_seconds())
+
+
 @dataclass(frozen=True, slots=True)
 class Moment:
     """When something happened, in both clocks of the host.

@@ -12,11 +12,11 @@ from service.core.gates.acceptance import acceptance_refusal, demanded_role
 from service.core.gates.dependence import dependent_steps, used_steps
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import OperatorVerb
+from service.core.records.moments import seconds_between
 from service.core.recovery.words import REMEDIES, UNKNOWN_REMEDY
 from service.core.run.actions import redo_refusal, skip_refusal, unmet_requirements
 from service.core.run.noted import Mending
 from service.core.run.state import RunState, StepState
-from service.core.run.state_transitions import seconds_between
 
 _WITH_WHAT_IS_THERE = "Judge it again with the existing images; single images are taken again on the page Capture"
 Trouble = Literal["gates", "failure", "requirements"]

@@ -10,7 +10,7 @@ from statistics import median
 from service.core.protocol.models import Protocol, Step
 from service.core.recovery.ways_on import planned_views, view_s
 from service.core.run.actions import needs_leave
-from service.core.run.state import RunState
+from service.core.run.state import RunState, StepState
 
 _TOO_LONG = 1.5  # times what is usual, and longer than ever before
 _SHORT_S = 20.0  # nobody leaves for less
@@ -50,20 +50,20 @@ def work_words(
     step = protocol.step(now.step)
     if step.by_hand:  # as long as the person takes
         return ""
-    began = datetime.fromisoformat(now.work_began_utc)
     usual = usual_time(protocol, state, step, earlier)
     if usual is None:
         return f"Begun at {clock(now.work_began_utc)}; how long it takes is not known yet on this site."
-    until_utc = (began + timedelta(seconds=usual.seconds)).isoformat()
-    took_s = (datetime.fromisoformat(now_utc) - began).total_seconds()
+    took_s = now.work_s(now_utc)
     said = f"Usually {duration(usual.seconds)} ({usual.source}); begun at {clock(now.work_began_utc)}"
     if took_s > max(_TOO_LONG * usual.seconds, usual.longest_s):
         longest = duration(usual.longest_s)
         most = "" if usual.longest_s == usual.seconds else f", and longer than ever before ({longest})"
+        worked = "It has worked for" if now.waited_s else "That is"
         return (
-            f"{said}. That is {duration(took_s)} ago{most}: not normal any more. Look at what the banner says it "
-            "waits for, at that device, and whether a worker computes."
+            f"{said}. {worked} {duration(took_s)}{'' if now.waited_s else ' ago'}{most}: not normal any more. "
+            "Look at what the banner says it waits for, at that device, and whether a worker computes."
         )
+    until_utc = (datetime.fromisoformat(now_utc) + timedelta(seconds=usual.seconds - took_s)).isoformat()
     return f"{said}, so until about {clock(until_utc)}."
 
 
@@ -85,7 +85,7 @@ def away_words(
         if usual is None:
             unknown = step.title
             break
-        left_s += _left_s(usual, now.work_began_utc if here else "", now_utc)
+        left_s += _left_s(usual, now if here else None, now_utc)
         if step.sign:
             break
     if left_s < _SHORT_S:
@@ -115,19 +115,18 @@ def run_words(protocol: Protocol, state: RunState, earlier: EarlierTimes, now_ut
             continue
         known += 1
         now = state.steps[step.id]
-        left_s += _left_s(usual, now.work_began_utc if now.phase == "running" else "", now_utc)
+        left_s += _left_s(usual, now if now.phase == "running" else None, now_utc)
     if not known:
         return ""
     part = "" if known == len(left) else f", of {known} of the {len(left)} steps left"
     return f"Work left{part}: about {duration(left_s)}, and the time for which the run waits for people."
 
 
-def _left_s(usual: UsualTime, began_utc: str, now_utc: str) -> float:
-    """The seconds that work usually still takes which began at a time; all of them where that is ""."""
-    if not began_utc:
+def _left_s(usual: UsualTime, now: StepState | None, now_utc: str) -> float:
+    """The seconds that the work of a step usually still takes; all of them where it is not under way."""
+    if now is None or not now.work_began_utc:
         return usual.seconds
-    done = datetime.fromisoformat(now_utc) - datetime.fromisoformat(began_utc)
-    return max(0.0, usual.seconds - done.total_seconds())
+    return max(0.0, usual.seconds - now.work_s(now_utc))
 
 
 def duration(seconds: float) -> str:

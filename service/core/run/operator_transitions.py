@@ -12,7 +12,7 @@ from service.core.run.actions import refuse
 from service.core.run.effects.arms import all_seen
 from service.core.run.lifecycle import redo
 from service.core.run.state import AcceptedDeviation, DeviationKind, Leave, RunState, StepState
-from service.core.run.state_transitions import UNMEASURED, change, deviate, go, pass_on, supersede
+from service.core.run.state_transitions import UNMEASURED, change, deviate, go, pass_on, supersede, wait, wait_no_more
 
 
 def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorAction) -> RunState:  # noqa: PLR0911 - one return per verb
@@ -44,7 +44,7 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
         case "abort":
             return replace(go(protocol, state, "abort"), stop_reason=p.reason or f"aborted by {event.actor}")
         case "pause":
-            return go(protocol, state, "pause")
+            return go(protocol, wait(protocol, state, event), "pause")
         case "resume":
             return go(protocol, _let_move(protocol, state, event), "resume")
         case "redo" if p.viewpoint is not None:
@@ -56,7 +56,7 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
 
 def _let_move(protocol: Protocol, state: RunState, event: Event) -> RunState:
     state = replace(state, restarted=False, lapse=None, leave=Leave(event.seq, event.actor))
-    state = change(state, state.current, tries=None)
+    state = wait_no_more(change(state, state.current, tries=None), event)
     return all_seen(state, event) if protocol.step(state.current).moves_robot else state
 
 

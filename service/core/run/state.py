@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from service.core.jobs.priorities import WAITED
 from service.core.records.events import ArtefactRef, ComputedBy, GateVerdict, Identified, RegionDrawn, Uncertainty
+from service.core.records.moments import seconds_between
 from service.core.run.connections import ArmConnection
 from service.core.run.lifecycle import Phase
 from service.core.run.noted import MOTION_PLAN, Mending, NotedMotionPlan
@@ -136,7 +137,14 @@ class StepState:
     started_utc: str = ""
     ended_utc: str = ""
     work_began_utc: str = ""  # of the present attempt
+    waits_since_utc: str = ""  # the arm's work waits for a person: it was paused, or the leave to move is over
+    waited_s: float = 0.0  # for which it waited so until then, since the work began
     worked_s: float | None = None  # how long the last attempt worked until it had its figures or failed
+
+    def work_s(self, now_utc: str) -> float:
+        """Seconds that the present attempt has worked until a time (ISO 8601), without those for which it waited."""
+        waits_s = seconds_between(self.waits_since_utc, now_utc) if self.waits_since_utc else 0.0
+        return max(0.0, seconds_between(self.work_began_utc, now_utc) - self.waited_s - waits_s)
 
     @property
     def passed_its_gates(self) -> bool:

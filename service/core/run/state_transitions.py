@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import datetime
 from typing import Any
 
 from service.core.protocol.models import Protocol
 from service.core.records.events import Event
+from service.core.records.moments import seconds_between
 from service.core.run.lifecycle import ABORTED, COMPLETED, lifecycle
 from service.core.run.state import Deviation, DeviationKind, RunState, Superseded
 
@@ -28,9 +28,26 @@ UNMEASURED: Mapping[str, Any] = {
 }
 
 
-def seconds_between(earlier_utc: str, later_utc: str) -> float:
-    """Seconds from one recorded time (ISO 8601) to a later one; 0 if the clock was set back in between."""
-    return max(0.0, (datetime.fromisoformat(later_utc) - datetime.fromisoformat(earlier_utc)).total_seconds())
+def work_begins(event: Event) -> dict[str, Any]:
+    """What a step remembers of when the work of an attempt began."""
+    return {"work_began_utc": event.at_utc, "waits_since_utc": "", "waited_s": 0.0}
+
+
+def wait(protocol: Protocol, state: RunState, event: Event) -> RunState:
+    """The arm's work waits from now on for a person; work without an arm goes on meanwhile."""
+    if not protocol.step(state.current).moves_robot or state.step.waits_since_utc:
+        return state
+    return change(state, state.current, waits_since_utc=event.at_utc)
+
+
+def wait_no_more(state: RunState, event: Event) -> RunState:
+    """A person has let the work go on."""
+    since_utc, waited_s = state.step.waits_since_utc, state.step.waited_s
+    if not since_utc:
+        return state
+    waited_s += seconds_between(since_utc, event.at_utc)
+    state = change(state, state.current, waits_since_utc="", waited_s=waited_s)
+    return replace(state, last_view=("", ""))  # the time until the next one is not that of a view
 
 
 def go(protocol: Protocol, state: RunState, trigger: str, **changes: Any) -> RunState:

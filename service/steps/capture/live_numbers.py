@@ -265,7 +265,9 @@ class LiveAnalysis:
             if self.context.monotonic_s() > deadline_s:
                 self.context.note("live_numbers_late", images=left)
                 return
-            self.context.progress("analysing the last images", len(waiting) - left, len(waiting))
+            images = [job for job in waiting if job.kind in _DESCRIBED]
+            done = sum(job.status != "enqueued" for job in images)
+            self.context.progress("analysing the last images", done, len(images))
             self.context.wait_for_results(0.1)
 
     def _tell(self) -> None:

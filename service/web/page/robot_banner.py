@@ -201,7 +201,7 @@ def _busy(snapshot: Snapshot) -> str:
 
 def _not_heard_of(snapshot: Snapshot) -> Banner:
     text = (
-        f"It has not been heard of for {snapshot.robot_silent_s:.0f} s, in which the program that drives it is at: "
+        f"It has not been heard of for {snapshot.robot_silent_s:.0f} s; the program that drives it is still at "
         f"{busy_words(snapshot) or 'its work'}. Look at the robot. {NOT_THE_STOP}"
     )
     return Banner("unknown", "unknown", "unknown", "Robot: unknown.", text)

@@ -11,7 +11,7 @@ from service.core.equipment.clocks import ClockReading
 from service.core.equipment.disk_space import Forecast, size_words
 from service.core.gates.verdict import figure
 from service.core.protocol.models import Gate, Protocol, Step
-from service.core.records.events import Event, GateVerdict, RecordedView, SessionStarted
+from service.core.records.events import Event, GateVerdict, OperatorAction, RecordedView, SessionStarted
 from service.core.run.expected import duration
 from service.core.run.state import RunState, StepState
 from service.monitor.snapshot import Snapshot
@@ -111,10 +111,10 @@ def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event
 
 
 def view_intervals_s(events: Sequence[Event], step: str | None = None) -> list[float]:
-    """Seconds from one exposure to the next of the same attempt of a step, without a restart in between."""
+    """Seconds between two exposures of the same attempt of a step, without a restart or a person's act in between."""
     chains: list[list[tuple[str, int, float]]] = [[]]
     for event in events:
-        if isinstance(event.payload, SessionStarted):
+        if isinstance(event.payload, SessionStarted | OperatorAction):  # a pause is not the time of a view
             chains.append([])
         elif isinstance(event.payload, RecordedView) and step in (None, event.payload.step):
             chains[-1].append((event.payload.step, event.payload.attempt, event.monotonic_s))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
+from datetime import datetime, timedelta
 from typing import Any
 
 from pydantic import Field
@@ -148,6 +149,7 @@ class Log:
     ) -> None:
         self.protocol = protocol or toy_protocol()
         self.events: list[Event] = []
+        self.late_s = 0.0  # by which the next events come later
         self.state: RunState = initial_state(self.protocol)
         self.append(
             RunStarted(
@@ -166,11 +168,12 @@ class Log:
     def event(self, payload: Payload, actor: str = "runner") -> Event:
         """The event that would come next."""
         seq = len(self.events) + 1
+        at = datetime(2026, 11, 21) + timedelta(seconds=self.late_s, microseconds=seq)  # noqa: DTZ001 - written as UTC
         return Event(
             seq=seq,
             run_id="run",
-            at_utc=f"2026-11-21T00:00:00.{seq:06d}Z",
-            monotonic_s=float(seq),
+            at_utc=f"{at.isoformat(timespec='microseconds')}Z",
+            monotonic_s=seq + self.late_s,
             actor=actor,
             payload=payload,
             previous_sha256="0" * 64,

@@ -10,6 +10,7 @@ from service.core.records.events import DeviceOpened, DeviceTrouble, Event, Leav
 from service.core.run.connections import ENDINGS, NO_ARM, ArmConnection, Loss
 from service.core.run.effects.place import without_effect
 from service.core.run.state import Lapse, RunState, Trouble
+from service.core.run.state_transitions import wait
 
 
 def device_opened(protocol: Protocol, state: RunState, event: Event, p: DeviceOpened) -> RunState:
@@ -75,6 +76,7 @@ def leave_lapsed(protocol: Protocol, state: RunState, event: Event, p: LeaveLaps
     """The leave to move is over; without effect if a person has given another one meanwhile."""
     if state.leave is None or state.leave.seq != p.leave_seq:
         return without_effect(state, event)
+    state = wait(protocol, state, event)
     return replace(state, leave=None, lapse=Lapse(event.seq, state.leave.by, p.idle_s, p.limit_s, p.why))
 
 

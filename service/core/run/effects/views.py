@@ -6,10 +6,11 @@ from dataclasses import replace
 
 from service.core.protocol.models import Protocol
 from service.core.records.events import CaptureAsked, Event, RecordedView, ViewImported, ViewpointFailed
+from service.core.records.moments import seconds_between
 from service.core.run.effects.place import is_void_now, require_running, without_effect
 from service.core.run.persistent_map import put
 from service.core.run.state import FailedTries, RunState
-from service.core.run.state_transitions import change, deviate, seconds_between, supersede
+from service.core.run.state_transitions import change, deviate, supersede
 
 _VIEWS_TIMED = 30  # number of latest views whose median gap estimates the time per view
 
