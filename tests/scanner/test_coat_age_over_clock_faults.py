@@ -203,6 +203,23 @@ def test_a_scan_dated_before_the_step_before_is_named(bench: Bench, rig: OneScan
     assert "left out 1 export older" in note.note
 
 
+def test_the_scan_of_an_earlier_step_is_not_named_as_left_out(tmp_path: Path, rig: OneScanner) -> None:
+    first = "  - {id: first, kind: scan_import, title: First scan, params: {spheres: 5, wait_s: 20}}\n"
+    protocol = _PROTOCOL.replace("steps:\n", f"steps:\n{first}")
+    with bench_store(tmp_path / "data") as store:
+        bench = begin_computing_run(store, protocol, tmp_path, rig)
+
+        def export(question: AskOperator, _state: RunState) -> OperatorAction:
+            _export(rig, bench.clock.utc_s())
+            return answer(question, "confirm")
+
+        bench.script("first", "confirm", export)
+        bench.script("scan", "recovery", say("abort", reason="no scan came"))
+        assert bench.run().status == "aborted"
+        assert bench.state().steps["first"].phase == "passed"
+        assert not [note for note in bench.payloads(StepNote) if "left out" in note.note]
+
+
 def test_times_that_run_backwards_are_a_note_of_the_audit(bench: Bench, rig: OneScanner) -> None:
     def happens() -> None:
         bench.clock.set_utc(-3600.0)

@@ -136,10 +136,19 @@ class _LeftOut:
     def __init__(self, context: StepContext, since: str) -> None:
         self._context, self._since = context, since
         self._told: set[tuple[str, str]] = set()
+        kept = (ref for step in context.run.steps.values() for ref in step.artefacts)
+        self._imported = {(ref.original_name, ref.size_bytes) for ref in kept}
 
     def look(self, exports: Sequence[ScanExport]) -> None:
-        """Tell of exports of which it was not told yet; a host whose clock was set back dates new ones before."""
-        new = [export for export in exports if (export.name, export.modified_utc) not in self._told]
+        """Tell of exports of which it was not told yet; a host whose clock was set back dates new ones before.
+
+        Those that an earlier step of this run imported are where they belong.
+        """
+        new = [
+            export
+            for export in exports
+            if (export.name, export.modified_utc) not in self._told and not self._is_imported(export)
+        ]
         if not new:
             return
         self._told.update((export.name, export.modified_utc) for export in new)
@@ -152,6 +161,10 @@ class _LeftOut:
         self._context.tell(text)
         shown = sorted(new, key=lambda export: _time(export.modified_utc))[-_NAMED:]
         self._context.note(text, left_out={export.name: export.modified_utc for export in shown}, since=self._since)
+
+    def _is_imported(self, export: ScanExport) -> bool:
+        mesh = export.files[0]
+        return mesh.exists() and (mesh.name, mesh.stat().st_size) in self._imported
 
 
 def _age(context: StepContext, application: str) -> dict[str, float]:
