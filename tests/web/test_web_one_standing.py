@@ -13,17 +13,21 @@ import pytest
 
 from service.core.records.events import FilesKept, OperatorAction, RecordedView
 from service.core.recovery.ways_on import ways_on
+from service.monitor.snapshot import RobotPhase, Snapshot, write_snapshot
 from service.people.roles import ROLES, Role, may
 from service.web.page.run_standing import RunStanding, run_standing
 from tests.support.pages.browsed_run import words
 from tests.support.pages.shown_site import ShownSite, shown_site
+from tests.support.pages.states import BEGUN
 from tests.support.pages.web import Browser, WebSite, web_site
 
 _PAGES = ("", "/capture", "/scene", "/calibration", "/dataset")
 _STATES = (
     "listing", "moving", "signing", "failed", "acceptable", "held", "calibrated", "completed", "paused", "died",
-    "aborted",
+    "aborted", "working", "arm_stopped",
 )  # fmt: skip
+# What the runner reported last of the robot.
+_ROBOTS: dict[str, RobotPhase] = {"working": "moving", "arm_stopped": "protective_stop"}
 _MODES = {"ask", "sign", "recover", "work", "paused", "died", "ended"}
 
 
@@ -36,7 +40,8 @@ class Shown:
 
     def stands(self, which: str) -> RunStanding:
         log = self.web.site.run(self.runs[which])
-        return run_standing(log.protocol, log.state, driven=self.web.site.launcher.driven(log.run_id))
+        driven = self.web.site.launcher.driven(log.run_id)
+        return run_standing(log.protocol, log.state, driven=driven, robot=_ROBOTS.get(which, "not_connected"))
 
 
 @pytest.fixture(scope="module")
@@ -45,9 +50,13 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
     folder = Path(shutil.copytree(recorded.folder, tmp_path_factory.mktemp("stands") / "site"))
     with web_site(folder) as web:
         runs = {name: str(getattr(recorded, name)) for name in _STATES[:8]}
-        runs |= {name: web.begin_run().run_id for name in ("paused", "died", "aborted")}
-        for run_id in (*recorded.under_way, runs["paused"]):
+        runs |= {name: web.begin_run().run_id for name in ("paused", "died", "aborted", *_ROBOTS)}
+        for run_id in (*recorded.under_way, runs["paused"], *(runs[name] for name in _ROBOTS)):
             web.site.launcher.start(run_id)
+        for name, robot in _ROBOTS.items():
+            web.store.record(runs[name], [*BEGUN], actor="ada")
+            reported = {"at_utc_s": web.now_utc_s, "doing": "working", "robot": robot}
+            write_snapshot(web.site.data, runs[name], Snapshot.model_validate(reported))
         for name, verb in (("paused", "pause"), ("aborted", "abort")):
             web.store.record(
                 runs[name], [OperatorAction.model_validate({"action": verb, "reason": "x"})], actor="ada"
@@ -56,7 +65,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
 
 
 def test_the_states_are_all_there(shown: Shown) -> None:
-    assert {shown.stands(which).mode for which in _STATES} >= _MODES - {"work"}
+    assert {shown.stands(which).mode for which in _STATES} == _MODES
 
 
 @pytest.mark.parametrize("role", ROLES)
@@ -65,6 +74,9 @@ def test_all_pages_tell_the_same(shown: Shown, which: str, role: Role) -> None:
     stands, run_id = shown.stands(which), shown.runs[which]
     browser = shown.web.browser(role)
     pages = {page: browser.get(f"/runs/{run_id}{page}").text for page in _PAGES}
+    banners = {re.findall(r'data-robot="(\w+)"', html)[-1] for html in pages.values()}
+    assert len(banners) == 1
+    assert which not in _ROBOTS or banners == {_ROBOTS[which]}
     for page, html in pages.items():
         alert = re.search(rf'data-attention="(\w+)" data-words="([^"]*)" data-of="{run_id}"', html)
         assert alert is not None, page
@@ -79,7 +91,8 @@ def test_all_pages_tell_the_same(shown: Shown, which: str, role: Role) -> None:
 
 def _listed(browser: Browser, run_id: str, stands: RunStanding) -> None:
     """What the first page says of the run."""
-    home = browser.get("/").text
+    first, second = browser.get("/").text, browser.get("/?page=2").text
+    home = first if f'href="/runs/{run_id}"' in first else second
     if stands.mode == "ended":
         (row,) = [row for row in home.split("<tr") if f'href="/runs/{run_id}"' in row]
         assert stands.word.lower() in words(row).lower()
