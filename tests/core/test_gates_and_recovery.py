@@ -25,7 +25,7 @@ from service.core.run.decide import (
     RunStep,
     evaluate_gates,
 )
-from tests.support.record.core import Log, toy_protocol
+from tests.support.record.core import GOOD, Log, toy_protocol
 from tests.support.record.core_log import at_capture, failure, refused
 
 
@@ -203,6 +203,15 @@ def test_a_retry_keeps_what_was_captured_and_raises_the_attempt() -> None:
     log.capture(["c"])
     assert log.state.step.failures == 0  # progress in between
     assert log.state.deviations == ()
+
+
+def test_figures_are_progress_too() -> None:
+    log = at_capture()
+    log.begin()
+    log.append(failure(log))
+    log.append(StepRetried(step="capture", attempt=2, why="timeout"))
+    log.append(StepMeasured(step="capture", attempt=2, measures=GOOD))
+    assert log.state.step.failures == 0
 
 
 def test_an_operator_grants_a_retry_and_what_was_given_up_gets_another_chance() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from service.core.errors import IntegrityError
+from service.core.gates.release import release_meaning
 from service.core.records.events import (
     ActionRefused,
     OperatorAction,
@@ -245,3 +246,12 @@ def test_a_step_that_requires_another_without_being_irreversible() -> None:
     log.do()
     refused(log, "not passed: fix_it", action="confirm")
     assert allowed_actions(log.protocol, log.state) == ("redo", "skip", "pause", "abort")
+
+
+def test_a_release_names_the_first_twenty_deviations_and_counts_the_others(log: Log) -> None:
+    for _ in range(21):
+        log.act("resume")
+    words = release_meaning(log.state)
+    assert "release it with its 21 deviations: refused, resume had no effect" in words
+    assert words.count("resume had no effect") == 20
+    assert words.endswith("; and 1 more")

@@ -200,6 +200,15 @@ def test_each_line_is_signed_with_its_place_and_its_purpose_in_canonical_json(da
         previous = hashlib.sha256(raw).hexdigest()
 
 
+def test_no_key_is_replaced_while_the_sites_own_record_does_not_verify(data: Path) -> None:
+    tamper(data, f"UPDATE events SET actor = 'eve' WHERE run_id = '{SITE}' AND seq = 1")
+    with Store.open(data) as store:
+        before = public_keys(store)
+        with pytest.raises(IntegrityError, match="nothing is signed"):
+            rotate_key(store, reason="yearly", actor="ada")
+        assert public_keys(store) == before
+
+
 def test_the_log_follows_the_key(data: Path) -> None:
     with Store.open(data) as store:
         rotate_key(store, reason="yearly", actor="ada")

@@ -68,6 +68,7 @@ def test_a_checkpoint_is_stamped_once_and_verified_with_and_without_certificates
         signed = checkpoint(store, run)
         asked = authority.asked
         stamp = timestamp(store, signed, ask(authority))
+        assert authority.sent == "application/timestamp-query", "RFC 3161, 3.4"
         assert timestamp(store, signed, ask(authority)) == stamp
         assert authority.asked == asked + 1
         assert store.timestamps(run) == [stamp]

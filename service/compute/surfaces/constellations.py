@@ -141,7 +141,7 @@ def _triangles(a: Array, b: Array, tolerance: float) -> list[tuple[list[int], li
                 agree = (np.abs(da[i][:, None] - db[p][None]) < tolerance) & (
                     np.abs(da[j][:, None] - db[q][None]) < tolerance
                 )
-                agree[: j + 1] = False
+                agree[: j + 1] = False  # the triples in this order alone
                 agree[:, [p, q]] = False
                 out += [([i, j, int(t)], [int(p), int(q), int(s)]) for t, s in zip(*np.nonzero(agree), strict=True)]
     return out

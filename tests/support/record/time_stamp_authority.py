@@ -42,6 +42,7 @@ class TimeStampAuthority:
     behaviour: str = "good"  # good, silent, asleep, dripping, garbage, replay, html, long
     asked: int = 0
     first: bytes = b""
+    sent: str = ""  # what the last question said that it was
     lock: threading.Lock = field(default_factory=threading.Lock)
     woken: threading.Event = field(default_factory=threading.Event)
 
@@ -101,6 +102,7 @@ def time_stamp_authority(folder: Path) -> Generator[TimeStampAuthority]:
             query = self.rfile.read(int(self.headers["Content-Length"]))
             with authority.lock:
                 authority.asked += 1
+                authority.sent = str(self.headers["Content-Type"])
                 answer = reply(folder, query)
                 authority.first = authority.first or answer
             kind = "text/html" if authority.behaviour == "html" else "application/timestamp-reply"

@@ -175,7 +175,7 @@ def rim_vertices(surface: Surface) -> IntArray:
 def distance_to(points: Array, chosen: Mask, within_m: float) -> Array:
     """(N,) distance from each point (N, 3) to the nearest chosen one; infinite if none is nearer than `within_m`."""
     distance = np.where(chosen, 0.0, np.inf)
-    if chosen.any() and not chosen.all():
+    if chosen.any():
         distance[~chosen] = PointIndex(points[chosen]).nearest(points[~chosen], within_m)[0]
     return distance
 
