@@ -177,9 +177,11 @@ def test_a_restart_after_the_clock_was_set_forward_forgets_no_guess(office: Offi
 def test_hashes_follow_the_parameters_of_today(office: Office, tmp_path: Path) -> None:
     assert PasswordHasher().type is Type.ID
     stronger = People(office.store, PasswordHasher(time_cost=2, memory_cost=16, parallelism=1))
+    refused(lambda: stronger.sign_in("grace", "a wrong password"))
     stronger.sign_in("grace", password_of("grace"))
     with closing(sqlite3.connect(database_path(office.data))) as connection:
         stored = dict(connection.execute("SELECT account, password_hash FROM accounts"))
+        assert connection.execute("SELECT failures FROM accounts WHERE account = 'grace'").fetchone() == (0,)
     assert "m=16,t=2" in stored["grace"]
     assert "m=8,t=1" in stored["emmy"]
     office.enter("grace")  # and the old process still accepts it

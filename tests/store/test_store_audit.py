@@ -151,6 +151,8 @@ def test_an_altered_row_is_named_with_the_file_that_it_is_about(data: Path) -> N
     tamper(data, "UPDATE artefacts SET device = 'phone' WHERE seq = 3")
     (fault,) = [fault for fault in verify(data).faults if "row was altered" in fault.what]
     assert (fault.seq, data / fault.file) == (3, image_path(data, "v2"))
+    (fault,) = [fault for fault in verify(data, files=False).faults if "row was altered" in fault.what]
+    assert (fault.seq, fault.file) == (3, ""), "the files were not read"
 
 
 def test_event_rewritten_with_its_hash_breaks_the_next_link(data: Path) -> None:
