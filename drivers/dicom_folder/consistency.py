@@ -112,10 +112,12 @@ def _slices(names: Sequence[str]) -> str:
 
 
 def _stated(attribute: _Attribute, dataset: Dataset, groups: Sequence[Dataset]) -> str:
-    places = [*groups, dataset]
+    places: list[Dataset] = []
     for group in groups:
         inside = group.get(attribute.sequence) if attribute.sequence else None
-        places = [*(item for item in cast("list[object]", inside or ()) if isinstance(item, Dataset)), *places]
+        places += [item for item in cast("list[object]", inside or ()) if isinstance(item, Dataset)]
+        places.append(group)
+    places.append(dataset)
     return " ".join(filter(None, (_first(places, keyword) for keyword in attribute.keywords)))
 
 

@@ -10,8 +10,11 @@ from pathlib import Path
 
 import gdcm
 import numpy as np
+import pydicom
 import pytest
+from highdicom.legacy import LegacyConvertedEnhancedCTImage
 from pydicom.dataset import Dataset
+from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 from typer.testing import CliRunner
 
 from drivers.dicom_folder import DicomFolderConfig
@@ -129,6 +132,33 @@ def test_values_of_another_unit_are_not_called_hounsfield(kind: str, words: str,
     assert words in " ".join(series.problems)
     with pytest.raises(UnreadableFileError, match="not said to be Hounsfield units"):
         source.read(series)
+
+
+def test_frames_of_an_enhanced_file_are_checked_as_slices_are(tmp_path: Path) -> None:
+    """Written by highdicom; one frame's type and unit, and the padding, are changed as programs state them there."""
+    write_series(tmp_path / "slices", change=hospital)
+    (tmp_path / "enhanced").mkdir()
+    enhanced = LegacyConvertedEnhancedCTImage(
+        legacy_datasets=[pydicom.dcmread(path) for path in sorted((tmp_path / "slices").iterdir())],
+        series_instance_uid=generate_uid(),
+        series_number=2,
+        sop_instance_uid=generate_uid(),
+        instance_number=1,
+        transfer_syntax_uid=ExplicitVRLittleEndian,
+    )
+    enhanced.PixelPaddingValue = 0
+    enhanced.save_as(tmp_path / "enhanced" / "a.dcm")
+    source = _source(tmp_path / "enhanced")
+    expected = pixels() * 2 - 1000
+    expected[0, 0, 0] = -1000  # stored 0: padding, and here it would be that anyway
+    np.testing.assert_array_equal(source.read(source.series()[0]).hounsfield, expected)
+    groups = Dataset()
+    groups.RescaleSlope, groups.RescaleIntercept, groups.RescaleType = 2, -1000, "MGML"
+    enhanced.PerFrameFunctionalGroupsSequence[1].PixelValueTransformationSequence = [groups]
+    enhanced.save_as(tmp_path / "enhanced" / "a.dcm")
+    told = " ".join(_source(tmp_path / "enhanced").series()[0].problems)
+    assert "mg/ml, as of an iodine map" in told
+    assert "a.dcm frame 2" in told
 
 
 @pytest.mark.parametrize("word", ["EFF_ATOMIC_NUM", "ELECTRON_DENSITY", "MAT_SPECIFIC"])

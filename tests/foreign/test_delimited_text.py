@@ -98,7 +98,7 @@ def test_words_that_are_not_utf8_are_refused_with_the_line_unless_only_numbers_m
 
 
 def test_joints_and_stations_are_read_from_semicolons_and_decimal_commas(tmp_path: Path) -> None:
-    (tmp_path / "joints.csv").write_text("image;q1;q2\na.jpg;0,5;-1,25\n")
+    (tmp_path / "joints.csv").write_text("image;q1;q2\nimages\\A.JPG;0,5;-1,25\n")
     assert read_joints_csv(tmp_path / "joints.csv", ["a.jpg"])["a.jpg"].tolist() == [0.5, -1.25]
-    (tmp_path / "stations.csv").write_bytes("image\tstation\na.jpg\tl\u00e4ngs\n".encode("utf-16"))
+    (tmp_path / "stations.csv").write_bytes("image\tstation\nC:\\a\tl\u00e4ngs\n".encode("utf-16"))
     assert read_stations(tmp_path / "stations.csv", ["a.jpg"]) == {"a.jpg": "l\u00e4ngs"}

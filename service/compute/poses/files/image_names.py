@@ -1,4 +1,4 @@
-"""Matches the names of images in files of poses with the images of a folder, whatever program wrote the file.
+"""Matches the names of images in a table with the images of a folder, whatever program wrote it.
 
 Programs write paths of their own computer, with backslashes and drive letters, leave the extension out, and change
 the case or the Unicode form of letters. A name that fits only one image that way is that image's; one that fits
@@ -22,29 +22,25 @@ _PICTURES = frozenset({
 _NAMED = 3
 
 
-def matched_names(images: Sequence[str], named: Collection[str], where: str) -> dict[str, str]:
-    """For each image that a file of poses names, its name there.
+def matched_names(images: Sequence[str], named: Collection[str], where: str, *, what: str = "pose") -> dict[str, str]:
+    """For each image that a file names, its name there.
 
     Args:
         images: names of image files.
         named: the names in the file.
         where: names the file in errors.
+        what: the file has of each image.
 
     Raises:
-        DataError: a name in the file can be several images, or several names one image; or none of them fits.
+        DataError: a name in the file can be several images, or several names one image.
     """
     found = {image: image for image in images if image in named}
+    place = (where, what)
     for key in (_file, _composed, _caseless):
-        _match(images, named, key, key, found, where)
+        _match(images, named, key, key, found, place)
     bare = [name for name in named if PurePosixPath(_composed(name)).suffix.lower() not in _PICTURES]
     for key in (_composed, _caseless):
-        _match(images, bare, lambda image, key=key: _stem(key(image)), key, found, where)
-    if images and not found:
-        raise DataError(
-            f"no image has a pose: the images are named {_some(images)}, those of the poses {_some(list(named))}",
-            where=where,
-            remedy="Give the poses of these images, or name them alike",
-        )
+        _match(images, bare, lambda image, key=key: _stem(key(image)), key, found, place)
     return found
 
 
@@ -54,7 +50,7 @@ def _match(
     of_image: Callable[[str], str],
     of_name: Callable[[str], str],
     found: dict[str, str],
-    where: str,
+    place: tuple[str, str],
 ) -> None:
     """Add the images whose key is that of one name; those that were found before do not count."""
     used = set(found.values())
@@ -69,8 +65,8 @@ def _match(
     for key, those in alike.items():
         if len(those) > 1 or len(names[key]) > 1:
             raise DataError(
-                f"it is not clear whose pose it is: {_some(names[key])} can be {_some(those)}",
-                where=where,
+                f"it is not clear whose {place[1]} it is: {some_names(names[key])} can be {some_names(those)}",
+                where=place[0],
                 remedy="Name the images in the file as they are named in their folder",
             )
         found[those[0]] = names[key][0]
@@ -94,5 +90,6 @@ def _stem(name: str) -> str:
     return PurePosixPath(name).stem
 
 
-def _some(names: Sequence[str]) -> str:
+def some_names(names: Sequence[str]) -> str:
+    """The first names of several, for messages."""
     return ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")

@@ -15,7 +15,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.images.folder import ImageFolder, strict_refusal
 from service.compute.poses.colmap import model_files as colmap_files
 from service.compute.poses.files.camera_files import finite_numbers, json_object
-from service.compute.poses.files.image_names import matched_names
+from service.compute.poses.files.image_names import matched_names, some_names
 from service.compute.poses.files.trajectory import is_trajectory, trajectory_poses
 from service.core.delimited_text import read_table
 from service.core.errors import DataError
@@ -107,8 +107,19 @@ def _select(poses: Mapping[str, Transform], images: Sequence[str], path: Path) -
 def _matched(
     poses: Mapping[str, Transform], images: Sequence[str], path: Path
 ) -> tuple[dict[str, Transform], list[str]]:
-    """Poses by image, and the names of the images without one. Raises DataError as `matched_names` does."""
+    """Poses by image, and the names of the images without one.
+
+    Raises:
+        DataError: as `matched_names`, or none of the images has one.
+    """
     names = matched_names(images, poses, str(path))
+    if images and not names:
+        raise DataError(
+            f"no image has a pose: the images are named {some_names(images)}, those of the poses "
+            f"{some_names(list(poses))}",
+            where=str(path),
+            remedy="Give the poses of these images, or name them alike",
+        )
     return {image: poses[name] for image, name in names.items()}, [name for name in images if name not in names]
 
 
