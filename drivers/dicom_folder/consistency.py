@@ -107,8 +107,8 @@ def _value(what: str, value: str, number: int) -> str:
 
 
 def _slices(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    return ", ".join(names[:_MOST_NAMED]) + more
+    more = ", …" if len(names) > _MOST_NAMED else ""
+    return f"{len(names)} slice{'s' * (len(names) > 1)} ({', '.join(names[:_MOST_NAMED])}{more})"
 
 
 def _stated(attribute: _Attribute, dataset: Dataset, groups: Sequence[Dataset]) -> str:

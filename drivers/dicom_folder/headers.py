@@ -62,8 +62,12 @@ class SliceHeader:
     @property
     def name(self) -> str:
         """File name, frame (counted from 1, as in DICOM) and instance UID, for messages."""
-        frame = "" if self.frame is None else f" frame {self.frame + 1}"
-        return f"{self.path.name}{frame} ({self.instance_uid})"
+        return f"{self.file_name} ({self.instance_uid})"
+
+    @property
+    def file_name(self) -> str:
+        """File name and frame."""
+        return self.path.name + ("" if self.frame is None else f" frame {self.frame + 1}")
 
 
 def read_headers(path: Path) -> tuple[SliceHeader, ...] | str:

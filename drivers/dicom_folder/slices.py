@@ -70,7 +70,7 @@ def problems_of(
     problems += _count_problems(headers, first_number)
     images = [header for header in headers if header.rows * header.columns > 0]
     bodies = [header for header in images if "LOCALIZER" not in header.image_type]
-    problems += differences([(header.name, _stated(header)) for header in bodies])
+    problems += differences([(header.file_name, _stated(header)) for header in bodies])
     placed = [header for header in images if _placed(header) and "LOCALIZER" not in header.image_type]
     if placed:
         problems += _shape_problems(placed) or _position_problems(placed)

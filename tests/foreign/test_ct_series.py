@@ -86,7 +86,7 @@ def test_what_one_slice_states_and_others_do_not_is_a_difference(tmp_path: Path)
 
     write_series(tmp_path, change=drop)
     (problem,) = _source(tmp_path).series()[0].problems
-    assert "; none in I0000" in problem
+    assert "; none in 2 slices (I0000, I0001)" in problem
 
 
 def test_how_names_and_numbers_are_padded_is_no_difference(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_the_doctor_tells_of_two_frames_of_reference_in_one_series(tmp_path: Pat
     words = ["doctor", "--rig", str(rig), "--data", str(tmp_path / "data")]
     told = " ".join(CliRunner().invoke(app, words, catch_exceptions=False).output.split())
     assert "mixed frame of reference, which must be the same in a whole series" in told
-    assert "1.2.826.0.1.3680043.8.498.999 in I0003" in told
+    assert "1.2.826.0.1.3680043.8.498.999 in 2 slices (I0003, I0004)" in told
     assert "! ct" in told
 
 
