@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Form, Path, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, StreamingResponse
-from pydantic import BaseModel, Field, field_validator, model_validator
+from pydantic import BaseModel, Field, ValidationInfo, field_validator
 
 from service.audit.export.exports import Exports, What
 from service.audit.export.folder_zip import zip_chunks
@@ -158,6 +158,9 @@ def start_export(
     return _back(run_id)
 
 
+_LINES = ("creators", "funders")  # fields with one entry on each line
+
+
 class FormatForm(BaseModel):
     """A data set in a format, as the form has it."""
 
@@ -176,18 +179,21 @@ class FormatForm(BaseModel):
     version: str = Field(FIRST_VERSION, pattern=VERSION)
     csrf: str = ""
 
-    @field_validator("creators", "funders")
+    @field_validator(*_LINES)
     @classmethod
     def _short_names(cls, text: str) -> str:
         if any(len(name) > LONGEST_NAME for name in _lines(text)):
             raise ValueError(f"a name has at most {LONGEST_NAME} characters; write one name on each line")
         return text
 
-    @model_validator(mode="after")
-    def _identified(self) -> FormatForm:
-        for error in self._stated().problems().values():
+    @field_validator("licence", "doi", "publisher", "creators", "funders")
+    @classmethod
+    def _identified(cls, text: str, info: ValidationInfo) -> str:
+        name = info.field_name or ""
+        stated = DataSetStatement.model_validate({name: _lines(text) if name in _LINES else text.strip()})
+        for error in stated.problems().values():
             raise ValueError(str(error))
-        return self
+        return text
 
     def wanted(self) -> WantedExport:
         """What is asked for. What the fields of the statement leave out is the protocol's."""

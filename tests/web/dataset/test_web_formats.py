@@ -285,3 +285,18 @@ def test_an_altered_folder_is_not_sent_as_whole(tmp_path: Path) -> None:
     (folder / SUMS).write_text(sums + sums)
     with pytest.raises(IntegrityError):
         list(zip_chunks(folder, recorded))
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"creators": "Ada L.\nAda L. 0000-0002-1825-0098"}, ("creators", "check digit is wrong")),
+        ({"licence": "CC BY 4.0"}, ("licence", "did you mean cc-by-4.0?")),
+    ],
+)
+def test_a_mistyped_identifier_is_named_with_its_field(
+    web: WebSite, run: str, supervisor: Browser, fields: dict[str, str], words: tuple[str, ...]
+) -> None:
+    page_of(web, supervisor, run)
+    shown = supervisor.send_form(f"/runs/{run}/exports/formats", form="colmap", **fields).text
+    assert all(word in shown for word in words)
