@@ -141,15 +141,8 @@ def read_exif(path: Path) -> ExifRecord:
         )
     except exiv2.Exiv2Error as error:
         raise UnreadableFileError(
-            f"the photograph's data cannot be read: {_words(error)}",
-            where=str(path),
-            remedy="Copy it again from the camera",
+            f"the photograph cannot be read: {error}", where=str(path), remedy="Copy it again from the camera"
         ) from error
-
-
-def _words(error: Exception) -> str:
-    """exiv2's sentence, without the code before it."""
-    return str(error.args[-1] if error.args else type(error).__name__)
 
 
 def _find(exif: Any, name: str) -> Any:
