@@ -94,11 +94,16 @@ def find_places(
 
 
 def list_import(
-    places: ImportFolders, progress: Progress = lambda _what, _done, _total: None, *, ct_first_number: int = 1
+    places: ImportFolders,
+    progress: Progress = lambda _what, _done, _total: None,
+    *,
+    ct_first_number: int = 1,
+    ct_unspecified_is_hounsfield: bool = False,
 ) -> ImportList:
     """Every file to be imported, with its hash, and the files left out, with the reasons.
 
-    `ct_first_number` is the number of the first slice of a whole series.
+    `ct_first_number` is the number of the first slice of a whole series, and `ct_unspecified_is_hounsfield` says that
+    values of a series that states no unit are Hounsfield units.
 
     Raises:
         DataError: photographs are damaged or missing, or there is not exactly one complete scan or CT series.
@@ -114,7 +119,7 @@ def list_import(
             left_out += others
     if places.ct is not None:
         progress("CT", 0, 1)
-        series, others = _ct(places.ct, ct_first_number)
+        series, others = _ct(places.ct, ct_first_number, unspecified_is_hounsfield=ct_unspecified_is_hounsfield)
         files["ct"] = tuple(_file(listed(path), places, "application/dicom") for path in series)
         left_out += others
     left_out += _elsewhere(places)
@@ -126,7 +131,9 @@ def list_import(
     )
 
 
-def import_rig(listing: ImportList, *, simulated: bool, ct_first_number: int = 1) -> Rig:
+def import_rig(
+    listing: ImportList, *, simulated: bool, ct_first_number: int = 1, ct_unspecified_is_hounsfield: bool = False
+) -> Rig:
     """The rig of an import's run: the list, with the folders of scan and CT as devices."""
     devices: dict[str, dict[str, Any]] = {}
     for role in _SCANS:
@@ -136,7 +143,7 @@ def import_rig(listing: ImportList, *, simulated: bool, ct_first_number: int = 1
     if listing.holds("ct"):
         folders = {Path(listing.absolute(file)).parent for file in listing.files["ct"]}
         common = min(folders, key=lambda folder: len(folder.parts))
-        devices["ct"] = _ct_device(common, ct_first_number)
+        devices["ct"] = _ct_device(common, ct_first_number, unspecified_is_hounsfield=ct_unspecified_is_hounsfield)
     section = RigSection(
         name=f"import of {Path(listing.folder).name}", simulated=simulated, devices=devices, imported=listing
     )
@@ -282,14 +289,19 @@ def _scan(place: Path, role: str) -> tuple[tuple[Path, ...], list[LeftOut]]:
     return export, left_out
 
 
-def _ct_device(folder: Path, first_number: int) -> dict[str, Any]:
+def _ct_device(folder: Path, first_number: int, *, unspecified_is_hounsfield: bool) -> dict[str, Any]:
     device: dict[str, Any] = {"driver": "dicom_folder", "folder": str(folder), "stable_s": 0}
-    return device if first_number == 1 else {**device, "first_number": first_number}
+    if first_number != 1:
+        device["first_number"] = first_number
+    return {**device, "unspecified_is_hounsfield": True} if unspecified_is_hounsfield else device
 
 
-def _ct(folder: Path, first_number: int) -> tuple[tuple[Path, ...], list[LeftOut]]:
+def _ct(
+    folder: Path, first_number: int, *, unspecified_is_hounsfield: bool
+) -> tuple[tuple[Path, ...], list[LeftOut]]:
     """The slices of the only complete series in a folder, and the other files there."""
-    section = RigSection(name="CT", devices={"ct": _ct_device(folder, first_number)})
+    device = _ct_device(folder, first_number, unspecified_is_hounsfield=unspecified_is_hounsfield)
+    section = RigSection(name="CT", devices={"ct": device})
     station = Station(Rig(section, folder / "import-list.json", b""))
     try:
         found = station.ct().series()
@@ -299,7 +311,10 @@ def _ct(folder: Path, first_number: int) -> tuple[tuple[Path, ...], list[LeftOut
     if len(sound) != 1:
         problems = "; ".join(f"{one.description or one.uid}: {', '.join(one.problems)}" for one in found)
         what = f"{len(sound)} CT series" if sound else f"no complete CT series ({problems or 'no DICOM file'})"
-        remedy = "Name the folder of one complete series with --ct, and with --ct-first-number where it begins"
+        remedy = (
+            "Name the folder of one complete series with --ct. What a rig.yaml would say of it, say with "
+            "--ct-first-number and --ct-unspecified-is-hounsfield"
+        )
         raise DataError(what, where=str(folder), remedy=remedy)
     chosen = set(sound[0].files)
     others = [path for path in files_below(folder) if path not in chosen]

@@ -27,6 +27,11 @@ class DicomFolderConfig(DriverConfig):
         description="number of the first slice of a whole series (InstanceNumber); a series that begins later is "
         "incomplete",
     )
+    unspecified_is_hounsfield: bool = Field(
+        default=False,
+        description="values whose unit the files state as unspecified are Hounsfield units (rescale type US, as some "
+        "programs write it when they copy a series)",
+    )
     deidentify: bool = Field(
         default=True,
         description="keep copies of series and segmentations that name no person, instead of the files themselves",

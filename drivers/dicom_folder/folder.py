@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -124,9 +124,7 @@ class DicomFolder:
         """
         found = [self._header(path) for path in series.files]
         sound = [header for headers in found if not isinstance(headers, str) for header in headers]
-        problems = [headers for headers in found if isinstance(headers, str)] + list(
-            problems_of(sound, self._config.first_number)
-        )
+        problems = [headers for headers in found if isinstance(headers, str)] + list(self._problems(sound))
         if problems:
             raise UnreadableFileError(
                 f"the series cannot be used: {'; '.join(problems)}",
@@ -233,6 +231,13 @@ class DicomFolder:
             return f"{path.name}: cannot be opened ({error.strerror})"
         return read_headers(path) if known is None else known
 
+    def _problems(self, headers: Sequence[SliceHeader]) -> tuple[str, ...]:
+        return problems_of(
+            headers,
+            self._config.first_number,
+            unspecified_is_hounsfield=self._config.unspecified_is_hounsfield,
+        )
+
     def _series(self, uid: str, headers: list[SliceHeader], arriving: tuple[str, ...]) -> CtSeries:
         return CtSeries(
             uid=uid,
@@ -240,7 +245,7 @@ class DicomFolder:
             modality=headers[0].modality,
             slices=len(headers),
             files=tuple(dict.fromkeys(header.path for header in headers)),
-            problems=arriving + problems_of(headers, self._config.first_number),
+            problems=arriving + self._problems(headers),
             frame_of_reference=headers[0].frame_of_reference,
             acquired_images=acquired_images(headers),
         )

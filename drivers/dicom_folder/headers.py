@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -11,6 +11,7 @@ from typing import cast
 import numpy as np
 from pydicom.dataset import Dataset, FileDataset
 
+from drivers.dicom_folder.consistency import common_of, value_unit
 from drivers.dicom_folder.files import PARSE_ERRORS, read_dicom
 
 _DEFLATED = "1.2.840.10008.1.2.1.99"  # the whole file is compressed, so its unpacked size is unbounded
@@ -49,6 +50,9 @@ class SliceHeader:
     orientation: tuple[float, ...] | None  # direction of a row (+i), direction of a column (+j)
     position_mm: tuple[float, ...] | None
     rescale: tuple[float, float] | None  # slope and intercept: stored values to Hounsfield units
+    value_unit: str  # what the values are if not Hounsfield units; "" for these
+    padding: tuple[int, int] | None  # the stored values, first and last, of pixels outside the image
+    common: Mapping[str, str]  # what must be equal in a whole series
     cut_short: bool
     stated_instances: int | None  # NumberOfSeriesRelatedInstances: the files of the whole series, where it is stated
     number: int | None  # of the slice in its series: InstanceNumber, or the frame's place in its stack
@@ -58,8 +62,12 @@ class SliceHeader:
     @property
     def name(self) -> str:
         """File name, frame (counted from 1, as in DICOM) and instance UID, for messages."""
-        frame = "" if self.frame is None else f" frame {self.frame + 1}"
-        return f"{self.path.name}{frame} ({self.instance_uid})"
+        return f"{self.file_name} ({self.instance_uid})"
+
+    @property
+    def file_name(self) -> str:
+        """File name and frame."""
+        return self.path.name + ("" if self.frame is None else f" frame {self.frame + 1}")
 
 
 def read_headers(path: Path) -> tuple[SliceHeader, ...] | str:
@@ -105,6 +113,7 @@ def _header(path: Path, dataset: FileDataset, groups: Sequence[Dataset], frame: 
     spacing = grouped(groups, "PixelMeasuresSequence", "PixelSpacing", 2)
     slope = grouped(groups, "PixelValueTransformationSequence", "RescaleSlope", 1)
     intercept = grouped(groups, "PixelValueTransformationSequence", "RescaleIntercept", 1)
+    image_type = _image_type(dataset, groups)
     return SliceHeader(
         path=path,
         frame=frame,
@@ -113,7 +122,7 @@ def _header(path: Path, dataset: FileDataset, groups: Sequence[Dataset], frame: 
         frame_of_reference=str(dataset.get("FrameOfReferenceUID") or ""),
         description=str(dataset.get("SeriesDescription") or ""),
         modality=str(dataset.get("Modality") or "unknown"),
-        image_type=_image_type(dataset, groups),
+        image_type=image_type,
         transfer_syntax=syntax or "unknown",
         rows=rows,
         columns=columns,
@@ -123,12 +132,30 @@ def _header(path: Path, dataset: FileDataset, groups: Sequence[Dataset], frame: 
         orientation=grouped(groups, "PlaneOrientationSequence", "ImageOrientationPatient", 6),
         position_mm=grouped(groups, "PlanePositionSequence", "ImagePositionPatient", 3),
         rescale=None if slope is None or intercept is None else (slope[0], intercept[0]),
+        value_unit=value_unit(dataset, groups, image_type),
+        padding=_padding(dataset),
+        common=common_of(dataset, groups),
         cut_short=syntax in _UNCOMPRESSED and path.stat().st_size < pixel_bytes,
         stated_instances=_count(dataset, "NumberOfSeriesRelatedInstances"),
         number=_number(groups),
         part=_part(dataset),
         acquisition=_acquisition(dataset),
     )
+
+
+def _padding(dataset: Dataset) -> tuple[int, int] | None:
+    """The range of stored values that are padding (PS3.3, C.7.5.1.1.2), as the pixels are stored.
+
+    Programs write the value as signed or unsigned whatever the pixels are: it has the same bits.
+    """
+    value = _numbers(dataset, "PixelPaddingValue", 1)
+    if value is None:
+        return None
+    limit = _numbers(dataset, "PixelPaddingRangeLimit", 1) or value
+    bits, signed = int(dataset.get("BitsAllocated") or 16), int(dataset.get("PixelRepresentation") or 0) == 1
+    ends = [int(end) % (1 << bits) for end in (*value, *limit)]
+    ends = sorted(end - (1 << bits) if signed and end >= 1 << (bits - 1) else end for end in ends)
+    return ends[0], ends[1]
 
 
 def _count(dataset: Dataset, name: str) -> int | None:

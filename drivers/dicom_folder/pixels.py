@@ -15,12 +15,16 @@ from drivers.dicom_folder.files import PARSE_ERRORS, read_dicom
 from drivers.dicom_folder.headers import SliceHeader
 from drivers.errors import UnreadableFileError
 
+# Pixels outside the reconstructed circle or suppressed as background have a padding value, which is no pixel of the
+# image (DICOM PS3.3, C.7.5.1.1.2), and which the rescaling may turn into anything: nothing is known there, so that it
+# counts as air, as the standard recommends to who writes it.
+_AIR_HU = -1000
 # What pydicom, its plug-ins and Pillow raise for pixels that are truncated, damaged or of a missing codec.
 DECODE_ERRORS = (*PARSE_ERRORS, RuntimeError, OSError)
 
 
 def hounsfield(headers: Sequence[SliceHeader]) -> Iterator[NDArray[np.int16]]:
-    """The pixels of each slice in Hounsfield units, (J, I), in the order of the headers.
+    """The pixels of each slice in Hounsfield units, (J, I), in the order of the headers; padding counts as air.
 
     Raises UnreadableFileError, which names the slice and the file.
     """
@@ -44,10 +48,15 @@ def hounsfield(headers: Sequence[SliceHeader]) -> Iterator[NDArray[np.int16]]:
                 remedy="Export the series again as single monochrome slices",
             )
         slope, intercept = header.rescale or (1.0, 0.0)  # a series without them is refused before
-        yield np.clip(np.rint(stored * slope + intercept), -32768, 32767).astype(np.int16)
+        values = np.clip(np.rint(stored * slope + intercept), -32768, 32767).astype(np.int16)
+        if header.padding is not None:
+            first, last = header.padding
+            outside = (stored >= first) & (stored <= last)
+            values[outside] = np.minimum(values[outside], _AIR_HU)  # many write less than air: it stays as it is
+        yield values
 
 
-def _stored(dataset: FileDataset, frame: int | None) -> NDArray[np.generic]:
+def _stored(dataset: FileDataset, frame: int | None) -> NDArray[np.integer]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return np.asarray(dataset.pixel_array if frame is None else pixel_array(dataset, index=frame))

@@ -9,6 +9,7 @@ import numpy as np
 from pydicom.uid import UID
 
 from drivers.dicom_folder.codecs import lacking_decoder
+from drivers.dicom_folder.consistency import UNSPECIFIED, differences
 from drivers.dicom_folder.headers import SliceHeader
 from drivers.interfaces import Array, Transform
 from service.core.units import metres
@@ -21,10 +22,15 @@ _POSITION_TOLERANCE_MM = 0.01
 _MAX_NAMED = 5
 
 
-def problems_of(headers: Sequence[SliceHeader], first_number: int) -> tuple[str, ...]:
+def problems_of(
+    headers: Sequence[SliceHeader], first_number: int, *, unspecified_is_hounsfield: bool = False
+) -> tuple[str, ...]:
     """Why these slices do not form a uniform CT volume, one text per problem; empty if they do.
 
-    `first_number` is the number of the first slice of a whole series.
+    Args:
+        headers: of the slices.
+        first_number: the number of the first slice of a whole series.
+        unspecified_is_hounsfield: values whose unit the files state as unspecified are Hounsfield units.
     """
     if all(header.rows == 0 or header.columns == 0 for header in headers):
         return (f"it holds no images (modality {headers[0].modality})",)
@@ -43,6 +49,13 @@ def problems_of(headers: Sequence[SliceHeader], first_number: int) -> tuple[str,
         ),
         ("colour images", [h for h in headers if h.samples > 1]),
         ("images that are not CT", [h for h in headers if h.modality != "CT"]),
+        *(
+            (_other_unit(unit), same)
+            for unit in sorted(
+                {h.value_unit for h in headers} - {"", UNSPECIFIED if unspecified_is_hounsfield else ""}
+            )
+            if (same := [h for h in headers if h.value_unit == unit])
+        ),
         ("no rescale slope and intercept, so no Hounsfield units, in", [h for h in headers if h.rescale is None]),
         ("no position, orientation or pixel spacing in", [h for h in headers if not _placed(h)]),
     ):
@@ -56,10 +69,26 @@ def problems_of(headers: Sequence[SliceHeader], first_number: int) -> tuple[str,
     ]
     problems += _count_problems(headers, first_number)
     images = [header for header in headers if header.rows * header.columns > 0]
+    bodies = [header for header in images if "LOCALIZER" not in header.image_type]
+    problems += differences([(header.file_name, _stated(header)) for header in bodies])
     placed = [header for header in images if _placed(header) and "LOCALIZER" not in header.image_type]
     if placed:
         problems += _shape_problems(placed) or _position_problems(placed)
     return tuple(problems)
+
+
+def _other_unit(unit: str) -> str:
+    if unit == UNSPECIFIED:
+        remedy = "if they are Hounsfield units, set unspecified_is_hounsfield: true for this device in rig.yaml"
+    else:
+        remedy = "use a series of the attenuation"
+    return f"values that are not said to be Hounsfield units ({unit}; {remedy}) in"
+
+
+def _stated(header: SliceHeader) -> dict[str, str]:
+    # Further image types are a manufacturer's own words.
+    kinds = {"image type": "\\".join(header.image_type[:3]), "unit of the values": header.value_unit or "HU"}
+    return {**header.common, **kinds}
 
 
 def _count_problems(headers: Sequence[SliceHeader], first_number: int) -> list[str]:

@@ -36,6 +36,7 @@ _READING = frozenset({"report", "settings"})  # calls that only read what the de
 
 _LOG = logging.getLogger("drivers.host")
 _LEVELS = logging.getLevelNamesMapping()
+_OURS = frozenset({"drivers", "service", "root"})  # what libraries log in a child is for the log file, not for people
 
 
 def hosted(
@@ -313,6 +314,7 @@ def _log_output(process: Popen[str], name: str) -> None:
     for line in process.stdout:
         level, separator, message = line.rstrip().partition("|")
         if separator and level in _LEVELS:
-            log.log(_LEVELS[level], "%s", message)
+            ours = message.partition(":")[0].partition(".")[0] in _OURS
+            log.log(_LEVELS[level] if ours else min(_LEVELS[level], logging.INFO), "%s", message)
         elif line.strip():
             log.info("%s", line.rstrip())

@@ -12,7 +12,7 @@ from typing import Any
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage
 from service.core.errors import DataError
-from service.core.picture_files import TruncatedPictureError, check_jpeg
+from service.core.picture_files import ForeignKindError, TruncatedPictureError, check_jpeg, kind_of
 
 # The library has no types; see docs/decisions/0002-strict-typing.md.
 exiv2: Any = importlib.import_module("exiv2")
@@ -209,8 +209,19 @@ def check_jpeg_complete(path: Path) -> None:
         check_jpeg(data, str(path))
     except TruncatedPictureError as error:
         raise _incomplete(path, "is cut off: its end marker is missing", len(data)) from error
+    except ForeignKindError as error:
+        raise UnreadableFileError(error.what, where=str(path), remedy=error.remedy) from error
     except DataError as error:
         raise _incomplete(path, f"cannot be used: {error.what}", len(data)) from error
+
+
+def kind_of_file(path: Path) -> str:
+    """What a file is by its first bytes, as `service.core.picture_files.kind_of`; "" too if it cannot be opened."""
+    try:
+        with path.open("rb") as stream:
+            return kind_of(stream.read(64))
+    except OSError:
+        return ""
 
 
 def _incomplete(path: Path, what: str, size_bytes: int) -> UnreadableFileError:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from drivers.errors import UnreadableFileError
 from drivers.folder_files import files_below
-from drivers.photos.photo_file import ExifRecord, check_jpeg_complete, read_exif, sha256_of
+from drivers.photos.photo_file import ExifRecord, check_jpeg_complete, kind_of_file, read_exif, sha256_of
+from service.core.picture_files import ForeignKindError
 
 JPEG_SUFFIXES = (".jpg", ".jpeg")
 RAW_MEDIA_TYPES: Mapping[str, str] = {
@@ -23,6 +24,8 @@ RAW_MEDIA_TYPES: Mapping[str, str] = {
     ".raf": "image/x-fuji-raf",
     ".rw2": "image/x-panasonic-rw2",
 }
+# Programs and telephones give JPEG files these names too; what a file holds decides.
+_PICTURE_SUFFIXES = (".jpe", ".jfif", ".heic", ".heif", ".png", ".webp", ".tif", ".tiff", ".bmp")
 _SYSTEM_FILES = ("thumbs.db", "desktop.ini", "picasa.ini", ".ds_store")
 _THUMBNAIL_FOLDERS = ("thumbs", "thumbnails", ".thumbnails", "@eadir", "previews")
 
@@ -66,7 +69,8 @@ class Photographs:
 def list_photographs(folder: Path) -> Photographs:
     """List the photographs in a folder and its subfolders, sorted by path.
 
-    A photograph is a JPEG file as a camera wrote it. A raw file belongs to the JPEG with the same name, anywhere in
+    A photograph is a JPEG file as a camera wrote it, whatever its name says. A file of another kind under the name of
+    a JPEG is left out, and the reason says what it is. A raw file belongs to the JPEG with the same name, anywhere in
     the folder; if there are several, to the one in the same subfolder. Nothing is written or changed.
 
     Raises:
@@ -80,7 +84,7 @@ def list_photographs(folder: Path) -> Photographs:
         suffix = path.suffix.lower()
         if reason:
             left_out.append(LeftOut(path, reason))
-        elif suffix in JPEG_SUFFIXES:
+        elif suffix in JPEG_SUFFIXES or (suffix in _PICTURE_SUFFIXES and kind_of_file(path) == "JPEG"):
             jpegs.append(path)
         elif suffix in RAW_MEDIA_TYPES:
             raws.append(path)
@@ -96,7 +100,7 @@ def list_photographs(folder: Path) -> Photographs:
             exif = read_exif(path)
             photographs.append(Photograph(listed(path), exif, tuple(map(listed, of_jpeg.get(path, ())))))
         except UnreadableFileError as error:
-            damaged.append(LeftOut(path, error.what))
+            (left_out if isinstance(error.__cause__, ForeignKindError) else damaged).append(LeftOut(path, error.what))
     return Photographs(tuple(photographs), tuple(left_out), tuple(damaged))
 
 

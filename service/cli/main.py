@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import logging
 import os
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -14,6 +13,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from service.core.loading import begin_loading, end_loading
+from service.logs.terminal import show_own_words_only
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,9 +201,7 @@ def main() -> None:
     # With small matrices and many processes, threads of the linear algebra wait for each other and are ten times
     # slower on a busy machine. The library reads this when it is loaded, here and in every child process.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    # It warns of every unusual value in every slice of a CT; what matters about a series is reported in words.
-    logging.getLogger("pydicom").setLevel(logging.ERROR)
+    show_own_words_only()
     app()
 
 

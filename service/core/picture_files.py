@@ -1,4 +1,4 @@
-"""JPEG and PNG files as bytes: whether they are whole, and their size, before anything is decoded."""
+"""Picture files as bytes: which kind they are, whatever their name says, whether they are whole, and their size."""
 
 from __future__ import annotations
 
@@ -20,8 +20,72 @@ _STANDALONE = {0x01, *range(0xD0, 0xD8)}  # markers without a length
 _FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # headers with the size
 
 
+# Brands of ISO base media files, the most telling first.
+_BRANDS = (
+    ("AVIF", {b"avif", b"avis"}),
+    ("HEIC", {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}),
+    ("raw file", {b"crx "}),
+)
+# What files begin with.
+_KINDS = (
+    (JPEG_BEGINS, "JPEG"),
+    (PNG_BEGINS, "PNG"),
+    (b"GIF8", "GIF"),
+    (b"II*\0", "TIFF"),
+    (b"MM\0*", "TIFF"),
+    (b"II+\0", "TIFF"),
+    (b"MM\0+", "TIFF"),
+    (b"BM", "BMP"),
+    (b"\0\0\0\x0cjP  \r\n\x87\n", "JPEG 2000"),
+    (b"\xff\x4f\xff\x51", "JPEG 2000"),
+    (b"\0\0\0\x0cJXL \r\n\x87\n", "JPEG XL"),
+    (b"\xff\x0a", "JPEG XL"),
+    (b"8BPS", "Photoshop"),
+    (b"\x76\x2f\x31\x01", "OpenEXR"),
+    (b"%PDF", "PDF"),
+    (b"PK\3\4", "ZIP"),
+    (b"\x1aE\xdf\xa3", "video"),
+    (b"version https://git-lfs", "Git LFS pointer"),
+)
+_NO_PICTURES = {"PDF", "ZIP", "video", "text", "Git LFS pointer", "raw file", "Photoshop"}
+_TEXT_BEGINS = (b"<!doctype html", b"<html", b"<?xml", b"{")
+
+
 class TruncatedPictureError(DataError):
     """A file ends before its picture does."""
+
+
+class ForeignKindError(DataError):
+    """A file is whole, as far as can be seen, but of another kind than can be read."""
+
+
+def kind_of(data: bytes) -> str:
+    """What a file is by its first bytes: JPEG, PNG, WebP, HEIC, …; "" if that is not known."""
+    if data[:4] == b"RIFF":
+        return {b"WEBP": "WebP", b"AVI ": "video"}.get(data[8:12], "")
+    if data[4:8] == b"ftyp":
+        brands = {data[at : at + 4] for at in (8, *range(16, min(int.from_bytes(data[:4], "big"), 64), 4))}
+        return next((kind for kind, named in _BRANDS if brands & named), "video")
+    if data[:1] == b"P" and data[1:2] in b"1234567" and data[2:3].isspace():
+        return "PNM"
+    if data[:64].lstrip(b"\xef\xbb\xbf \t\r\n").lower().startswith(_TEXT_BEGINS):
+        return "text"
+    return next((kind for begins, kind in _KINDS if data.startswith(begins)), "")
+
+
+def another_kind(kind: str, wanted: str, where: str) -> ForeignKindError:
+    """The error for a file of this kind, as `kind_of` names it, where only the wanted ones are read."""
+    return ForeignKindError(
+        f"this is {_article(kind)} {kind}{'' if kind in _NO_PICTURES else ' picture'}, not {wanted}",
+        where=where,
+        remedy=f"Save it as {wanted}, at its full size and without turning it"
+        if kind not in _NO_PICTURES
+        else "Copy the picture itself",
+    )
+
+
+def _article(kind: str) -> str:
+    return "an" if kind in {"AVIF", "OpenEXR"} else "a"
 
 
 def check_jpeg(data: bytes, where: str) -> None:
@@ -30,10 +94,14 @@ def check_jpeg(data: bytes, where: str) -> None:
     Data after that marker (previews that cameras append) is allowed.
 
     Raises:
+        ForeignKindError: the file is of another kind, which the error names.
         TruncatedPictureError: the file ends before its picture does.
         DataError: the file is not a JPEG, is damaged, or claims more pixels than any camera has.
     """
-    if not data.startswith(JPEG_BEGINS):
+    kind = kind_of(data)
+    if kind not in {"JPEG", ""}:
+        raise another_kind(kind, "JPEG", where)
+    if not kind:
         raise DataError("this is not a JPEG file", where=where, remedy="Use JPEG or PNG images")
     for marker, at in _segments(data, where):
         if marker == _END_OF_IMAGE:
@@ -80,8 +148,18 @@ def check_png(data: bytes, where: str) -> None:
         at = end + 4
 
 
+def check_webp(data: bytes, where: str) -> None:
+    """Check that a WebP file is as long as it says. Raises TruncatedPictureError if it is not."""
+    if len(data) < 8 + int.from_bytes(data[4:8], "little"):
+        raise TruncatedPictureError(
+            "the WebP ends before its picture is complete",
+            where=where,
+            remedy="Copy the file again; a half-written image is not used",
+        )
+
+
 def check_picture(data: bytes, where: str, *, partly: bool = False) -> None:
-    """Check a JPEG or PNG without decoding it; other formats are not checked. `partly` accepts a truncated JPEG.
+    """Check a JPEG, PNG or WebP without decoding it, and no other format. `partly` accepts a truncated JPEG.
 
     Raises:
         DataError: as `check_jpeg` and `check_png`.
@@ -90,6 +168,8 @@ def check_picture(data: bytes, where: str, *, partly: bool = False) -> None:
         check_png(data, where)
     elif data.startswith(JPEG_BEGINS) and not partly:
         check_jpeg(data, where)
+    elif kind_of(data) == "WebP":
+        check_webp(data, where)
 
 
 def picture_size(data: bytes, where: str = "its first bytes") -> tuple[int, int]:

@@ -70,6 +70,10 @@ def implausible(
             found.append(
                 ((section, field), f"{value:g} {unit} is not credible: {least:g} to {most:g} {unit}".strip())
             )
+    found += [
+        (("data_set", *field), f"{error.what}. {error.remedy}")
+        for field, error in loaded.protocol.data_set.problems().items()
+    ]
     steps = {step.id: step for step in loaded.protocol.steps}
     for index, step in enumerate(loaded.protocol.steps):
         known = measures_of(step, steps)

@@ -25,6 +25,7 @@ from service.compute.memory import keep_freed_memory
 from service.compute.priority import compute_in_background
 from service.core.jobs.priorities import Lane
 from service.logs.file_log import file_log
+from service.logs.terminal import show_own_words_only
 from service.monitor.worker_sign import SignOfLife
 from service.store.store import Store
 from service.worker.loop import work
@@ -166,6 +167,7 @@ def work_side_by_side(
 
 def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int) -> None:
     """Entry point of a child."""
+    show_own_words_only()
     os.setsid()  # Ctrl-C must reach only the worker, which ends its children and their processes
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     tempfile.tempdir = str(scratch)

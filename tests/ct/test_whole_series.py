@@ -116,9 +116,9 @@ def test_frames_keep_the_numbers_that_they_had_as_slices(tmp_path: Path) -> None
 def test_a_missing_file_of_several_with_frames_is_known_by_its_number(
     tmp_path: Path, total: int | None, missing: int
 ) -> None:
-    target, uid = tmp_path / "enhanced", generate_uid()
+    target, uid, source_uid = tmp_path / "enhanced", generate_uid(), generate_uid()
     for part, skip in ((1, (3, 4)), (2, (0, 1, 2))):
-        write_series(tmp_path / str(part), change=hospital, skip=skip)
+        write_series(tmp_path / str(part), change=hospital, skip=skip, uid=source_uid)
         enhanced(tmp_path / str(part), target, uid, (part, 2))
     for path in target.iterdir():
         file = pydicom.dcmread(path)

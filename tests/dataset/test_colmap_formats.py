@@ -94,7 +94,10 @@ def test_the_points_of_sugar_are_in_the_scene_and_tell_nothing_of_the_surface(
 def test_eth3d_has_depth_and_scan(dataset: DataSet, pinholes: DataSet, tmp_path: Path) -> None:
     folder = written(dataset, "eth3d", tmp_path)
     model = pycolmap.Reconstruction(str(folder / "dslr_calibration_undistorted"))
-    images = {image.name: image for image in model.images.values()}
+    for image in model.images.values():  # ETH3D's own sets name them so, and their image_path is images/
+        assert (folder / "images" / image.name).is_file()
+        assert image.name.startswith("dslr_images_undistorted/")
+    images = {Path(image.name).name: image for image in model.images.values()}
     assert set(images) == {view.file for view in dataset.views}
     for view in pinholes.views:
         projected = np.array([images[view.file].project_point(point) for point in corners()])

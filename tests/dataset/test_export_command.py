@@ -182,15 +182,16 @@ def test_what_the_options_state_stands_in_the_metadata(recorded: Path, tmp_path:
         recorded,
         *("--format", "gltf", "--out", str(out), "--title", "A spine", "--licence", "CC-BY-4.0"),
         *("--ethics", "Waived, 2026-7", "--creator", "A. Name", "--creator", "B. Name", "--cite", "Name, 2026."),
-        *("--data-version", "2.1.0", "--anonymous"),
+        *("--data-version", "2.1.0", "--anonymous", "--doi", "doi:10.5281/zenodo.1", "--publisher", "A press"),
+        *("--funder", "A fund https://ror.org/05a28rw58"),
     )
     assert status == 0, printed
     card = (out / "DATACARD.md").read_text(encoding="utf-8")
     for words in ("# A spine", "CC-BY-4.0", "Waived, 2026-7", "A. Name, B. Name", "Name, 2026.", "Version 2.1.0"):
         assert words in card
     crate = json.loads((out / "ro-crate-metadata.json").read_text())
-    kinds = [entity["@type"] for entity in crate["@graph"]]
-    assert "Person" not in kinds
+    # Those who are stated as makers are named; those who took part in the run are not.
+    assert {e["name"] for e in crate["@graph"] if e["@type"] == "Person"} == {"A. Name", "B. Name"}
     assert {e["serialNumber"] for e in crate["@graph"] if e["@type"] == "IndividualProduct"} == {""}
     assert "serial number" not in card
 
@@ -203,6 +204,10 @@ def test_what_the_options_state_stands_in_the_metadata(recorded: Path, tmp_path:
         (("--format", "gltf", "--crop", "wide"), "'wide' is not a size"),
         (("--format", "gltf", "--crop", "99999x10"), "does not fit"),
         (("--format", "gltf", "--crops", "2"), "1920 × 1080 px does not fit"),
+        (("--format", "gltf", "--creator", "A. Name 0000-0002-1825-0098"), "check digit is wrong"),
+        (("--format", "gltf", "--licence", "CC BY 4.0"), "Did you mean CC-BY-4.0"),
+        (("--format", "gltf", "--funder", "ETH ror.org/05a28rw59"), "the ROR is mistyped"),
+        (("--format", "gltf", "--doi", "zenodo.1"), "this is not a DOI"),
     ],
 )
 def test_what_cannot_be_is_refused(recorded: Path, tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:

@@ -142,7 +142,8 @@ def test_ro_crate_lists_every_file_with_its_hash(exported: Path) -> None:
     }
     assert {one for one in referred if not one.startswith("http")} <= set(entities)
     assert (root["version"], root["creditText"]) == ("1.2.0", STATED.cite)
-    assert entities["#licence"]["description"] == STATED.licence
+    assert root["license"] == {"@id": STATED.licence}
+    assert entities[STATED.licence]["@type"] == "CreativeWork"
     assert entities["#ethics"]["description"] == STATED.ethics
     assert "SIMULATED" in root["name"]
 

@@ -105,6 +105,13 @@ def test_odd_files_are_left_out_by_name_with_the_reason(folder: Path) -> None:
     assert views[first.stem].camera["exif_time"].startswith("2024:03:01 10:03")
 
 
+def test_a_picture_of_another_kind_is_named_and_the_import_goes_on(folder: Path) -> None:
+    heic = folder / "images" / "DSC00099.JPG"
+    heic.write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(200))
+    assert left_out(folder)["images/DSC00099.JPG"] == "this is a HEIC picture, not JPEG"
+    assert len(listed(folder).of("image")) == 2
+
+
 def test_damaged_photographs_are_an_error_that_names_them_all(folder: Path, tmp_path: Path) -> None:
     for path in (folder / "images").glob("*.JPG"):
         path.write_bytes(path.read_bytes()[:-2000])

@@ -22,10 +22,11 @@ from service.compute.poses.ros.messages import StampedImage, StampedTransform
 from service.compute.poses.ros.recording import Recording, read_recording, recording_file
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Transform
+from service.core.picture_files import kind_of
 from service.core.text.counts import counted
 from service.core.units import ms, nanoseconds, seconds_of_ms, seconds_of_ns
 
-_SUFFIXES = {"jpeg": ".jpg", "jpg": ".jpg", "png": ".png"}
+_SUFFIXES = {"JPEG": ".jpg", "PNG": ".png"}
 _HAND_EYE_NOTE = "from the static transforms of the recording; no uncertainty is stated there"
 
 
@@ -77,7 +78,7 @@ def import_ros_command(
 
             def keep(topic: str, image: StampedImage) -> None:
                 if image_topic in ("", topic):
-                    _keep(part, image, images.setdefault(topic, {}), refused.setdefault(topic, {}))
+                    keep_image(part, image, images.setdefault(topic, {}), refused.setdefault(topic, {}))
 
             found = read_recording(file, keep)
             topic = _image_topic(found, image_topic, file)
@@ -148,13 +149,13 @@ def _new_folder(out: Path) -> Generator[Path]:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _keep(out: Path, image: StampedImage, stamps: dict[str, int], left_out: dict[str, str]) -> None:
-    """Write one image under the name of its stamp."""
-    form = image.form.lower().split(";")[-1].split()
-    suffix = next((_SUFFIXES[word] for word in form if word in _SUFFIXES), None)
+def keep_image(out: Path, image: StampedImage, stamps: dict[str, int], left_out: dict[str, str]) -> None:
+    """Write one image under the name of its stamp. What it holds decides its kind: messages may state another."""
+    kind = kind_of(image.data)
+    suffix = _SUFFIXES.get(kind)
     name = f"{image.stamp_ns}{suffix or ''}"
     if suffix is None:
-        left_out[name] = f"its format {image.form[:40]!r} is not jpeg or png"
+        left_out[name] = f"its format {image.form[:40]!r} is not jpeg or png" + (f", but {kind}" if kind else "")
     elif name in stamps:
         left_out[f"{name} again"] = "another image has this stamp"
     else:

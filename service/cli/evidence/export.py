@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from pydantic import ValidationError
@@ -59,12 +59,27 @@ def export_command(
     title: Annotated[
         str, typer.Option(help="Title of the data set; this and what follows replace the protocol's.")
     ] = "",
-    licence: Annotated[str, typer.Option(help="Such as CC-BY-4.0, or the licence's address.")] = "",
+    licence: Annotated[
+        str, typer.Option(help="SPDX identifier, such as CC-BY-4.0, or the address of the licence's text.")
+    ] = "",
     ethics: Annotated[str, typer.Option(help="Approval or waiver: its number, and the body that gave it.")] = "",
     creator: Annotated[
-        list[str] | None, typer.Option(help="A person or body that made the data set; may be given again.")
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="A person, with ORCID: 'Rivera, Ana 0000-0002-1825-0097', or a body, with ROR: 'ETH Zurich "
+            "ror.org/05a28rw58'. Without one, `person: NAME` or `organisation: NAME` says which. May be given again.",
+        ),
     ] = None,
     cite: Annotated[str, typer.Option(help="How to cite the data set.")] = "",
+    doi: Annotated[str, typer.Option(metavar="DOI", help="Of the data set, such as 10.5281/zenodo.1234567.")] = "",
+    publisher: Annotated[
+        str, typer.Option(metavar="NAME", help="The body that publishes it, with its ROR if it has one.")
+    ] = "",
+    funder: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="A body that paid for it, with its ROR if it has one; may be given again."),
+    ] = None,
     data_version: Annotated[str, typer.Option(help="Version of the data set.")] = FIRST_VERSION,
     operator: OperatorOption = "",
     password_stdin: PasswordOption = False,
@@ -82,7 +97,16 @@ def export_command(
 
         target = out.resolve()
         run_id = store.find_run(run)
-        stated = _stated(title, licence, ethics, creator or [], cite)
+        stated = _stated(
+            title=title,
+            licence=licence,
+            ethics=ethics,
+            creators=tuple(creator or ()),
+            cite=cite,
+            doi=doi,
+            publisher=publisher,
+            funders=tuple(funder or ()),
+        )
         wanted = WantedExport(form, crop, crops, anonymous, stated, data_version)
         who = acting_person(store, operator, password_stdin=password_stdin)
         with progress_bar(quiet=json) as progress:
@@ -103,12 +127,16 @@ def export_command(
             console.print("  The run is simulated, and its files say so.")
 
 
-def _stated(title: str, licence: str, ethics: str, creators: list[str], cite: str) -> DataSetStatement:
-    """The statement of the options. Raises ConfigurationError if one is too long or empty."""
+def _stated(**fields: Any) -> DataSetStatement:
+    """The statement of the options. Raises ConfigurationError if one is too long, empty or a wrong identifier."""
     try:
-        return DataSetStatement(title=title, licence=licence, ethics=ethics, creators=tuple(creators), cite=cite)
+        stated = DataSetStatement(**fields)
     except ValidationError as error:
         first = error.errors()[0]
         raise ConfigurationError(
             f"{first['loc'][0]}: {first['msg']}", where="the options of the export", remedy="Correct it"
         ) from error
+    for (name, *_), error in stated.problems().items():
+        option = f"--{str(name).removesuffix('s')}"
+        raise ConfigurationError(error.what, where=f"{option} {error.where}", remedy=error.remedy) from error
+    return stated

@@ -75,6 +75,13 @@ def import_command(
         int,
         typer.Option("--ct-first-number", min=0, help="Number of the series' first slice, if it is not 1."),
     ] = 1,
+    ct_unspecified_is_hounsfield: Annotated[
+        bool,
+        typer.Option(
+            "--ct-unspecified-is-hounsfield",
+            help="The series' values are Hounsfield units, though its files leave the unit open (rescale type US).",
+        ),
+    ] = False,
     simulated: Annotated[
         bool, typer.Option("--simulated", help="The files come from simulators; all results are marked accordingly.")
     ] = False,
@@ -110,7 +117,12 @@ def import_command(
         require_plausible(loaded, str(protocol))
         with progress_bar(quiet=json) as progress:
             places = find_places(folder, given, _parts_of(loaded.protocol))
-            listing = list_import(places, progress, ct_first_number=ct_first_number)
+            listing = list_import(
+                places,
+                progress,
+                ct_first_number=ct_first_number,
+                ct_unspecified_is_hounsfield=ct_unspecified_is_hounsfield,
+            )
         _require_wanted(loaded.protocol, listing)
         if not json:
             _show(listing)
@@ -118,7 +130,12 @@ def import_command(
             if json:
                 print_json(listing_record(listing))
             return
-        rig = import_rig(listing, simulated=simulated, ct_first_number=ct_first_number)
+        rig = import_rig(
+            listing,
+            simulated=simulated,
+            ct_first_number=ct_first_number,
+            ct_unspecified_is_hounsfield=ct_unspecified_is_hounsfield,
+        )
         with Store.open(data) as store:
             who = acting_person(store, operator, password_stdin=password_stdin)
             run_id = _run_of(store, loaded, rig, operator=who.name, again=again, about=about)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import logging
 import signal
 import threading
 from pathlib import Path
@@ -49,7 +48,6 @@ def dicom_listen_command(
                 "port to the CT suite in the firewall",
             )
         require_writable_folder(folder)
-        logging.getLogger("pynetdicom").setLevel(logging.CRITICAL)  # what people should know is printed in words
         stopped = threading.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: stopped.set())

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.compute.poses.files.image_names import matched_names
 from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.text.counts import counted
@@ -49,11 +50,12 @@ def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
         if row[0].strip() in joints:
             raise DataError(f"image {row[0].strip()} has two rows", where=where, remedy="Remove one of them")
         joints[row[0].strip()] = values
-    missing = [image for image in images if image not in joints]
+    names = matched_names(images, joints, str(path), what="row of joints")
+    missing = [image for image in images if image not in names]
     if missing:
         raise DataError(
             f"no joints for {counted(len(missing), 'image')}: {', '.join(missing[:5])}",
             where=str(path),
             remedy="Add their rows, or leave the images out",
         )
-    return {image: joints[image] for image in images}
+    return {image: joints[names[image]] for image in images}

@@ -12,8 +12,19 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.images.decode import REDUCED, decode
 from service.core.errors import DataError
-from service.core.picture_files import check_jpeg, check_picture, picture_size
+from service.core.picture_files import (
+    JPEG_BEGINS,
+    another_kind,
+    check_jpeg,
+    check_picture,
+    kind_of,
+    picture_size,
+)
 
+# Kinds of pictures that nothing here decodes, and files that are no pictures.
+_UNREAD = frozenset({
+    "HEIC", "JPEG XL", "Photoshop", "raw file", "PDF", "ZIP", "video", "text", "Git LFS pointer"
+})  # fmt: skip
 _REMEDY = "Copy the file from the camera again, and use JPEG or PNG images"
 
 
@@ -23,15 +34,26 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         DataError: as `read_image`.
     """
-    if path.suffix.lower() in {".jpg", ".jpeg"}:
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise _unreadable(path, error) from error
-        check_jpeg(data, str(path))
+    data = _checked(path)
+    if data.startswith(JPEG_BEGINS):
         return picture_size(data, str(path))
-    height, width = read_grey(path).shape
+    height, width = _decoded(data, path, cv2.IMREAD_GRAYSCALE).shape
     return width, height
+
+
+def _checked(path: Path) -> bytes:
+    """The content of an image file, which decides its kind, not its name."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    kind = kind_of(data)
+    if kind in _UNREAD:
+        raise another_kind(kind, "JPEG or PNG", str(path))
+    if not kind and path.suffix.lower() in {".jpg", ".jpeg"}:
+        check_jpeg(data, str(path))  # OpenCV would read some formats without a mark of their own
+    check_picture(data, str(path))
+    return data
 
 
 def _unreadable(path: Path, error: OSError) -> DataError:
@@ -61,14 +83,10 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
 
 
 def _decode(path: Path, how: int) -> NDArray[np.uint8]:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise _unreadable(path, error) from error
-    if path.suffix.lower() in {".jpg", ".jpeg"}:
-        check_jpeg(data, str(path))
-    else:
-        check_picture(data, str(path))
+    return _decoded(_checked(path), path, how)
+
+
+def _decoded(data: bytes, path: Path, how: int) -> NDArray[np.uint8]:
     return decode(data, how | cv2.IMREAD_IGNORE_ORIENTATION, name=str(path), remedy=_REMEDY)
 
 

@@ -1,7 +1,7 @@
 """Reads a folder of images by one rule for all commands: odd files are left out, damaged ones are errors.
 
 Odd files are intact but do not belong: macOS's notes beside files (`._…`), second copies of an image, images of
-another size. `strict` refuses these too.
+another size, files of a kind that is not read under the name of one that is. `strict` refuses these too.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ from pathlib import Path
 
 from service.compute.images.files import image_size
 from service.core.errors import DataError
+from service.core.picture_files import ForeignKindError
 from service.core.text.counts import counted
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm"})
-READ = "JPEG, PNG, TIFF, BMP, PGM and PNM files are read"
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm", ".webp"})
+READ = "JPEG, PNG, TIFF, BMP, PGM, PNM and WebP files are read"
+_OTHER_SUFFIXES = frozenset({".heic", ".heif", ".avif", ".jxl"})
 _NAMED = 5  # damaged files named in an error
 
 
@@ -52,9 +54,15 @@ def image_folder(folder: Path, *, size: tuple[int, int] | None = None, strict: b
     reasons = {file.name: "a hidden file, not an image" for file in present if file.name.startswith(".")}
     shown = [file for file in present if file.name not in reasons]
     if not shown:
-        raise DataError("no image in this folder", where=str(folder), remedy=READ)
-    sizes = _sizes(shown, folder)
-    reasons |= _copies(shown)
+        others = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in _OTHER_SUFFIXES]
+        held = f": {others[0].name} is not of a kind that is read" if others else ""
+        raise DataError(f"no image in this folder{held}", where=str(folder), remedy=READ)
+    sizes, foreign = _sizes(shown, folder)
+    reasons |= foreign | _copies(shown)
+    shown = [file for file in shown if file.name in sizes]
+    if not shown:
+        name, reason = next(iter(foreign.items()))
+        raise DataError(f"no image in this folder can be read; {name}: {reason}", where=str(folder), remedy=READ)
     wanted = size or Counter(sizes[file.name] for file in shown if file.name not in reasons).most_common(1)[0][0]
     for file in shown:
         if file.name not in reasons and sizes[file.name] != wanted:
@@ -82,12 +90,16 @@ def strict_refusal(reasons: dict[str, str], folder: Path) -> DataError:
     )
 
 
-def _sizes(files: Sequence[Path], folder: Path) -> dict[str, tuple[int, int]]:
+def _sizes(files: Sequence[Path], folder: Path) -> tuple[dict[str, tuple[int, int]], dict[str, str]]:
+    """The sizes of the images, and the reasons why others, though whole, are not read."""
     sizes: dict[str, tuple[int, int]] = {}
+    foreign: dict[str, str] = {}
     damaged: list[str] = []
     for file in files:
         try:
             sizes[file.name] = image_size(file)
+        except ForeignKindError as error:
+            foreign[file.name] = f"{error.what}. {error.remedy}"
         except DataError as error:
             damaged.append(f"{file.name}: {error.what}")
     if damaged:
@@ -97,7 +109,7 @@ def _sizes(files: Sequence[Path], folder: Path) -> dict[str, tuple[int, int]]:
             where=str(folder),
             remedy="Copy them from the camera again, or take them out of the folder",
         )
-    return sizes
+    return sizes, foreign
 
 
 def _copies(files: Sequence[Path]) -> dict[str, str]:

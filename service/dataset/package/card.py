@@ -60,10 +60,18 @@ def _head(dataset: DataSet, words: str) -> list[str]:
 def _rights(about: About) -> list[str]:
     return _pairs(
         [
-            ("Licence", about.licence),
+            (
+                "Licence",
+                about.licence
+                if about.licence_address in {"", about.licence}
+                else f"{about.licence} ({about.licence_address})",
+            ),
             ("Ethics", about.ethics),
-            ("Made by", ", ".join(about.creators) or NOT_STATED),
+            ("Made by", ", ".join(maker.words for maker in about.creators) or NOT_STATED),
             ("Cite as", about.citation),
+            ("DOI", about.doi or NOT_STATED),
+            ("Publisher", about.publisher.words if about.publisher is not None else NOT_STATED),
+            ("Paid for by", ", ".join(funder.words for funder in about.funders) or NOT_STATED),
             ("Procedure", about.source or NOT_STATED),
         ]
     )

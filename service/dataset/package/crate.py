@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from service.core.records.attribution import Party, licence_name
 from service.dataset.package.crate_entities import (
     CONTEXT,
     Entity,
@@ -32,11 +33,15 @@ def crate(dataset: DataSet, words: str, files: Sequence[ListedFile], described: 
     about = dataset.about
     people = [person(name, {}) for name in about.people]
     devices = [device(one.name, one.model, one.firmware, one.serial) for one in about.devices]
-    makers = [_maker(name) for name in about.creators]
+    makers = _parties("creator", about.creators)
+    publishers = _parties("publisher", () if about.publisher is None else (about.publisher,))
+    funders = _parties("funder", about.funders)
     parts = [file_entity(file.path, file.sha256, file.size_bytes, described.get(file.path, "")) for file in files]
     root = _root(dataset, words) | {
         "creator": _ids(makers),
         "contributor": _ids(people),
+        **({"publisher": _ids(publishers)[0]} if publishers else {}),
+        **({"funder": _ids(funders)} if funders else {}),
         "hasPart": _ids(parts),
         "mentions": _ids(devices),
     }
@@ -46,11 +51,12 @@ def crate(dataset: DataSet, words: str, files: Sequence[ListedFile], described: 
         "@graph": [
             descriptor(),
             root,
-            {"@id": "#licence", "@type": "CreativeWork", "name": "Licence", "description": about.licence},
+            _licence(about),
             {"@id": "#ethics", "@type": "CreativeWork", "name": "Ethics", "description": about.ethics},
             software(about.software or "unknown"),
             run,
-            *makers,
+            # One body may make, publish and pay for a data set.
+            *{entity["@id"]: entity for entity in (*makers, *publishers, *funders)}.values(),
             *people,
             *devices,
             *parts,
@@ -75,8 +81,8 @@ def _root(dataset: DataSet, words: str) -> Entity:
         ),
         "datePublished": about.published_utc,
         "version": about.version,
-        "identifier": about.run,
-        "license": {"@id": "#licence"},
+        "identifier": [about.doi, about.run] if about.doi else about.run,
+        "license": {"@id": _licence(about)["@id"]},
         "subjectOf": {"@id": "#ethics"},
         "creditText": about.citation,
         "keywords": ["simulated"] if dataset.simulated else [],
@@ -96,8 +102,25 @@ def _run(about: About, devices: Sequence[Entity]) -> Entity:
     }
 
 
-def _maker(name: str) -> Entity:
-    return {"@id": anchor("creator", name), "@type": "Organization", "name": name}
+def _licence(about: About) -> Entity:
+    """By its address, as RO-Crate wants it; in words where it has none."""
+    address = about.licence_address
+    if not address:
+        return {"@id": "#licence", "@type": "CreativeWork", "name": "Licence", "description": about.licence}
+    return {"@id": address, "@type": "CreativeWork", "name": licence_name(address), "url": address}
+
+
+def _parties(kind: str, found: Sequence[Party]) -> list[Entity]:
+    """People by their ORCID and bodies by their ROR, where they have one."""
+    return [
+        {"@id": one.address or anchor(kind, one.name), "@type": one.kind, "name": one.name, **_names(one)}
+        for one in found
+    ]
+
+
+def _names(one: Party) -> Entity:
+    family, comma, given = one.name.partition(", ")
+    return {"familyName": family, "givenName": given} if one.kind == "Person" and comma and "," not in given else {}
 
 
 def _ids(entities: Sequence[Entity]) -> list[dict[str, str]]:

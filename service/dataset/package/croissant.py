@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
 
+from service.core.records.attribution import Party
 from service.dataset.package import views_table
 from service.dataset.package.crate_entities import media_type
 from service.dataset.package.croissant_context import CONTEXT
@@ -50,10 +51,13 @@ def croissant(
         ),
         "version": about.version,
         "datePublished": about.published_utc[:10] or "1970-01-01",
-        "license": about.licence,
+        "license": about.licence_address or about.licence,
         "citeAs": about.citation,
-        "url": f"urn:orthocapture:run:{about.run or 'unknown'}",
-        "creator": [{"@type": "sc:Organization", "name": name} for name in about.creators or ("not stated",)],
+        "url": about.doi or f"urn:orthocapture:run:{about.run or 'unknown'}",
+        "creator": [_party(maker) for maker in about.creators or (Party("not stated", "Organization"),)],
+        **({} if about.publisher is None else {"publisher": _party(about.publisher)}),
+        **({"funder": [_party(funder) for funder in about.funders]} if about.funders else {}),
+        **({"identifier": about.doi} if about.doi else {}),
         "keywords": ["simulated"] if dataset.simulated else ["captured"],
         "distribution": [
             *(_file_object(file, described) for file in files if file.path not in of_views),
@@ -64,6 +68,10 @@ def croissant(
             *(_pictures(role) for role, named in parts.items() if _is_pictures(role, named.values())),
         ],
     }
+
+
+def _party(one: Party) -> dict[str, str]:
+    return {"@type": f"sc:{one.kind}", "name": one.name, **({"url": one.address} if one.address else {})}
 
 
 def _file_object(file: ListedFile, described: Mapping[str, str]) -> dict[str, Any]:

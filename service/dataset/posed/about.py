@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
+from service.core.errors import DataError
+from service.core.records.attribution import Party, doi_address, licence_address, party
 from service.core.records.data_set import FIRST_VERSION, DataSetStatement
 from service.jobs.registration.evaluate import ErrorBudget, Row
 
@@ -94,19 +97,57 @@ class About:
         return self.stated.licence or "No licence was stated: ask the site that made the data set"
 
     @property
+    def licence_address(self) -> str:
+        """The address of the licence; "" where none was stated, or one in words as old protocols have it."""
+        try:
+            return licence_address(self.stated.licence)
+        except DataError:
+            return ""
+
+    @property
     def ethics(self) -> str:
         """The ethics statement in words."""
         return self.stated.ethics or "No ethics statement was given, neither in the protocol nor at the export"
 
     @property
-    def creators(self) -> tuple[str, ...]:
+    def creators(self) -> tuple[Party, ...]:
         """Who made the data set: as stated, else the site."""
-        return self.stated.creators or tuple(filter(None, (self.site,)))
+        site = (Party(self.site, "Organization"),) if self.site else ()
+        return tuple(_party(name) for name in self.stated.creators) or site
+
+    @property
+    def publisher(self) -> Party | None:
+        """Who publishes it, if that was stated."""
+        return _party(self.stated.publisher, "Organization") if self.stated.publisher else None
+
+    @property
+    def funders(self) -> tuple[Party, ...]:
+        """Who paid for it."""
+        return tuple(_party(name, "Organization") for name in self.stated.funders)
+
+    @property
+    def doi(self) -> str:
+        """The address of the data set's DOI, if it was stated and is one."""
+        try:
+            return doi_address(self.stated.doi)
+        except DataError:
+            return ""
 
     @property
     def citation(self) -> str:
         """How to cite it: as stated, else put together from the record."""
         if self.stated.cite:
             return self.stated.cite
-        whose = f"{', '.join(self.creators)}: " if self.creators else ""
-        return f"{whose}{self.title}. Data set, version {self.version}" + (f", run {self.run}." if self.run else ".")
+        names = ", ".join(maker.name for maker in self.creators)
+        whose = f"{names}: " if names else ""
+        where = f", {self.publisher.name}" if self.publisher is not None else ""
+        which = f", {self.doi}" if self.doi else f", run {self.run}" if self.run else ""
+        return f"{whose}{self.title}. Data set, version {self.version}{where}{which}."
+
+
+def _party(text: str, otherwise: Literal["Person", "Organization", ""] = "") -> Party:
+    """A stated person or body; one that an older record has in a wrong form is named as it stands there."""
+    try:
+        return party(text, otherwise=otherwise)
+    except DataError:
+        return Party(text, otherwise or "Person")

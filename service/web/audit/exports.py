@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Form, Path, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, StreamingResponse
-from pydantic import BaseModel, Field, field_validator
+from pydantic import BaseModel, Field, ValidationInfo, field_validator
 
 from service.audit.export.exports import Exports, What
 from service.audit.export.folder_zip import zip_chunks
@@ -158,6 +158,9 @@ def start_export(
     return _back(run_id)
 
 
+_LINES = ("creators", "funders")  # fields with one entry on each line
+
+
 class FormatForm(BaseModel):
     """A data set in a format, as the form has it."""
 
@@ -170,26 +173,43 @@ class FormatForm(BaseModel):
     ethics: str = Field("", max_length=1000)
     creators: str = Field("", max_length=4000)  # one a line
     cite: str = Field("", max_length=1000)
+    doi: str = Field("", max_length=1000)
+    publisher: str = Field("", max_length=1000)
+    funders: str = Field("", max_length=4000)  # one a line
     version: str = Field(FIRST_VERSION, pattern=VERSION)
     csrf: str = ""
 
-    @field_validator("creators")
+    @field_validator(*_LINES)
     @classmethod
     def _short_names(cls, text: str) -> str:
         if any(len(name) > LONGEST_NAME for name in _lines(text)):
             raise ValueError(f"a name has at most {LONGEST_NAME} characters; write one name on each line")
         return text
 
+    @field_validator("licence", "doi", "publisher", "creators", "funders")
+    @classmethod
+    def _identified(cls, text: str, info: ValidationInfo) -> str:
+        name = info.field_name or ""
+        stated = DataSetStatement.model_validate({name: _lines(text) if name in _LINES else text.strip()})
+        for error in stated.problems().values():
+            raise ValueError(str(error))
+        return text
+
     def wanted(self) -> WantedExport:
         """What is asked for. What the fields of the statement leave out is the protocol's."""
-        stated = DataSetStatement(
+        return WantedExport(self.form, self.crop, self.crops, self.anonymous, self._stated(), self.version)
+
+    def _stated(self) -> DataSetStatement:
+        return DataSetStatement(
             title=self.title.strip(),
             licence=self.licence.strip(),
             ethics=self.ethics.strip(),
             creators=_lines(self.creators),
             cite=self.cite.strip(),
+            doi=self.doi.strip(),
+            publisher=self.publisher.strip(),
+            funders=_lines(self.funders),
         )
-        return WantedExport(self.form, self.crop, self.crops, self.anonymous, stated, self.version)
 
 
 @router.post("/runs/{run_id}/exports/formats", name="start_format_export", dependencies=_EXPORT)

@@ -99,7 +99,10 @@ def test_what_the_form_states_is_in_the_card_and_the_metadata(web: WebSite, run:
     stated = {
         "title": 'Spine <7> "b"',
         "licence": "CC-BY-4.0",
-        "creators": "Ada L.\r\n\r\n Institute X ",
+        "creators": "Ada L. 0000-0002-1825-0097\r\n\r\n Institute X ",
+        "doi": "10.5281/zenodo.1234567",
+        "publisher": "ETH Zurich ror.org/05a28rw58",
+        "funders": "A fund\r\nAnother fund",
         "version": "2.1.0",
     }
     assert ask(supervisor, run, "plain", **stated) == 303
@@ -109,11 +112,16 @@ def test_what_the_form_states_is_in_the_card_and_the_metadata(web: WebSite, run:
     files = fetch(supervisor, run, event.payload.file_name)
     croissant = json.loads(files["croissant.json"])
     assert croissant["name"] == 'SIMULATED Spine <7> "b"'
-    assert (croissant["license"], croissant["version"]) == ("CC-BY-4.0", "2.1.0")
+    assert (croissant["license"], croissant["version"]) == ("https://spdx.org/licenses/CC-BY-4.0", "2.1.0")
     assert [creator["name"] for creator in croissant["creator"]] == ["Ada L.", "Institute X"]
+    assert (croissant["url"], croissant["publisher"]["name"]) == (
+        "https://doi.org/10.5281/zenodo.1234567",
+        "ETH Zurich",
+    )
+    assert [funder["name"] for funder in croissant["funder"]] == ["A fund", "Another fund"]
     assert "No ethics statement was given" in croissant["description"]
     card = files["DATACARD.md"].decode()
-    assert "Made by**: Ada L., Institute X" in card
+    assert "Made by**: Ada L. (https://orcid.org/0000-0002-1825-0097), Institute X" in card
     assert "Version 2.1.0" in card
 
 
@@ -139,6 +147,10 @@ def test_crops_that_do_not_fit_say_so_and_leave_nothing(web: WebSite, run: str, 
         {"form": "colmap", "version": "1.0"},
         {"form": "colmap", "title": "x" * 1001},
         {"form": "colmap", "creators": "x" * 201},
+        {"form": "colmap", "creators": "Ada L. 0000-0002-1825-0098"},
+        {"form": "colmap", "licence": "as you like"},
+        {"form": "colmap", "doi": "zenodo.1234567"},
+        {"form": "colmap", "publisher": "ETH Zurich ror.org/05a28rw59"},
     ],
 )
 def test_other_formats_and_options_are_refused(
@@ -273,3 +285,18 @@ def test_an_altered_folder_is_not_sent_as_whole(tmp_path: Path) -> None:
     (folder / SUMS).write_text(sums + sums)
     with pytest.raises(IntegrityError):
         list(zip_chunks(folder, recorded))
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"creators": "Ada L.\nAda L. 0000-0002-1825-0098"}, ("creators", "check digit is wrong")),
+        ({"licence": "CC BY 4.0"}, ("licence", "did you mean cc-by-4.0?")),
+    ],
+)
+def test_a_mistyped_identifier_is_named_with_its_field(
+    web: WebSite, run: str, supervisor: Browser, fields: dict[str, str], words: tuple[str, ...]
+) -> None:
+    page_of(web, supervisor, run)
+    shown = supervisor.send_form(f"/runs/{run}/exports/formats", form="colmap", **fields).text
+    assert all(word in shown for word in words)

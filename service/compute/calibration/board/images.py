@@ -16,6 +16,7 @@ from service.compute.calibration.board.board import Board, BoardView, Grey, find
 from service.compute.calibration.board.diagnosis import Diagnosis, diagnose, wrong_board
 from service.compute.images.files import read_grey
 from service.core.errors import ComputeError, DataError
+from service.logs.terminal import show_own_words_only
 
 _MANY_FILES = 24
 _MANY_BYTES = 30e6
@@ -76,7 +77,8 @@ def find_boards(
             if progress:
                 progress(len(found), len(files))
         return tuple(found)
-    with ProcessPoolExecutor(min(workers, len(files)), mp_context=get_context("spawn")) as pool:
+    pool_of = partial(ProcessPoolExecutor, mp_context=get_context("spawn"), initializer=show_own_words_only)
+    with pool_of(min(workers, len(files))) as pool:
         for image in pool.map(work, files):
             found.append(image)
             if progress:

@@ -29,6 +29,7 @@ from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.identification.pairing import paired
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import inverse
+from service.logs.terminal import show_own_words_only
 
 _MOST_FAILED = 0.4  # share of images whose prediction may fail before the prediction itself is doubted
 
@@ -216,6 +217,7 @@ def _mapping(workers: int, items: int) -> Generator[MapFunction]:
 
 
 def _one_thread() -> None:
+    show_own_words_only()
     cv2.setNumThreads(1)
 
 

@@ -17,6 +17,7 @@ import psutil
 
 from service.core.errors import DataError
 from service.core.geometry import Transform
+from service.logs.terminal import show_own_words_only
 
 _SPARE_BYTES = 1 << 30  # beyond what the library itself needs
 _SPARE_S, _BYTES_PER_S = 3.0, 1e6  # text is read sixty times as fast
@@ -55,6 +56,7 @@ def _bound(folder: str) -> None:
 
     Counts in a damaged file may request any amount; beyond the limits, the system ends the process.
     """
+    show_own_words_only()
     importlib.import_module("pycolmap")
     mapped_bytes = psutil.Process().memory_info().vms
     files_bytes = sum(file.stat().st_size for file in Path(folder).iterdir() if file.is_file())

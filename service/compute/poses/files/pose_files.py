@@ -1,4 +1,4 @@
-"""Reads and writes camera poses: CSV, transforms.json and COLMAP folders."""
+"""Reads and writes camera poses: CSV, trajectories, transforms.json and COLMAP folders."""
 
 from __future__ import annotations
 
@@ -15,43 +15,68 @@ from service.compute.camera_model import CameraModel
 from service.compute.images.folder import ImageFolder, strict_refusal
 from service.compute.poses.colmap import model_files as colmap_files
 from service.compute.poses.files.camera_files import finite_numbers, json_object
+from service.compute.poses.files.image_names import matched_names, some_names
+from service.compute.poses.files.trajectory import is_trajectory, trajectory_poses
+from service.core.delimited_text import read_table
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, from_quaternion, transform
-from service.core.text.file_text import csv_rows
+from service.core.text.file_text import csv_rows, file_bytes
 
 _HEADER = ("image", "x", "y", "z", "qx", "qy", "qz", "qw")
 _UNIT = 1e-3  # tolerance of a quaternion's length from 1, so that files with four decimals pass
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # T_camera_openglcamera: x right, y up, z backward
+_COLMAP_IMAGES = ("images.txt", "images.bin")
 HALF_PIXEL = 0.5  # in formats whose first pixel has its corner, not its centre, at 0
 
 
 def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Transform]:
-    """T_world_camera by image name from a CSV, a transforms.json or a COLMAP model folder.
+    """T_world_camera by image name from a CSV, a TUM trajectory, a transforms.json or a COLMAP model folder.
 
     Args:
         path: file or folder; its kind determines the format.
-        images: names that must have a pose, matched by file name if necessary; only these are returned. None returns
+        images: names that must have a pose, matched as `matched_names` does; only these are returned. None returns
             all.
 
     Raises:
         DataError: unknown format, malformed content (with file:line), or an image without a pose.
     """
     if path.is_dir():
-        transforms = path / "transforms.json"
-        poses = read_transforms_json(transforms) if transforms.is_file() else read_colmap_model(path)
+        transforms = _transforms_in(path)
+        poses = read_transforms_json(transforms) if transforms is not None else read_colmap_model(path)
+    elif path.name in _COLMAP_IMAGES and path.is_file():
+        poses = read_colmap_model(path.parent)
     elif not path.is_file():
         raise DataError("the pose file does not exist", where=str(path), remedy="Check the path")
     elif path.suffix.lower() == ".json":
         poses = read_transforms_json(path)
-    elif path.suffix.lower() in {".csv", ".txt"}:
-        poses = read_poses_csv(path)
+    elif path.suffix.lower() in {".csv", ".txt", ".tum", ".tsv"}:
+        table = read_table(file_bytes(path), str(path))
+        poses = trajectory_poses(table, path) if is_trajectory(table) else read_poses_csv(path)
     else:
         raise DataError(
             "unknown kind of pose file",
             where=str(path),
-            remedy="Give a .csv, a transforms.json or a COLMAP model folder",
+            remedy="Give a .csv, a trajectory of TUM (.txt), a transforms.json or a COLMAP model folder",
         )
     return poses if images is None else _select(poses, images, path)
+
+
+def _transforms_in(folder: Path) -> Path | None:
+    """The transforms.json of a folder, by this name or another that NeuS2 and Blender's data sets give it.
+
+    Raises:
+        DataError: there are several.
+    """
+    if (folder / "transforms.json").is_file():
+        return folder / "transforms.json"
+    found = sorted(folder.glob("transform*.json"))
+    if len(found) > 1:
+        raise DataError(
+            f"several files of poses: {', '.join(file.name for file in found)}",
+            where=str(folder),
+            remedy="Name one of them instead of the folder",
+        )
+    return found[0] if found else None
 
 
 def posed_images(
@@ -63,7 +88,7 @@ def posed_images(
         DataError: as `read_poses`; no image has a pose; or, with `strict`, one has none.
     """
     names = [file.name for file in images.files]
-    chosen, missing = _matched(read_poses(path), names)
+    chosen, missing = _matched(read_poses(path), names, path)
     if not chosen:
         raise _without_pose(missing, names, path)
     reasons = dict.fromkeys(missing, f"no pose in {path.name}")
@@ -73,28 +98,29 @@ def posed_images(
 
 
 def _select(poses: Mapping[str, Transform], images: Sequence[str], path: Path) -> dict[str, Transform]:
-    chosen, missing = _matched(poses, images)
+    chosen, missing = _matched(poses, images, path)
     if missing:
         raise _without_pose(missing, images, path)
     return chosen
 
 
-def _matched(poses: Mapping[str, Transform], images: Sequence[str]) -> tuple[dict[str, Transform], list[str]]:
-    """Poses by image, and the names of the images without one."""
-    by_file_name: dict[str, list[str]] = {}
-    for name in poses:
-        by_file_name.setdefault(Path(name).name, []).append(name)
-    chosen: dict[str, Transform] = {}
-    missing: list[str] = []
-    for image in images:
-        alike = by_file_name.get(Path(image).name, [])
-        if image in poses:
-            chosen[image] = poses[image]
-        elif len(alike) == 1:
-            chosen[image] = poses[alike[0]]
-        else:
-            missing.append(image)
-    return chosen, missing
+def _matched(
+    poses: Mapping[str, Transform], images: Sequence[str], path: Path
+) -> tuple[dict[str, Transform], list[str]]:
+    """Poses by image, and the names of the images without one.
+
+    Raises:
+        DataError: as `matched_names`, or none of the images has one.
+    """
+    names = matched_names(images, poses, str(path))
+    if images and not names:
+        raise DataError(
+            f"no image has a pose: the images are named {some_names(images)}, those of the poses "
+            f"{some_names(list(poses))}",
+            where=str(path),
+            remedy="Give the poses of these images, or name them alike",
+        )
+    return {image: poses[name] for image, name in names.items()}, [name for name in images if name not in names]
 
 
 def _without_pose(missing: Sequence[str], images: Sequence[str], path: Path) -> DataError:
@@ -161,14 +187,18 @@ def write_poses_csv(path: Path, T_world_camera: Mapping[str, Transform]) -> None
 
 
 def read_transforms_json(path: Path) -> dict[str, Transform]:
-    """T_world_camera from a nerfstudio or Instant-NGP transforms.json, whose cameras look along -z.
+    """T_world_camera from a transforms.json of nerfstudio, Instant-NGP, Blender's data sets or NeuS2.
 
-    Names are the frames' file_path without a leading "./".
+    Cameras look along -z, but those of NeuS2's own form and of Mitsuba along +z. Names are the frames' file_path
+    without a leading "./". Where `unit_box.json` of our own export lies beside it, positions are taken back to the
+    world.
 
     Raises:
         DataError: another kind of file, a matrix that is not rigid, or a duplicate image.
     """
-    frames = json_object(path).get("frames")
+    document = json_object(path)
+    T_camera_file, centre_m = _camera_axes(document), _centre_beside(path)
+    frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError("no list of frames in the file", where=str(path), remedy="Give a nerfstudio transforms.json")
     poses: dict[str, Transform] = {}
@@ -184,8 +214,30 @@ def read_transforms_json(path: Path) -> dict[str, Transform]:
             raise DataError(f"transform_matrix is {matrix.shape}, not 4 × 4", where=where, remedy="Correct the frame")
         if name in poses:
             raise DataError(f"image {name} has two poses", where=where, remedy="Remove one of them")
-        poses[name] = transform(_rotation(matrix[:3, :3], where), matrix[:3, 3]) @ OPENGL
+        poses[name] = transform(_rotation(matrix[:3, :3], where), matrix[:3, 3] + centre_m) @ T_camera_file
     return poses
+
+
+def _camera_axes(document: Mapping[str, Any]) -> Transform:
+    """The axes of a file's cameras, as `nerf_matrix_to_ngp` of NeuS2 and Instant-NGP takes them.
+
+    They test only whether the keys are there: with `from_na` x is right, y down, z forward, with `normal_mts_args`
+    (Mitsuba) x is left, y up, z forward.
+    """
+    if "from_na" in document:
+        return np.eye(4)
+    return np.diag([-1.0, -1.0, 1.0, 1.0]) if "normal_mts_args" in document else OPENGL
+
+
+def _centre_beside(path: Path) -> Array:
+    """The centre (3,) that our own exporters of the unit box subtracted from the positions, in metres; else zero."""
+    beside = path.parent / "unit_box.json"
+    if not beside.is_file():
+        return np.zeros(3)
+    centre_m = finite_numbers(json_object(beside).get("centre_m"), str(beside))
+    if centre_m.shape != (3,):
+        raise DataError("centre_m is not [x, y, z]", where=str(beside), remedy="Export the data set again")
+    return centre_m
 
 
 def _rotation(matrix: Array, where: str) -> Array:
@@ -253,7 +305,8 @@ def read_colmap_model(folder: Path) -> dict[str, Transform]:
     Raises:
         DataError: the folder has no model, or it cannot be read.
     """
-    for place in (folder, folder / "sparse" / "0", folder / "sparse", folder / "0"):
+    below = ("", "sparse/0", "sparse", "0", "dslr_calibration_undistorted")  # the last is ETH3D's
+    for place in (folder / name for name in below):
         if any((place / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
             return colmap_files.read_model(place)
     raise DataError(

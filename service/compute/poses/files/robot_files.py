@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.compute.poses.files.image_names import matched_names
 from service.core.errors import DataError
 from service.core.geometry import Transform
 from service.core.text.counts import counted
@@ -50,11 +51,13 @@ def read_stations(path: Path, images: Iterable[str]) -> dict[str, str]:
         if len(row) <= max(image, station):
             raise DataError("the line has no image or no station", where=f"{path}:{line}", remedy="Correct the line")
         found[row[image].strip()] = row[station].strip()
-    missing = sorted(set(images) - set(found))
+    wanted = list(images)
+    names = matched_names(wanted, found, str(path), what="station")
+    missing = sorted(set(wanted) - set(names))
     if missing:
         raise DataError(
             f"no station for {counted(len(missing), 'image')}: {', '.join(missing[:5])}",
             where=str(path),
             remedy="Add their lines",
         )
-    return found
+    return {image: found[name] for image, name in names.items()}

@@ -28,8 +28,10 @@ def write_images(dataset: DataSet, folder: ExportFolder, place: str) -> None:
         folder.file(f"{place}/{view.file}", lambda view=view: dataset.pixels.picture(view), Part("image", view.name))
 
 
-def write_model_text(dataset: DataSet, folder: ExportFolder, place: str) -> None:
+def write_model_text(dataset: DataSet, folder: ExportFolder, place: str, *, images: str = "") -> None:
     """cameras.txt, images.txt and an empty points3D.txt, as COLMAP's documentation describes them.
+
+    `images` stands before the names of pictures: "" or a folder below COLMAP's image_path, ending with `/`.
 
     Raises:
         DataError: the name of a picture has white space, which ends a name in this format.
@@ -53,7 +55,9 @@ def write_model_text(dataset: DataSet, folder: ExportFolder, place: str) -> None
     for number, view in enumerate(dataset.views, start=1):
         q, t = world_to_camera(view.T_world_camera)
         numbers = " ".join(repr(float(x)) for x in (*q, *t))
-        lines.append(f"{number} {numbers} {cameras[view.camera]} {view.file}\n\n")  # an empty line: no 2D points
+        lines.append(
+            f"{number} {numbers} {cameras[view.camera]} {images}{view.file}\n\n"
+        )  # an empty line: no 2D points
     folder.text(f"{place}/images.txt", head + "".join(lines))
     folder.text(f"{place}/points3D.txt", head)
 
