@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Generator
+import zlib
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import IncompleteExportError, UnreadableFileError
+from drivers.errors import DeviceError, IncompleteExportError, UnreadableFileError
 from drivers.interfaces import Array, Mesh, ScanExport, ScannedMesh
-from drivers.meshes.mesh_format import check_complete, companions, file_has_normals
+from drivers.meshes.companions import companions
+from drivers.meshes.mesh_format import check_complete
+from drivers.meshes.obj import read_obj
+from drivers.meshes.off import read_off
+from drivers.meshes.ply import read_ply
+from drivers.meshes.raw_mesh import IntArray, RawMesh
+from drivers.meshes.stl import read_stl
 
 MeshUnit = Literal["auto", "mm", "m"]
 METRES_PER_UNIT = {"mm": 1e-3, "m": 1.0}
@@ -26,12 +34,11 @@ OBJECT_DIAGONAL_M = (0.02, 20.0)
 MESH_SUFFIXES = (".obj", ".ply", ".stl")
 TEXTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".tga")
 
-IntArray = NDArray[np.int64]
-
-# What trimesh and NumPy raise for a damaged file or one of another format; some are bugs of trimesh (NameError).
+# What readers raise for a damaged file or one of another format. Some are bugs of trimesh (NameError), or a library
+# that it would like to have for such a file (ImportError).
 PARSE_ERRORS = (
     *(ValueError, TypeError, LookupError, AttributeError, NameError, EOFError, AssertionError, ArithmeticError),
-    *(RuntimeError, struct.error),
+    *(RuntimeError, ImportError, MemoryError, struct.error, zlib.error),
 )
 
 
@@ -54,8 +61,8 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
     Returns:
         The mesh with bitwise equal vertices merged (STL facets, UV seams), vertex normals (V, 3) from the file or
         area-weighted from its faces, and `findings`, the numbers of: vertices, faces, holes, boundary_edges,
-        non_manifold_edges, components, degenerate_faces, unreferenced_vertices, textures; normals_computed is 0
-        or 1.
+        non_manifold_edges, components, degenerate_faces, unreferenced_vertices, polygons_in_doubt, textures;
+        normals_computed is 0 or 1.
 
     Raises:
         IncompleteExportError: truncated, still growing, locked, or a companion is missing.
@@ -70,8 +77,8 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
     with unchanged(path):
         check_complete(path)
         export = export or export_of(path)
-        vertices, faces, normals = parse_mesh(path)
-    return scanned_mesh(vertices, faces, normals, unit, export)
+        raw = read_raw_mesh(path)
+    return scanned_mesh(raw, unit, export)
 
 
 @contextmanager
@@ -102,14 +109,13 @@ def unchanged(path: Path) -> Generator[None]:
         )
 
 
-def scanned_mesh(
-    vertices: Array, faces: IntArray, normals: Array | None, unit: MeshUnit, export: ScanExport
-) -> ScannedMesh:
+def scanned_mesh(raw: RawMesh, unit: MeshUnit, export: ScanExport) -> ScannedMesh:
     """Check a mesh that was read from an export, in the file's unit, and report on it as `read_mesh_file` does.
 
     Raises UnreadableFileError as `check_mesh` and `credible_unit` do.
     """
     path = export.files[0]
+    vertices, faces, normals = raw.vertices, raw.faces, raw.normals
     check_mesh(path, vertices, faces)
     found, evidence = credible_unit(path, vertices[_used(faces, len(vertices))], unit)
     vertices = vertices * METRES_PER_UNIT[found]
@@ -119,6 +125,7 @@ def scanned_mesh(
     kept = vertex_normals(merged, faces) if normals is None else _unit_length(_summed(index, normals, len(merged)))
     findings = {
         **mesh_findings(merged, faces),
+        "polygons_in_doubt": float(raw.polygons_in_doubt),
         "normals_computed": float(computed),
         "textures": float(sum(file.suffix.lower() in TEXTURE_SUFFIXES for file in export.files[1:])),
     }
@@ -208,41 +215,63 @@ def _unit_length(normals: Array) -> Array:
 def parse_mesh(path: Path) -> tuple[Array, IntArray, Array | None]:
     """Vertices (V, 3) in the file's unit, faces (F, 3) and the file's vertex normals, None if missing or invalid.
 
+    Raises as `read_raw_mesh` does.
+    """
+    raw = read_raw_mesh(path)
+    return raw.vertices, raw.faces, raw.normals
+
+
+def read_raw_mesh(path: Path) -> RawMesh:
+    """The triangles of an OBJ, PLY, STL, OFF, GLB or glTF file, in its unit, with normals only if they are valid.
+
     Raises:
+        IncompleteExportError: the file is cut short.
         UnreadableFileError: not a mesh of the format that the name says, or no faces.
         OSError: the file cannot be opened.
     """
-    import trimesh  # noqa: PLC0415 - half a second, for those who read a mesh
-
-    suffix = path.suffix.lower()[1:]
-    # The geometry does not need the materials, which travel with the export as companions.
-    options: dict[str, Any] = {"skip_materials": True} if suffix == "obj" else {}
+    suffix = path.suffix.lower()
     try:
-        with path.open("rb") as stream:
-            loaded = trimesh.load(stream, file_type=suffix, process=False, **options)
-            mesh = loaded.to_geometry() if isinstance(loaded, trimesh.Scene) else loaded
-            if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-                raise UnreadableFileError(
-                    "the file has no faces, only points",
-                    where=str(path),
-                    remedy="Export a triangle mesh; triangle strips and point clouds are not supported",
-                )
-            vertices = np.array(mesh.vertices, dtype=np.float64)
-            faces = np.array(mesh.faces, dtype=np.int64)
-            normals = None
-            if suffix != "stl" and file_has_normals(path) and len(mesh.vertex_normals) == len(vertices):
-                normals = np.array(mesh.vertex_normals, dtype=np.float64)
+        raw = _READERS.get(suffix, _by_trimesh)(path)
+    except (DeviceError, OSError):
+        raise
     except PARSE_ERRORS as error:
         raise UnreadableFileError(
-            f"the file cannot be parsed as a {suffix.upper()} mesh ({error})",
+            f"the file cannot be parsed as a {suffix[1:].upper()} mesh ({error})",
             where=str(path),
             remedy="Open it in the scanner's software and export it again",
         ) from error
-    if normals is not None:
-        length = np.linalg.norm(normals, axis=1)
-        if not np.all(np.isfinite(length)) or np.mean(np.abs(length - 1.0) > 0.05) > 0.01:
-            normals = None
-    return vertices, faces, normals
+    if len(raw.faces) == 0:
+        raise UnreadableFileError(
+            "the file has no faces, only points",
+            where=str(path),
+            remedy="Export a triangle mesh; triangle strips and point clouds are not supported",
+        )
+    return raw if _valid(raw) else replace(raw, normals=None)
+
+
+_READERS: Mapping[str, Callable[[Path], RawMesh]] = {
+    ".obj": read_obj, ".off": read_off, ".ply": read_ply, ".stl": read_stl
+}  # fmt: skip
+
+
+def _by_trimesh(path: Path) -> RawMesh:
+    """The mesh of a GLB or glTF, whose faces are triangles. Raises one of PARSE_ERRORS."""
+    import trimesh  # noqa: PLC0415 - half a second, for those who read such a mesh
+
+    with path.open("rb") as stream:
+        loaded = trimesh.load(stream, file_type=path.suffix.lower()[1:], process=False)
+    mesh = loaded.to_geometry() if isinstance(loaded, trimesh.Scene) else loaded
+    if not isinstance(mesh, trimesh.Trimesh):
+        return RawMesh(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
+    return RawMesh(np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64))
+
+
+def _valid(raw: RawMesh) -> bool:
+    """Whether nearly all normals of vertices that have a face are of unit length."""
+    if raw.normals is None:
+        return True
+    length = np.linalg.norm(raw.normals[_used(raw.faces, len(raw.vertices))], axis=1)
+    return bool(np.all(np.isfinite(length)) and np.mean(np.abs(length - 1.0) > 0.05) <= 0.01)
 
 
 def check_mesh(path: Path, vertices: Array, faces: IntArray) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import PurePosixPath
 
-from drivers.meshes.mesh_format import companion_names
+from drivers.meshes.companions import companion_names
 from service.dataset.posed.records import ScanFile
 from service.dataset.registered_scan import registered_scan
 from service.dataset.summary import RunSummary
