@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 # Of names that are not UTF-8: Western Europe, Japan, China, Korea, Taiwan, Central Europe, Russia, DOS, macOS.
 _LEGACY = (
     "cp1252", "cp932", "gb18030", "cp949", "big5", "cp1250", "cp1251", "cp850", "cp437", "mac_roman", "latin-1",
 )  # fmt: skip
 _BLOCK_BYTES = 1 << 24
-_LONGEST_NUMBER = 64  # characters
+_SHOWN = 64  # most bytes of a word in an error
 _UTF16 = ((codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be"))
 # A line that goes on after a backslash. Not any line does: a comment may end with a folder's name, and the second
 # byte of a character of Shift-JIS may be a backslash.
@@ -90,25 +91,33 @@ def _plain(block: bytes) -> bytes:
     return block
 
 
-def numbers(words: list[bytes], kind: type[np.float64] | type[np.int64] = np.float64) -> Any:
-    """Words as numbers (N,). Raises ValueError with the first that is none."""
-    if not words:
+def numbers(
+    text: bytes, kind: type[np.float64] | type[np.int64] = np.float64, count: int | None = None
+) -> NDArray[Any]:
+    """The words of a text as numbers (N,); `count` is how many words there are, if it is known.
+
+    Raises ValueError with the first that is none.
+    """
+    count = len(text.split()) if count is None else count
+    if count == 0:
         return np.empty(0, dtype=kind)
     try:
-        if max(map(len, words)) <= _LONGEST_NUMBER:  # all take as much memory as the longest
-            return np.array(words, dtype="S").astype(kind)
-    except (ValueError, OverflowError):
-        pass
+        values = np.fromstring(text, dtype=kind, sep=" ")
+    except (ValueError, DeprecationWarning):  # NumPy 2.3 and older warn
+        values = np.empty(0, dtype=kind)
+    if len(values) == count:  # 1-2 would be taken for two numbers
+        return values
+    words = text.split()
     wrong = next((word for word in words if not is_number(word, kind)), words[0])
-    text = readings(wrong[:_LONGEST_NUMBER])[0]
-    comma = " (a decimal comma)" if re.fullmatch(r"[-+]?\d+,\d+(e[-+]?\d+)?", text, re.IGNORECASE) else ""
-    raise ValueError(f"{text!r} is not a number{comma}")
+    shown = readings(wrong[:_SHOWN])[0]
+    comma = " (a decimal comma)" if re.fullmatch(r"[-+]?\d+,\d+(e[-+]?\d+)?", shown, re.IGNORECASE) else ""
+    raise ValueError(f"{shown!r} is not a number{comma}")
 
 
 def is_number(word: bytes, kind: type[np.float64] | type[np.int64] = np.float64) -> bool:
     """Whether `numbers` takes a word for a number."""
     try:
-        np.array([word], dtype="S").astype(kind)
+        kind(word)
     except (ValueError, OverflowError):
         return False
-    return len(word) <= _LONGEST_NUMBER
+    return b"_" not in word

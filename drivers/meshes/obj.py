@@ -88,11 +88,12 @@ class _Lines:
 
     def values(self, per_line: IntArray, kind: type[np.float64] | type[np.int64]) -> Array:
         """All words as numbers; `per_line` says how many each line has. Raises ValueError with the line's number."""
-        words = self.text.tobytes().split()
+        text = self.text.tobytes()
         try:
-            return numbers(words, kind)
+            return numbers(text, kind, int(per_line.sum()))
         except ValueError as error:
-            wrong = next(place for place, word in enumerate(words) if not is_number(word, kind))
+            words = enumerate(text.split())
+            wrong = next((place for place, word in words if not is_number(word, kind)), 0)
             line = self.numbers[np.searchsorted(np.cumsum(per_line), wrong, side="right")]
             raise ValueError(f"line {line}: {error}") from None
 

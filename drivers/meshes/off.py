@@ -30,15 +30,14 @@ def read_off(path: Path) -> RawMesh:
     if first[head.end() :].strip().upper() == b"BINARY":
         raise ValueError("it is a binary OFF, which is not supported")
     counts = first[head.end() :].split() or next(rows, b"").split()
-    n_vertices, n_faces = numbers(counts[:2], np.int64).tolist()
+    n_vertices, n_faces = numbers(b" ".join(counts[:2]), np.int64).tolist()
     table = [row.split()[:3] for row in islice(rows, n_vertices)]
     faces = [row.split() for row in islice(rows, n_faces)]
     if len(table) < n_vertices or len(faces) < n_faces or any(len(row) < 3 for row in table):
         raise ValueError("it is shorter than it announces")
-    sizes = numbers([row[0] for row in faces], np.int64)
+    sizes = numbers(b" ".join(row[0] for row in faces), np.int64)
     if any(len(row) <= size for row, size in zip(faces, sizes.tolist(), strict=True)):
         raise ValueError("a face has fewer corners than it announces")
-    corners = numbers(
-        [word for row, size in zip(faces, sizes.tolist(), strict=True) for word in row[1 : 1 + size]], np.int64
-    )
-    return raw_mesh(numbers([word for row in table for word in row]).reshape(-1, 3), Polygons(corners, sizes))
+    corners = b" ".join(word for row, size in zip(faces, sizes.tolist(), strict=True) for word in row[1 : 1 + size])
+    points = b" ".join(word for row in table for word in row)
+    return raw_mesh(numbers(points).reshape(-1, 3), Polygons(numbers(corners, np.int64), sizes))

@@ -228,9 +228,9 @@ class _Cells:
             while chunk := stream.read(_BLOCK_BYTES):
                 chunk = rest + chunk
                 end = max(chunk.rfind(blank) for blank in (b"\n", b" ", b"\r", b"\t")) + 1
-                parts.append(numbers(chunk[:end].split()))
+                parts.append(numbers(chunk[:end]))
                 rest = chunk[end:]
-            parts.append(numbers(rest.split()))
+            parts.append(numbers(rest))
         return cls(np.concatenate(parts), "")
 
     def width(self, kind: str) -> int:

@@ -35,16 +35,19 @@ def read_stl(path: Path) -> RawMesh:
             return _of_facets(corners, np.full(len(corners) // 3, 3, dtype=np.int64))
     points, ends, known = [np.empty((0, 3))], [np.empty(0, np.int64)], 0
     for block in logical_lines(path):
-        # Names may hold any word, and numbers 1E-3.
-        words = _NAMES.sub(b"", block.lower()).split()
-        keys = np.array([word[:8] for word in words] or [b""], dtype="S8")
-        at = np.flatnonzero(keys == b"vertex")
-        if len(at) and at[-1] + 3 >= len(words):
-            raise ValueError("its last vertex is cut short")
-        values = numbers([words[place + k] for place in at.tolist() for k in (1, 2, 3)])
+        # Names may hold any word; the words of the format may be in capitals, and all in one line.
+        words = _NAMES.sub(b"", block.lower()).replace(b"vertex", b"\nv").replace(b"endloop", b"\n!\n")
+        text = np.frombuffer(words + b"\n", dtype=np.uint8).copy()
+        line_ends = np.flatnonzero(text == ord("\n"))
+        starts = np.concatenate([[0], line_ends[:-1] + 1])
+        is_vertex, is_end = text[starts] == ord("v"), text[starts] == ord("!")
+        text[starts[is_vertex]] = ord(" ")
+        values = numbers(text[np.repeat(is_vertex, line_ends - starts + 1)].tobytes())
+        if len(values) != 3 * np.count_nonzero(is_vertex):
+            raise ValueError("a vertex has more or fewer than three numbers")
         points.append(values.reshape(-1, 3))
-        ends.append(known + np.searchsorted(at, np.flatnonzero(keys == b"endloop")))
-        known += len(at)
+        ends.append(known + np.cumsum(is_vertex)[is_end])
+        known += int(is_vertex.sum())
     counts = np.diff(np.concatenate([[0], *ends]))
     if counts.sum() != known:
         raise ValueError("it has vertices outside its facets")
