@@ -38,9 +38,12 @@ PARSE_ERRORS = (
     AttributeError,
     LookupError,
     TypeError,
+    NameError,
     EOFError,
-    NotImplementedError,
-    RecursionError,
+    ImportError,  # of a codec that a library would like to have
+    AssertionError,
+    MemoryError,  # as much as a wrong length asks for
+    RuntimeError,
     struct.error,
     zlib.error,
 )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.folder_files import files_below
+from drivers.foreign_code import reading
 from drivers.interfaces import ScanExport
 from drivers.meshes.mesh_file import MESH_SUFFIXES, export_of
 from drivers.meshes.mesh_format import check_complete
@@ -83,10 +84,11 @@ class ExportWatch:
         if old is not None and old.export is not None and _signature(old.export.files) == old.signature:
             return old
         try:
-            if old is None or old.signature[:1] != own or old.trouble:
-                self._check(path)
-            export = export_of(path)
-            files = export.files
+            with reading(path, "an export", "Export it again"):
+                if old is None or old.signature[:1] != own or old.trouble:
+                    self._check(path)
+                export = export_of(path)
+                files = export.files
         except IncompleteExportError as error:
             trouble = str(error)
         except UnreadableFileError as error:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,7 +12,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import DeviceError, IncompleteExportError, UnreadableFileError
+from drivers.errors import IncompleteExportError, UnreadableFileError
+from drivers.foreign_code import reading
 from drivers.interfaces import Array, Mesh, ScanExport, ScannedMesh
 from drivers.meshes.companions import companions
 from drivers.meshes.mesh_format import check_complete
@@ -33,13 +32,6 @@ SCENE_DIAGONAL_M = (0.1, 3.0)
 OBJECT_DIAGONAL_M = (0.02, 20.0)
 MESH_SUFFIXES = (".obj", ".ply", ".stl")
 TEXTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".tga")
-
-# What readers raise for a damaged file or one of another format. Some are bugs of trimesh (NameError), or a library
-# that it would like to have for such a file (ImportError).
-PARSE_ERRORS = (
-    *(ValueError, TypeError, LookupError, AttributeError, NameError, EOFError, AssertionError, ArithmeticError),
-    *(RuntimeError, ImportError, MemoryError, struct.error, zlib.error),
-)
 
 
 def export_of(path: Path) -> ScanExport:
@@ -230,16 +222,9 @@ def read_raw_mesh(path: Path) -> RawMesh:
         OSError: the file cannot be opened.
     """
     suffix = path.suffix.lower()
-    try:
+    remedy = "Open it in the scanner's software and export it again"
+    with reading(path, f"a {suffix[1:].upper()} mesh", remedy):
         raw = _READERS.get(suffix, _by_trimesh)(path)
-    except (DeviceError, OSError):
-        raise
-    except PARSE_ERRORS as error:
-        raise UnreadableFileError(
-            f"the file cannot be parsed as a {suffix[1:].upper()} mesh ({error})",
-            where=str(path),
-            remedy="Open it in the scanner's software and export it again",
-        ) from error
     if len(raw.faces) == 0:
         raise UnreadableFileError(
             "the file has no faces, only points",
@@ -255,7 +240,7 @@ _READERS: Mapping[str, Callable[[Path], RawMesh]] = {
 
 
 def _by_trimesh(path: Path) -> RawMesh:
-    """The mesh of a GLB or glTF, whose faces are triangles. Raises one of PARSE_ERRORS."""
+    """The mesh of a GLB or glTF, whose faces are triangles. Raises whatever trimesh does."""
     import trimesh  # noqa: PLC0415 - half a second, for those who read such a mesh
 
     with path.open("rb") as stream:

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from drivers.errors import DeviceError, UnreadableFileError
+from drivers.foreign_code import reading
 from drivers.interfaces import Array
 from drivers.meshes.foreign_text import is_number, logical_lines, readings
-from drivers.meshes.mesh_file import METRES_PER_UNIT, PARSE_ERRORS, MeshUnit, credible_unit
+from drivers.meshes.mesh_file import METRES_PER_UNIT, MeshUnit, credible_unit
 from drivers.meshes.ply import Rows, read_header, read_rows
 
 _SAMPLE_BYTES = 64 * 1024
@@ -67,13 +68,13 @@ def read_point_cloud(path: Path, unit: MeshUnit = "auto") -> PointCloud:
 
 def parse_point_cloud(path: Path) -> tuple[Array, Array | None]:
     """Points (N, 3) in the file's unit, and unit normals (N, 3) or None; raises as `read_point_cloud` does."""
+    remedy = "Export points as PLY, or as text with x y z in each line and decimal points"
     try:
-        points, normals = _text(path) if path.suffix.lower() in TEXT_SUFFIXES else _ply(path)
-    except (OSError, *PARSE_ERRORS) as error:
+        with reading(path, "a point cloud", remedy):
+            points, normals = _text(path) if path.suffix.lower() in TEXT_SUFFIXES else _ply(path)
+    except OSError as error:
         raise UnreadableFileError(
-            f"the file cannot be parsed as a point cloud ({error})",
-            where=str(path),
-            remedy="Export points as PLY, or as text with x y z in each line and decimal points",
+            f"the file cannot be opened ({error.strerror})", where=str(path), remedy="Check its permissions"
         ) from error
     if len(points) < 3 or not np.isfinite(points).all():
         raise UnreadableFileError(
@@ -104,7 +105,8 @@ class _Form:
 
 
 def _form(block: bytes) -> _Form:
-    lines = [line for line in _without_quotes(block[:_SAMPLE_BYTES]).split(b"\n") if re.match(rb"[-+.,]?\d", line)]
+    rows = map(_without_remark, _without_quotes(block[:_SAMPLE_BYTES]).split(b"\n"))
+    lines = [row for row in rows if re.match(rb"[-+.,]?\d", row)]
     if any(b";" in line for line in lines):
         separator, commas = b";", any(b"," in line for line in lines)
     else:
@@ -119,7 +121,7 @@ def _plain_lines(path: Path, form: _Form) -> Iterator[str]:
     first = True
     for block in logical_lines(path):
         for line in _without_quotes(block).split(b"\n"):
-            row = re.split(rb"#|//", line, maxsplit=1)[0].strip() if b"#" in line or b"//" in line else line.strip()
+            row = _without_remark(line)
             # The first line can be a header, or only the number of points (.pts).
             header, first = first and bool(row), first and not row
             words = row.replace(b",", b" ").replace(b";", b" ").split()
@@ -132,6 +134,10 @@ def _plain_lines(path: Path, form: _Form) -> Iterator[str]:
             if form.commas and b"." in row:
                 raise ValueError(f"it has decimal points and decimal commas, as in {readings(row)[0]!r}")
             yield (row.replace(b",", b".") if form.commas else row).decode("latin-1")
+
+
+def _without_remark(line: bytes) -> bytes:
+    return (re.split(rb"#|//", line, maxsplit=1)[0] if b"#" in line or b"//" in line else line).strip()
 
 
 def _without_quotes(block: bytes) -> bytes:
@@ -147,7 +153,7 @@ def _ply(path: Path) -> tuple[Array, Array | None]:
 def ply_points(path: Path) -> tuple[Array, Array | None]:
     """The vertices (N, 3) of a PLY file as they are, also if not finite, and its normals (N, 3) or None.
 
-    Raises OSError, DeviceError, or one of PARSE_ERRORS if the file is damaged.
+    Raises ValueError if the file is damaged, OSError, and as read_rows does.
     """
     vertex = read_rows(path).get("vertex", Rows({}, {}))
     points = vertex.table("x", "y", "z")

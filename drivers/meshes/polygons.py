@@ -27,6 +27,16 @@ class Triangles:
     doubtful: int
 
 
+def in_doubt(doubtful: int) -> str:
+    """Words for polygons that have no inside to speak of; empty if there are none."""
+    if not doubtful:
+        return ""
+    return (
+        f"{doubtful} of its polygons have fewer than three corners (left out), no area, or an outline that crosses "
+        "itself (cut from one corner)"
+    )
+
+
 def cut(vertices: Array, corners: IntArray, counts: IntArray) -> Triangles:
     """Cut polygons into triangles; a polygon of n corners becomes n - 2.
 

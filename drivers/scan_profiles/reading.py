@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from drivers.errors import UnreadableFileError
+from drivers.foreign_code import reading
 from drivers.interfaces import Array, ScanExport, ScannedMesh
-from drivers.meshes.mesh_file import PARSE_ERRORS, MeshUnit, read_mesh_file, scanned_mesh, unchanged
+from drivers.meshes.mesh_file import MeshUnit, read_mesh_file, scanned_mesh, unchanged
 from drivers.meshes.mesh_format import check_complete
 from drivers.meshes.point_cloud import is_point_cloud, ply_points
 from drivers.meshes.raw_mesh import IntArray, RawMesh
@@ -69,12 +70,8 @@ def _of_e57(path: Path) -> tuple[Array, IntArray, None]:
 
 
 def _of_view(profile: ScanProfile, path: Path) -> tuple[Array, IntArray, Array | None]:
-    try:
+    with reading(path, "PLY", profile.advice):
         points, normals = ply_points(path)
-    except PARSE_ERRORS as error:
-        raise UnreadableFileError(
-            f"the file cannot be parsed as PLY ({error})", where=str(path), remedy=profile.advice
-        ) from error
     shape = next(((rows, columns) for columns, rows in profile.views if rows * columns == len(points)), None)
     if shape is None:
         known = ", ".join(f"{columns} × {rows}" for columns, rows in profile.views)

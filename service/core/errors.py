@@ -87,3 +87,7 @@ class ImagesSpoiltError(OrthocaptureError):
 
 class ComputeError(OrthocaptureError):
     """A computation has no trustworthy answer for this data; the message says why."""
+
+
+class UnforeseenError(OrthocaptureError):
+    """A step ended with an error that nobody foresaw, such as one of a library; the log has where it was raised."""

@@ -14,7 +14,15 @@ from rich.table import Table
 
 from drivers.meshes.mesh_file import MeshUnit, read_mesh_file
 from drivers.meshes.point_cloud import is_point_cloud, read_point_cloud
-from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors, require_writable
+from service.cli.common import (
+    JsonOption,
+    console,
+    print_json,
+    print_table,
+    reporting_errors,
+    require_writable,
+    tell_doubt,
+)
 from service.compute.surfaces.spheres.mesh_spheres import MeshSphere, SphereLimits, locate_spheres
 from service.compute.surfaces.spheres.other_radii import MeasuredRadius, seen_radius
 from service.core.errors import ComputeError, DataError
@@ -154,6 +162,7 @@ def spheres_of(
         vertices, normals = cloud.points_m, cloud.normals
     else:
         scan = read_mesh_file(mesh, unit)
+        tell_doubt(mesh, scan.findings["polygons_in_doubt"])
         vertices, faces = scan.mesh.vertices_m, scan.mesh.faces
     try:
         return locate_spheres(vertices, faces, radius_m, expected, limits, normals=normals, seeds_m=seeds_m)
