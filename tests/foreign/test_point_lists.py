@@ -74,6 +74,7 @@ def test_normals_are_read_too(tmp_path: Path, separator: str, comma: str) -> Non
     path.write_text("\n".join(separator.join(f"{v:.6f}".replace(".", comma) for v in row) for row in table))
     points, found = parse_point_cloud(path)
     np.testing.assert_allclose(points, POINTS, rtol=1e-6)
+    assert found is not None
     np.testing.assert_allclose(found, normals(), atol=1e-5)
 
 
