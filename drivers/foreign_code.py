@@ -37,3 +37,16 @@ def reading(path: Path, what: str, remedy: str) -> Generator[None]:
         raise UnreadableFileError(
             f"the file cannot be parsed as {what} ({words})", where=str(path), remedy=remedy
         ) from error
+
+
+def check_name(path: Path) -> None:
+    """Check that the name of a file can be written down: on the disk it may be any bytes.
+
+    Raises UnreadableFileError.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise UnreadableFileError(
+            "the name of the file is not UTF-8 text", where=str(path), remedy="Rename the file, or its folder"
+        ) from None

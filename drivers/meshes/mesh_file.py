@@ -244,7 +244,7 @@ def _by_trimesh(path: Path) -> RawMesh:
     import trimesh  # noqa: PLC0415 - half a second, for those who read such a mesh
 
     with path.open("rb") as stream:
-        loaded = trimesh.load(stream, file_type=path.suffix.lower()[1:], process=False)
+        loaded = trimesh.load(stream, file_type=path.suffix.lower()[1:], process=False, skip_materials=True)
     mesh = loaded.to_geometry() if isinstance(loaded, trimesh.Scene) else loaded
     if not isinstance(mesh, trimesh.Trimesh):
         return RawMesh(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))

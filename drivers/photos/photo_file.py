@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.errors import UnreadableFileError
-from drivers.foreign_code import reading
+from drivers.foreign_code import check_name, reading
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage
 from service.core.errors import DataError
 from service.core.picture_files import TruncatedPictureError, check_jpeg
@@ -117,6 +117,7 @@ _KEYS = {
 
 def read_exif(path: Path) -> ExifRecord:
     """Read the EXIF of a photograph (JPEG, TIFF, PNG, raw). Raises UnreadableFileError if it is not an image."""
+    check_name(path)
     with reading(path, "a photograph", "Copy it again from the camera"):
         image = exiv2.ImageFactory.open(str(path))
         image.readMetadata()

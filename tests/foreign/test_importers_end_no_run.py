@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -160,3 +161,11 @@ def test_a_photograph_that_a_reader_cannot_bear_is_named(tmp_path: Path, monkeyp
     with pytest.raises(UnreadableFileError, match="OddError") as caught:
         read_exif(path)
     assert caught.value.where == str(path)
+
+
+def test_a_photograph_whose_name_is_no_text_is_named(tmp_path: Path) -> None:
+    path = tmp_path / os.fsdecode("Rücken.JPG".encode("latin-1"))
+    path.write_bytes(b"\xff\xd8\xff\xd9")
+    with pytest.raises(UnreadableFileError, match=r"not UTF-8 text.*Rename") as caught:
+        read_exif(path)
+    assert "R\\udcfccken.JPG" in caught.value.where
