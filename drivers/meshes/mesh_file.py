@@ -16,6 +16,7 @@ from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.foreign_code import reading
 from drivers.interfaces import Array, Mesh, ScanExport, ScannedMesh
 from drivers.meshes.companions import companions
+from drivers.meshes.foreign_text import name_of
 from drivers.meshes.mesh_format import check_complete
 from drivers.meshes.obj import read_obj
 from drivers.meshes.off import read_off
@@ -38,7 +39,7 @@ def export_of(path: Path) -> ScanExport:
     """Return the export formed by this mesh file and its companions. Raises as `mesh_format.companions` does."""
     stat = path.stat()
     modified = datetime.fromtimestamp(stat.st_mtime, UTC).isoformat().replace("+00:00", "Z")
-    return ScanExport(name=path.name, files=(path, *companions(path)), modified_utc=modified)
+    return ScanExport(name=name_of(path), files=(path, *companions(path)), modified_utc=modified)
 
 
 def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | None = None) -> ScannedMesh:

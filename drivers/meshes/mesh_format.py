@@ -7,6 +7,7 @@ import struct
 from pathlib import Path
 
 from drivers.errors import IncompleteExportError, UnreadableFileError
+from drivers.foreign_code import reading
 from drivers.meshes.foreign_text import logical_lines, readings
 from drivers.meshes.ply import Element, read_header
 from drivers.meshes.stl import announced_bytes
@@ -17,7 +18,24 @@ _HEAD_BYTES = 64 * 1024
 _WHAT = rb"(vertices|vertexes|verts|faces)"
 _COUNTS = tuple(
     re.compile(pattern, re.MULTILINE | re.IGNORECASE)
-    for pattern in (rb"^#\s*(\d+) " + _WHAT + rb"\s*$", rb"^#\s*" + _WHAT + rb"\s*[:=]?\s*(\d+)\s*$")
+    for pattern in (rb"^#\s*(\d{1,18}) " + _WHAT + rb"\s*$", rb"^#\s*" + _WHAT + rb"\s*[:=]?\s*(\d{1,18})\s*$")
+)
+_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb")
+_MARK = rb"(?:\xef\xbb\xbf)?\s*"
+# What a file begins with, what it is then, and the names that it may have.
+_CONTENTS = (
+    (re.compile(_MARK + rb"ply[ \t]*[\r\n]"), "a PLY", (".ply",)),
+    (re.compile(_MARK + rb"solid\b.*\bfacet\b", re.IGNORECASE | re.DOTALL), "an STL", (".stl",)),
+    (re.compile(_MARK + rb"(?:ST)?C?N?OFF\s"), "an OFF", (".off",)),
+    (re.compile(rb"glTF"), "a GLB", (".glb",)),
+    (
+        re.compile(_MARK + rb"(?:#[^\n]*\n\s*)*(?:mtllib [^\n]*\s+)?(?:[og] [^\n]*\s+)?v[ \t]+[-\d.]"),
+        "an OBJ",
+        (".obj",),
+    ),
+    (re.compile(rb"PK\x03\x04"), "a ZIP archive", ()),
+    (re.compile(rb"\x1f\x8b"), "a file compressed by gzip", ()),
+    (re.compile(rb"version https://git-lfs"), "a pointer to a file that Git LFS has not fetched", ()),
 )
 _LEAST = {b"v": 3, b"vn": 3, b"vt": 1, b"f": 3}  # words after the keyword
 _NAMED = (b"usemtl", b"mtllib")
@@ -34,15 +52,33 @@ def check_complete(path: Path, *, points: bool = False) -> None:
     size = path.stat().st_size
     if size == 0:
         raise IncompleteExportError("the file is empty", where=str(path), remedy=_AGAIN)
-    match path.suffix.lower():
-        case ".ply":
-            _check_ply(path, size, points=points)
-        case ".stl":
-            _check_stl(path, size)
-        case ".obj":
-            _check_obj(path)
-        case _:
-            pass
+    with reading(path, "a mesh", "Export the scan again"):
+        _check_content(path)
+        match path.suffix.lower():
+            case ".ply":
+                _check_ply(path, size, points=points)
+            case ".stl":
+                _check_stl(path, size)
+            case ".obj":
+                _check_obj(path)
+            case _:
+                pass
+
+
+def _check_content(path: Path) -> None:
+    """Refuse a file whose content is plainly of another kind than its name says."""
+    with path.open("rb") as stream:
+        head = stream.read(1024)
+    suffix = path.suffix.lower()
+    for pattern, what, right in _CONTENTS:
+        if suffix in _SUFFIXES and suffix not in right and pattern.match(head):
+            raise UnreadableFileError(
+                f"its content is that of {what}, and its name ends with {path.suffix}",
+                where=str(path),
+                remedy=f"Give it a name that ends with {right[0]}"
+                if right
+                else "Unpack it, or export the scan again",
+            )
 
 
 # --- PLY -----------------------------------------------------------------------------------------------

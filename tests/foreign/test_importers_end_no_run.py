@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,7 +16,8 @@ from drivers.dicom_folder.folder import DicomFolder
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import CtSource, Scanner
 from drivers.photos.photo_file import exiv2, read_exif
-from service.core.records.events import StepFailed
+from drivers.scan_folder import ScanFolder, ScanFolderConfig
+from service.core.records.events import DeviceOpened, StepFailed
 from service.core.records.import_list import ImportList
 from tests.support.ct.ct_series import write_series
 from tests.support.rig.bench_rig import BenchRig
@@ -169,3 +171,22 @@ def test_a_photograph_whose_name_is_no_text_is_named(tmp_path: Path) -> None:
     with pytest.raises(UnreadableFileError, match=r"not UTF-8 text.*Rename") as caught:
         read_exif(path)
     assert "R\\udcfccken.JPG" in caught.value.where
+
+
+@pytest.mark.parametrize("device", ["scans", "ct"])
+def test_a_damaged_file_whose_name_is_no_text_is_reported_and_no_more(tmp_path: Path, device: str) -> None:
+    """Its name could be neither printed nor recorded, and with that no file of the folder could be imported."""
+    folder = tmp_path / device
+    folder.mkdir()
+    (folder / os.fsdecode("Rücken.ply".encode("latin-1"))).write_bytes(b"ply\n")
+    (folder / os.fsdecode("Rücken.dcm".encode("latin-1"))).write_bytes(b"no slice")
+    scans, series = ScanFolder(ScanFolderConfig(folder=folder)), DicomFolder(DicomFolderConfig(folder=folder))
+    opened = scans if device == "scans" else series
+    opened.open()
+    report = opened.report()
+    assert len(report.problems) == (1 if device == "scans" else 2)
+    assert any("Rücken.ply: the PLY header is cut short" in problem for problem in report.problems)
+    with bench_store(tmp_path / "data") as store:
+        bench = begin_run(store, HEAD + STEPS["scan"], tmp_path)
+        store.record(bench.run_id, [DeviceOpened(device=device, report=asdict(report))], actor="runner")
+    "\n".join(report.problems).encode()

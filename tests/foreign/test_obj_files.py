@@ -71,6 +71,7 @@ WRITTEN: dict[str, bytes] = {
     "texture coordinates of three numbers": BOX.replace("\nf", "\nvt 0 0 0\nf", 1).encode(),
     "points and lines too": BOX.encode() + b"p 1 2\nl 1 2 3\n",
     "ends with a line of another kind": BOX.encode() + b"l 1 2",
+    "a remark with a count beyond belief": b"# " + b"9" * 5000 + b" vertices\n" + BOX.encode(),
     "ends with a group without a name": BOX.encode() + b"g",
     "several objects": BOX.replace("\nf", "\no one\nf", 1).encode() + b"g two\ns off\n",
     "capitals of keywords in names": BOX.encode() + b"o V 1 2 3\n",
@@ -147,6 +148,7 @@ def test_the_record_says_whether_the_normals_are_the_files(tmp_path: Path, faces
         (b"f 1 2 \\", "middle of a line"),
         (b"usemt", "middle of a line"),
         (b"# 20 faces\n", "6 faces of 20"),
+        (b"# faces: 20", "6 faces of 20"),
     ],
 )
 def test_a_file_that_is_still_written_is_waited_for(tmp_path: Path, end: bytes, words: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import struct
 import sys
 from pathlib import Path
@@ -132,3 +133,30 @@ def test_a_wrong_off_is_refused_by_name(tmp_path: Path, content: str, words: str
     with pytest.raises(UnreadableFileError, match=words) as caught:
         read_surface_file(path, "mm")
     assert caught.value.where == str(path)
+
+
+def test_a_file_of_another_kind_than_its_name_says_is_refused_with_the_right_name(tmp_path: Path) -> None:
+    """People rename files, and programs add the extension that was typed."""
+    contents = {
+        ".stl": BOX.encode(),
+        ".off": OFF["plain"].encode(),
+        ".ply": b"ply\nformat ascii 1.0\nelement vertex 0\nelement face 0\nend_header\n",
+        ".obj": b"# of a program\nmtllib a.mtl\no box\nv 0 0 0\nv 300 0 0\nv 0 300 0\nf 1 2 3\n",
+        ".glb": b"glTF" + bytes(2000),
+    }
+    others = {
+        "PK": b"PK\x03\x04" + bytes(100),
+        "gzip": gzip.compress(BOX.encode()),
+        "LFS": b"version https://git-lfs",
+    }
+    for suffix in contents:
+        path = tmp_path / f"a{suffix}"
+        for right, content in contents.items():
+            if right != suffix:
+                path.write_bytes(content)
+                with pytest.raises(UnreadableFileError, match=f"a name that ends with {right}"):
+                    read_surface_file(path, "mm")
+        for content in others.values():
+            path.write_bytes(content)
+            with pytest.raises(UnreadableFileError, match="Unpack it, or export"):
+                read_surface_file(path, "mm")
