@@ -42,7 +42,9 @@ def export_of(path: Path) -> ScanExport:
     return ScanExport(name=name_of(path), files=(path, *companions(path)), modified_utc=modified)
 
 
-def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | None = None) -> ScannedMesh:
+def read_mesh_file(
+    path: Path, unit: MeshUnit = "auto", *, export: ScanExport | None = None, any_size: bool = False
+) -> ScannedMesh:
     """Read a triangle mesh, in metres.
 
     Args:
@@ -50,6 +52,7 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
         unit: of the file; `auto` infers it from the size of the bounding box, and `unit_evidence` says how. A unit
             that contradicts the size is an error, never silently corrected.
         export: the export that the file belongs to; found beside the file if not given.
+        any_size: as `credible_unit` takes it.
 
     Returns:
         The mesh with bitwise equal vertices merged (STL facets, UV seams), vertex normals (V, 3) from the file or
@@ -71,7 +74,7 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
         check_complete(path)
         export = export or export_of(path)
         raw = read_raw_mesh(path)
-    return scanned_mesh(raw, unit, export)
+    return scanned_mesh(raw, unit, export, any_size=any_size)
 
 
 @contextmanager
@@ -102,7 +105,7 @@ def unchanged(path: Path) -> Generator[None]:
         )
 
 
-def scanned_mesh(raw: RawMesh, unit: MeshUnit, export: ScanExport) -> ScannedMesh:
+def scanned_mesh(raw: RawMesh, unit: MeshUnit, export: ScanExport, *, any_size: bool = False) -> ScannedMesh:
     """Check a mesh that was read from an export, in the file's unit, and report on it as `read_mesh_file` does.
 
     Raises UnreadableFileError as `check_mesh` and `credible_unit` do.
@@ -110,7 +113,7 @@ def scanned_mesh(raw: RawMesh, unit: MeshUnit, export: ScanExport) -> ScannedMes
     path = export.files[0]
     vertices, faces, normals = raw.vertices, raw.faces, raw.normals
     check_mesh(path, vertices, faces)
-    found, evidence = credible_unit(path, vertices[_used(faces, len(vertices))], unit)
+    found, evidence = credible_unit(path, vertices[_used(faces, len(vertices))], unit, any_size=any_size)
     vertices = vertices * METRES_PER_UNIT[found]
     first, index = merge_equal(vertices)
     merged, faces = vertices[first], index[faces]
@@ -283,15 +286,19 @@ def check_mesh(path: Path, vertices: Array, faces: IntArray) -> None:
         )
 
 
-def credible_unit(path: Path, vertices: Array, unit: MeshUnit) -> tuple[str, str]:
+def credible_unit(path: Path, vertices: Array, unit: MeshUnit, *, any_size: bool = False) -> tuple[str, str]:
     """Determine the unit of vertices (V, 3) from the size of their bounding box; returns the unit and the evidence.
+
+    With `any_size`, `auto` also takes what is smaller or larger than a scene: for those whom something else, such as
+    the radius of the spheres in it, tells if the unit is wrong.
 
     Raises:
         UnreadableFileError: no unit is plausible, or the configured one contradicts the size.
     """
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    low, high = SCENE_DIAGONAL_M if unit == "auto" else OBJECT_DIAGONAL_M
-    span = f"{'a scene' if unit == 'auto' else 'what is scanned'} is {low:g} to {high:g} m across"
+    scene = unit == "auto" and not any_size
+    low, high = SCENE_DIAGONAL_M if scene else OBJECT_DIAGONAL_M
+    span = f"{'a scene' if scene else 'what is scanned'} is {low:g} to {high:g} m across"
     fitting = [name for name, scale in METRES_PER_UNIT.items() if low <= diagonal * scale <= high]
     if unit == "auto":
         if len(fitting) != 1:

@@ -51,18 +51,19 @@ def is_point_cloud(path: Path) -> bool:
     return not header.count("face") and not any(element.name == "tristrips" for element in header.elements)
 
 
-def read_point_cloud(path: Path, unit: MeshUnit = "auto") -> PointCloud:
+def read_point_cloud(path: Path, unit: MeshUnit = "auto", *, any_size: bool = False) -> PointCloud:
     """Read a point cloud, in metres.
 
     A text file has one point per line: x y z, then an optional unit normal as the last three columns. Other columns
     are ignored. Numbers may be separated by blanks, commas or semicolons, and have decimal commas where these cannot
-    be taken for separators. `unit` is that of the file; `auto` infers it from the size of the bounding box.
+    be taken for separators. `unit` is that of the file; `auto` infers it from the size of the bounding box,
+    with `any_size` as `credible_unit` takes it.
 
     Raises:
         UnreadableFileError: not a point cloud, coordinates that are not finite, or an implausible unit.
     """
     points, normals = parse_point_cloud(path)
-    found, evidence = credible_unit(path, points, unit)
+    found, evidence = credible_unit(path, points, unit, any_size=any_size)
     return PointCloud(points * METRES_PER_UNIT[found], normals, found, evidence)
 
 

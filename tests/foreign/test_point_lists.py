@@ -123,3 +123,16 @@ def test_the_command_finds_a_sphere_in_a_list_with_decimal_commas(tmp_path: Path
     assert answer.exit_code == 0, answer.output
     (centre,) = json.loads((tmp_path / "o.json").read_text())["registration_mm"]
     np.testing.assert_allclose(centre, [40, -20, 150], atol=0.01)
+
+
+def test_the_radius_confirms_the_unit_of_a_single_ball_or_the_size_is_said_to_be_none(tmp_path: Path) -> None:
+    """29 units across: millimetres for a ball of 9.5 mm. The same in inches holds no such ball."""
+    directions = np.random.default_rng(0).normal(size=(4000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    path = tmp_path / "points.xyz"
+    for radius, code in ((9.5, 0), (9.5 / 2.54, 1)):
+        np.savetxt(path, np.concatenate([radius * directions, [[20.0, 20.0, 0.0]]]))
+        words = ["spheres", "--mesh", str(path), "--radius-mm", "9.5", "--out", str(tmp_path / "o.json")]
+        answer = CliRunner().invoke(app, words)
+        assert answer.exit_code == code, answer.output
+        assert ("unit cannot be determined" in answer.output) == bool(code)

@@ -15,11 +15,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from drivers.dicom_folder import DicomFolderConfig
+from drivers.dicom_folder.folder import DicomFolder
 from drivers.errors import UnreadableFileError
+from drivers.interfaces import ScannedMesh
 from drivers.meshes.mesh_file import read_mesh_file
 from drivers.meshes.surface_file import read_surface_file
+from drivers.scan_folder import ScanFolder, ScanFolderConfig
 from service.cli.main import app
 from service.core.geometry import Array
+from service.core.units import mm
 from tests.support.scenes.mesh_figures import BOX_MM, L_AREA_MM2, L_MM, area_mm2, area_vector_mm2
 
 Corners = list[int]
@@ -80,6 +85,36 @@ def test_what_is_compared_is_read_so_too(tmp_path: Path, writer: Writer) -> None
     writer(file, L_MM, [list(range(6))])
     surface = read_surface_file(file, "mm")
     corners = 1e3 * surface.vertices_m[surface.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    assert area == pytest.approx(L_AREA_MM2, rel=1e-6)
+
+
+def of_scanner(file: Path) -> ScannedMesh:
+    scanner = ScanFolder(ScanFolderConfig(folder=file.parent, stable_s=0, unit="mm"))
+    (export,) = scanner.exports()
+    return scanner.read(export)
+
+
+def of_profile(file: Path) -> ScannedMesh:
+    scanner = ScanFolder(ScanFolderConfig(folder=file.parent, stable_s=0, profile="structured_light"))
+    (export,) = scanner.exports()
+    return scanner.read(export)
+
+
+def of_ct(file: Path) -> ScannedMesh:
+    ct = DicomFolder(DicomFolderConfig(folder=file.parent, stable_s=0, mesh_unit="mm"))
+    (export,) = ct.segmented_meshes()
+    return ct.read_mesh(export)
+
+
+@pytest.mark.parametrize("form", WRITERS)
+@pytest.mark.parametrize("importer", [of_scanner, of_profile, of_ct])
+def test_every_device_reads_it_so(tmp_path: Path, form: str, importer: Callable[[Path], ScannedMesh]) -> None:
+    write, suffix = WRITERS[form]
+    file = (tmp_path / "L").with_suffix(suffix)
+    write(file, L_MM, [list(range(6))])
+    mesh = importer(file).mesh
+    corners = mm(mesh.vertices_m)[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
     assert area == pytest.approx(L_AREA_MM2, rel=1e-6)
 
