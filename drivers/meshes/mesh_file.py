@@ -220,6 +220,8 @@ def parse_mesh(path: Path) -> tuple[Array, IntArray, Array | None]:
 def read_raw_mesh(path: Path) -> RawMesh:
     """The triangles of an OBJ, PLY, STL, OFF, GLB or glTF file, in its unit, with normals only if they are valid.
 
+    Vertices that are no numbers and belong to no face, as of pixels without a measurement, are left out.
+
     Raises:
         IncompleteExportError: the file is cut short.
         UnreadableFileError: not a mesh of the format that the name says, or no faces.
@@ -235,6 +237,7 @@ def read_raw_mesh(path: Path) -> RawMesh:
             where=str(path),
             remedy="Export a triangle mesh; triangle strips and point clouds are not supported",
         )
+    raw = _without_holes(raw)
     return raw if _valid(raw) else replace(raw, normals=None)
 
 
@@ -253,6 +256,16 @@ def _by_trimesh(path: Path) -> RawMesh:
     if not isinstance(mesh, trimesh.Trimesh):
         return RawMesh(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
     return RawMesh(np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64))
+
+
+def _without_holes(raw: RawMesh) -> RawMesh:
+    """The mesh without vertices of no face whose coordinates are no numbers."""
+    kept = np.isfinite(raw.vertices).all(axis=1) | _used(raw.faces, len(raw.vertices))
+    if kept.all():
+        return raw
+    place = np.cumsum(kept) - 1
+    normals, colours = (None if rows is None else rows[kept] for rows in (raw.normals, raw.colours))
+    return replace(raw, vertices=raw.vertices[kept], faces=place[raw.faces], normals=normals, colours=colours)
 
 
 def _valid(raw: RawMesh) -> bool:

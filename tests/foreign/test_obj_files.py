@@ -74,6 +74,9 @@ WRITTEN: dict[str, bytes] = {
     "a remark with a count beyond belief": b"# " + b"9" * 5000 + b" vertices\n" + BOX.encode(),
     "ends with a group without a name": BOX.encode() + b"g",
     "several objects": BOX.replace("\nf", "\no one\nf", 1).encode() + b"g two\ns off\n",
+    "pixels without a measurement": b"v nan nan nan\n" + "\n".join([*VERTICES, "v nan nan nan", *(
+        "f " + " ".join(str(corner + 2) for corner in face) for face in BOX_FACES
+    )]).encode(),
     "capitals of keywords in names": BOX.encode() + b"o V 1 2 3\n",
 }  # fmt: skip
 
