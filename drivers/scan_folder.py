@@ -14,6 +14,7 @@ from pydantic import Field, field_validator
 from drivers.errors import DeviceUnavailableError, IncompleteExportError
 from drivers.interfaces import DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
 from drivers.meshes.export_watch import ExportWatch, mesh_files
+from drivers.meshes.foreign_text import name_of
 from drivers.meshes.mesh_file import MESH_SUFFIXES, MeshUnit, read_mesh_file
 from drivers.plugin import DriverConfig, DriverSpec
 from drivers.scan_profiles import profile_named
@@ -118,7 +119,7 @@ class ScanFolder:
         others = tuple(suffix for suffix in _SURFACES if suffix not in self._profile.suffixes)
         known = ", ".join(suffix[1:].upper() for suffix in self._profile.suffixes)
         return tuple(
-            f"{path.name}: the profile {self._config.profile} does not read this kind of file, only {known}. "
+            f"{name_of(path)}: the profile {self._config.profile} does not read this kind of file, only {known}. "
             f"{self._profile.advice}"
             for path in mesh_files(self._config.folder, others)
         )
@@ -130,7 +131,7 @@ class ScanFolder:
             serial="",
             firmware="",
             driver="scan_folder",
-            driver_version=f"trimesh {version('trimesh')}",
+            driver_version=f"orthocapture {version('orthocapture')}",
             address=str(self._config.folder),
         )
 

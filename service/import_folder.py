@@ -11,6 +11,7 @@ from typing import Any
 
 from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.folder_files import files_below
+from drivers.foreign_code import check_name
 from drivers.meshes.mesh_file import MESH_SUFFIXES, export_of
 from drivers.photos.photo_file import ExifRecord
 from drivers.photos.photo_folder import (
@@ -283,6 +284,8 @@ def _scan(place: Path, role: str) -> tuple[tuple[Path, ...], list[LeftOut]]:
         )
     try:
         export = export_of(meshes[0]).files
+        for path in export:
+            check_name(path)
     except (IncompleteExportError, UnreadableFileError) as error:
         raise DataError(error.what, where=error.where, remedy=error.remedy) from error
     left_out = [LeftOut(path, odd(path, place) or "no part of the scan") for path in others if path not in export]

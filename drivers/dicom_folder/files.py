@@ -38,9 +38,12 @@ PARSE_ERRORS = (
     AttributeError,
     LookupError,
     TypeError,
+    NameError,
     EOFError,
-    NotImplementedError,
-    RecursionError,
+    ImportError,  # of a codec that a library would like to have
+    AssertionError,
+    MemoryError,  # as much as a wrong length asks for
+    RuntimeError,
     struct.error,
     zlib.error,
 )
@@ -81,7 +84,12 @@ def read_dicom(path: Path, *, header_only: bool = False) -> FileDataset:
     """
     with warnings.catch_warnings(), path.open("rb", buffering=0) as raw, _NoFurther(raw) as file:
         warnings.simplefilter("ignore")
-        dataset = pydicom.dcmread(file, force=True, stop_before_pixels=header_only)
-        # Elements are decoded on access, which can warn too.
-        dataset.decode()
+        try:
+            dataset = pydicom.dcmread(file, force=True, stop_before_pixels=header_only)
+            # Elements are decoded on access, which can warn too.
+            dataset.decode()
+        except (OSError, *PARSE_ERRORS):
+            raise
+        except Exception as error:  # a plug-in's own
+            raise ValueError(f"{type(error).__name__}: {error}") from error
     return dataset

@@ -9,6 +9,8 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from service.core.errors import printable
+
 Array = NDArray[np.float64]
 Transform = Array  # (4, 4), T_a_b: p_a = T_a_b @ p_b, metres
 
@@ -37,6 +39,10 @@ class DeviceReport:
     battery_fraction: float | None = None
     details: Mapping[str, str] = field(default_factory=dict[str, str])
     problems: tuple[str, ...] = ()  # each says what is wrong and what to do
+
+    def __post_init__(self) -> None:
+        # They quote names of files, which may be any bytes and could then be neither shown nor recorded.
+        object.__setattr__(self, "problems", tuple(map(printable, self.problems)))
 
 
 @runtime_checkable

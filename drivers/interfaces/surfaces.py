@@ -40,7 +40,7 @@ class ScannedMesh:
     unit_evidence: str  # how that unit was determined
     findings: Mapping[
         str, float
-    ]  # holes, non_manifold_edges, components, degenerate_faces, normals_computed, textures
+    ]  # holes, non_manifold_edges, components, degenerate_faces, polygons_in_doubt, normals_computed, textures
     source: ScanExport
 
 

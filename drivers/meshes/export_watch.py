@@ -9,7 +9,9 @@ from pathlib import Path
 
 from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.folder_files import files_below
+from drivers.foreign_code import reading
 from drivers.interfaces import ScanExport
+from drivers.meshes.foreign_text import name_of
 from drivers.meshes.mesh_file import MESH_SUFFIXES, export_of
 from drivers.meshes.mesh_format import check_complete
 
@@ -62,15 +64,15 @@ class ExportWatch:
                 seen = self._observe(path, now)
             except OSError as error:
                 self._seen.pop(path, None)
-                pending.append(f"{path.name}: cannot be read ({error.strerror})")
+                pending.append(f"{name_of(path)}: cannot be read ({error.strerror})")
                 continue
             waited_s = now - seen.since_s
             if seen.export is not None and waited_s >= self._stable_s:
                 exports.append((seen.signature[0][2], seen.export))
             elif seen.export is not None:
-                pending.append(f"{path.name}: unchanged for {waited_s:.1f} s, waiting for {self._stable_s:g} s")
+                pending.append(f"{name_of(path)}: unchanged for {waited_s:.1f} s, waiting for {self._stable_s:g} s")
             else:
-                pending.append(f"{path.name}: {seen.trouble}")
+                pending.append(f"{name_of(path)}: {seen.trouble}")
         exports.sort(key=lambda item: (item[0], item[1].name))
         return tuple(export for _, export in exports), tuple(pending)
 
@@ -83,10 +85,11 @@ class ExportWatch:
         if old is not None and old.export is not None and _signature(old.export.files) == old.signature:
             return old
         try:
-            if old is None or old.signature[:1] != own or old.trouble:
-                self._check(path)
-            export = export_of(path)
-            files = export.files
+            with reading(path, "an export", "Export it again"):
+                if old is None or old.signature[:1] != own or old.trouble:
+                    self._check(path)
+                export = export_of(path)
+                files = export.files
         except IncompleteExportError as error:
             trouble = str(error)
         except UnreadableFileError as error:

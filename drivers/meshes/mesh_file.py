@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import IncompleteExportError, UnreadableFileError
+from drivers.foreign_code import reading
 from drivers.interfaces import Array, Mesh, ScanExport, ScannedMesh
-from drivers.meshes.mesh_format import check_complete, companions, file_has_normals
+from drivers.meshes.companions import companions
+from drivers.meshes.foreign_text import name_of
+from drivers.meshes.mesh_format import check_complete
+from drivers.meshes.obj import read_obj
+from drivers.meshes.off import read_off
+from drivers.meshes.ply import read_ply
+from drivers.meshes.raw_mesh import IntArray, RawMesh
+from drivers.meshes.stl import read_stl
 
 MeshUnit = Literal["auto", "mm", "m"]
 METRES_PER_UNIT = {"mm": 1e-3, "m": 1.0}
@@ -26,23 +34,17 @@ OBJECT_DIAGONAL_M = (0.02, 20.0)
 MESH_SUFFIXES = (".obj", ".ply", ".stl")
 TEXTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".tga")
 
-IntArray = NDArray[np.int64]
-
-# What trimesh and NumPy raise for a damaged file or one of another format; some are bugs of trimesh (NameError).
-PARSE_ERRORS = (
-    *(ValueError, TypeError, LookupError, AttributeError, NameError, EOFError, AssertionError, ArithmeticError),
-    *(RuntimeError, struct.error),
-)
-
 
 def export_of(path: Path) -> ScanExport:
     """Return the export formed by this mesh file and its companions. Raises as `mesh_format.companions` does."""
     stat = path.stat()
     modified = datetime.fromtimestamp(stat.st_mtime, UTC).isoformat().replace("+00:00", "Z")
-    return ScanExport(name=path.name, files=(path, *companions(path)), modified_utc=modified)
+    return ScanExport(name=name_of(path), files=(path, *companions(path)), modified_utc=modified)
 
 
-def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | None = None) -> ScannedMesh:
+def read_mesh_file(
+    path: Path, unit: MeshUnit = "auto", *, export: ScanExport | None = None, any_size: bool = False
+) -> ScannedMesh:
     """Read a triangle mesh, in metres.
 
     Args:
@@ -50,12 +52,13 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
         unit: of the file; `auto` infers it from the size of the bounding box, and `unit_evidence` says how. A unit
             that contradicts the size is an error, never silently corrected.
         export: the export that the file belongs to; found beside the file if not given.
+        any_size: as `credible_unit` takes it.
 
     Returns:
         The mesh with bitwise equal vertices merged (STL facets, UV seams), vertex normals (V, 3) from the file or
         area-weighted from its faces, and `findings`, the numbers of: vertices, faces, holes, boundary_edges,
-        non_manifold_edges, components, degenerate_faces, unreferenced_vertices, textures; normals_computed is 0
-        or 1.
+        non_manifold_edges, components, degenerate_faces, unreferenced_vertices, polygons_in_doubt, textures;
+        normals_computed is 0 or 1.
 
     Raises:
         IncompleteExportError: truncated, still growing, locked, or a companion is missing.
@@ -70,8 +73,8 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
     with unchanged(path):
         check_complete(path)
         export = export or export_of(path)
-        vertices, faces, normals = parse_mesh(path)
-    return scanned_mesh(vertices, faces, normals, unit, export)
+        raw = read_raw_mesh(path)
+    return scanned_mesh(raw, unit, export, any_size=any_size)
 
 
 @contextmanager
@@ -102,16 +105,15 @@ def unchanged(path: Path) -> Generator[None]:
         )
 
 
-def scanned_mesh(
-    vertices: Array, faces: IntArray, normals: Array | None, unit: MeshUnit, export: ScanExport
-) -> ScannedMesh:
+def scanned_mesh(raw: RawMesh, unit: MeshUnit, export: ScanExport, *, any_size: bool = False) -> ScannedMesh:
     """Check a mesh that was read from an export, in the file's unit, and report on it as `read_mesh_file` does.
 
     Raises UnreadableFileError as `check_mesh` and `credible_unit` do.
     """
     path = export.files[0]
+    vertices, faces, normals = raw.vertices, raw.faces, raw.normals
     check_mesh(path, vertices, faces)
-    found, evidence = credible_unit(path, vertices[_used(faces, len(vertices))], unit)
+    found, evidence = credible_unit(path, vertices[_used(faces, len(vertices))], unit, any_size=any_size)
     vertices = vertices * METRES_PER_UNIT[found]
     first, index = merge_equal(vertices)
     merged, faces = vertices[first], index[faces]
@@ -119,6 +121,7 @@ def scanned_mesh(
     kept = vertex_normals(merged, faces) if normals is None else _unit_length(_summed(index, normals, len(merged)))
     findings = {
         **mesh_findings(merged, faces),
+        "polygons_in_doubt": float(raw.polygons_in_doubt),
         "normals_computed": float(computed),
         "textures": float(sum(file.suffix.lower() in TEXTURE_SUFFIXES for file in export.files[1:])),
     }
@@ -208,41 +211,69 @@ def _unit_length(normals: Array) -> Array:
 def parse_mesh(path: Path) -> tuple[Array, IntArray, Array | None]:
     """Vertices (V, 3) in the file's unit, faces (F, 3) and the file's vertex normals, None if missing or invalid.
 
+    Raises as `read_raw_mesh` does.
+    """
+    raw = read_raw_mesh(path)
+    return raw.vertices, raw.faces, raw.normals
+
+
+def read_raw_mesh(path: Path) -> RawMesh:
+    """The triangles of an OBJ, PLY, STL, OFF, GLB or glTF file, in its unit, with normals only if they are valid.
+
+    Vertices that are no numbers and belong to no face, as of pixels without a measurement, are left out.
+
     Raises:
+        IncompleteExportError: the file is cut short.
         UnreadableFileError: not a mesh of the format that the name says, or no faces.
         OSError: the file cannot be opened.
     """
-    import trimesh  # noqa: PLC0415 - half a second, for those who read a mesh
-
-    suffix = path.suffix.lower()[1:]
-    # The geometry does not need the materials, which travel with the export as companions.
-    options: dict[str, Any] = {"skip_materials": True} if suffix == "obj" else {}
-    try:
-        with path.open("rb") as stream:
-            loaded = trimesh.load(stream, file_type=suffix, process=False, **options)
-            mesh = loaded.to_geometry() if isinstance(loaded, trimesh.Scene) else loaded
-            if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-                raise UnreadableFileError(
-                    "the file has no faces, only points",
-                    where=str(path),
-                    remedy="Export a triangle mesh; triangle strips and point clouds are not supported",
-                )
-            vertices = np.array(mesh.vertices, dtype=np.float64)
-            faces = np.array(mesh.faces, dtype=np.int64)
-            normals = None
-            if suffix != "stl" and file_has_normals(path) and len(mesh.vertex_normals) == len(vertices):
-                normals = np.array(mesh.vertex_normals, dtype=np.float64)
-    except PARSE_ERRORS as error:
+    suffix = path.suffix.lower()
+    remedy = "Open it in the scanner's software and export it again"
+    with reading(path, f"a {suffix[1:].upper()} mesh", remedy):
+        raw = _READERS.get(suffix, _by_trimesh)(path)
+    if len(raw.faces) == 0:
         raise UnreadableFileError(
-            f"the file cannot be parsed as a {suffix.upper()} mesh ({error})",
+            "the file has no faces, only points",
             where=str(path),
-            remedy="Open it in the scanner's software and export it again",
-        ) from error
-    if normals is not None:
-        length = np.linalg.norm(normals, axis=1)
-        if not np.all(np.isfinite(length)) or np.mean(np.abs(length - 1.0) > 0.05) > 0.01:
-            normals = None
-    return vertices, faces, normals
+            remedy="Export a triangle mesh; triangle strips and point clouds are not supported",
+        )
+    raw = _without_holes(raw)
+    return raw if _valid(raw) else replace(raw, normals=None)
+
+
+_READERS: Mapping[str, Callable[[Path], RawMesh]] = {
+    ".obj": read_obj, ".off": read_off, ".ply": read_ply, ".stl": read_stl
+}  # fmt: skip
+
+
+def _by_trimesh(path: Path) -> RawMesh:
+    """The mesh of a GLB or glTF, whose faces are triangles. Raises whatever trimesh does."""
+    import trimesh  # noqa: PLC0415 - half a second, for those who read such a mesh
+
+    with path.open("rb") as stream:
+        loaded = trimesh.load(stream, file_type=path.suffix.lower()[1:], process=False, skip_materials=True)
+    mesh = loaded.to_geometry() if isinstance(loaded, trimesh.Scene) else loaded
+    if not isinstance(mesh, trimesh.Trimesh):
+        return RawMesh(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
+    return RawMesh(np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64))
+
+
+def _without_holes(raw: RawMesh) -> RawMesh:
+    """The mesh without vertices of no face whose coordinates are no numbers."""
+    kept = np.isfinite(raw.vertices).all(axis=1) | _used(raw.faces, len(raw.vertices))
+    if kept.all():
+        return raw
+    place = np.cumsum(kept) - 1
+    normals, colours = (None if rows is None else rows[kept] for rows in (raw.normals, raw.colours))
+    return replace(raw, vertices=raw.vertices[kept], faces=place[raw.faces], normals=normals, colours=colours)
+
+
+def _valid(raw: RawMesh) -> bool:
+    """Whether nearly all normals of vertices that have a face are of unit length."""
+    if raw.normals is None:
+        return True
+    length = np.linalg.norm(raw.normals[_used(raw.faces, len(raw.vertices))], axis=1)
+    return bool(np.all(np.isfinite(length)) and np.mean(np.abs(length - 1.0) > 0.05) <= 0.01)
 
 
 def check_mesh(path: Path, vertices: Array, faces: IntArray) -> None:
@@ -268,15 +299,19 @@ def check_mesh(path: Path, vertices: Array, faces: IntArray) -> None:
         )
 
 
-def credible_unit(path: Path, vertices: Array, unit: MeshUnit) -> tuple[str, str]:
+def credible_unit(path: Path, vertices: Array, unit: MeshUnit, *, any_size: bool = False) -> tuple[str, str]:
     """Determine the unit of vertices (V, 3) from the size of their bounding box; returns the unit and the evidence.
+
+    With `any_size`, `auto` also takes what is smaller or larger than a scene: for those whom something else, such as
+    the radius of the spheres in it, tells if the unit is wrong.
 
     Raises:
         UnreadableFileError: no unit is plausible, or the configured one contradicts the size.
     """
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    low, high = SCENE_DIAGONAL_M if unit == "auto" else OBJECT_DIAGONAL_M
-    span = f"{'a scene' if unit == 'auto' else 'what is scanned'} is {low:g} to {high:g} m across"
+    scene = unit == "auto" and not any_size
+    low, high = SCENE_DIAGONAL_M if scene else OBJECT_DIAGONAL_M
+    span = f"{'a scene' if scene else 'what is scanned'} is {low:g} to {high:g} m across"
     fitting = [name for name, scale in METRES_PER_UNIT.items() if low <= diagonal * scale <= high]
     if unit == "auto":
         if len(fitting) != 1:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import Array
-from drivers.meshes.mesh_file import MESH_SUFFIXES, METRES_PER_UNIT, MeshUnit, check_mesh, parse_mesh
+from drivers.meshes.mesh_file import MESH_SUFFIXES, METRES_PER_UNIT, MeshUnit, check_mesh, read_raw_mesh
 from drivers.meshes.mesh_format import check_complete
 from drivers.meshes.point_cloud import TEXT_SUFFIXES, is_point_cloud, parse_point_cloud
 
@@ -28,6 +28,7 @@ class SurfaceFile:
         normals: (V, 3) unit normals of a cloud's points; None if it has none, and for a mesh.
         unit: of the file, mm or m.
         unit_evidence: how it was determined.
+        polygons_in_doubt: polygons of a mesh that have no inside to speak of.
     """
 
     vertices_m: Array = field(repr=False)
@@ -35,10 +36,11 @@ class SurfaceFile:
     normals: Array | None = field(repr=False)
     unit: str
     unit_evidence: str
+    polygons_in_doubt: int = 0
 
 
 def read_surface_file(path: Path, unit: MeshUnit = "auto") -> SurfaceFile:
-    """Read a mesh (OBJ, PLY, STL, or what trimesh reads alone: OFF, GLB, glTF) or a point cloud (PLY, text).
+    """Read a mesh (OBJ, PLY, STL, OFF, GLB, glTF) or a point cloud (PLY, text).
 
     Args:
         path: the file.
@@ -52,7 +54,7 @@ def read_surface_file(path: Path, unit: MeshUnit = "auto") -> SurfaceFile:
     if not path.is_file():
         raise UnreadableFileError("there is no such file", where=str(path), remedy="Check the path")
     try:
-        faces = np.empty((0, 3), dtype=np.int64)
+        faces, doubtful = np.empty((0, 3), dtype=np.int64), 0
         if is_point_cloud(path):
             vertices, normals = parse_point_cloud(path)
         else:
@@ -60,7 +62,8 @@ def read_surface_file(path: Path, unit: MeshUnit = "auto") -> SurfaceFile:
             check_complete(path)
             if path.suffix.lower() == ".glb":
                 _check_chunks(path)
-            (vertices, faces, _), normals = parse_mesh(path), None
+            raw = read_raw_mesh(path)
+            vertices, faces, normals, doubtful = raw.vertices, raw.faces, None, raw.polygons_in_doubt
             check_mesh(path, vertices, faces)
     except OSError as error:
         raise UnreadableFileError(
@@ -71,7 +74,7 @@ def read_surface_file(path: Path, unit: MeshUnit = "auto") -> SurfaceFile:
     found = unit if unit != "auto" else "m" if diagonal <= LARGEST_IN_METRES else "mm"
     how = "inferred" if unit == "auto" else "given"
     evidence = f"{how}: the bounding box is {diagonal:.4g} {found} across"
-    return SurfaceFile(vertices * METRES_PER_UNIT[found], faces, normals, found, evidence)
+    return SurfaceFile(vertices * METRES_PER_UNIT[found], faces, normals, found, evidence, doubtful)
 
 
 def _check_format(path: Path) -> None:

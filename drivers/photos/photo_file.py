@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.errors import UnreadableFileError
+from drivers.foreign_code import check_name, reading
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage
 from service.core.errors import DataError
 from service.core.picture_files import ForeignKindError, TruncatedPictureError, check_jpeg, kind_of
@@ -116,7 +117,8 @@ _KEYS = {
 
 def read_exif(path: Path) -> ExifRecord:
     """Read the EXIF of a photograph (JPEG, TIFF, PNG, raw). Raises UnreadableFileError if it is not an image."""
-    try:
+    check_name(path)
+    with reading(path, "a photograph", "Copy it again from the camera"):
         image = exiv2.ImageFactory.open(str(path))
         image.readMetadata()
         exif = image.exifData()
@@ -139,10 +141,6 @@ def read_exif(path: Path) -> ExifRecord:
             focus_mode=_text(exif, "focus_mode", in_words=True),
             focus_position=_integer(exif, "focus_position"),
         )
-    except exiv2.Exiv2Error as error:
-        raise UnreadableFileError(
-            f"the photograph cannot be read: {error}", where=str(path), remedy="Copy it again from the camera"
-        ) from error
 
 
 def _find(exif: Any, name: str) -> Any:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from drivers.errors import DriverMissingError, IncompleteExportError, UnreadableFileError
+from drivers.foreign_code import reading
 from drivers.interfaces import Array
 from drivers.scan_profiles.views import View
 
@@ -48,7 +49,6 @@ def read_e57(path: Path) -> tuple[tuple[View, Array], ...]:
     """
     try:
         import pye57  # noqa: PLC0415 - optional, and it loads a native library
-        from pye57.libe57 import E57Exception  # noqa: PLC0415
     except ImportError as error:
         raise DriverMissingError(
             "E57 files need the package pye57, which is not installed",
@@ -56,16 +56,12 @@ def read_e57(path: Path) -> tuple[tuple[View, Array], ...]:
             remedy="Install orthocapture[e57], or export the scan as a mesh (PLY, OBJ or STL)",
         ) from error
 
-    try:
+    with reading(path, "E57", "Export the scan again"):
         file = pye57.E57(str(path))
         try:
             views = tuple(_view(path, file, index) for index in range(file.scan_count))
         finally:
             file.close()
-    except (E57Exception, ValueError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError) as error:
-        raise UnreadableFileError(
-            f"the file cannot be read as E57 ({error})", where=str(path), remedy="Export the scan again"
-        ) from error
     if not views:
         raise UnreadableFileError("the file has no scans", where=str(path), remedy="Export the scan again as E57")
     return views

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from drivers.errors import UnreadableFileError
+from drivers.foreign_code import reading
 from drivers.interfaces import Array, ScanExport, ScannedMesh
-from drivers.meshes.mesh_file import PARSE_ERRORS, IntArray, MeshUnit, read_mesh_file, scanned_mesh, unchanged
+from drivers.meshes.mesh_file import MeshUnit, read_mesh_file, scanned_mesh, unchanged
 from drivers.meshes.mesh_format import check_complete
 from drivers.meshes.point_cloud import is_point_cloud, ply_points
+from drivers.meshes.raw_mesh import IntArray, RawMesh
 from drivers.scan_profiles.e57 import check_e57, read_e57
 from drivers.scan_profiles.profile import ScanProfile
 from drivers.scan_profiles.views import View, looks_along_z, view_mesh
@@ -54,7 +56,7 @@ def read_export(profile: ScanProfile, export: ScanExport, unit: MeshUnit = "auto
     with unchanged(path):
         check_export(profile, path)
         vertices, faces, normals = _of_e57(path) if suffix == ".e57" else _of_view(profile, path)
-    return scanned_mesh(vertices, faces, normals, stated, export)
+    return scanned_mesh(RawMesh(vertices, faces, normals), stated, export)
 
 
 def _of_e57(path: Path) -> tuple[Array, IntArray, None]:
@@ -68,12 +70,8 @@ def _of_e57(path: Path) -> tuple[Array, IntArray, None]:
 
 
 def _of_view(profile: ScanProfile, path: Path) -> tuple[Array, IntArray, Array | None]:
-    try:
+    with reading(path, "PLY", profile.advice):
         points, normals = ply_points(path)
-    except PARSE_ERRORS as error:
-        raise UnreadableFileError(
-            f"the file cannot be parsed as PLY ({error})", where=str(path), remedy=profile.advice
-        ) from error
     shape = next(((rows, columns) for columns, rows in profile.views if rows * columns == len(points)), None)
     if shape is None:
         known = ", ".join(f"{columns} × {rows}" for columns, rows in profile.views)

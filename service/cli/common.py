@@ -106,6 +106,14 @@ def tell_left_out(left_out: Mapping[str, str]) -> None:
         error_console.print(f"[yellow]left out[/] {escape(name)}: {escape(reason)}")
 
 
+def tell_doubt(file: Path, doubtful: float) -> None:
+    """Print that polygons of a mesh have no inside to speak of, if there are any."""
+    from drivers.meshes.polygons import in_doubt  # noqa: PLC0415 - NumPy, for those who read a mesh
+
+    if words := in_doubt(int(doubtful)):
+        error_console.print(f"[yellow]{escape(file.name)}[/]: {words}")
+
+
 def require_writable(file: Path) -> None:
     """Raise ConfigurationError unless the file can be written; called before a long computation."""
     if file.is_dir():

@@ -21,9 +21,9 @@ class OrthocaptureError(Exception):
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
         super().__init__(what)
-        self.what = _shown(what)
-        self.where = _shown(where)
-        self.remedy = _shown(remedy)
+        self.what = printable(what)
+        self.where = printable(where)
+        self.remedy = printable(remedy)
 
     def __str__(self) -> str:
         place = f" [{self.where}]" if self.where else ""
@@ -40,7 +40,8 @@ def what_of(text: str) -> str:
     return text.split(" [", maxsplit=1)[0].split(". ", maxsplit=1)[0].rstrip(".")
 
 
-def _shown(text: str) -> str:
+def printable(text: str) -> str:
+    """A text that can be printed and recorded: without control characters and lone surrogates, and not too long."""
     plain = _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
     return _cut("\n".join(_cut(line, _LONGEST_LINE) for line in plain.split("\n")), _LONGEST)
 
@@ -87,3 +88,7 @@ class ImagesSpoiltError(OrthocaptureError):
 
 class ComputeError(OrthocaptureError):
     """A computation has no trustworthy answer for this data; the message says why."""
+
+
+class UnforeseenError(OrthocaptureError):
+    """A step ended with an error that nobody foresaw, such as one of a library; the log has where it was raised."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
@@ -9,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from drivers.errors import DeviceError
-from service.core.errors import OrthocaptureError
+from service.core.errors import OrthocaptureError, UnforeseenError
 from service.core.protocol.models import Protocol, Step
 from service.core.records.base import recorded
 from service.core.records.events import DeviceTrouble, Payload, StepFailed, StepMeasured
@@ -27,6 +28,7 @@ from service.steps import step_kinds
 from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
 from service.store.durable_effects import Clock, moment_of
 
+_LOG = logging.getLogger(__name__)
 _NOBODY_S = 30.0  # a worker that died has been replaced by then
 _TOLD_AGAIN_S = 300.0
 _EVERY_S = 5.0
@@ -91,6 +93,13 @@ class StepExecution:
             self.operator.tell(str(interruption))
         except OrthocaptureError as error:
             self._failed(step_id, attempt, error)
+        except Exception as error:
+            # A step that reads strangers' files may not end the run. One that moves the robot may: then the arm's
+            # watchdog no longer hears of this program, and stops it.
+            if step.moves_robot:
+                raise
+            _LOG.info("%s", step_id, exc_info=True)  # below what the terminal shows
+            self._failed(step_id, attempt, _unforeseen(step_id, error))
         else:
             self._measured(step_id, attempt, outcome)
 
@@ -172,3 +181,11 @@ class StepExecution:
             raise StepInterruptedError("paused")
         if state.terminal or (state.current, state.step.attempt, state.phase) != (step, attempt, "running"):
             raise StepInterruptedError(f"the operator has ended this attempt; the run is {state.status}")
+
+
+def _unforeseen(step_id: str, error: Exception) -> UnforeseenError:
+    return UnforeseenError(
+        f"this was not foreseen: {type(error).__name__}: {error}",
+        where=str(getattr(error, "filename", None) or f"step {step_id}"),
+        remedy="Take the file away that it was about, or use another one, then repeat the step; the log says more",
+    )

@@ -12,6 +12,8 @@ import numpy as np
 
 from drivers.errors import DeviceTimeoutError
 from drivers.interfaces import CtSource, DeviceReport, ScannedMesh
+from drivers.meshes.foreign_text import name_of
+from drivers.meshes.polygons import in_doubt
 from service.core.records.events import ArtefactRef, FilesKept
 from service.steps.context import StepContext
 from service.steps.notes import DEIDENTIFIED
@@ -72,11 +74,12 @@ def keep(context: StepContext, path: Path, *, device: str, kind: str, media_type
 
     Raises DataError in a run that imports, if the file has changed since it was listed.
     """
-    ref = context.evidence.put_file(path, kind=kind, media_type=media_type, original_name=path.name)
-    note = f"kept {path.name}"
+    name = name_of(path)
+    ref = context.evidence.put_file(path, kind=kind, media_type=media_type, original_name=name)
+    note = f"kept {name}"
     listing = context.devices.imported()
     if listing is not None:
-        note = f"imported {path.name}, written {listing.check(str(path), ref.sha256).modified_utc}"
+        note = f"imported {name}, written {listing.check(str(path), ref.sha256).modified_utc}"
     _record(context, ref, device, note)
     return ref
 
@@ -150,10 +153,15 @@ def keep_mesh(
     )
     buffer = io.BytesIO()
     np.savez(buffer, vertices_m=scan.mesh.vertices_m, faces=scan.mesh.faces)
+    name = name_of(scan.source.files[0])
     mesh = context.evidence.put_bytes(
-        buffer.getvalue(), kind=kind, media_type="application/x-npz", original_name=f"{scan.source.name}.npz"
+        buffer.getvalue(), kind=kind, media_type="application/x-npz", original_name=f"{name}.npz"
     )
-    _record(context, mesh, device, f"read {scan.source.name}: unit {scan.unit} ({scan.unit_evidence})")
+    doubt = in_doubt(int(scan.findings.get("polygons_in_doubt", 0)))
+    if doubt:
+        context.tell(f"{name}: {doubt}")
+    said = f"; {doubt}" if doubt else ""
+    _record(context, mesh, device, f"read {name}: unit {scan.unit} ({scan.unit_evidence}){said}")
     return mesh, (*originals, mesh)
 
 

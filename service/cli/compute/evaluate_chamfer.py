@@ -11,7 +11,15 @@ from rich.table import Table
 
 from drivers.meshes.mesh_file import METRES_PER_UNIT, MeshUnit
 from drivers.meshes.surface_file import SurfaceFile, read_surface_file
-from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors, require_writable
+from service.cli.common import (
+    JsonOption,
+    console,
+    print_json,
+    print_table,
+    reporting_errors,
+    require_writable,
+    tell_doubt,
+)
 from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, Direction, chamfer
 from service.compute.ground_truth.distances.heat_map import HeatScale, heat_picture
 from service.compute.ground_truth.distances.heat_mesh import write_heat_mesh
@@ -46,6 +54,8 @@ def chamfer_command(
         _check_out(heat_map, ".ply")
         _check_out(picture, ".png")
         files = (read_surface_file(pred, pred_unit), read_surface_file(gt, gt_unit))
+        for path, file in zip((pred, gt), files, strict=True):
+            tell_doubt(path, file.polygons_in_doubt)
         judged, truth = (Surface(file.vertices_m, file.faces, file.normals) for file in files)
         score = chamfer(judged, truth, settings)
         scale = HeatScale.of(score, settings.outlier_m)

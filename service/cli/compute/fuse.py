@@ -10,7 +10,15 @@ import typer
 
 from drivers.interfaces import ScannedMesh
 from drivers.meshes.mesh_file import METRES_PER_UNIT, MeshUnit, read_mesh_file
-from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors, require_writable
+from service.cli.common import (
+    JsonOption,
+    console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+    require_writable,
+    tell_doubt,
+)
 from service.compute.ground_truth.align import TRANSPORT_GATE_M, Aligned, align
 from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, chamfer
 from service.compute.ground_truth.distances.heat_map import HeatScale
@@ -62,8 +70,10 @@ def fuse_command(
         for file in (out, heat_map, picture):
             if file is not None:
                 require_writable(file)
-        of_scan = read_mesh_file(scan, scan_unit)
-        scanned, tomogram = _surface(of_scan), _surface(read_mesh_file(ct, ct_unit))
+        of_scan, of_ct = read_mesh_file(scan, scan_unit), read_mesh_file(ct, ct_unit)
+        for file, read in ((scan, of_scan), (ct, of_ct)):
+            tell_doubt(file, read.findings["polygons_in_doubt"])
+        scanned, tomogram = _surface(of_scan), _surface(of_ct)
         with progress_bar(quiet=json) as report:
             report("spheres", 0, 3)
             aligned = align(tomogram, scanned, metres(radius_mm))

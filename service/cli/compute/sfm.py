@@ -24,6 +24,7 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
     require_writable_folder,
+    tell_doubt,
     tell_left_out,
 )
 from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
@@ -153,7 +154,9 @@ def _spheres(
     if radius_mm is None:
         raise typer.BadParameter("--mesh needs --radius-mm")
     assert mesh is not None
-    scan = read_mesh_file(mesh, mesh_unit).mesh
+    read = read_mesh_file(mesh, mesh_unit)
+    tell_doubt(mesh, read.findings["polygons_in_doubt"])
+    scan = read.mesh
     found = locate_spheres(scan.vertices_m, scan.faces, metres(radius_mm))
     return np.array([sphere.centre_m for sphere in found]), metres(radius_mm)
 

@@ -12,9 +12,17 @@ import typer
 from numpy.typing import NDArray
 from rich.table import Table
 
-from drivers.meshes.mesh_file import MeshUnit, read_mesh_file
+from drivers.meshes.mesh_file import METRES_PER_UNIT, MeshUnit, credible_unit, read_mesh_file
 from drivers.meshes.point_cloud import is_point_cloud, read_point_cloud
-from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors, require_writable
+from service.cli.common import (
+    JsonOption,
+    console,
+    print_json,
+    print_table,
+    reporting_errors,
+    require_writable,
+    tell_doubt,
+)
 from service.compute.surfaces.spheres.mesh_spheres import MeshSphere, SphereLimits, locate_spheres
 from service.compute.surfaces.spheres.other_radii import MeasuredRadius, seen_radius
 from service.core.errors import ComputeError, DataError
@@ -150,14 +158,17 @@ def spheres_of(
     normals: Array | None = None
     faces: NDArray[np.integer] = np.empty((0, 3), dtype=np.int64)
     if mesh.is_file() and is_point_cloud(mesh):
-        cloud = read_point_cloud(mesh, unit)
-        vertices, normals = cloud.points_m, cloud.normals
+        cloud = read_point_cloud(mesh, unit, any_size=True)
+        vertices, normals, found = cloud.points_m, cloud.normals, cloud.unit
     else:
-        scan = read_mesh_file(mesh, unit)
-        vertices, faces = scan.mesh.vertices_m, scan.mesh.faces
+        scan = read_mesh_file(mesh, unit, any_size=True)
+        tell_doubt(mesh, scan.findings["polygons_in_doubt"])
+        vertices, faces, found = scan.mesh.vertices_m, scan.mesh.faces, scan.unit
     try:
         return locate_spheres(vertices, faces, radius_m, expected, limits, normals=normals, seeds_m=seeds_m)
     except ComputeError as error:
+        # Spheres of the given radius confirm the unit of a single object; without them, only its size can.
+        credible_unit(mesh, vertices / METRES_PER_UNIT[found], unit)
         seen = seen_radius(vertices, faces, radius_m, limits, normals=normals)
         # A scan may hold some other balls; suggest their radius only if there are at least as many as expected.
         if seen is None or (expected is not None and len(seen.spheres) < expected):

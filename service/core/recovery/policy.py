@@ -23,6 +23,7 @@ NEEDS_A_PERSON = frozenset(
         "IntegrityError",
         "ImagesSpoiltError",
         "SpaceShortError",
+        "UnforeseenError",
     }
 )
 

@@ -30,6 +30,7 @@ REMEDIES: Mapping[str, str] = {
     "ProtocolError": "Put right what the message names",
     "StoreError": "Check the disk that holds the evidence: free space, cable, permissions",
     "SpaceShortError": "Make room on the disk of the data folder, as the message says",
+    "UnforeseenError": "Take away the file that the message names, or use another one; report it with the log",
     "IntegrityError": "Restore the damaged file from a copy; it is checked against its hash when it is read",
 }
 UNKNOWN_REMEDY = "Put right what the message names"

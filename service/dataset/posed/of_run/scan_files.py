@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import PurePosixPath
 
-from drivers.meshes.mesh_format import companion_names
+from drivers.meshes.companions import companion_names
+from drivers.meshes.foreign_text import alike
 from service.dataset.posed.records import ScanFile
 from service.dataset.registered_scan import registered_scan
 from service.dataset.summary import RunSummary
 
-_REFERRING = (".obj", ".mtl")
+_MOST_BYTES = 1 << 20  # of a mesh, which names its companions in its first lines, and of a material
+_REFERRING = (".obj", ".mtl", ".ply")
 
 
 def scan_files(summary: RunSummary) -> tuple[ScanFile, ...]:
@@ -21,12 +23,14 @@ def scan_files(summary: RunSummary) -> tuple[ScanFile, ...]:
     step = registered_scan(summary.protocol, summary.state)
     kept = summary.state.steps[step].artefacts if step else ()
     refs = [ref for ref in kept if ref.kind == "scan_mesh_original"]
-    named: dict[str, str] = {}  # by the last part of the name, in lower case
+    named: dict[str, str] = {}  # by the last part of the name, in lower case and with accents composed
     for ref in refs:
         if ref.original_name.lower().endswith(_REFERRING):
-            for name in companion_names(summary.store.artefact_path(ref.sha256).read_bytes()):
-                named.setdefault(PurePosixPath(name).name.casefold(), name)
+            with summary.store.artefact_path(ref.sha256).open("rb") as file:
+                content = file.read(_MOST_BYTES)
+            for name in companion_names(content):
+                named.setdefault(alike(PurePosixPath(name).name), name)
     return tuple(
-        ScanFile(named.get(ref.original_name.casefold(), ref.original_name), summary.store.artefact_path(ref.sha256))
+        ScanFile(named.get(alike(ref.original_name), ref.original_name), summary.store.artefact_path(ref.sha256))
         for ref in refs
     )

@@ -61,6 +61,9 @@ class Measures(SphereMeasures):
     scan_components: Annotated[Count, "parts that are not connected"] = None
     scan_degenerate_faces: Annotated[Count, "faces without an area"] = None
     scan_unreferenced_vertices: Annotated[Count, "vertices of no face"] = None
+    scan_polygons_in_doubt: Annotated[
+        Count, "polygons of the scan with fewer than three corners, no area, or an outline that crosses itself"
+    ] = None
     scan_normals_computed: Annotated[Count, "1 if the scan came without normals and they were computed, else 0"] = (
         None
     )

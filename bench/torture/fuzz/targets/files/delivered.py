@@ -227,7 +227,7 @@ TARGETS: tuple[Target, ...] = (
     Target("mesh_obj", "drivers.meshes.mesh_file:read_mesh_file", _mesh("obj"), lambda _: _scan("obj"), TEXT),
     Target(
         "mesh_material",
-        "drivers.meshes.mesh_format:companions",
+        "drivers.meshes.companions:companions",
         _material,
         lambda _: [_obj_parts()[1][1]],
         TEXT,
