@@ -103,6 +103,14 @@ def test_the_key_file_is_never_readable_by_others(store: Store, monkeypatch: pyt
     assert seen["keys"] == (os.O_EXCL, 0o600)
 
 
+def test_no_run_is_signed_while_the_sites_own_record_does_not_verify(store: Store) -> None:
+    site_event(store)
+    tamper(folder(store), f"UPDATE events SET actor = 'eve' WHERE run_id = '{SITE}' AND seq = 1")
+    with pytest.raises(IntegrityError, match="nothing is signed"):
+        checkpoint(store, RUN)
+    assert store.checkpoints(RUN) == []
+
+
 def test_a_chain_rewritten_to_its_end_is_found(store: Store) -> None:
     checkpoint(store, RUN)
     assert faults(store) == []
