@@ -76,8 +76,8 @@ def leave_lapsed(protocol: Protocol, state: RunState, event: Event, p: LeaveLaps
     """The leave to move is over; without effect if a person has given another one meanwhile."""
     if state.leave is None or state.leave.seq != p.leave_seq:
         return without_effect(state, event)
-    state = wait(protocol, state, event)
-    return replace(state, leave=None, lapse=Lapse(event.seq, state.leave.by, p.idle_s, p.limit_s, p.why))
+    lapse = Lapse(event.seq, state.leave.by, p.idle_s, p.limit_s, p.why)
+    return wait(protocol, replace(state, leave=None, lapse=lapse), event)
 
 
 def with_arm(state: RunState, name: str, arm: ArmConnection) -> RunState:
