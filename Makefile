@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-all test-drawn test-whole test-sweeps test-versions marks lint format docs reference bench mutants torture-audit torture-crash torture-faults torture-fuzz soak lock clean
+.PHONY: demo test test-all test-drawn test-realtime test-whole test-sweeps test-versions marks lint format docs reference bench mutants torture-audit torture-crash torture-faults torture-fuzz soak lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
@@ -25,11 +25,15 @@ test-all: $(TOOLS) $(NETWORKS)
 	$(BIN)/pytest -m "not realtime"
 	$(BIN)/pytest -m realtime -n 0 $(call with,realtime)
 
-# What `make test` leaves out, with a tenth of the whole runs and sweeps: SEED draws them.
+# What `make test` leaves out, but for the tests that meet the clock, with a tenth of the whole runs and sweeps: SEED
+# draws them.
 SEED = $(shell git rev-parse HEAD)
 test-drawn: $(TOOLS) $(NETWORKS)
 	.ci/packages
 	$(BIN)/pytest -m "(slow or packages or whole or sweep) and not realtime" --draw $(SEED) $(call with,slow|packages|whole|sweep) tests/browser
+
+# The tests that meet the clock, alone.
+test-realtime: $(TOOLS)
 	$(BIN)/pytest -m realtime -n 0 $(call with,realtime)
 
 # The test files in which one of these marks stands: to read all of the others takes pytest half a minute.

@@ -164,7 +164,7 @@ RUN_ELSEWHERE = {
         "tests/system/test_docs.py::test_the_extras_that_documents_install_are_declared"
     ),
     **dict.fromkeys(
-        ("make test-drawn", "make test-whole", "make test-sweeps"),
+        ("make test-drawn", "make test-realtime", "make test-whole", "make test-sweeps"),
         "tests/house/test_suite_rules.py::"
         "test_whole_runs_are_drawn_by_file_sweeps_by_row_and_what_was_drawn_is_printed",
     ),

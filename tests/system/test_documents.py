@@ -78,7 +78,7 @@ def test_make_targets_do_what_the_documents_say() -> None:
     for target, last in (
         ("test", '.venv/bin/pytest -m "not (slow or realtime or packages or whole or sweep)"'),
         ("test-all", f".venv/bin/pytest -m realtime -n 0 {with_realtime}"),
-        ("test-drawn", f".venv/bin/pytest -m realtime -n 0 {with_realtime}"),
+        ("test-realtime", f".venv/bin/pytest -m realtime -n 0 {with_realtime}"),
         ("test-whole", ".venv/bin/pytest -m whole"),
         ("test-sweeps", ".venv/bin/pytest -m sweep"),
         ("marks", ".venv/bin/ruff format --quiet tests"),
