@@ -46,6 +46,7 @@ def _said(*command: str | Path, **environment: str) -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_a_series_of_which_pydicom_complains_is_told_of_in_our_words(tmp_path: Path) -> None:
     write_series(tmp_path / "ct", uid="1.2.3.45")
     for path in (tmp_path / "ct").iterdir():  # a leading zero, which a part of a UID may not have
@@ -59,6 +60,7 @@ def test_a_series_of_which_pydicom_complains_is_told_of_in_our_words(tmp_path: P
     assert "Invalid value" in _said(*words, **{ASKED: "1"}), "pydicom complains of these files"
 
 
+@pytest.mark.slow
 def test_no_library_speaks_whatever_its_import_sets(tmp_path: Path) -> None:
     said = _said(sys.executable, "-c", AFTER)
     assert "words of" not in said, said
