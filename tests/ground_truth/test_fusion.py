@@ -10,10 +10,13 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
+from skimage.measure import marching_cubes
 
 from service.compute.ground_truth.frames import close_transforms, distance_changes
 from service.compute.ground_truth.fusion.cut_out import Markers, without_markers
+from service.compute.ground_truth.fusion.deviation import moved_unfolded
 from service.compute.ground_truth.fusion.fuse import Fused, FusionSettings, Source, fuse
 from service.compute.ground_truth.fusion.overlap import overlap, rim_vertices
 from service.compute.ground_truth.fusion.regions import Box, Prism, RegionCorrection, corrected, outline
@@ -96,6 +99,24 @@ def test_no_face_is_turned_over_even_where_the_ct_has_slivers() -> None:
     straight = before.vertices_m + result.weight[:, None] * (overlap(before, scan).nearest_m - before.vertices_m)
     would = Surface(straight, before.faces).area_vectors_m2
     assert np.any(np.einsum("fi,fi->f", would, before.area_vectors_m2) < 0)  # a plain move would turn some over
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_face_is_turned_over_by_however_rough_a_move(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    voxels = gaussian_filter(rng.standard_normal((32, 32, 32)), 2.0)
+    corners, faces, normals, _ = marching_cubes(voxels, 0.0)
+    surface = Surface(0.4e-3 * corners, faces.astype(np.int64))
+    rough = gaussian_filter(rng.standard_normal(voxels.shape), 0.7)
+    place = np.rint(corners).astype(int).T
+    move = 1e-3 * (rough / rough.std())[tuple(place)][:, None] * normals
+    moved, folded = moved_unfolded(surface, move)
+    turned = np.einsum("fi,fi->f", moved.area_vectors_m2, surface.area_vectors_m2) < 0
+    assert (folded, np.count_nonzero(turned)) == (0, 0)
+    straight = Surface(surface.vertices_m + move, surface.faces).area_vectors_m2
+    assert np.count_nonzero(np.einsum("fi,fi->f", straight, surface.area_vectors_m2) < 0) > 1000
+    away_m = np.linalg.norm(moved.vertices_m - surface.vertices_m - move, axis=1)
+    assert np.median(away_m) < 1e-3, "the surface still follows the move"
 
 
 def test_the_ct_is_in_the_wound_the_scan_outside_and_the_mesh_closed() -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 
 from service.compute.ground_truth.fusion.overlap import Mask
@@ -21,6 +22,22 @@ _ITERATIONS, _RELATIVE = 2000, 1e-3
 _AVERAGED = 4  # times in each attempt
 _ALIKE = (1, 1, 2)  # rings of neighbours around faces that turn over: in them, moves become alike
 _ROUNDED = (0,) * 10  # then their own corners are evened out
+_STIFF = (
+    1,
+    1,
+    2,
+    2,
+    4,
+    4,
+    8,
+    8,
+    16,
+    16,
+    32,
+    32,
+    64,
+    64,
+)  # at last they move as one piece; over so many rings, into the rest
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +84,7 @@ def moved_unfolded(surface: Surface, move_m: Array) -> tuple[Surface, int]:
 
     Around faces that turn over (mostly slivers of marching cubes), displacements are averaged with those of their
     neighbours: equal displacements turn no face. Where that is not enough, vertices move to the mean of their
-    neighbours.
+    neighbours. Faces that still turn over move as one piece with what is around them.
     """
     points = surface.vertices_m + move_m
     folded = _folded(surface, points)
@@ -87,8 +104,33 @@ def moved_unfolded(surface: Surface, move_m: Array) -> tuple[Surface, int]:
             points[chosen] = fixed[chosen] + 0.5 * (move[chosen] + means[chosen] @ move)
         folded = _folded(surface, points)
         if not len(folded):
-            break
-    return Surface(points, surface.faces), len(folded)
+            return Surface(points, surface.faces), 0
+    for rings in _STIFF:
+        share, piece = _pieces(surface, links, folded, rings)
+        move = points - surface.vertices_m
+        whole = np.maximum(np.bincount(piece, share), 1.0)  # 0 for vertices of no piece, whose share is 0 too
+        mean = np.stack([np.bincount(piece, share * move[:, k]) / whole for k in range(3)], axis=1)
+        points = points + share[:, None] * (mean[piece] - move)
+        still = _folded(surface, points)
+        if not len(still):
+            return Surface(points, surface.faces), 0
+        folded = np.union1d(folded, still)  # those that lie straight now stay in their pieces
+    return Surface(points, surface.faces), len(_folded(surface, points))
+
+
+def _pieces(surface: Surface, links: csr_matrix, folded: IntArray, rings: int) -> tuple[Array, IntArray]:
+    """(V,) share with which each vertex moves as a part of its piece, and (V,) the piece's number.
+
+    The share is 1 at the corners of the folded faces and their neighbours, and passes to 0 over `rings` rings.
+    """
+    near = np.zeros(len(surface.vertices_m), dtype=bool)
+    near[surface.faces[folded].ravel()] = True
+    share = near.astype(np.float64)
+    for ring in range(rings + 1):
+        near |= links @ near.astype(np.float64) > 0
+        share = np.maximum(share, np.where(near, 1.0 - ring / (rings + 1), 0.0))
+    inside = diags(near.astype(np.float64))
+    return share, np.asarray(connected_components(inside @ links @ inside, directed=False)[1], dtype=np.int64)
 
 
 def adjacency(surface: Surface) -> csr_matrix:
