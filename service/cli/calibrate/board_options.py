@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from service.cli.common import progress_bar
-from service.compute.calibration.board.board import Board, Pattern
+from service.compute.calibration.board.board import SIZE_TOLERANCE, Board, Pattern
 from service.compute.calibration.board.images import UsableViews, find_boards, probe_board, usable_views
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.units import metres, mm
@@ -37,11 +37,28 @@ DictionaryOption = Annotated[str, typer.Option("--dictionary", help="Dictionary 
 LegacyOption = Annotated[
     bool, typer.Option("--legacy", help="The ChArUco board was made by OpenCV before version 4.6.")
 ]
+SizeToleranceOption = Annotated[
+    float,
+    typer.Option(
+        "--size-tolerance-percent",
+        min=0.0,
+        max=20.0,
+        help="Largest error of the square's side, in percent of it, as the board's maker states it; 0: exactly known.",
+    ),
+]
 DEFAULT_DICTIONARY = "DICT_5X5_1000"
+DEFAULT_SIZE_TOLERANCE_PERCENT = 100 * SIZE_TOLERANCE
 
 
 def described_board(
-    board: str, square_mm: float, pattern: Pattern, marker_mm: float | None, dictionary: str, *, legacy: bool
+    board: str,
+    square_mm: float,
+    pattern: Pattern,
+    marker_mm: float | None,
+    dictionary: str,
+    *,
+    legacy: bool,
+    size_tolerance_percent: float = DEFAULT_SIZE_TOLERANCE_PERCENT,
 ) -> Board:
     """The board that the options describe.
 
@@ -62,7 +79,8 @@ def described_board(
             remedy=f"Give the side of a square in millimetres{likely}",
         )
     marker_m = None if marker_mm is None else metres(marker_mm)
-    return Board(int(columns), int(rows), metres(square_mm), pattern, marker_m, dictionary, legacy)
+    tolerance = size_tolerance_percent / 100
+    return Board(int(columns), int(rows), metres(square_mm), pattern, marker_m, dictionary, legacy, tolerance)
 
 
 def searched(files: Sequence[Path], board: Board, *, quiet: bool) -> UsableViews:

@@ -13,11 +13,13 @@ from rich.markup import escape
 
 from service.cli.calibrate.board_options import (
     DEFAULT_DICTIONARY,
+    DEFAULT_SIZE_TOLERANCE_PERCENT,
     BoardOption,
     DictionaryOption,
     LegacyOption,
     MarkerOption,
     PatternOption,
+    SizeToleranceOption,
     SquareOption,
     described_board,
     searched,
@@ -71,6 +73,7 @@ def hand_eye_command(
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = DEFAULT_DICTIONARY,
     legacy: LegacyOption = False,
+    size_tolerance_percent: SizeToleranceOption = DEFAULT_SIZE_TOLERANCE_PERCENT,
     setup: Annotated[
         Setup,
         typer.Option("--setup", help="eye-to-hand: the camera stands beside the robot, the board is on its flange."),
@@ -93,7 +96,7 @@ def hand_eye_command(
 ) -> None:
     """Calibrate the camera's pose on the robot's flange, with its uncertainty."""
     with reporting_errors(json):
-        target = described_board(board, square_mm, pattern, marker_mm, dictionary, legacy=legacy)
+        target = described_board(board, square_mm, pattern, marker_mm, dictionary, legacy=legacy, size_tolerance_percent=size_tolerance_percent)
         _require_possible(setup, joints, arm, preview)
         model = read_camera_json(camera)
         folder = image_folder(images, size=(model.width, model.height), strict=strict)
@@ -111,6 +114,7 @@ def hand_eye_command(
                 corners=session.corners,
                 joints_rad=joints_rad,
                 arm=kinematics,
+                board=target,
             ),
             method=method,
             T_board_turned=target.half_turn(),
@@ -133,7 +137,7 @@ def hand_eye_command(
         if json:
             print_json(record.printed())
             return
-        _tell(result, record)
+        _tell(result, record, target.square_m)
         console.print(f"written: {out}")
 
 
@@ -231,7 +235,7 @@ def _drawn(result: HandEyeResult, session: _BoardSession, suggested: Sequence[Su
     return draw_board_plan(cameras, suggested, best.T_base_board, corners.points_m, corners.camera)
 
 
-def _tell(result: HandEyeResult, record: HandEyeFile) -> None:
+def _tell(result: HandEyeResult, record: HandEyeFile, square_m: float) -> None:
     x, y, z = mm(result.T_flange_camera[:3, 3])
     frame = "flange" if record.setup == "eye-in-hand" else "robot's base"
     console.print(
@@ -243,6 +247,9 @@ def _tell(result: HandEyeResult, record: HandEyeFile) -> None:
         f"held-out images: {held_mm:.3f} mm, {held_deg:.4f}° (median); "
         f"other methods up to {result.spread_mm:.3f} mm away; condition {result.condition:.1f}"
     )
+    console.print(result.size.words(square_m))
+    for finding in result.findings:
+        console.print(f"[yellow]warning[/] {escape(finding)}")
     camera_mm, camera_deg = record.sigma.camera_mm, record.sigma.camera_deg
     if camera_mm and camera_deg is not None:
         console.print(f"of that ± {camera_mm:.3f} mm, ± {camera_deg:.4f}° from the uncertainty of the camera")

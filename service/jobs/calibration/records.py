@@ -187,6 +187,22 @@ class RobotNoise(JobRecord):
     deg: float | None = None
 
 
+class BoardSizeByRobot(JobRecord):
+    """The board's true size over the stated one, as the robot's lengths show it.
+
+    Attributes:
+        ratio: by robot and images alone.
+        sigma: standard deviation of `ratio`.
+        tolerance: stated for the board, relative.
+        used: in the answer.
+    """
+
+    ratio: float
+    sigma: float
+    tolerance: float
+    used: float
+
+
 class HandEyeMethod(JobRecord):
     """A hand-eye transform by one method, and its distance from the one in use."""
 
@@ -224,6 +240,7 @@ class ArmAnswer(ArmCorrection):
     residuals: Residuals
     robot_noise: RobotNoise = RobotNoise()
     terms: str = ""
+    board_size: BoardSizeByRobot | None = None
 
 
 class HandEye(JobRecord):
@@ -245,6 +262,8 @@ class HandEye(JobRecord):
         turned: images in which the board was seen turned by 180°.
         arm_held_out_rms_mm: error of held-out images, by terms of the arm's model; "none": poses as reported.
         arm_correction: the answer with the arm's errors corrected; None if that does not improve held-out images.
+        board_size: by the robot.
+        findings: what robot and images contradict each other in, in words.
     """
 
     T_flange_camera: Matrix
@@ -262,6 +281,8 @@ class HandEye(JobRecord):
     turned: tuple[str, ...] = ()
     arm_held_out_rms_mm: dict[str, float] = Field(default_factory=dict[str, float])
     arm_correction: ArmAnswer | None = None
+    board_size: BoardSizeByRobot | None = None
+    findings: tuple[str, ...] = ()
 
     @property
     def best(self) -> HandEye | ArmAnswer:

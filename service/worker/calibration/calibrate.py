@@ -89,6 +89,7 @@ def _hand_eye(
             corners=board_corners(usable.views, board, camera),
             joints_rad=None if arm is None else joints,
             arm=arm,
+            board=board,
         ),
         T_board_turned=board.half_turn(),
     )
@@ -109,6 +110,8 @@ def _hand_eye_measures(solved: HandEyeResult) -> dict[str, float]:
         "hand_eye_methods_spread_mm": solved.spread_mm,
         "hand_eye_condition": solved.condition,
         "rotation_spread_deg": solved.rotation_spread_deg,
+        "hand_eye_board_size_percent": 100 * (best.size.ratio - 1),
+        "hand_eye_findings": float(len(solved.findings)),
     }
     if best.robot_noise_mm is not None and best.robot_noise_deg is not None:
         measures |= {"robot_noise_mm": best.robot_noise_mm, "robot_noise_deg": best.robot_noise_deg}

@@ -9,6 +9,7 @@ import numpy as np
 from service.compute.arm.correction import ArmCorrection, CorrectedMounting
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.hand_eye.answers import CorrectedHandEye, HandEyeAnswer, HandEyeResult
+from service.compute.calibration.hand_eye.board_size import BoardSizeFound
 from service.compute.calibration.hand_eye.closed_form import distance
 from service.compute.calibration.hand_eye.setup import Setup
 from service.compute.calibration.intrinsics.estimate import COVERAGE_GRID, IntrinsicsResult
@@ -93,6 +94,8 @@ def hand_eye_record(result: HandEyeResult, images: Sequence[str], setup: Setup =
         turned=tuple(name for name, turned in zip(images, result.turned, strict=True) if turned),
         arm_held_out_rms_mm={str(terms): error_mm for terms, error_mm in result.arm_held_out_mm.items()},
         arm_correction=None if corrected is None else _arm_answer(corrected, images),
+        board_size=_size(result.size),
+        findings=result.findings,
     )
 
 
@@ -139,6 +142,13 @@ def _arm_answer(corrected: CorrectedHandEye, images: Sequence[str]) -> records.A
         residuals=_residuals_of(corrected, images),
         robot_noise=records.RobotNoise(mm=corrected.robot_noise_mm, deg=corrected.robot_noise_deg),
         terms=corrected.terms,
+        board_size=_size(corrected.size),
+    )
+
+
+def _size(size: BoardSizeFound) -> records.BoardSizeByRobot:
+    return records.BoardSizeByRobot(
+        ratio=size.ratio, sigma=size.sigma, tolerance=size.tolerance, used=size.used
     )
 
 

@@ -24,6 +24,8 @@ _MAX_HALF = 30  # px; a larger window gains nothing, and lens distortion bends t
 _SMOOTHING = 0.15  # sigma of the smoothing, in half windows
 _MAX_SMOOTHING_PX = 1.5
 _MIN_CHARUCO_CORNERS = 8
+#: Largest relative error of a board's size if nothing is stated: 0.1 mm in 200 mm, as of boards made for measuring.
+SIZE_TOLERANCE = 5e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +43,7 @@ class Board:
         dictionary: OpenCV's name for the dictionary of a ChArUco board's markers.
         legacy: a ChArUco board as OpenCV printed it before 4.6 (differs if the number of squares in a column is
             even).
+        size_tolerance: largest relative error of `square_m`, as the maker states it.
     """
 
     columns: int
@@ -50,6 +53,7 @@ class Board:
     marker_m: float | None = None
     dictionary: str = "DICT_5X5_1000"
     legacy: bool = False
+    size_tolerance: float = SIZE_TOLERANCE
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or not 0 < self.square_m < 10:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from service.compute.arm.correction import ArmCorrection
+from service.compute.calibration.hand_eye.board_size import BoardSizeFound
 from service.compute.calibration.hand_eye.fit import ArmTerms, Method
 from service.core.geometry import Array, Transform
 
@@ -29,6 +30,7 @@ class HandEyeAnswer:
         residual_deg: (N,) the same for its orientation.
         held_out_mm: (N,) as residual_mm, but each view is judged by a calibration without its fold.
         held_out_deg: (N,) the same for its orientation.
+        size: of the board, by the robot's lengths.
     """
 
     T_flange_camera: Transform
@@ -44,6 +46,7 @@ class HandEyeAnswer:
     residual_deg: Array
     held_out_mm: Array
     held_out_deg: Array
+    size: BoardSizeFound
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +82,7 @@ class HandEyeResult(HandEyeAnswer):
             not lower the held-out error.
         arm_held_out_mm: root mean square of held_out_mm for each arm model that was tried ("none": the poses as
             reported).
+        findings: what the measurements contradict, in words; empty if nothing.
     """
 
     method: Method
@@ -93,3 +97,4 @@ class HandEyeResult(HandEyeAnswer):
     excluded: dict[int, str]
     corrected: CorrectedHandEye | None
     arm_held_out_mm: dict[ArmTerms, float]
+    findings: tuple[str, ...]

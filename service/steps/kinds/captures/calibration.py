@@ -110,6 +110,12 @@ class Measures(CaptureMeasures):
     hand_eye_condition: Annotated[float | None, Measure("", 1, 1e6), "condition number of the hand-eye equations"] = (
         None
     )
+    hand_eye_board_size_percent: Annotated[
+        float | None,
+        Measure("%", -20, 20),
+        "by how much the board is larger by the robot's lengths than it is stated to be",
+    ] = None
+    hand_eye_findings: Annotated[Count, "contradictions between robot and images, in words in the result"] = None
     rotation_spread_deg: Annotated[float | None, Measure("°", 0, 180), "largest rotation between two views"] = None
     robot_noise_mm: Annotated[FineMm, "standard deviation of the arm's remaining position error, along each axis"] = (
         None
