@@ -43,7 +43,7 @@ SizeToleranceOption = Annotated[
         "--size-tolerance-percent",
         min=0.0,
         max=20.0,
-        help="Largest error of the square's side, in percent of it, as the board's maker states it; 0: exactly known.",
+        help="Largest error of the square's side, in percent of it, as its maker states it; 0: exactly known.",
     ),
 ]
 DEFAULT_DICTIONARY = "DICT_5X5_1000"

@@ -18,6 +18,7 @@ class Arguments(BoardSize):
         camera: known intrinsics; None if they are solved.
         corners: for each image, the file of its job `board_view`; None if the image has not been searched.
         known: estimate of camera, mount and board, with which images of a part of the board can be used.
+        size_tolerance: largest relative error of the board's size; None: nothing is stated.
     """
 
     solve: tuple[Literal["intrinsics", "hand_eye"], ...]
@@ -25,6 +26,7 @@ class Arguments(BoardSize):
     camera: Camera | None = None
     corners: tuple[Hash | None, ...] | None = None
     known: KnownBoard | None = None
+    size_tolerance: float | None = None
 
 
 class CalibrationDetails(JobRecord):
@@ -59,5 +61,6 @@ KIND = JobKind(
     answer=Answer,
     compute="service.worker.calibration.calibrate:calibrate",
     words="camera calibration",
+    version=3,  # the hand-eye calibration weighs the board's stated size against the robot's lengths
     order=12,
 )

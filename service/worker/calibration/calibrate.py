@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,6 +37,8 @@ def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
     images = arguments.images
     names = [image.viewpoint for image in images]
     board = board_of(arguments)
+    if arguments.size_tolerance is not None:
+        board = replace(board, size_tolerance=arguments.size_tolerance)
     found, parts = boards_of(context, board)
     usable = usable_views(found)
     seen = usable.indices

@@ -147,9 +147,7 @@ def _arm_answer(corrected: CorrectedHandEye, images: Sequence[str]) -> records.A
 
 
 def _size(size: BoardSizeFound) -> records.BoardSizeByRobot:
-    return records.BoardSizeByRobot(
-        ratio=size.ratio, sigma=size.sigma, tolerance=size.tolerance, used=size.used
-    )
+    return records.BoardSizeByRobot(ratio=size.ratio, sigma=size.sigma, tolerance=size.tolerance, used=size.used)
 
 
 def _spread(answer: HandEyeAnswer) -> records.Spread:

@@ -62,7 +62,9 @@ class BoardSizeFound:
             return f"by the robot the board is {self.ratio:.4f} ± {self.sigma:.4f} times as large as stated"
         found, spread = mm(self.ratio * square_m), mm(self.sigma * square_m)
         digits = int(np.clip(1 - np.floor(np.log10(max(spread, 1e-9))), 2, 5))
-        return f"the squares are {found:.{digits}f} ± {spread:.{digits}f} mm by the robot, {mm(square_m):g} were given"
+        return (
+            f"the squares are {found:.{digits}f} ± {spread:.{digits}f} mm by the robot, {mm(square_m):g} were given"
+        )
 
     def require_credible(self, square_m: float | None) -> None:
         """Raise ComputeError, with the ratio's likely cause, unless the size is credible."""

@@ -27,6 +27,7 @@ MIN_VIEWS = 6
 _MIN_ROTATION_DEG = 15.0  # largest rotation between two views
 _MIN_SECOND_AXIS_DEG = 4.0  # root mean square rotation about the second best axis
 _SUBSETS, _SUBSET_SIZE = 24, 8
+_FAR_BETTER = 3.0  # times smaller misfit without the stated size
 _USUAL_NOISE_M = 1e-3  # of an arm, to weigh the stated size of the board against the views
 
 
@@ -121,7 +122,7 @@ def untwist(hands: Array, boards: Array, T_board_turned: Transform) -> tuple[Arr
 
 @dataclass(frozen=True, slots=True)
 class RobustStart:
-    """T_flange_camera, T_base_board and the board's scale (true size over the stated one) that fit half of all views."""
+    """T_flange_camera, T_base_board and the board's scale (true size over the stated one)."""
 
     T_flange_camera: Transform
     T_base_board: Transform
@@ -143,7 +144,7 @@ def solve_with_scale(hands: Array, boards: Array) -> RobustStart:
     """Park's rotation, which no scale changes, and the positions with the board's scale by linear least squares.
 
     The stated size counts as one measurement with an error of 100 %, so that views that do not determine the scale
-    leave it where it is.
+    leave it where it is; if the views fit far better without it, as with lengths in another unit, it does not count.
     """
     R = solve_closed_form(hands, boards, "park")[:3, :3]
     n = len(hands)
@@ -154,6 +155,10 @@ def solve_with_scale(hands: Array, boards: Array) -> RobustStart:
     right[:-1] = -hands[:, :3, 3].ravel()
     system[-1, 6] = right[-1] = _USUAL_NOISE_M
     shift = np.linalg.lstsq(system, right)[0]
+    free = np.linalg.lstsq(system[:-1], right[:-1])[0]
+    misfit = [float(np.linalg.norm(system[:-1] @ answer - right[:-1])) for answer in (shift, free)]
+    if free[6] > 0 and _FAR_BETTER * misfit[1] < misfit[0]:
+        shift = free
     X, scale = transform(R, shift[:3]), float(shift[6])
     return RobustStart(X, mean_pose(hands @ X @ scaled(boards, scale)), scale)
 

@@ -167,8 +167,8 @@ def calibrate_hand_eye(
 class _Agreed:
     """The views with half-turned boards turned back, the outliers among them, and answers without the arm's errors.
 
-    `plain` is by the method that was asked for, `weighted` by the weighted fit, and `free` by one that knows nothing of
-    the board's size.
+    `plain` is by the method that was asked for, `weighted` by the weighted fit, and `free` by one that knows
+    nothing of the board's size.
     """
 
     data: HandEyeMeasurements
@@ -202,7 +202,7 @@ def _agreed(
     sized: Callable[[HandEyeSolution, float], BoardSizeFound],
     rng: np.random.Generator,
 ) -> _Agreed:
-    """The views on which robot and images agree; `check` refuses poses of robot and board that cannot belong together."""
+    """The views on which robot and images agree; `check` refuses poses that do not belong together."""
 
     def solved(turned: NDArray[np.bool_]) -> _Agreed:
         straight, sigma_px = _straightened(data, turned, T_board_turned)

@@ -214,9 +214,7 @@ def fit_method(data: HandEyeMeasurements, method: Method, start: HandEyeSolution
     return weighted if method == "weighted" else fit_resized(data, method, weighted, weighted.scale)
 
 
-def fit_resized(
-    data: HandEyeMeasurements, method: Method, near: HandEyeSolution, scale: float
-) -> HandEyeSolution:
+def fit_resized(data: HandEyeMeasurements, method: Method, near: HandEyeSolution, scale: float) -> HandEyeSolution:
     """An unweighted method's answer for a board that is `scale` times as large as stated.
 
     These methods have no noise by which the stated size could be weighed against the views: the weighted fit tells

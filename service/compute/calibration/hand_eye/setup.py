@@ -62,17 +62,19 @@ class PosesAsRead:
     Attributes:
         hands: (M, 4, 4) of all rows in the file's order, as they were read.
         rows: (N,) the row of each view.
+        images: (N) their names.
         readings: how else the file could be read.
     """
 
     hands: Array
     rows: NDArray[np.int64]
+    images: tuple[str, ...]
     readings: tuple[Reading, ...] = ()
 
     def inverted(self) -> PosesAsRead:
         """The same with every pose inverted."""
         readings = tuple(replace(reading, hands=inverted(reading.hands)) for reading in self.readings)
-        return PosesAsRead(inverted(self.hands), self.rows, readings)
+        return replace(self, hands=inverted(self.hands), readings=readings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +106,7 @@ class SetupFit:
         return None
 
     def __str__(self) -> str:
-        return f"{self.mm:.3g} mm and {self.deg:.2g}°"
+        return f"{self.mm:.3g} mm and {self.deg:.2g}°" if np.isfinite(self.mm) else "by any distance"
 
 
 def inverted(poses: Array) -> Array:
@@ -195,7 +197,8 @@ def _lost_row(hands: Array, boards: Array, point_m: Array, poses: PosesAsRead | 
             count = int(explained[k])
             if count < _LOST_SHARE * n or count < own.sum() + _LOST_FEWEST or (best and count <= best[0]):
                 continue
-            from_ = "each image" if k == 0 else f"from the {_ordinal(k + 1)} image with a board on each"
+            first = f"the {_ordinal(k + 1)} image" if poses is None else poses.images[min(k, n - 1)]
+            from_ = "each image" if k == 0 else f"from {first} on each"
             best = count, f"if {from_} has the pose of the row {words} its own ({counted(count, 'image')} of {n})"
     return None if best is None else best[1]
 

@@ -115,4 +115,3 @@ def not_below_held_out(covariance: Array, held_out_mm: Array, held_out_deg: Arra
     stated = np.sqrt([np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])])
     factor = np.repeat(np.maximum(1.0, least / np.maximum(stated, 1e-12)), 3)
     return covariance * np.outer(factor, factor)
-

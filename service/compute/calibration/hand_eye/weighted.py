@@ -4,7 +4,8 @@ According to the images, the flange's pose in view i is  T_base_board · inverse
 inverse(T_flange_camera).  Its increment e from the reported pose, in the flange's axes, is the sum of the robot's and
 the images' errors:
 
-    e_i(T_flange_camera, T_base_board, κ) = G_i φ + a_i + J_i c_i,   a_i ~ N(0, diag(σ_t² 1, σ_r² 1)),  c_i ~ N(0, C_i)
+    e_i(T_flange_camera, T_base_board, κ) = G_i φ + a_i + J_i c_i,
+    a_i ~ N(0, diag(σ_t² 1, σ_r² 1)),  c_i ~ N(0, C_i)
 
 C_i is the covariance of the board's pose in the image; G_i φ is the arm's systematic error (arm.correction) with the
 prior φ ~ N(0, s²) in units of usual tolerances. The variances σ_t², σ_r² and s² maximise the restricted likelihood

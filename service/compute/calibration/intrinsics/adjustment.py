@@ -25,10 +25,11 @@ PARAMETER_COUNT: dict[LensModel, int] = {"pinhole": 4, "radial2": 6, "opencv4": 
 _HUBER = 3.0  # standard deviations of one coordinate beyond which a corner is downweighted
 _MAX_ITERATIONS = 40
 _DAMPING = Damping(1e-4)
-# In px per unit of a term: pulls k3 … k6 towards 0 ± 3 with the weight of one corner of 0.03 px. If the images
+# In px per unit of a term: pulls k3 … k6 towards 0 ± 1 with the weight of one corner of 0.03 px. If the images
 # determine these terms, the effect vanishes; if not, it stops numerator and denominator from cancelling without
-# limit.
-_PRIOR = 0.03 / 3
+# limit, along a valley in which a weaker pull needs three times as many steps.
+_PRIOR = 0.03
+_SETTLED = 1e-6  # decrease of the cost, in squares of the corners' scale: a thousandth of a standard deviation
 _START_VIEWS = 20  # used by OpenCV's solver for a start; the others join in the adjustment
 
 
@@ -282,7 +283,7 @@ def _settles(here: _Linearised, there: _Linearised) -> bool:
     if _gain(here, there) < 0 or there.step is None:
         return False
     relative = np.abs(there.step / np.maximum(np.abs(here.theta), 1e-3)).max()
-    return bool(relative < 1e-9 or here.cost - there.cost < 1e-13 * here.cost)
+    return bool(relative < 1e-9 or here.cost - there.cost < _SETTLED * here.scale**2)
 
 
 def linearised(boards: Array, points: Array, camera: CameraModel, parameters: int) -> Adjustment:

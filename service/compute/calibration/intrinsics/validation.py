@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.calibration.intrinsics.adjustment import adjust, fit_pose, rms
-from service.compute.calibration.intrinsics.estimate import IntrinsicsResult
+from service.compute.calibration.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics
 from service.compute.calibration.intrinsics.uncertainty import ProjectionUncertainty
 from service.core.errors import ComputeError
 from service.core.geometry import Array
@@ -23,6 +23,8 @@ _COVERAGE = 0.9
 _TILT_DEG = 30.0
 _HELD_OUT_FACTOR = 1.3
 _INFLATION = 4.0
+_SIMPLE = ("pinhole", "radial2", "opencv4", "opencv5")  # models that a wide lens does not follow
+_WIDE = 0.5  # times as large residuals with the rational model tell a wide lens
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +105,21 @@ def residual_field(result: IntrinsicsResult, columns: int = 24, rows: int = 16) 
     return mean.reshape(rows, columns, 2), count.reshape(rows, columns).astype(np.int64)
 
 
+def _wide_lens(result: IntrinsicsResult) -> list[str]:
+    """The warning that a lens is too wide for its model, if the rational one fits the same views far better."""
+    size = (result.camera.width, result.camera.height)
+    try:
+        wide = calibrate_intrinsics(result.corners, result.board, size, model="rational")
+    except ComputeError:  # these views do not determine so many terms
+        return []
+    if wide.rms_px > _WIDE * result.rms_px or len(wide.views) < len(result.views) - 1:
+        return []
+    return [
+        f"a wide lens: the model {result.model} fits to {result.rms_px:.2f} px, rational to {wide.rms_px:.2f} px "
+        f"(fx {wide.camera.fx:.1f} ± {wide.sigma['fx']:.1f}): calibrate with --model rational"
+    ]
+
+
 def calibration_warnings(
     result: IntrinsicsResult, validation: CrossValidation | None, uncertainty: ProjectionUncertainty
 ) -> tuple[str, ...]:
@@ -123,7 +140,10 @@ def calibration_warnings(
             f"images disagree {np.sqrt(result.inflation):.1f} times as much as their corners' noise explains "
             "(light, a bent board or a wrong model); the sigmas are enlarged by this"
         )
-    for name, sigma in result.sigma.items():
+    if result.model in _SIMPLE and (result.rms_px > _RMS_PX or result.inflation > _INFLATION):
+        found += _wide_lens(result)
+    # Terms of a quotient may cancel each other: what they mean together is in the projection's uncertainty.
+    for name, sigma in result.sigma.items() if result.model != "rational" else ():
         if name in ("k2", "k3", "k4", "k5", "k6") and sigma > abs(getattr(result.camera, name)):
             found.append(
                 f"{name} is not determined ({getattr(result.camera, name):.3g} ± {sigma:.2g}): use fewer terms"

@@ -233,6 +233,9 @@ def _solve(
         **board_arguments(board),
         camera=None if camera is None else camera.answer.camera,
     )
+    described = context.protocol.board
+    if described is not None and described.size_tolerance_percent is not None:
+        arguments = arguments.model_copy(update={"size_tolerance": described.size_tolerance_percent / 100})
     references = {} if camera is None else {"camera": camera.reference("camera")}
     if capture is not None:
         corners = tuple(looks[image.sha256].corners_sha256 if image.sha256 in looks else None for image in images)
