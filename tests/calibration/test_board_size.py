@@ -1,4 +1,4 @@
-"""The board's size by the robot's lengths: fitted with its tolerance, told in words, refused if it is not credible."""
+"""The size of a board by the robot: fitted with its tolerance, told in words, refused if it is not credible."""
 
 from __future__ import annotations
 

@@ -9,10 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.calibration.intrinsics.adjustment import adjust, fit_pose, rms
-from service.compute.calibration.intrinsics.estimate import IntrinsicsResult, calibrate_intrinsics
+from service.compute.calibration.intrinsics.estimate import (
+    IntrinsicsResult,
+    calibrate_intrinsics,
+    leave_one_out,
+    surface_of,
+)
 from service.compute.calibration.intrinsics.uncertainty import ProjectionUncertainty
 from service.core.errors import ComputeError
 from service.core.geometry import Array
+from service.core.units import mm
 
 MIN_VIEWS_TO_VALIDATE = 4
 _FOLDS = 5
@@ -55,7 +61,7 @@ def cross_validate(result: IntrinsicsResult, *, seed: int = 0) -> CrossValidatio
     n = len(result.corners)
     if n < MIN_VIEWS_TO_VALIDATE:
         raise ComputeError(f"{n} views cannot be cross-validated", remedy="Take more board images")
-    points = result.board.points()
+    surface = surface_of(result.board)
     size = (result.camera.width, result.camera.height)
     folds = min(_FOLDS, n)
     fold = np.random.default_rng(seed).permutation(n) % folds
@@ -65,19 +71,21 @@ def cross_validate(result: IntrinsicsResult, *, seed: int = 0) -> CrossValidatio
         train = np.flatnonzero(fold != k)
         without = adjust(
             [result.corners[i] for i in train],
-            points,
+            surface,
             size,
             solution.camera,
             solution.poses[train],
             parameters=len(result.parameters),
+            bow_m=solution.bow_m,
             iterations=6,
         )
+        points = surface.bent(without.bow_m)
         for i in np.flatnonzero(fold == k):
             held_out[i] = fit_pose(result.corners[i], points, without.camera, solution.poses[i])[1]
     one_out = np.array(
         [
             rms(view.residual + view.reduced @ change)
-            for view, change in zip(solution.views, result.leave_one_out, strict=True)
+            for view, change in zip(solution.views, leave_one_out(solution), strict=True)
         ]
     )
     counts = np.array([len(view.indices) for view in result.corners])
@@ -120,6 +128,23 @@ def _wide_lens(result: IntrinsicsResult) -> list[str]:
     ]
 
 
+def _undetermined(result: IntrinsicsResult, uncertainty: ProjectionUncertainty) -> list[str]:
+    """Warnings that the images do not determine terms of the distortion."""
+    if result.model == "rational":
+        # Terms of a quotient may cancel each other: what they mean together is in the projection's uncertainty.
+        if uncertainty.worst_px <= _RMS_PX:
+            return []
+        return [
+            "the quotient of k1 … k6 is not determined in all of the image: show the board in its corners, or use "
+            "fewer terms"
+        ]
+    return [
+        f"{name} is not determined ({getattr(result.camera, name):.3g} ± {sigma:.2g}): use fewer terms"
+        for name, sigma in result.sigma.items()
+        if name in ("k2", "k3") and sigma > abs(getattr(result.camera, name))
+    ]
+
+
 def calibration_warnings(
     result: IntrinsicsResult, validation: CrossValidation | None, uncertainty: ProjectionUncertainty
 ) -> tuple[str, ...]:
@@ -142,12 +167,13 @@ def calibration_warnings(
         )
     if result.model in _SIMPLE and (result.rms_px > _RMS_PX or result.inflation > _INFLATION):
         found += _wide_lens(result)
-    # Terms of a quotient may cancel each other: what they mean together is in the projection's uncertainty.
-    for name, sigma in result.sigma.items() if result.model != "rational" else ():
-        if name in ("k2", "k3", "k4", "k5", "k6") and sigma > abs(getattr(result.camera, name)):
-            found.append(
-                f"{name} is not determined ({getattr(result.camera, name):.3g} ± {sigma:.2g}): use fewer terms"
-            )
+    found += _undetermined(result, uncertainty)
+    bow_m = max(result.board.bow_m, key=abs)
+    if abs(bow_m) > result.board.flatness_m:
+        found.append(
+            f"the board is bent by {mm(abs(bow_m)):.2f} mm, more than its stated flatness of "
+            f"{mm(result.board.flatness_m):g} mm: the camera is corrected for an even bow, not for waves"
+        )
     if result.board.pattern == "circles":
         found.append("the middle of a tilted circle's image is not its centre: a checkerboard is more accurate")
     if validation is None:
