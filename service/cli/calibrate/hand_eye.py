@@ -63,9 +63,12 @@ from service.core.arms.model import ArmModel
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform
 from service.core.text.counts import counted
+from service.core.text.file_text import file_text
+from service.core.text.json_text import parse_json
 from service.core.units import mm
+from service.jobs.calibration.records import BoardSeen
 from service.jobs.records import matrix
-from service.worker.calibration.records import hand_eye_record
+from service.worker.calibration.records import hand_eye_record, seen_board
 
 
 def hand_eye_command(
@@ -127,7 +130,7 @@ def hand_eye_command(
             size_tolerance_percent=size_tolerance_percent,
         )
         _require_possible(setup, joints, arm, preview)
-        model = read_camera_json(camera)
+        model, target = read_camera_json(camera), _with_bow(target, camera)
         folder = image_folder(images, size=(model.width, model.height), strict=strict)
         poses, folder = _robot_poses(robot_poses, folder, images, rotation, length, strict=strict)
         files = folder.files
@@ -169,7 +172,7 @@ def hand_eye_command(
             return
         if poses.table is not None and not poses.table.plain:
             console.print(f"{escape(robot_poses.name)} was read with {poses.table.words}")
-        _tell(result, record, target.square_m)
+        _tell(result, record)
         console.print(f"written: {out}")
 
 
@@ -234,6 +237,13 @@ def _session(
         np.array([poses[name] for name in names]),
         np.array([locate_view(view, board, camera)[0] for view in usable.views]),
     )
+
+
+def _with_bow(board: Board, camera: Path) -> Board:
+    """The board as bent as the calibration of the camera has found it, if camera.json says so."""
+    record = parse_json(file_text(camera), name=str(camera), remedy="Give a camera.json")
+    seen = record.get("board")
+    return seen_board(board, BoardSeen.model_validate(seen) if isinstance(seen, dict) and "bow_mm" in seen else None)
 
 
 def _require_possible(setup: Setup, joints: Path | None, arm: str | None, preview: Path | None) -> None:
@@ -317,7 +327,7 @@ def _drawn(result: HandEyeResult, session: _BoardSession, suggested: Sequence[Su
     return draw_board_plan(cameras, suggested, best.T_base_board, corners.points_m, corners.camera)
 
 
-def _tell(result: HandEyeResult, record: HandEyeFile, square_m: float) -> None:
+def _tell(result: HandEyeResult, record: HandEyeFile) -> None:
     x, y, z = mm(result.T_flange_camera[:3, 3])
     frame = "flange" if record.setup == "eye-in-hand" else "robot's base"
     console.print(
@@ -329,7 +339,7 @@ def _tell(result: HandEyeResult, record: HandEyeFile, square_m: float) -> None:
         f"held-out images: {held_mm:.3f} mm, {held_deg:.4f}° (median); "
         f"other methods up to {result.spread_mm:.3f} mm away; condition {result.condition:.1f}"
     )
-    console.print(result.size.words(square_m))
+    console.print((result.corrected or result).size.words)
     for finding in result.findings:
         console.print(f"[yellow]warning[/] {escape(finding)}")
     camera_mm, camera_deg = record.sigma.camera_mm, record.sigma.camera_deg

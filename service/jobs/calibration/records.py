@@ -90,12 +90,32 @@ class KnownBoard(JobRecord):
 
 
 class BoardSeen(JobRecord):
-    """The calibration board: inner corners, and the edge of a square."""
+    """The calibration board: inner corners, the edge of a square, and how it is bent.
+
+    Attributes:
+        pattern: printed on it.
+        columns, rows: of inner corners.
+        square_mm: edge of a square.
+        flatness_mm: largest bow that was stated.
+        bow_mm: how far its middle lies behind its sides, and behind its ends; None if it was taken as flat.
+        bow_sigma_mm: standard deviations of the two.
+    """
 
     pattern: str
     columns: int
     rows: int
     square_mm: float
+    flatness_mm: float | None = None
+    bow_mm: tuple[float, float] | None = None
+    bow_sigma_mm: tuple[float, float] | None = None
+
+    @property
+    def bow_words(self) -> str:
+        """The bow for people; empty for a board that was taken as flat."""
+        if self.bow_mm is None or self.bow_sigma_mm is None:
+            return ""
+        x, y = (f"{bow:+.3f} ± {sigma:.3f} mm" for bow, sigma in zip(self.bow_mm, self.bow_sigma_mm, strict=True))
+        return f"{x} across its columns, {y} across its rows (+: the middle lies away from the camera)"
 
 
 class Tilt(JobRecord):
@@ -195,12 +215,14 @@ class BoardSizeByRobot(JobRecord):
         sigma: standard deviation of `ratio`.
         tolerance: stated for the board, relative.
         used: in the answer.
+        words: the same for people.
     """
 
     ratio: float
     sigma: float
     tolerance: float
     used: float
+    words: str = ""
 
 
 class HandEyeMethod(JobRecord):

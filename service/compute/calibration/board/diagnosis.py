@@ -224,7 +224,7 @@ def _marker_ratios(image: Grey, board: Board) -> Array:
     corners, identifiers, _ = _marker_detector(board.dictionary).detectMarkers(image)
     if identifiers is None or len(identifiers) < _FEWEST_MARKERS:  # pyright: ignore[reportUnnecessaryComparison]
         return np.zeros(0)
-    places = dict(zip(described.getIds().ravel().tolist(), described.getObjPoints(), strict=True))
+    places = dict(zip(np.asarray(described.getIds()).ravel().tolist(), described.getObjPoints(), strict=True))
     known = [(np.asarray(c, dtype=np.float64).reshape(4, 2), places[i]) for c, i in
              zip(corners, np.asarray(identifiers).ravel().tolist(), strict=True) if i in places]  # fmt: skip
     if len(known) < _FEWEST_MARKERS:

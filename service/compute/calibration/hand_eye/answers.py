@@ -30,7 +30,6 @@ class HandEyeAnswer:
         residual_deg: (N,) the same for its orientation.
         held_out_mm: (N,) as residual_mm, but each view is judged by a calibration without its fold.
         held_out_deg: (N,) the same for its orientation.
-        size: of the board, by the robot's lengths.
     """
 
     T_flange_camera: Transform
@@ -46,7 +45,6 @@ class HandEyeAnswer:
     residual_deg: Array
     held_out_mm: Array
     held_out_deg: Array
-    size: BoardSizeFound
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +54,12 @@ class CorrectedHandEye(HandEyeAnswer):
     Attributes:
         correction: the arm's systematic error.
         terms: which of its parameters were estimated.
+        size: of the board, by the lengths of the corrected arm.
     """
 
     correction: ArmCorrection
     terms: ArmTerms
+    size: BoardSizeFound
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +82,7 @@ class HandEyeResult(HandEyeAnswer):
             not lower the held-out error.
         arm_held_out_mm: root mean square of held_out_mm for each arm model that was tried ("none": the poses as
             reported).
+        size: of the board, by the robot's lengths.
         findings: what the measurements contradict, in words; empty if nothing.
     """
 
@@ -97,4 +98,5 @@ class HandEyeResult(HandEyeAnswer):
     excluded: dict[int, str]
     corrected: CorrectedHandEye | None
     arm_held_out_mm: dict[ArmTerms, float]
+    size: BoardSizeFound
     findings: tuple[str, ...]

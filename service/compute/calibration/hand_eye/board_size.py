@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from service.compute.calibration.board.board import Board
 from service.compute.calibration.hand_eye.fit import HandEyeMeasurements, HandEyeSolution
 from service.compute.calibration.hand_eye.weighted import resample
 from service.core.errors import ComputeError
@@ -44,36 +45,37 @@ class BoardSizeFound:
         sigma: standard deviation of `ratio`, without that of the robot's own lengths.
         tolerance: stated for the board: the largest relative error of its size.
         used: in the answer: `ratio` and the stated size, weighted.
+        square_m: the stated side of a square; None if none was stated.
     """
 
     ratio: float
     sigma: float
     tolerance: float
     used: float
+    square_m: float | None
 
     @property
     def credible(self) -> bool:
         """Whether the difference lies within tolerance, uncertainty and the arm's own lengths."""
         return abs(self.ratio - 1) <= _SURE * float(np.hypot(self.sigma, _RULER)) + self.tolerance
 
-    def words(self, square_m: float | None) -> str:
+    @property
+    def words(self) -> str:
         """`the squares are 14.50 ± 0.01 mm by the robot, 15 were given`."""
-        if square_m is None:
+        if self.square_m is None:
             return f"by the robot the board is {self.ratio:.4f} ± {self.sigma:.4f} times as large as stated"
-        found, spread = mm(self.ratio * square_m), mm(self.sigma * square_m)
+        found, spread = mm(self.ratio * self.square_m), mm(self.sigma * self.square_m)
         digits = int(np.clip(1 - np.floor(np.log10(max(spread, 1e-9))), 2, 5))
-        return (
-            f"the squares are {found:.{digits}f} ± {spread:.{digits}f} mm by the robot, {mm(square_m):g} were given"
-        )
+        given = f"{mm(self.square_m):g} were given"
+        return f"the squares are {found:.{digits}f} ± {spread:.{digits}f} mm by the robot, {given}"
 
-    def require_credible(self, square_m: float | None) -> None:
+    def require_credible(self) -> None:
         """Raise ComputeError, with the ratio's likely cause, unless the size is credible."""
         if self.credible:
             return
         likely = _likely(self.ratio)
         raise ComputeError(
-            f"{self.words(square_m)} (ratio {self.ratio:.4f}{likely}); the board's tolerance is "
-            f"{100 * self.tolerance:.2g} %",
+            f"{self.words} (ratio {self.ratio:.4f}{likely}); the board's tolerance is {100 * self.tolerance:.2g} %",
             remedy="Measure ten squares with a ruler and give their true size; if it is right, check that the "
             "robot's positions are in the stated unit and that its model is the mounted arm",
         )
@@ -92,20 +94,21 @@ def size_sigma(tolerance: float) -> float:
     return tolerance / float(np.sqrt(3))
 
 
-def size_found(free: HandEyeSolution, used: float, tolerance: float, counts: Array) -> BoardSizeFound:
+def size_found(free: HandEyeSolution, used: float, board: Board | None, counts: Array) -> BoardSizeFound:
     """The board's size by robot and images alone.
 
     Args:
         free: answer of the weighted fit that knows nothing of the board's size.
         used: the board's scale in the answer that weighs the stated size too.
-        tolerance: of the stated size, relative.
+        board: as described; None: its size is exactly known.
         counts: (R, N) how often each view counts in each replicate of a bootstrap.
     """
     assert free.views is not None
     assert free.noise is not None
     assert free.fit is not None
     scatter = float(np.std(resample(free.views, free.noise, free.fit, counts)[:, 12])) if len(counts) > 1 else 0.0
-    return BoardSizeFound(free.scale, max(scatter, free.scale_sigma), tolerance, used)
+    tolerance, square_m = (0.0, None) if board is None else (board.size_tolerance, board.square_m)
+    return BoardSizeFound(free.scale, max(scatter, free.scale_sigma), tolerance, used, square_m)
 
 
 def contradictions(data: HandEyeMeasurements, answer: HandEyeSolution) -> tuple[str, ...]:

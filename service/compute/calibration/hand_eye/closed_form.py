@@ -159,7 +159,7 @@ def solve_with_scale(hands: Array, boards: Array) -> RobustStart:
     misfit = [float(np.linalg.norm(system[:-1] @ answer - right[:-1])) for answer in (shift, free)]
     if free[6] > 0 and _FAR_BETTER * misfit[1] < misfit[0]:
         shift = free
-    X, scale = transform(R, shift[:3]), float(shift[6])
+    X, scale = transform(R, np.asarray(shift[:3], dtype=np.float64)), float(shift[6])
     return RobustStart(X, mean_pose(hands @ X @ scaled(boards, scale)), scale)
 
 

@@ -280,8 +280,8 @@ def _sized(board: Board | None, count: int, seed: int, free: HandEyeSolution, us
     assert free.views is not None
     n = len(free.views.T_base_flange)
     counts = bootstrap_counts(bootstrap_picks(n, count, np.random.default_rng(seed)), n)
-    size = size_found(free, used, 0.0 if board is None else board.size_tolerance, counts)
-    size.require_credible(None if board is None else board.square_m)
+    size = size_found(free, used, board, counts)
+    size.require_credible()
     return size
 
 

@@ -227,8 +227,8 @@ def fit_resized(data: HandEyeMeasurements, method: Method, near: HandEyeSolution
     if method == "reprojection":
         if resized.corners is None:
             raise ComputeError("the method `reprojection` needs the corners, not only the board's poses")
-        X, B = solve_reprojection(resized.hands, resized.corners, near.T_flange_camera, near.T_base_board)
-        return HandEyeSolution(X, B, scale, near.scale_sigma)
+        two = solve_reprojection(resized.hands, resized.corners, near.T_flange_camera, near.T_base_board)
+        return HandEyeSolution(*two, scale, near.scale_sigma)
     assert method != "weighted"
     X = solve_closed_form(resized.hands, resized.boards, method)
     return HandEyeSolution(X, mean_pose(resized.hands @ X @ resized.boards), scale, near.scale_sigma)

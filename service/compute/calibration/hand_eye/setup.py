@@ -176,31 +176,46 @@ def _readings(hands: Array, setup: Setup, poses: PosesAsRead | None, *, every: b
 
 def _lost_row(hands: Array, boards: Array, point_m: Array, poses: PosesAsRead | None) -> str | None:
     """How the poses fit if a row was lost, or there twice: from one view on, each has its neighbour's pose."""
-    every, rows = (hands, np.arange(len(hands))) if poses is None else (poses.hands, poses.rows)
-    n = len(hands)
-    if n < MIN_VIEWS + _LOST_FEWEST:
+    if len(hands) < MIN_VIEWS + _LOST_FEWEST:
         return None
-    best: tuple[int, str] | None = None
+    every, rows = (hands, np.arange(len(hands))) if poses is None else (poses.hands, poses.rows)
+    found: list[tuple[int, str]] = []
     for step, words in ((1, "after"), (-1, "before")):
         there = (rows + step >= 0) & (rows + step < len(every))
         moved = np.where(there[:, None, None], every[np.clip(rows + step, 0, len(every) - 1)], hands)
-        # The row is lost in one half: the other half has its own poses, or all its neighbours'.
-        half = max(MIN_VIEWS, n // 2)
-        for whole, part in ((hands, slice(0, half)), (moved, slice(n - half, n))):
-            try:
-                common = solve_with_scale(whole[part], boards[part])
-            except (cv2.error, ComputeError):
-                continue
-            own, next_ = _near(common, hands, boards, point_m), _near(common, moved, boards, point_m) & there
-            explained = np.concatenate([[0], np.cumsum(own)]) + next_.sum() - np.concatenate([[0], np.cumsum(next_)])
-            k = int(np.argmax(explained))
-            count = int(explained[k])
-            if count < _LOST_SHARE * n or count < own.sum() + _LOST_FEWEST or (best and count <= best[0]):
-                continue
-            first = f"the {_ordinal(k + 1)} image" if poses is None else poses.images[min(k, n - 1)]
-            from_ = "each image" if k == 0 else f"from {first} on each"
-            best = count, f"if {from_} has the pose of the row {words} its own ({counted(count, 'image')} of {n})"
-    return None if best is None else best[1]
+        for common in _answers_of_a_half(hands, moved, boards):
+            own = _near(common, hands, boards, point_m)
+            count, first = _split(own, _near(common, moved, boards, point_m) & there)
+            if count >= max(_LOST_SHARE * len(hands), own.sum() + _LOST_FEWEST):
+                name = f"the {_ordinal(first + 1)} image" if poses is None else poses.images[first]
+                begin = "each image" if first == 0 else f"from {name} on each"
+                fitting = f"{counted(count, 'image')} of {len(hands)}"
+                found.append((count, f"if {begin} has the pose of the row {words} its own ({fitting})"))
+    return max(found)[1] if found else None
+
+
+def _answers_of_a_half(hands: Array, moved: Array, boards: Array) -> Iterator[RobustStart]:
+    """Answers of the first views with their own poses, and of the last ones with their neighbours'.
+
+    The row is lost in one half, so one of the two halves has no wrong pose.
+    """
+    half = max(MIN_VIEWS, len(hands) // 2)
+    for whole, part in ((hands, slice(0, half)), (moved, slice(len(hands) - half, None))):
+        try:
+            yield solve_with_scale(whole[part], boards[part])
+        except (cv2.error, ComputeError):  # a half may have too little rotation
+            continue
+
+
+def _split(own: NDArray[np.bool_], neighbours: NDArray[np.bool_]) -> tuple[int, int]:
+    """Number of views that fit at most if the first ones have their own poses and the others their neighbours'.
+
+    Also the index of the first of the others.
+    """
+    before = np.concatenate([[0], np.cumsum(own)])[:-1]
+    after = neighbours.sum() - np.concatenate([[0], np.cumsum(neighbours)])[:-1]
+    first = int(np.argmax(before + after))
+    return int(before[first] + after[first]), first
 
 
 def _ordinal(number: int) -> str:
