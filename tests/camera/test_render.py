@@ -18,7 +18,15 @@ from simulators.geometry import apply, inverse, look_at
 from simulators.rendering.overlays import Frame, draw_sphere, half_plane_coverage
 from simulators.rendering.render import PREVIEW_WIDTH, REFERENCE, Renderer
 from simulators.scene.intrinsics import Intrinsics
-from simulators.scene.world import BOARD_SQUARE_M, BOARD_SQUARES, NOMINAL_LUX, RADIUS_M, SCENE_CENTRE_M, Scene
+from simulators.scene.world import (
+    BOARD_SQUARE_M,
+    BOARD_SQUARES,
+    NOMINAL_LUX,
+    RADIUS_M,
+    SCENE_CENTRE_M,
+    Scene,
+    board_sag_m,
+)
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -128,7 +136,7 @@ def test_checkerboard_corners_lie_where_the_lens_projects_them(renderer: Rendere
     picture = renderer.render(view(scene, ABOVE, board=T_world_board.tolist()), REFERENCE, 1)
     columns, rows = BOARD_SQUARES[0] - 1, BOARD_SQUARES[1] - 1
     x, y = np.meshgrid(np.arange(columns) * BOARD_SQUARE_M, np.arange(rows) * BOARD_SQUARE_M)
-    board: Array = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(np.float64)
+    board: Array = np.stack([x.ravel(), y.ravel(), board_sag_m(x.ravel(), y.ravel())], axis=1)
     true = lens.project(apply(inverse(ABOVE) @ T_world_board, board))
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     start = (true + 0.7).astype(np.float32).reshape(-1, 1, 2)
@@ -141,6 +149,29 @@ def test_checkerboard_corners_lie_where_the_lens_projects_them(renderer: Rendere
     pinhole = dataclasses.replace(lens, k1=0.0, k2=0.0, p1=0.0, p2=0.0)
     straight = pinhole.project(apply(inverse(ABOVE) @ T_world_board, board))
     assert np.linalg.norm(found - straight, axis=1).max() > 0.5
+
+
+def test_the_simulated_board_is_bent_as_its_ground_truth_says(renderer: Renderer, scene: Scene) -> None:
+    T_world_board = scene.board_placement(1)
+    lens = scene.camera_intrinsics(WIDTH)
+    # Seen from the side, where a displacement along the board's normal shows.
+    aside = look_at(np.array([0.2, -0.45, 0.55]), np.array([0.0, 0.0, 0.14]), np.array([0.0, 1.0, 0.0]))
+    picture = renderer.render(view(scene, aside, board=T_world_board.tolist()), REFERENCE, 1)
+    columns, rows = BOARD_SQUARES[0] - 1, BOARD_SQUARES[1] - 1
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(columns) * BOARD_SQUARE_M, np.arange(rows) * BOARD_SQUARE_M))
+    T_camera_board = inverse(aside) @ T_world_board
+    flat, bent = (
+        lens.project(apply(T_camera_board, np.stack([x, y, z], axis=1))) for z in (0 * x, board_sag_m(x, y))
+    )
+    inside = ((bent > 8) & (bent < np.array([lens.width, lens.height]) - 9)).all(axis=1)
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
+    start = bent[inside].astype(np.float32).reshape(-1, 1, 2)
+    found = cv2.cornerSubPix(grey, start, (3, 3), (-1, -1), stop).reshape(-1, 2)
+    moved, shift = (found - flat[inside]).ravel(), (bent - flat)[inside].ravel()
+    assert np.abs(shift).max() > 0.03
+    assert inside.sum() > 100
+    assert moved @ shift / (shift @ shift) == pytest.approx(1.0, abs=0.25)
 
 
 def test_a_half_plane_covers_what_fine_sampling_says() -> None:

@@ -36,7 +36,7 @@ _CLEARLY = 3.0  # the true reading's errors are this many times smaller, in posi
 _LIKE = 0.12  # relative difference up to which a ratio of lengths counts as that of two units
 #: Ratio of a board's size by the robot to its true size, if the robot's positions are not in metres.
 _UNITS = ((1000.0, "millimetres", "mm"), (100.0, "centimetres", "cm"), (39.37, "inches", "in"))
-_LOST_FEWEST = 3  # views that a lost row must explain
+_LOST_FEWEST = 2  # views that a lost row must explain: an outlier, or two poses that were swapped, explain one
 _LOST_SHARE = 0.9  # of the views that fit if a row was lost
 
 
