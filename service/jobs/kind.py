@@ -50,8 +50,7 @@ class JobKind(Generic[A, R]):
         compute: `module:function`, imported at the first such job. The function takes a JobContext[arguments] and
             returns a JobAnswer (service/worker/job.py).
         words: its name for people.
-        version: of the arguments and of the computation. 1 holds copies of earlier results, 2 and later references to
-            them; all are read. A kind whose numbers change gets the next one.
+        version: of the arguments. 1 holds copies of earlier results, 2 references to them; both are read.
         order: position among the kinds in lists and texts, as a run uses them.
         replayed: whether a replay recomputes it by default; not for kinds that only help during a capture.
         aside: whether the provenance drawing omits it, because no result depends on it.
