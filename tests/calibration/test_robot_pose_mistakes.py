@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -77,7 +78,7 @@ def _check(path: Path, session: Session) -> None:
     check_setup(every[taken], session.boards, point_m=np.zeros(3), setup="eye-in-hand", poses=poses)
 
 
-def _turned(form: str, *, degrees: bool) -> Callable[[Array], Array]:
+def _turned(form: Literal["xyz", "ZYX", "XYZ", "ZYZ"], *, degrees: bool) -> Callable[[Array], Array]:
     return lambda hands: Rotation.from_matrix(hands[:, :3, :3]).as_euler(form, degrees=degrees)
 
 

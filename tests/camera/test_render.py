@@ -130,13 +130,19 @@ def test_sphere_outlines_in_the_picture_lie_on_the_analytic_cone(plain: Picture,
     assert abs(centre_and_size_px[2]) < 0.03
 
 
+def _inner_corners() -> Array:
+    """(N, 3) of the simulated board, if it were flat."""
+    columns, rows = BOARD_SQUARES[0] - 1, BOARD_SQUARES[1] - 1
+    x, y = np.meshgrid(np.arange(columns) * BOARD_SQUARE_M, np.arange(rows) * BOARD_SQUARE_M)
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(np.float64)
+
+
 def test_checkerboard_corners_lie_where_the_lens_projects_them(renderer: Renderer, scene: Scene) -> None:
     T_world_board = scene.board_placement(1)
     lens = scene.camera_intrinsics(WIDTH)
     picture = renderer.render(view(scene, ABOVE, board=T_world_board.tolist()), REFERENCE, 1)
-    columns, rows = BOARD_SQUARES[0] - 1, BOARD_SQUARES[1] - 1
-    x, y = np.meshgrid(np.arange(columns) * BOARD_SQUARE_M, np.arange(rows) * BOARD_SQUARE_M)
-    board: Array = np.stack([x.ravel(), y.ravel(), board_sag_m(x.ravel(), y.ravel())], axis=1)
+    board = _inner_corners()
+    board[:, 2] = board_sag_m(board[:, 0], board[:, 1])
     true = lens.project(apply(inverse(ABOVE) @ T_world_board, board))
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     start = (true + 0.7).astype(np.float32).reshape(-1, 1, 2)
@@ -157,12 +163,10 @@ def test_the_simulated_board_is_bent_as_its_ground_truth_says(renderer: Renderer
     # Seen from the side, where a displacement along the board's normal shows.
     aside = look_at(np.array([0.2, -0.45, 0.55]), np.array([0.0, 0.0, 0.14]), np.array([0.0, 1.0, 0.0]))
     picture = renderer.render(view(scene, aside, board=T_world_board.tolist()), REFERENCE, 1)
-    columns, rows = BOARD_SQUARES[0] - 1, BOARD_SQUARES[1] - 1
-    x, y = (a.ravel() for a in np.meshgrid(np.arange(columns) * BOARD_SQUARE_M, np.arange(rows) * BOARD_SQUARE_M))
-    T_camera_board = inverse(aside) @ T_world_board
-    flat, bent = (
-        lens.project(apply(T_camera_board, np.stack([x, y, z], axis=1))) for z in (0 * x, board_sag_m(x, y))
-    )
+    T_camera_board, corners = inverse(aside) @ T_world_board, _inner_corners()
+    flat = lens.project(apply(T_camera_board, corners))
+    corners[:, 2] = board_sag_m(corners[:, 0], corners[:, 1])
+    bent = lens.project(apply(T_camera_board, corners))
     inside = ((bent > 8) & (bent < np.array([lens.width, lens.height]) - 9)).all(axis=1)
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
