@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.arm.kinematics import active_tool, forward
-from service.compute.calibration.hand_eye.setup import PosesAsRead, Reading, check_setup
+from service.compute.calibration.hand_eye.setup import PoseReading, PosesAsRead, check_setup
 from service.compute.poses.files.robot_poses import matched_rows, other_orders, read_robot_poses
 from service.core.arms.known import arm_model
 from service.core.errors import ComputeError
@@ -69,9 +69,9 @@ def _check(path: Path, session: Session) -> None:
     table = read_robot_poses(path)
     rows = matched_rows(table, NAMES, path)
     every, taken = table.poses(), np.array([rows[name] for name in NAMES])
-    readings = [Reading(poses[taken], words, remedy) for poses, words, remedy in table.other_readings()]
+    readings = [PoseReading(poses[taken], words, remedy) for poses, words, remedy in table.other_readings()]
     readings += [
-        Reading(every[[order[name] for name in NAMES]], words, "Give each image its own pose")
+        PoseReading(every[[order[name] for name in NAMES]], words, "Give each image its own pose")
         for order, words in other_orders(rows)
     ]
     poses = PosesAsRead(every, taken, NAMES, tuple(readings))

@@ -43,7 +43,7 @@ from service.compute.calibration.hand_eye.answers import HandEyeResult
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.fit import Method
 from service.compute.calibration.hand_eye.reprojection import BoardCorners, board_corners
-from service.compute.calibration.hand_eye.setup import PosesAsRead, Reading, Setup
+from service.compute.calibration.hand_eye.setup import PoseReading, PosesAsRead, Setup
 from service.compute.calibration.intrinsics.estimate import locate_view
 from service.compute.camera_covariance import read_camera_covariance
 from service.compute.camera_model import CameraModel
@@ -189,10 +189,10 @@ class _RobotPoses:
         if self.table is None:
             return None
         rows, every = np.array([self.rows[image] for image in images]), self.table.poses()
-        readings = [Reading(poses[rows], words, remedy) for poses, words, remedy in self.table.other_readings()]
+        readings = [PoseReading(poses[rows], words, remedy) for poses, words, remedy in self.table.other_readings()]
         for order, words in other_orders(self.rows):
             moved = every[[order[image] for image in images]]
-            readings.append(Reading(moved, words, "Give each image its own pose: count names with leading zeros"))
+            readings.append(PoseReading(moved, words, "Give each image its own pose: count names with leading zeros"))
         return PosesAsRead(every, rows, tuple(images), tuple(readings))
 
 

@@ -41,7 +41,7 @@ _LOST_SHARE = 0.9  # of the views that fit if a row was lost
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class PoseReading:
     """Another way to read the robot's poses.
 
     Attributes:
@@ -69,7 +69,7 @@ class PosesAsRead:
     hands: Array
     rows: NDArray[np.int64]
     images: tuple[str, ...]
-    readings: tuple[Reading, ...] = ()
+    readings: tuple[PoseReading, ...] = ()
 
     def inverted(self) -> PosesAsRead:
         """The same with every pose inverted."""
@@ -159,13 +159,13 @@ def _misread(as_read: SetupFit, found: SetupFit, words: str, remedy: str) -> Com
     )
 
 
-def _readings(hands: Array, setup: Setup, poses: PosesAsRead | None, *, every: bool) -> Iterator[Reading]:
+def _readings(hands: Array, setup: Setup, poses: PosesAsRead | None, *, every: bool) -> Iterator[PoseReading]:
     """Other ways to read the poses, the likeliest first; without `every` only that which may fit like the first."""
     other: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
     where = (
         "beside the robot, the board on its flange" if other == "eye-to-hand" else "on the flange, the board still"
     )
-    yield Reading(
+    yield PoseReading(
         inverted(hands),
         f"inverted: either the file holds T_flange_base, or the camera stands {where}",
         f"Invert the poses in the file, or give --setup {other}",
