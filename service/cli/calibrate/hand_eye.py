@@ -70,6 +70,8 @@ from service.jobs.calibration.records import BoardSeen
 from service.jobs.records import matrix
 from service.worker.calibration.records import hand_eye_record, seen_board
 
+_VAGUE_SIZE = 0.01  # relative standard deviation of the board's size by the robot
+
 
 def hand_eye_command(
     images: Annotated[Path, typer.Option("--images", help="Folder of the board images.")],
@@ -340,6 +342,8 @@ def _tell(result: HandEyeResult, record: HandEyeFile) -> None:
         f"other methods up to {result.spread_mm:.3f} mm away; condition {result.condition:.1f}"
     )
     console.print((result.corrected or result).size.words)
+    if result.size.sigma > _VAGUE_SIZE:
+        console.print("the images hardly tell the size of the squares: take more, from other distances and sides")
     for finding in result.findings:
         console.print(f"[yellow]warning[/] {escape(finding)}")
     camera_mm, camera_deg = record.sigma.camera_mm, record.sigma.camera_deg
