@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from simulators.geometry import Array, Array32
 from simulators.rendering.surfaces import LAMP_COLOUR, ROOM_COLOUR
 from simulators.scene.intrinsics import Intrinsics
-from simulators.scene.world import BOARD_SQUARE_M, BOARD_SQUARES
+from simulators.scene.world import BOARD_SQUARE_M, BOARD_SQUARES, board_sag_m
 
 MARKER_ALBEDO = np.array([0.50, 0.74, 0.085])
 MARGIN_M = 0.020
 PAPER, INK = 0.80, 0.035
 _SUBSAMPLES = 64
+_SAG_ROUNDS = 2  # the first leaves a hundredth of the sag
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +115,10 @@ def draw_calibration_board(frame: Frame, T_world_board: Array, lamp_m: Array) ->
     R, origin = T_camera_board[:3, :3], T_camera_board[:3, 3]
     t = (origin @ R[:, 2]) / (frame.rays @ R[:, 2])
     place = frame.rays * t[..., None] - origin
+    for _ in range(_SAG_ROUNDS):  # where the ray meets the bent surface, from where it meets the one before
+        sag = board_sag_m(place @ R[:, 0], place @ R[:, 1])
+        t = (origin @ R[:, 2] + sag) / (frame.rays @ R[:, 2])
+        place = frame.rays * t[..., None] - origin
     # In units of squares, from the outer corner of the pattern.
     x, y = place @ R[:, 0] / BOARD_SQUARE_M + 1.0, place @ R[:, 1] / BOARD_SQUARE_M + 1.0
     margin = MARGIN_M / BOARD_SQUARE_M

@@ -22,6 +22,9 @@ BOARD_THICKNESS_M = 0.018
 POST_RADIUS_M = 0.005
 BOARD_SQUARES = (24, 17)  # along the board's x and y
 BOARD_SQUARE_M = 0.015
+# The calibration board is bent, as printed and glued plates are: by how much its middle sags between the outermost
+# inner corners of a row, and of a column. Nothing outside the simulators knows it.
+BOARD_BOW_M = (0.9e-4, 0.4e-4)
 SCENE_CENTRE_M = np.array([0.0, 0.0, 0.05])
 STATIONS = ("station_1", "station_2")
 NOMINAL_LUX = 45_000.0
@@ -38,6 +41,13 @@ def parse_moved(text: str) -> Moved:
 def nominal_hand_eye() -> Array:
     """Nominal T_flange_camera from the mount's drawing: the camera looks along the flange's z, its top towards -y."""
     return from_euler(np.zeros(3), np.array([0.0, -0.055, 0.095]))
+
+
+def board_sag_m(x_m: Array, y_m: Array) -> Array:
+    """How far the calibration board's surface lies behind the plane z = 0 of its frame, at x and y in this frame."""
+    half = 0.5 * BOARD_SQUARE_M * (np.array(BOARD_SQUARES) - 2.0)
+    across, along = (np.clip(place / h - 1.0, -1.5, 1.5) for place, h in zip((x_m, y_m), half, strict=True))
+    return BOARD_BOW_M[0] * (1.0 - across**2) + BOARD_BOW_M[1] * (1.0 - along**2)
 
 
 @dataclass(frozen=True)
@@ -187,7 +197,7 @@ class Scene:
         """T_world_board of the calibration board's n-th placement: above the scene, slightly tilted.
 
         Board frame: origin at the first inner corner, x along the 23 corners, y along the 16, z into the table (the
-        camera's viewing direction), squares of 15 mm.
+        camera's viewing direction), squares of 15 mm. The surface lies `board_sag_m` behind z = 0.
         """
         rng = np.random.default_rng([self.seed, 0xB0A2D, nth])
         tilt = np.radians(rng.uniform(1.0, 4.0, 2)) * rng.choice([-1.0, 1.0], 2)

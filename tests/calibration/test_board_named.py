@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 from service.cli.main import app
 from service.compute.calibration.board.board import Board
-from service.compute.calibration.board.images import find_boards
+from service.compute.calibration.board.images import find_boards, probe_board
 from tests.support.boards.board_folder import BoardFolder, board_folder
 
 BOARD = Board(9, 6, 0.02)
@@ -70,6 +70,41 @@ def test_a_charuco_board_described_wrongly_is_named(
     assert done.exit_code == 1, done.output
     assert seen in done.output
     assert remedy in done.output
+
+
+@pytest.mark.parametrize("marker", ["12", "19"])
+def test_a_wrong_side_of_the_markers_is_named(charuco: BoardFolder, tmp_path: Path, marker: str) -> None:
+    options = ["--pattern", "charuco", "--board", "8x5", "--square-mm", "22", "--marker-mm", marker]
+    done = _run(charuco, tmp_path / "c.json", *options, "--dictionary", "DICT_4X4_100", "--legacy")
+    assert done.exit_code == 1, done.output
+    assert f"not {float(marker):.1f} mm, in squares of 22 mm" in done.output
+    side = float(done.output.partition("give --marker-mm ")[2].split()[0])
+    assert side == pytest.approx(16.0, abs=0.4)
+
+
+def _circles(*, asymmetric: bool) -> np.ndarray:
+    """A grid of 7 × 5 black circles on white."""
+    picture = np.full((700, 900), 235, dtype=np.uint8)
+    for row in range(5):
+        for column in range(7):
+            x = 120 + 90 * column + (45 if asymmetric and row % 2 else 0)
+            cv2.circle(picture, (x, 150 + 90 * row), 24, 20, -1, cv2.LINE_AA)
+    return cv2.GaussianBlur(picture, (0, 0), 1.0)
+
+
+@pytest.mark.parametrize("asymmetric", [True, False])
+def test_circles_are_not_a_checkerboard(tmp_path: Path, asymmetric: bool) -> None:
+    cv2.imwrite(str(tmp_path / "circles.png"), _circles(asymmetric=asymmetric))
+    wrong = probe_board([tmp_path / "circles.png"], BOARD)
+    assert wrong is not None
+    assert wrong.words == "the image shows circles, not squares"
+    assert "--pattern circles" in wrong.remedy
+
+
+def test_a_checkerboard_is_not_circles(photographs: BoardFolder) -> None:
+    wrong = probe_board([photographs.images / "b0.jpg"], dataclasses.replace(BOARD, pattern="circles"))
+    assert wrong is not None
+    assert "squares, not circles" in wrong.words
 
 
 def test_a_legacy_board_is_calibrated_and_serves_hand_eye(charuco: BoardFolder, tmp_path: Path) -> None:

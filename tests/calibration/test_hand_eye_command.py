@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
@@ -62,6 +63,34 @@ def test_poses_that_are_read_wrongly_are_refused_and_the_mistake_is_named(
         assert words in done.output
         assert remedy in done.output
         assert not out.exists()
+
+
+def test_squares_that_are_not_as_stated_are_refused_with_their_true_side(
+    photographs: BoardFolder, tmp_path: Path
+) -> None:
+    poses, out = photographs.poses(tmp_path / "poses.csv"), tmp_path / "hand_eye.json"
+    done = _run(photographs, poses, out, "--square-mm", "20.7")
+    assert done.exit_code == 1, done.output
+    assert "mm by the robot, 20.7 were given" in done.output
+    assert "the squares are 20.0" in done.output or "the squares are 19.9" in done.output
+    assert not out.exists()
+    right = _run(photographs, poses, out, "--size-tolerance-percent", "0.02")
+    assert right.exit_code == 0, right.output
+    assert "mm by the robot, 20 were given" in right.output
+    assert json.loads(out.read_text())["board_size"]["tolerance"] == pytest.approx(2e-4)
+
+
+def test_a_universal_robots_rows_without_header_are_read(photographs: BoardFolder, tmp_path: Path) -> None:
+    poses, out = tmp_path / "poses.txt", tmp_path / "hand_eye.json"
+    rows = [[*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_rotvec()] for T in photographs.T_base_flange.values()]
+    poses.write_text("\n".join(" ".join(f"{v:.9f}" for v in row) for row in rows))
+    done = _run(photographs, poses, out)
+    assert done.exit_code == 0, done.output
+    assert "was read with positions in m, rotations as rotation vectors in radians" in " ".join(done.output.split())
+    assert np.allclose(json.loads(out.read_text())["T_flange_camera"], T_FLANGE_CAMERA, atol=1e-3)
+    poses.write_text("\n".join(" ".join(f"{v:.9f}" for v in [*(1e3 * np.array(r[:3])), *r[3:]]) for r in rows))
+    assert "--length mm" in _run(photographs, poses, out).output
+    assert _run(photographs, poses, out, "--length", "mm").exit_code == 0
 
 
 def test_poses_of_other_images_fit_nothing(photographs: BoardFolder, tmp_path: Path) -> None:

@@ -211,7 +211,7 @@ def test_leaving_a_view_out_is_what_a_new_adjustment_without_it_gives() -> None:
         change = np.array([getattr(without.camera, n) - getattr(result.camera, n) for n in result.parameters])
         sigma = np.sqrt(np.diag(result.covariance))
         np.testing.assert_allclose(result.leave_one_out[k] / sigma, change / sigma, atol=0.15)
-        assert locate_view(views[k], BOARD, without.camera)[1] == pytest.approx(
+        assert locate_view(views[k], without.board, without.camera)[1] == pytest.approx(
             validation.leave_one_out_view_px[k], rel=0.02
         )
     assert validation.five_fold_rms_px > result.rms_px

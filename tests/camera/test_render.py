@@ -18,7 +18,15 @@ from simulators.geometry import apply, inverse, look_at
 from simulators.rendering.overlays import Frame, draw_sphere, half_plane_coverage
 from simulators.rendering.render import PREVIEW_WIDTH, REFERENCE, Renderer
 from simulators.scene.intrinsics import Intrinsics
-from simulators.scene.world import BOARD_SQUARE_M, BOARD_SQUARES, NOMINAL_LUX, RADIUS_M, SCENE_CENTRE_M, Scene
+from simulators.scene.world import (
+    BOARD_SQUARE_M,
+    BOARD_SQUARES,
+    NOMINAL_LUX,
+    RADIUS_M,
+    SCENE_CENTRE_M,
+    Scene,
+    board_sag_m,
+)
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -122,13 +130,19 @@ def test_sphere_outlines_in_the_picture_lie_on_the_analytic_cone(plain: Picture,
     assert abs(centre_and_size_px[2]) < 0.03
 
 
+def _inner_corners() -> Array:
+    """(N, 3) of the simulated board, if it were flat."""
+    columns, rows = BOARD_SQUARES[0] - 1, BOARD_SQUARES[1] - 1
+    x, y = np.meshgrid(np.arange(columns) * BOARD_SQUARE_M, np.arange(rows) * BOARD_SQUARE_M)
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(np.float64)
+
+
 def test_checkerboard_corners_lie_where_the_lens_projects_them(renderer: Renderer, scene: Scene) -> None:
     T_world_board = scene.board_placement(1)
     lens = scene.camera_intrinsics(WIDTH)
     picture = renderer.render(view(scene, ABOVE, board=T_world_board.tolist()), REFERENCE, 1)
-    columns, rows = BOARD_SQUARES[0] - 1, BOARD_SQUARES[1] - 1
-    x, y = np.meshgrid(np.arange(columns) * BOARD_SQUARE_M, np.arange(rows) * BOARD_SQUARE_M)
-    board: Array = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(np.float64)
+    board = _inner_corners()
+    board[:, 2] = board_sag_m(board[:, 0], board[:, 1])
     true = lens.project(apply(inverse(ABOVE) @ T_world_board, board))
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     start = (true + 0.7).astype(np.float32).reshape(-1, 1, 2)
@@ -141,6 +155,27 @@ def test_checkerboard_corners_lie_where_the_lens_projects_them(renderer: Rendere
     pinhole = dataclasses.replace(lens, k1=0.0, k2=0.0, p1=0.0, p2=0.0)
     straight = pinhole.project(apply(inverse(ABOVE) @ T_world_board, board))
     assert np.linalg.norm(found - straight, axis=1).max() > 0.5
+
+
+def test_the_simulated_board_is_bent_as_its_ground_truth_says(renderer: Renderer, scene: Scene) -> None:
+    T_world_board = scene.board_placement(1)
+    lens = scene.camera_intrinsics(WIDTH)
+    # Seen from the side, where a displacement along the board's normal shows.
+    aside = look_at(np.array([0.2, -0.45, 0.55]), np.array([0.0, 0.0, 0.14]), np.array([0.0, 1.0, 0.0]))
+    picture = renderer.render(view(scene, aside, board=T_world_board.tolist()), REFERENCE, 1)
+    T_camera_board, corners = inverse(aside) @ T_world_board, _inner_corners()
+    flat = lens.project(apply(T_camera_board, corners))
+    corners[:, 2] = board_sag_m(corners[:, 0], corners[:, 1])
+    bent = lens.project(apply(T_camera_board, corners))
+    inside = ((bent > 8) & (bent < np.array([lens.width, lens.height]) - 9)).all(axis=1)
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
+    start = bent[inside].astype(np.float32).reshape(-1, 1, 2)
+    found = cv2.cornerSubPix(grey, start, (3, 3), (-1, -1), stop).reshape(-1, 2)
+    moved, shift = (found - flat[inside]).ravel(), (bent - flat)[inside].ravel()
+    assert np.abs(shift).max() > 0.03
+    assert inside.sum() > 100
+    assert moved @ shift / (shift @ shift) == pytest.approx(1.0, abs=0.25)
 
 
 def test_a_half_plane_covers_what_fine_sampling_says() -> None:

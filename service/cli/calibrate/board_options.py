@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from service.cli.common import progress_bar
-from service.compute.calibration.board.board import Board, Pattern
+from service.compute.calibration.board.board import FLATNESS_M, SIZE_TOLERANCE, Board, Pattern
 from service.compute.calibration.board.images import UsableViews, find_boards, probe_board, usable_views
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.units import metres, mm
@@ -37,11 +37,36 @@ DictionaryOption = Annotated[str, typer.Option("--dictionary", help="Dictionary 
 LegacyOption = Annotated[
     bool, typer.Option("--legacy", help="The ChArUco board was made by OpenCV before version 4.6.")
 ]
+SizeToleranceOption = Annotated[
+    float,
+    typer.Option(
+        "--size-tolerance-percent",
+        min=0.0,
+        max=20.0,
+        help="Largest error of the square's side, in percent of it, as its maker states it; 0: exactly known.",
+    ),
+]
+FlatnessOption = Annotated[
+    float,
+    typer.Option(
+        "--flatness-mm", min=0.0, max=5.0, help="Largest bow of the board, as its maker states it; 0: exactly flat."
+    ),
+]
+DEFAULT_FLATNESS_MM = mm(FLATNESS_M)
 DEFAULT_DICTIONARY = "DICT_5X5_1000"
+DEFAULT_SIZE_TOLERANCE_PERCENT = 100 * SIZE_TOLERANCE
 
 
 def described_board(
-    board: str, square_mm: float, pattern: Pattern, marker_mm: float | None, dictionary: str, *, legacy: bool
+    board: str,
+    square_mm: float,
+    pattern: Pattern,
+    marker_mm: float | None,
+    dictionary: str,
+    *,
+    legacy: bool,
+    size_tolerance_percent: float = DEFAULT_SIZE_TOLERANCE_PERCENT,
+    flatness_mm: float = DEFAULT_FLATNESS_MM,
 ) -> Board:
     """The board that the options describe.
 
@@ -62,7 +87,10 @@ def described_board(
             remedy=f"Give the side of a square in millimetres{likely}",
         )
     marker_m = None if marker_mm is None else metres(marker_mm)
-    return Board(int(columns), int(rows), metres(square_mm), pattern, marker_m, dictionary, legacy)
+    tolerance, flatness_m = size_tolerance_percent / 100, metres(flatness_mm)
+    return Board(
+        int(columns), int(rows), metres(square_mm), pattern, marker_m, dictionary, legacy, tolerance, flatness_m
+    )
 
 
 def searched(files: Sequence[Path], board: Board, *, quiet: bool) -> UsableViews:

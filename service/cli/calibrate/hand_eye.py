@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -13,11 +13,13 @@ from rich.markup import escape
 
 from service.cli.calibrate.board_options import (
     DEFAULT_DICTIONARY,
+    DEFAULT_SIZE_TOLERANCE_PERCENT,
     BoardOption,
     DictionaryOption,
     LegacyOption,
     MarkerOption,
     PatternOption,
+    SizeToleranceOption,
     SquareOption,
     described_board,
     searched,
@@ -32,7 +34,7 @@ from service.cli.common import (
     require_writable,
 )
 from service.compute.arm.joint_file import read_joints_csv
-from service.compute.arm.kinematics import matching_arm, solve_joints
+from service.compute.arm.kinematics import active_tool, matching_arm, solve_joints
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.board.images import UsableViews
 from service.compute.calibration.board_poses.plan import SuggestedPose, suggest_board_poses
@@ -41,27 +43,45 @@ from service.compute.calibration.hand_eye.answers import HandEyeResult
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.compute.calibration.hand_eye.fit import Method
 from service.compute.calibration.hand_eye.reprojection import BoardCorners, board_corners
-from service.compute.calibration.hand_eye.setup import Setup
+from service.compute.calibration.hand_eye.setup import PoseReading, PosesAsRead, Setup
 from service.compute.calibration.intrinsics.estimate import locate_view
 from service.compute.camera_covariance import read_camera_covariance
 from service.compute.camera_model import CameraModel
-from service.compute.images.folder import image_folder
+from service.compute.images.folder import ImageFolder, image_folder
 from service.compute.poses.files.camera_files import read_camera_json
-from service.compute.poses.files.pose_files import posed_images
+from service.compute.poses.files.pose_files import only_posed, posed_images
+from service.compute.poses.files.robot_poses import (
+    LengthUnit,
+    RobotPoseTable,
+    RotationForm,
+    matched_rows,
+    other_orders,
+    read_robot_poses,
+)
 from service.core.arms.known import arm_model
 from service.core.arms.model import ArmModel
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform
 from service.core.text.counts import counted
+from service.core.text.file_text import file_text
+from service.core.text.json_text import parse_json
 from service.core.units import mm
+from service.jobs.calibration.records import BoardSeen
 from service.jobs.records import matrix
-from service.worker.calibration.records import hand_eye_record
+from service.worker.calibration.records import hand_eye_record, seen_board
+
+_VAGUE_SIZE = 0.01  # relative standard deviation of the board's size by the robot
 
 
 def hand_eye_command(
     images: Annotated[Path, typer.Option("--images", help="Folder of the board images.")],
     robot_poses: Annotated[
-        Path, typer.Option("--robot-poses", help="CSV image,x,y,z,qx,qy,qz,qw: T_base_flange in metres.")
+        Path,
+        typer.Option(
+            "--robot-poses",
+            help="T_base_flange of each image: image,x,y,z,qx,qy,qz,qw in metres, or a UR's x y z rx ry rz, "
+            "with or without header and names.",
+        ),
     ],
     camera: Annotated[Path, typer.Option("--camera", help="camera.json of a calibrated camera.")],
     board: BoardOption,
@@ -71,10 +91,19 @@ def hand_eye_command(
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = DEFAULT_DICTIONARY,
     legacy: LegacyOption = False,
+    size_tolerance_percent: SizeToleranceOption = DEFAULT_SIZE_TOLERANCE_PERCENT,
     setup: Annotated[
         Setup,
         typer.Option("--setup", help="eye-to-hand: the camera stands beside the robot, the board is on its flange."),
     ] = "eye-in-hand",
+    rotation: Annotated[
+        RotationForm | None,
+        typer.Option("--rotation", help="How the file writes rotations; default: by its header and its numbers."),
+    ] = None,
+    length: Annotated[
+        LengthUnit | None,
+        typer.Option("--length", help="Unit of the file's positions; default: by its header, or m."),
+    ] = None,
     method: Annotated[Method, typer.Option("--method", help="The method that gives the result.")] = "weighted",
     joints: Annotated[
         Path | None,
@@ -93,16 +122,24 @@ def hand_eye_command(
 ) -> None:
     """Calibrate the camera's pose on the robot's flange, with its uncertainty."""
     with reporting_errors(json):
-        target = described_board(board, square_mm, pattern, marker_mm, dictionary, legacy=legacy)
+        target = described_board(
+            board,
+            square_mm,
+            pattern,
+            marker_mm,
+            dictionary,
+            legacy=legacy,
+            size_tolerance_percent=size_tolerance_percent,
+        )
         _require_possible(setup, joints, arm, preview)
-        model = read_camera_json(camera)
+        model, target = read_camera_json(camera), _with_bow(target, camera)
         folder = image_folder(images, size=(model.width, model.height), strict=strict)
-        known, folder = posed_images(robot_poses, folder, images, strict=strict)
+        poses, folder = _robot_poses(robot_poses, folder, images, rotation, length, strict=strict)
         files = folder.files
         for file in filter(None, (out, preview)):
             require_writable(file)
         usable = searched(files, target, quiet=json)
-        session = _session(usable, [files[k].name for k in usable.indices], known, target, model)
+        session = _session(usable, [files[k].name for k in usable.indices], poses.known, target, model)
         joints_rad, kinematics = _arm(joints, arm, session)
         result = calibrate_hand_eye(
             HandEyeViews(
@@ -111,6 +148,8 @@ def hand_eye_command(
                 corners=session.corners,
                 joints_rad=joints_rad,
                 arm=kinematics,
+                board=target,
+                poses=poses.as_read(session.names),
             ),
             method=method,
             T_board_turned=target.half_turn(),
@@ -133,8 +172,52 @@ def hand_eye_command(
         if json:
             print_json(record.printed())
             return
+        if poses.table is not None and not poses.table.plain:
+            console.print(f"{escape(robot_poses.name)} was read with {poses.table.words}")
         _tell(result, record)
         console.print(f"written: {out}")
+
+
+@dataclass(frozen=True, slots=True)
+class _RobotPoses:
+    """T_base_flange by image, and the table and its row of each image where the poses come from a table."""
+
+    known: Mapping[str, Transform]
+    table: RobotPoseTable | None = None
+    rows: Mapping[str, int] = field(default_factory=dict[str, int])
+
+    def as_read(self, images: Sequence[str]) -> PosesAsRead | None:
+        """The file as a check against the images needs it: all its rows, and how else it could be read."""
+        if self.table is None:
+            return None
+        rows, every = np.array([self.rows[image] for image in images]), self.table.poses()
+        readings = [PoseReading(poses[rows], words, remedy) for poses, words, remedy in self.table.other_readings()]
+        for order, words in other_orders(self.rows):
+            moved = every[[order[image] for image in images]]
+            readings.append(PoseReading(moved, words, "Give each image its own pose: count names with leading zeros"))
+        return PosesAsRead(every, rows, tuple(images), tuple(readings))
+
+
+def _robot_poses(
+    path: Path,
+    folder: ImageFolder,
+    images: Path,
+    rotation: RotationForm | None,
+    length: LengthUnit | None,
+    *,
+    strict: bool,
+) -> tuple[_RobotPoses, ImageFolder]:
+    """The robot's poses, and the images that have one."""
+    if path.is_dir() or path.suffix.lower() == ".json" or not path.is_file():
+        if rotation is not None or length is not None:
+            raise typer.BadParameter("--rotation and --length are for tables of poses")
+        known, folder = posed_images(path, folder, images, strict=strict)
+        return _RobotPoses(known), folder
+    table = read_robot_poses(path, form=rotation, unit=length)
+    rows = matched_rows(table, [file.name for file in folder.files], path)
+    folder = only_posed(folder, rows, path, images, strict=strict)
+    every = table.poses()
+    return _RobotPoses({image: every[row] for image, row in rows.items()}, table, rows), folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +239,13 @@ def _session(
         np.array([poses[name] for name in names]),
         np.array([locate_view(view, board, camera)[0] for view in usable.views]),
     )
+
+
+def _with_bow(board: Board, camera: Path) -> Board:
+    """The board as bent as the calibration of the camera has found it, if camera.json says so."""
+    record = parse_json(file_text(camera), name=str(camera), remedy="Give a camera.json")
+    seen = record.get("board")
+    return seen_board(board, BoardSeen.model_validate(seen) if isinstance(seen, dict) and "bow_mm" in seen else None)
 
 
 def _require_possible(setup: Setup, joints: Path | None, arm: str | None, preview: Path | None) -> None:
@@ -193,6 +283,14 @@ def _arm(joints: Path | None, arm: str | None, session: _BoardSession) -> tuple[
         return values, arm_model(arm)
     found = matching_arm(values, session.T_base_flange)
     if found is None:
+        tool = active_tool(values, session.T_base_flange)
+        if tool is not None:
+            x, y, z = mm(tool[1][:3, 3])
+            raise ConfigurationError(
+                f"the poses are those of a tool at {x:.1f}, {y:.1f}, {z:.1f} mm on the flange of a {tool[0].name}",
+                where=str(joints),
+                remedy="Set the active tool (TCP) to zero at the controller, or write the flange's poses",
+            )
         raise ConfigurationError(
             "no known arm has these poses at these joint angles",
             where=str(joints),
@@ -243,6 +341,11 @@ def _tell(result: HandEyeResult, record: HandEyeFile) -> None:
         f"held-out images: {held_mm:.3f} mm, {held_deg:.4f}° (median); "
         f"other methods up to {result.spread_mm:.3f} mm away; condition {result.condition:.1f}"
     )
+    console.print((result.corrected or result).size.words)
+    if result.size.sigma > _VAGUE_SIZE:
+        console.print("the images hardly tell the size of the squares: take more, from other distances and sides")
+    for finding in result.findings:
+        console.print(f"[yellow]warning[/] {escape(finding)}")
     camera_mm, camera_deg = record.sigma.camera_mm, record.sigma.camera_deg
     if camera_mm and camera_deg is not None:
         console.print(f"of that ± {camera_mm:.3f} mm, ± {camera_deg:.4f}° from the uncertainty of the camera")

@@ -14,8 +14,10 @@ from drivers.errors import UnreadableFileError
 from drivers.photos.photo_file import read_exif
 from service.cli.calibrate.board_options import (
     DEFAULT_DICTIONARY,
+    DEFAULT_FLATNESS_MM,
     BoardOption,
     DictionaryOption,
+    FlatnessOption,
     LegacyOption,
     MarkerOption,
     PatternOption,
@@ -67,6 +69,7 @@ def intrinsics_command(
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = DEFAULT_DICTIONARY,
     legacy: LegacyOption = False,
+    flatness_mm: FlatnessOption = DEFAULT_FLATNESS_MM,
     model: Annotated[
         LensModel,
         typer.Option("--model", help="Distortion: none, k1 k2, + p1 p2, + k3, rational k1 … k6."),
@@ -85,7 +88,9 @@ def intrinsics_command(
 ) -> None:
     """Calibrate a camera from images of a flat board, with its uncertainty."""
     with reporting_errors(json):
-        seen = described_board(board, square_mm, pattern, marker_mm, dictionary, legacy=legacy)
+        seen = described_board(
+            board, square_mm, pattern, marker_mm, dictionary, legacy=legacy, flatness_mm=flatness_mm
+        )
         folder = image_folder(images, strict=strict)
         files = folder.files
         require_writable(out)
@@ -200,6 +205,8 @@ def _tell(
     console.print(f"{counted(len(result.views), 'view')}, {result.rms_px:.3f} px rms{held_out}")
     for name in result.parameters:
         console.print(f"  {name:<3} {getattr(result.camera, name):14.6g} ± {result.sigma[name]:.2g}")
+    if record.board is not None and record.board.bow_words:
+        console.print(f"the board is bent by {record.board.bow_words}")
     console.print(
         f"projection at {uncertainty.distance_m:.2f} m known to {uncertainty.centre_px:.3f} px "
         f"({uncertainty.centre_mm:.4f} mm) at the centre, {uncertainty.worst_px:.3f} px "

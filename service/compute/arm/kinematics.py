@@ -14,6 +14,7 @@ from service.core.geometry import Array, Transform, inverse, rotation_angle_rad,
 
 _LONGEST_STEP_RAD = 0.4
 _REACHED = 1e-7  # m and rad
+_SAME_TOOL_M, _SAME_TOOL_RAD = 0.01, 0.01  # between the tools of most poses, if they are one
 
 
 def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0.02) -> ArmModel | None:
@@ -33,6 +34,24 @@ def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0
         if median < best_m:
             best, best_m = arm, median
     return best
+
+
+def active_tool(joints_rad: Array, T_base_tool: Array) -> tuple[ArmModel, Transform] | None:
+    """The arm and its tool T_flange_tool whose poses these are; None if no known arm with one fixed tool has them.
+
+    Args:
+        joints_rad: (N, J).
+        T_base_tool: (N, 4, 4) as reported by a controller with an active tool centre point.
+    """
+    best: tuple[float, ArmModel, Transform] | None = None
+    for arm in (arm for arm in known_arms() if arm.axes == joints_rad.shape[1]):
+        tools = np.array([inverse(T) for T in forward(arm, joints_rad)]) @ T_base_tool
+        usual = tools[np.argsort(tools[:, 0, 3])[len(tools) // 2]]
+        apart_m = float(np.median(np.linalg.norm(tools[:, :3, 3] - usual[:3, 3], axis=1)))
+        turn_rad = float(np.median([rotation_angle_rad(inverse(usual) @ tool) for tool in tools]))
+        if apart_m < _SAME_TOOL_M and turn_rad < _SAME_TOOL_RAD and (best is None or apart_m < best[0]):
+            best = apart_m, arm, usual
+    return None if best is None else best[1:]
 
 
 def chain(values: Array) -> Array:

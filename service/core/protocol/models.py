@@ -84,6 +84,10 @@ class CalibrationBoard(Record):
     columns: Annotated[int, Field(ge=3)]  # inner corners in a row
     rows: Annotated[int, Field(ge=3)]  # inner corners in a column
     square_mm: Positive  # side of a square
+    # Largest bow of the board, as the maker states it; 0: exactly flat; default: 0.2.
+    flatness_mm: Annotated[float, Field(ge=0, le=5)] | None = None
+    # Largest error of the square's side, in percent of it, as the maker states it; default: 0.05 (0.1 mm in 200 mm).
+    size_tolerance_percent: Annotated[float, Field(ge=0, le=20)] | None = None
 
 
 class CameraSection(Record):

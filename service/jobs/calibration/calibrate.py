@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from service.jobs.calibration.records import HandEye, Intrinsics, KnownBoard
+from service.jobs.calibration.records import BoardSeen, HandEye, Intrinsics, KnownBoard
 from service.jobs.kind import JobKind, JobRecord
 from service.jobs.records import BoardSize, Camera, Hash, Matrix, PosedPhotograph
 
@@ -18,6 +18,9 @@ class Arguments(BoardSize):
         camera: known intrinsics; None if they are solved.
         corners: for each image, the file of its job `board_view`; None if the image has not been searched.
         known: estimate of camera, mount and board, with which images of a part of the board can be used.
+        flatness_mm: largest bow of the board; None: nothing is stated.
+        seen: the board as the calibration of `camera` saw it; None if the camera is solved here.
+        size_tolerance: largest relative error of the board's size; None: nothing is stated.
     """
 
     solve: tuple[Literal["intrinsics", "hand_eye"], ...]
@@ -25,6 +28,9 @@ class Arguments(BoardSize):
     camera: Camera | None = None
     corners: tuple[Hash | None, ...] | None = None
     known: KnownBoard | None = None
+    size_tolerance: float | None = None
+    flatness_mm: float | None = None
+    seen: BoardSeen | None = None
 
 
 class CalibrationDetails(JobRecord):
@@ -59,5 +65,6 @@ KIND = JobKind(
     answer=Answer,
     compute="service.worker.calibration.calibrate:calibrate",
     words="camera calibration",
+    version=3,  # weighs the board's stated size against the robot's lengths, and knows boards that are bent
     order=12,
 )

@@ -90,12 +90,32 @@ class KnownBoard(JobRecord):
 
 
 class BoardSeen(JobRecord):
-    """The calibration board: inner corners, and the edge of a square."""
+    """The calibration board: inner corners, the edge of a square, and how it is bent.
+
+    Attributes:
+        pattern: printed on it.
+        columns, rows: of inner corners.
+        square_mm: edge of a square.
+        flatness_mm: largest bow that was stated.
+        bow_mm: how far its middle lies behind its sides, and behind its ends; None if it was taken as flat.
+        bow_sigma_mm: standard deviations of the two.
+    """
 
     pattern: str
     columns: int
     rows: int
     square_mm: float
+    flatness_mm: float | None = None
+    bow_mm: tuple[float, float] | None = None
+    bow_sigma_mm: tuple[float, float] | None = None
+
+    @property
+    def bow_words(self) -> str:
+        """The bow for people; empty for a board that was taken as flat."""
+        if self.bow_mm is None or self.bow_sigma_mm is None:
+            return ""
+        x, y = (f"{bow:+.3f} ± {sigma:.3f} mm" for bow, sigma in zip(self.bow_mm, self.bow_sigma_mm, strict=True))
+        return f"{x} across its columns, {y} across its rows (+: the middle lies away from the camera)"
 
 
 class Tilt(JobRecord):
@@ -187,6 +207,24 @@ class RobotNoise(JobRecord):
     deg: float | None = None
 
 
+class BoardSizeByRobot(JobRecord):
+    """The board's true size over the stated one, as the robot's lengths show it.
+
+    Attributes:
+        ratio: by robot and images alone.
+        sigma: standard deviation of `ratio`.
+        tolerance: stated for the board, relative.
+        used: in the answer.
+        words: the same for people.
+    """
+
+    ratio: float
+    sigma: float
+    tolerance: float
+    used: float
+    words: str = ""
+
+
 class HandEyeMethod(JobRecord):
     """A hand-eye transform by one method, and its distance from the one in use."""
 
@@ -224,6 +262,7 @@ class ArmAnswer(ArmCorrection):
     residuals: Residuals
     robot_noise: RobotNoise = RobotNoise()
     terms: str = ""
+    board_size: BoardSizeByRobot | None = None
 
 
 class HandEye(JobRecord):
@@ -245,6 +284,8 @@ class HandEye(JobRecord):
         turned: images in which the board was seen turned by 180°.
         arm_held_out_rms_mm: error of held-out images, by terms of the arm's model; "none": poses as reported.
         arm_correction: the answer with the arm's errors corrected; None if that does not improve held-out images.
+        board_size: by the robot.
+        findings: what robot and images contradict each other in, in words.
     """
 
     T_flange_camera: Matrix
@@ -262,6 +303,8 @@ class HandEye(JobRecord):
     turned: tuple[str, ...] = ()
     arm_held_out_rms_mm: dict[str, float] = Field(default_factory=dict[str, float])
     arm_correction: ArmAnswer | None = None
+    board_size: BoardSizeByRobot | None = None
+    findings: tuple[str, ...] = ()
 
     @property
     def best(self) -> HandEye | ArmAnswer:

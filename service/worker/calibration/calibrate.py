@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,11 +22,12 @@ from service.compute.calibration.intrinsics.validation import (
 )
 from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
+from service.core.units import metres
 from service.jobs.calibration import calibrate as job
 from service.jobs.calibration.records import HandEye, Intrinsics
 from service.jobs.records import PosedPhotograph
 from service.worker.calibration.board_view import board_of, boards_of
-from service.worker.calibration.records import hand_eye_record, intrinsics_record
+from service.worker.calibration.records import hand_eye_record, intrinsics_record, seen_board
 from service.worker.camera import camera_of, camera_record
 from service.worker.job import JobAnswer, JobContext
 
@@ -35,7 +37,7 @@ def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
     arguments = context.arguments
     images = arguments.images
     names = [image.viewpoint for image in images]
-    board = board_of(arguments)
+    board = _board(arguments)
     found, parts = boards_of(context, board)
     usable = usable_views(found)
     seen = usable.indices
@@ -51,6 +53,7 @@ def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
         )
     if "intrinsics" in arguments.solve:
         camera, intrinsics_measures, intrinsics = _intrinsics(usable, board, names)
+        board = seen_board(board, intrinsics.board)
         details = details.model_copy(update={"intrinsics": intrinsics})
         measures |= intrinsics_measures
     elif arguments.camera is not None:
@@ -73,6 +76,16 @@ def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
     return JobAnswer(measures, (ref,), answer)
 
 
+def _board(arguments: job.Arguments) -> Board:
+    """The board as the protocol describes it, and bent as the camera's calibration has seen it."""
+    board = board_of(arguments)
+    if arguments.size_tolerance is not None:
+        board = replace(board, size_tolerance=arguments.size_tolerance)
+    if arguments.flatness_mm is not None:
+        board = replace(board, flatness_m=metres(arguments.flatness_mm))
+    return seen_board(board, arguments.seen)
+
+
 def _hand_eye(
     images: Sequence[PosedPhotograph], usable: UsableViews, board: Board, camera: CameraModel
 ) -> tuple[HandEye, dict[str, float]]:
@@ -89,6 +102,7 @@ def _hand_eye(
             corners=board_corners(usable.views, board, camera),
             joints_rad=None if arm is None else joints,
             arm=arm,
+            board=board,
         ),
         T_board_turned=board.half_turn(),
     )
@@ -109,6 +123,8 @@ def _hand_eye_measures(solved: HandEyeResult) -> dict[str, float]:
         "hand_eye_methods_spread_mm": solved.spread_mm,
         "hand_eye_condition": solved.condition,
         "rotation_spread_deg": solved.rotation_spread_deg,
+        "hand_eye_board_size_percent": 100 * (best.size.ratio - 1),
+        "hand_eye_findings": float(len(solved.findings)),
     }
     if best.robot_noise_mm is not None and best.robot_noise_deg is not None:
         measures |= {"robot_noise_mm": best.robot_noise_mm, "robot_noise_deg": best.robot_noise_deg}
@@ -143,6 +159,8 @@ def _intrinsics(
         "uncertainty_mm": uncertainty.worst_mm,
         "uncertainty_centre_mm": uncertainty.centre_mm,
     }
+    if record.board is not None and record.board.bow_mm is not None:
+        measures["board_bow_mm"] = max(map(abs, record.board.bow_mm))
     if validation is not None:
         measures["five_fold_rms_px"] = validation.five_fold_rms_px
         measures["leave_one_out_rms_px"] = validation.leave_one_out_rms_px

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from service.compute.arm.correction import ArmCorrection, CorrectedMounting
 from service.compute.calibration.board.board import Board
 from service.compute.calibration.hand_eye.answers import CorrectedHandEye, HandEyeAnswer, HandEyeResult
+from service.compute.calibration.hand_eye.board_size import BoardSizeFound
 from service.compute.calibration.hand_eye.closed_form import distance
 from service.compute.calibration.hand_eye.setup import Setup
 from service.compute.calibration.intrinsics.estimate import COVERAGE_GRID, IntrinsicsResult
@@ -16,7 +18,7 @@ from service.compute.calibration.intrinsics.uncertainty import ProjectionUncerta
 from service.compute.calibration.intrinsics.validation import CrossValidation, residual_field
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
-from service.core.units import deg, mm
+from service.core.units import deg, metres, mm
 from service.jobs import records as shared
 from service.jobs.calibration import records
 from service.jobs.records import Matrix, ParameterCovariance, matrix
@@ -44,7 +46,7 @@ def intrinsics_record(
     """
     return records.Intrinsics(
         model=result.model,
-        board=_board(result.board),
+        board=_board(result),
         n_views=len(result.views),
         images=tuple(names),
         rms_px=result.rms_px,
@@ -93,6 +95,8 @@ def hand_eye_record(result: HandEyeResult, images: Sequence[str], setup: Setup =
         turned=tuple(name for name, turned in zip(images, result.turned, strict=True) if turned),
         arm_held_out_rms_mm={str(terms): error_mm for terms, error_mm in result.arm_held_out_mm.items()},
         arm_correction=None if corrected is None else _arm_answer(corrected, images),
+        board_size=_size(result.size),
+        findings=result.findings,
     )
 
 
@@ -139,6 +143,13 @@ def _arm_answer(corrected: CorrectedHandEye, images: Sequence[str]) -> records.A
         residuals=_residuals_of(corrected, images),
         robot_noise=records.RobotNoise(mm=corrected.robot_noise_mm, deg=corrected.robot_noise_deg),
         terms=corrected.terms,
+        board_size=_size(corrected.size),
+    )
+
+
+def _size(size: BoardSizeFound) -> records.BoardSizeByRobot:
+    return records.BoardSizeByRobot(
+        ratio=size.ratio, sigma=size.sigma, tolerance=size.tolerance, used=size.used, words=size.words
     )
 
 
@@ -166,10 +177,31 @@ def _residuals_of(answer: HandEyeAnswer, images: Sequence[str]) -> records.Resid
     )
 
 
-def _board(board: Board) -> records.BoardSeen:
-    return records.BoardSeen(
+def _board(result: IntrinsicsResult) -> records.BoardSeen:
+    board = result.board
+    seen = records.BoardSeen(
         pattern=board.pattern, columns=board.columns, rows=board.rows, square_mm=mm(board.square_m)
     )
+    sigma = np.sqrt(np.diag(result.joint_covariance)[len(result.parameters) :])
+    if len(sigma) == 0:
+        return seen
+    (x, y), (sigma_x, sigma_y) = board.bow_m, sigma
+    return records.BoardSeen(
+        **seen.set_fields(),
+        flatness_mm=mm(board.flatness_m),
+        bow_mm=(mm(x), mm(y)),
+        bow_sigma_mm=(mm(float(sigma_x)), mm(float(sigma_y))),
+    )
+
+
+def seen_board(board: Board, seen: records.BoardSeen | None) -> Board:
+    """The board as a calibration of the camera has found it to be bent, if it saw this board."""
+    if seen is None or seen.bow_mm is None:
+        return board
+    if (seen.pattern, seen.columns, seen.rows) != (board.pattern, board.columns, board.rows):
+        return board
+    x, y = seen.bow_mm
+    return replace(board, bow_m=(metres(x), metres(y)))
 
 
 def _residuals(result: IntrinsicsResult) -> records.ResidualField:

@@ -86,6 +86,8 @@ def _intrinsics_facts(solved: Intrinsics) -> Iterator[tuple[str, str]]:
             off_mm = checked.five_fold_rms_px * sigma.worst_mm / sigma.worst_px
             text += f", which is {off_mm:.4f} mm at {sigma.distance_m:.2f} m"
         yield "Held-out error of the intrinsics", f"{text} ({checked.folds} folds)"
+    if solved.board is not None and solved.board.bow_words:
+        yield "Bow of the board", solved.board.bow_words
     if sigma is not None:
         spread = f"{sigma.centre_mm:.4f} mm in the centre, {sigma.worst_mm:.4f} mm at worst"
         yield "Uncertainty of a projected point", f"{spread}, at {sigma.distance_m:.2f} m"
@@ -98,6 +100,8 @@ def _hand_eye_facts(solved: HandEye) -> Iterator[tuple[str, str]]:
     yield "Held-out error of the hand-eye", text + corrected
     if best.sigma.mm is not None and best.sigma.deg is not None:
         yield "Uncertainty of the hand-eye", f"{best.sigma.mm:.3f} mm, {best.sigma.deg:.4f}°"
+    if best.board_size is not None:
+        yield "Size of the board", best.board_size.words
 
 
 def _median_mm(residuals: Residuals) -> float:
@@ -149,6 +153,8 @@ def _hand_eye(solved: calibrate.Answer) -> Iterator[Block]:
         f"solved by {record.method}."
     )
     yield Drawings((bars_drawing("hand_eye_held_out", "Held-out error of each view", text, held, "mm"),))
+    for finding in record.findings:
+        yield Paragraph(finding[:1].upper() + finding[1:] + ".", "attention")
     if record.arm_correction is not None:
         yield Paragraph(
             f"With the arm's poses as reported the median is {_median_mm(record.residuals):.3f} mm. The correction "

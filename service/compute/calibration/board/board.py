@@ -24,6 +24,10 @@ _MAX_HALF = 30  # px; a larger window gains nothing, and lens distortion bends t
 _SMOOTHING = 0.15  # sigma of the smoothing, in half windows
 _MAX_SMOOTHING_PX = 1.5
 _MIN_CHARUCO_CORNERS = 8
+#: Largest relative error of a board's size if nothing is stated: 0.1 mm in 200 mm, as of boards made for measuring.
+SIZE_TOLERANCE = 5e-4
+#: Largest bow of a board if nothing is stated: composite plates and glued prints have 0.05 to 0.2 mm.
+FLATNESS_M = 2e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +45,10 @@ class Board:
         dictionary: OpenCV's name for the dictionary of a ChArUco board's markers.
         legacy: a ChArUco board as OpenCV printed it before 4.6 (differs if the number of squares in a column is
             even).
+        size_tolerance: largest relative error of `square_m`, as the maker states it.
+        flatness_m: largest bow of the board, as the maker states it; 0: exactly flat.
+        bow_m: by how much the board's middle lies behind its sides, and behind its ends: the rise of an arc along the
+            columns and of one along the rows; negative if the middle comes towards the camera.
     """
 
     columns: int
@@ -50,6 +58,9 @@ class Board:
     marker_m: float | None = None
     dictionary: str = "DICT_5X5_1000"
     legacy: bool = False
+    size_tolerance: float = SIZE_TOLERANCE
+    flatness_m: float = FLATNESS_M
+    bow_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or not 0 < self.square_m < 10:
@@ -61,7 +72,22 @@ class Board:
             raise DataError("a ChArUco marker is smaller than its square", remedy="Give the marker's side")
 
     def points(self) -> Array:
-        """(columns · rows, 3) in the board frame, metres, row by row: x along the columns, y along the rows."""
+        """(columns · rows, 3) in the board frame, metres, row by row: x along the columns, y along the rows.
+
+        They lie in the plane z = 0 if the board is not bent.
+        """
+        flat = self._flat()
+        if any(self.bow_m):
+            flat[:, 2] = self.bends() @ self.bow_m
+        return flat
+
+    def bends(self) -> Array:
+        """(columns · rows, 2) displacement along z of each point by a bow of 1 along x, and along y."""
+        flat = self._flat()[:, :2]
+        half = np.ptp(flat, axis=0) / 2
+        return 1 - ((flat - flat.min(axis=0)) / half - 1) ** 2
+
+    def _flat(self) -> Array:
         if self.pattern != "circles":
             return board_points(self.columns, self.rows, self.square_m)
         row, column = np.mgrid[: self.rows, : self.columns]

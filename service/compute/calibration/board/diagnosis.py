@@ -12,6 +12,7 @@ import numpy as np
 
 from service.compute.calibration.board.board import Board, Grey
 from service.core.geometry import Array
+from service.core.units import mm
 
 _WIDTH = 1200  # px, of the reduced copies
 _CHARUCO_WIDTH = 1600
@@ -19,6 +20,9 @@ _LEAST = 3  # corners per side for a grid to count as a board
 _FEWEST_MARKERS = 4
 _BORDER = 1.6  # corner spacings between the last visible corner and the frame: the next one would be outside
 _FEWEST_CORNERS = 8
+_FEWEST_CIRCLES = 12
+_ROUND = 0.85  # circularity of a dark spot that is no square: a square has 0.79, a circle at 45° 0.9
+_MARKER_OFF = 0.05  # relative error of a marker's side that is told
 _DICTIONARIES = tuple(
     sorted(
         (name for name in dir(cv2.aruco) if name.startswith("DICT_") and "APRILTAG" not in name),
@@ -61,7 +65,7 @@ def wrong_board(images: Sequence[Grey], board: Board) -> Diagnosis | None:
     said: list[Diagnosis] = []
     for image in images:
         if _is_seen(image, board):
-            return None
+            return _wrong_markers(images, board) if board.pattern == "charuco" else None
         found = diagnose(image, board)
         if found is not None and found.of_board:
             if found in said or len(images) == 1:
@@ -105,6 +109,13 @@ def _checkerboard(image: Grey, board: Board) -> Diagnosis | None:
     small = _small(image, _WIDTH)
     seen = _seen(small)
     wanted, given = sorted((board.columns, board.rows)), f"{board.columns} × {board.rows}"
+    if (seen is None or sorted(seen[0]) == [_LEAST, _LEAST]) and _circles_in(small) >= _FEWEST_CIRCLES:
+        return Diagnosis(
+            "the image shows circles, not squares",
+            "Give --pattern circles, the circles of one row and the rows (an asymmetric grid; symmetric ones are "
+            "not read)",
+            True,
+        )
     if seen is None:
         if _best_dictionary(_small(image, _CHARUCO_WIDTH))[1] >= _FEWEST_MARKERS:
             return Diagnosis(
@@ -193,6 +204,46 @@ def _variants(board: Board) -> list[tuple[Board, str, str]]:
     return out
 
 
+def _wrong_markers(images: Sequence[Grey], board: Board) -> Diagnosis | None:
+    """The true side of a ChArUco board's markers if another one is described."""
+    ratios = [ratio for image in images for ratio in _marker_ratios(_small(image, _CHARUCO_WIDTH), board)]
+    if not ratios or abs(float(np.median(ratios)) - 1) < _MARKER_OFF:
+        return None
+    given = mm(board.charuco().getMarkerLength())
+    found = float(np.median(ratios)) * given
+    return Diagnosis(
+        f"the markers have sides of {found:.1f} mm, not {given:.1f} mm, in squares of {mm(board.square_m):g} mm",
+        f"Measure a marker and give --marker-mm {found:.1f}",
+        True,
+    )
+
+
+def _marker_ratios(image: Grey, board: Board) -> Array:
+    """True over described side of every marker in an image whose place on the board is known."""
+    described = board.charuco()
+    corners, identifiers, _ = _marker_detector(board.dictionary).detectMarkers(image)
+    if identifiers is None or len(identifiers) < _FEWEST_MARKERS:  # pyright: ignore[reportUnnecessaryComparison]
+        return np.zeros(0)
+    places = dict(zip(np.asarray(described.getIds()).ravel().tolist(), described.getObjPoints(), strict=True))
+    known = [(np.asarray(c, dtype=np.float64).reshape(4, 2), places[i]) for c, i in
+             zip(corners, np.asarray(identifiers).ravel().tolist(), strict=True) if i in places]  # fmt: skip
+    if len(known) < _FEWEST_MARKERS:
+        return np.zeros(0)
+    seen, at = np.array([c for c, _ in known]), np.array([np.asarray(p)[:, :2] for _, p in known])
+    H, inlier = cv2.findHomography(seen.mean(axis=1), at.mean(axis=1), cv2.RANSAC, 0.1 * board.square_m)
+    if H is None:  # pyright: ignore[reportUnnecessaryComparison]
+        return np.zeros(0)
+    flat = cv2.perspectiveTransform(seen[inlier.ravel() > 0].reshape(1, -1, 2), H).reshape(-1, 4, 2)
+    sides = np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2).mean(axis=1)
+    return np.asarray(sides, dtype=np.float64) / described.getMarkerLength()
+
+
+def _marker_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)), parameters)
+
+
 _LEGACY_WORDS = {
     True: "it is printed as OpenCV did before version 4.6",
     False: "it is printed as OpenCV does since version 4.6",
@@ -244,6 +295,15 @@ def _detector_of_all() -> cv2.aruco.ArucoDetector:
 # --- circles ----------------------------------------------------------------------------------------------
 
 
+def _circles_in(image: Grey) -> int:
+    """Number of dark round spots."""
+    settings = cv2.SimpleBlobDetector.Params()
+    settings.minArea, settings.maxArea = 20, image.size / 100
+    settings.filterByCircularity, settings.minCircularity = True, _ROUND
+    settings.minDistBetweenBlobs = 4
+    return len(cv2.SimpleBlobDetector.create(settings).detect(image))
+
+
 def _circles(image: Grey, board: Board) -> Diagnosis | None:
     small = _small(image, _WIDTH)
     if cv2.findCirclesGrid(small, (board.rows, board.columns), flags=cv2.CALIB_CB_ASYMMETRIC_GRID)[0]:
@@ -257,4 +317,7 @@ def _circles(image: Grey, board: Board) -> Diagnosis | None:
             return Diagnosis(
                 "the circles lie in a symmetric grid", "Print an asymmetric one; symmetric ones are not read", True
             )
+    seen = _seen(small)
+    if seen is not None and min(seen[0]) > _LEAST and _circles_in(small) < _FEWEST_CIRCLES:
+        return Diagnosis("the image shows squares, not circles", "Give --pattern checkerboard", True)
     return None

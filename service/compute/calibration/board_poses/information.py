@@ -86,7 +86,8 @@ def uncertainty_mm(boards: Array, camera: CameraModel, board: Board, corner_sigm
         return float("nan")
     views = tuple(BoardView(everything, np.zeros((len(everything), 2))) for _ in boards)
     covariance = inverse_of(normal[None])[0] * variance
-    known = EstimatedCamera(camera, board, views, solution, covariance, variance)
+    flat = np.zeros((len(everything), 0))
+    known = EstimatedCamera(camera, board, views, solution, covariance, flat, variance)
     middle = np.append(board.points().mean(axis=0), 1.0)
     return uncertainty_of(known, float(np.median((boards @ middle)[:, 2]))).worst_mm
 

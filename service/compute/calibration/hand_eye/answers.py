@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from service.compute.arm.correction import ArmCorrection
+from service.compute.calibration.hand_eye.board_size import BoardSizeFound
 from service.compute.calibration.hand_eye.fit import ArmTerms, Method
 from service.core.geometry import Array, Transform
 
@@ -53,10 +54,12 @@ class CorrectedHandEye(HandEyeAnswer):
     Attributes:
         correction: the arm's systematic error.
         terms: which of its parameters were estimated.
+        size: of the board, by the lengths of the corrected arm.
     """
 
     correction: ArmCorrection
     terms: ArmTerms
+    size: BoardSizeFound
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +82,8 @@ class HandEyeResult(HandEyeAnswer):
             not lower the held-out error.
         arm_held_out_mm: root mean square of held_out_mm for each arm model that was tried ("none": the poses as
             reported).
+        size: of the board, by the robot's lengths.
+        findings: what the measurements contradict, in words; empty if nothing.
     """
 
     method: Method
@@ -93,3 +98,5 @@ class HandEyeResult(HandEyeAnswer):
     excluded: dict[int, str]
     corrected: CorrectedHandEye | None
     arm_held_out_mm: dict[ArmTerms, float]
+    size: BoardSizeFound
+    findings: tuple[str, ...]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import cv2
@@ -26,6 +27,8 @@ MIN_VIEWS = 6
 _MIN_ROTATION_DEG = 15.0  # largest rotation between two views
 _MIN_SECOND_AXIS_DEG = 4.0  # root mean square rotation about the second best axis
 _SUBSETS, _SUBSET_SIZE = 24, 8
+_FAR_BETTER = 3.0  # times smaller misfit without the stated size
+_USUAL_NOISE_M = 1e-3  # of an arm, to weigh the stated size of the board against the views
 
 
 def solve_closed_form(hands: Array, boards: Array, method: ClosedForm) -> Transform:
@@ -117,8 +120,51 @@ def untwist(hands: Array, boards: Array, T_board_turned: Transform) -> tuple[Arr
     return np.where(flip[:, None, None], turned, boards), flip
 
 
-def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> tuple[Transform, Transform]:
-    """T_flange_camera and T_base_board by Park's method on the subset of views that fits half of all views best.
+@dataclass(frozen=True, slots=True)
+class RobustStart:
+    """T_flange_camera, T_base_board and the board's scale (true size over the stated one)."""
+
+    T_flange_camera: Transform
+    T_base_board: Transform
+    scale: float
+
+    def placed(self, hands: Array, boards: Array) -> Array:
+        """(N, 4, 4) T_base_board from each view alone."""
+        return hands @ self.T_flange_camera @ scaled(boards, self.scale)
+
+
+def scaled(boards: Array, scale: float) -> Array:
+    """Board poses (N, 4, 4) in the images of a board that is `scale` times as large as they were computed for."""
+    out = boards.copy()
+    out[:, :3, 3] *= scale
+    return out
+
+
+def solve_with_scale(hands: Array, boards: Array) -> RobustStart:
+    """Park's rotation, which no scale changes, and the positions with the board's scale by linear least squares.
+
+    The stated size counts as one measurement with an error of 100 %, so that views that do not determine the scale
+    leave it where it is; if the views fit far better without it, as with lengths in another unit, it does not count.
+    """
+    R = solve_closed_form(hands, boards, "park")[:3, :3]
+    n = len(hands)
+    system, right = np.zeros((3 * n + 1, 7)), np.zeros(3 * n + 1)
+    system[:-1, :3] = hands[:, :3, :3].reshape(-1, 3)
+    system[:-1, 3:6] = np.tile(-np.eye(3), (n, 1))
+    system[:-1, 6] = np.einsum("nij,nj->ni", hands[:, :3, :3] @ R, boards[:, :3, 3]).ravel()
+    right[:-1] = -hands[:, :3, 3].ravel()
+    system[-1, 6] = right[-1] = _USUAL_NOISE_M
+    shift = np.linalg.lstsq(system, right)[0]
+    free = np.linalg.lstsq(system[:-1], right[:-1])[0]
+    misfit = [float(np.linalg.norm(system[:-1] @ answer - right[:-1])) for answer in (shift, free)]
+    if free[6] > 0 and _FAR_BETTER * misfit[1] < misfit[0]:
+        shift = free
+    X, scale = transform(R, np.asarray(shift[:3], dtype=np.float64)), float(shift[6])
+    return RobustStart(X, mean_pose(hands @ X @ scaled(boards, scale)), scale)
+
+
+def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> RobustStart:
+    """The answer of the subset of views that fits half of all views best.
 
     Least median of squares over random subsets (Rousseeuw 1984) and all views, so that a few wrong poses have no
     influence.
@@ -126,22 +172,21 @@ def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> tuple
     n = len(hands)
     picks = [np.arange(n)]
     picks += [rng.choice(n, min(_SUBSET_SIZE, n), replace=False) for _ in range(_SUBSETS if n > _SUBSET_SIZE else 0)]
-    best: tuple[float, Transform, Array] | None = None
+    best: tuple[float, Array] | None = None
     for pick in picks:
         try:
-            X = solve_closed_form(hands[pick], boards[pick], "park")
+            found = solve_with_scale(hands[pick], boards[pick])
         except (cv2.error, ComputeError):
             continue
-        placed = hands @ X @ boards
+        placed = found.placed(hands, boards)
         mm, _ = deviation(placed, mean_pose(placed[pick]))
-        median = float(np.median(mm))
+        median = float(np.median(mm)) / max(abs(found.scale), 1e-9)  # a board of no size fits everywhere
         if best is None or median < best[0]:
-            best = (median, X, mm)
+            best = (median, mm)
     if best is None:
         raise ComputeError("hand-eye calibration has no answer", remedy="Take views with more rotation")
-    keep = np.argsort(best[2], kind="stable")[: max(MIN_VIEWS, (3 * n) // 4)]
-    answer = solve_closed_form(hands[keep], boards[keep], "park")
-    return answer, mean_pose((hands @ answer @ boards)[keep])
+    keep = np.argsort(best[1], kind="stable")[: max(MIN_VIEWS, (3 * n) // 4)]
+    return solve_with_scale(hands[keep], boards[keep])
 
 
 def mean_pose(poses: Array) -> Transform:

@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compute.calibration.board.board import Board
 from service.compute.calibration.hand_eye.answers import CorrectedHandEye, HandEyeResult
+from service.compute.calibration.hand_eye.board_size import (
+    BoardSizeFound,
+    contradictions,
+    size_found,
+    size_sigma,
+)
 from service.compute.calibration.hand_eye.closed_form import (
     CLOSED_FORMS,
     all_closed_forms,
@@ -30,13 +37,21 @@ from service.compute.calibration.hand_eye.fit import (
     arm_outliers,
     find_outliers,
     fit_method,
+    fit_resized,
     fit_with_arm,
     held_out,
     turned_back,
+    without_size,
 )
 from service.compute.calibration.hand_eye.reprojection import BoardCorners, board_covariance
-from service.compute.calibration.hand_eye.setup import Setup, check_setup, inverted
-from service.compute.calibration.hand_eye.spread import bootstrap_covariance, camera_share, not_below_held_out
+from service.compute.calibration.hand_eye.setup import PosesAsRead, Setup, check_setup, inverted
+from service.compute.calibration.hand_eye.spread import (
+    bootstrap_counts,
+    bootstrap_covariance,
+    bootstrap_picks,
+    camera_share,
+    not_below_held_out,
+)
 from service.compute.calibration.hand_eye.weighted import Noise
 from service.compute.camera_covariance import CameraCovariance
 from service.core.arms.model import ArmModel
@@ -60,6 +75,8 @@ class HandEyeViews:
         corners: the boards' corners, from which the board poses' covariance follows; required by `reprojection`.
         joints_rad: (N, J) as recorded with the poses.
         arm: the arm's model, with `joints_rad`.
+        board: as described, with the tolerance of its size; None: its size is exactly known.
+        poses: how else the file of the robot's poses could be read; None if they come from the robot itself.
     """
 
     T_base_flange: Array
@@ -67,6 +84,8 @@ class HandEyeViews:
     corners: BoardCorners | None = None
     joints_rad: Array | None = None
     arm: ArmModel | None = None
+    board: Board | None = None
+    poses: PosesAsRead | None = None
 
 
 def calibrate_hand_eye(
@@ -100,16 +119,20 @@ def calibrate_hand_eye(
     Raises:
         DataError: array shapes do not match, values are not finite, or the joints are another arm's.
         ComputeError: too few views, too little rotation, rotation about one axis only, poses that do not fit the
-            images (`check_setup` names the reading that does), or more than a third of the images disagree with the
-            robot.
+            images (`check_setup` names the reading that does), more than a third of the images disagree with the
+            robot, or the board's size differs from the stated one by more than its tolerance and the uncertainty.
     """
-    data = _measured(views)
+    data, poses = _measured(views), views.poses
     if setup == "eye-to-hand":
         data = dataclasses.replace(data, hands=inverted(data.hands), joints_rad=None, arm=None)
+        poses = None if poses is None else poses.inverted()
     spread, second, condition = observability(data.hands)
     point = np.zeros(3) if data.corners is None else data.corners.points_m.mean(axis=0)
-    turns = _agreed(data, T_board_turned, method, (point, setup), np.random.default_rng(seed))
+    check = partial(check_setup, point_m=point, setup=setup, poses=poses)
+    sized = partial(_sized, views.board, bootstrap, seed)
+    turns = _agreed(data, T_board_turned, method, check, sized, np.random.default_rng(seed))
     good = turns.data.take(turns.keep)
+    size = sized(turns.free, turns.weighted.scale)
     if not all(np.isfinite(observability(good.hands))):
         raise ComputeError("the remaining views do not determine the answer")
     outcomes = _outcomes(turns, method, _folds(len(turns.keep), seed), point)
@@ -118,12 +141,12 @@ def calibrate_hand_eye(
     }
     share = np.zeros((6, 6))
     if camera_covariance is not None and data.corners is not None:
-        share = camera_share(good, camera_covariance)
+        share = camera_share(good.resized(turns.plain.scale), camera_covariance)
     quality = partial(_quality, turns.data, point, share, partial(_bootstrap, good, method, bootstrap, seed))
     methods = _methods(good, method, turns.plain)
     distances = [distance(T, turns.plain.T_flange_camera) for T in methods.values()]
     return HandEyeResult(
-        **quality(outcomes["none"]),
+        **quality(size, outcomes["none"]),
         method=method,
         methods=methods,
         spread_mm=max(distance_mm for distance_mm, _ in distances),
@@ -134,20 +157,27 @@ def calibrate_hand_eye(
         condition=condition,
         turned=tuple(bool(t) for t in turns.turned),
         excluded=turns.excluded,
-        corrected=_corrected(outcomes, rms, quality),
+        corrected=_corrected(outcomes, rms, partial(_with_size, good, sized, quality)),
         arm_held_out_mm=rms,
+        findings=contradictions(good, turns.free),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class _Agreed:
-    """The views with half-turned boards turned back, the outliers among them, and the answer without the arm."""
+    """The views with half-turned boards turned back, the outliers among them, and answers without the arm's errors.
+
+    `plain` is by the method that was asked for, `weighted` by the weighted fit, and `free` by one that knows
+    nothing of the board's size.
+    """
 
     data: HandEyeMeasurements
     turned: NDArray[np.bool_]
     corner_sigma_px: float | None
     excluded: dict[int, str]
     plain: HandEyeSolution
+    weighted: HandEyeSolution
+    free: HandEyeSolution
 
     @property
     def keep(self) -> NDArray[np.bool_]:
@@ -168,17 +198,23 @@ def _agreed(
     data: HandEyeMeasurements,
     T_board_turned: Transform | None,
     method: Method,
-    checked: tuple[Array, Setup],
+    check: Callable[[Array, Array], None],
+    sized: Callable[[HandEyeSolution, float], BoardSizeFound],
     rng: np.random.Generator,
 ) -> _Agreed:
-    """The views on which robot and images agree; `checked` is the board's middle and the set-up, as stated."""
+    """The views on which robot and images agree; `check` refuses poses that do not belong together."""
 
     def solved(turned: NDArray[np.bool_]) -> _Agreed:
         straight, sigma_px = _straightened(data, turned, T_board_turned)
-        check_setup(straight.hands, straight.boards, *checked)
+        check(straight.hands, straight.boards)
         excluded = find_outliers(straight, rng)
         keep = ~np.isin(np.arange(len(turned)), list(excluded))
-        return _Agreed(straight, turned, sigma_px, excluded, fit_method(straight.take(keep), method))
+        good = straight.take(keep)
+        free = without_size(good)
+        sized(free, free.scale)  # before a fit that believes the stated size hides the difference in its noise
+        weighted = fit_method(good, "weighted")
+        answer = weighted if method == "weighted" else fit_resized(good, method, weighted, weighted.scale)
+        return _Agreed(straight, turned, sigma_px, excluded, answer, weighted, free)
 
     turned = np.zeros(len(data.hands), dtype=bool)
     if T_board_turned is None:
@@ -229,8 +265,33 @@ def _bootstrap(good: HandEyeMeasurements, method: Method, count: int, seed: int,
     return covariance
 
 
+def _with_size(
+    good: HandEyeMeasurements,
+    sized: Callable[[HandEyeSolution, float], BoardSizeFound],
+    quality: Callable[[BoardSizeFound, _Outcome], dict[str, Any]],
+    outcome: _Outcome,
+) -> dict[str, Any]:
+    """`quality` of an answer with the arm's errors, which shows the board's size better than one without them."""
+    return quality(sized(without_size(good, outcome.answer), outcome.answer.scale), outcome)
+
+
+def _sized(board: Board | None, count: int, seed: int, free: HandEyeSolution, used: float) -> BoardSizeFound:
+    """The board's size by the robot (`size_found`). Raises ComputeError if it is not credible."""
+    assert free.views is not None
+    n = len(free.views.T_base_flange)
+    counts = bootstrap_counts(bootstrap_picks(n, count, np.random.default_rng(seed)), n)
+    size = size_found(free, used, board, counts)
+    size.require_credible()
+    return size
+
+
 def _quality(
-    data: HandEyeMeasurements, point_m: Array, share: Array, resampled: Callable[[_Outcome], Array], outcome: _Outcome
+    data: HandEyeMeasurements,
+    point_m: Array,
+    share: Array,
+    resampled: Callable[[_Outcome], Array],
+    size: BoardSizeFound,
+    outcome: _Outcome,
 ) -> dict[str, Any]:
     """The fields of a HandEyeAnswer."""
     answer = outcome.answer
@@ -250,6 +311,7 @@ def _quality(
         "residual_deg": residual[1],
         "held_out_mm": outcome.held_out_mm,
         "held_out_deg": outcome.held_out_deg,
+        "size": size,
     }
 
 
@@ -269,7 +331,8 @@ def _measured(views: HandEyeViews) -> HandEyeMeasurements:
         axes = joints.shape[-1] if views.arm is None else views.arm.axes
         if joints.shape != (len(hands), axes) or not np.isfinite(joints).all():
             raise DataError(f"joints {joints.shape} instead of ({len(hands)}, {axes}) finite numbers")
-    return HandEyeMeasurements(hands, boards, np.zeros((len(hands), 6, 6)), corners, joints, views.arm)
+    sigma = 0.0 if views.board is None else size_sigma(views.board.size_tolerance)
+    return HandEyeMeasurements(hands, boards, np.zeros((len(hands), 6, 6)), corners, joints, views.arm, sigma)
 
 
 def _straightened(
@@ -306,7 +369,8 @@ def _arm_answer(
 def _methods(data: HandEyeMeasurements, method: Method, answer: HandEyeSolution) -> dict[Method, Transform]:
     """T_flange_camera by every method that has an answer."""
     answers: dict[Method, Transform] = {method: answer.T_flange_camera}
-    for name, T in all_closed_forms(data.hands, data.boards).items():
+    resized = data.resized(answer.scale)
+    for name, T in all_closed_forms(resized.hands, resized.boards).items():
         answers.setdefault(name, T)
     others: tuple[Method, ...] = ("weighted", "reprojection")
     for other in others:

@@ -21,11 +21,13 @@ from service.compute.arm.correction import (
 )
 from service.compute.calibration.hand_eye.closed_form import (
     MIN_VIEWS,
-    ClosedForm,
+    RobustStart,
     deviation,
     mean_pose,
     robust_start,
+    scaled,
     solve_closed_form,
+    solve_with_scale,
 )
 from service.compute.calibration.hand_eye.reprojection import BoardCorners, solve_reprojection
 from service.compute.calibration.hand_eye.weighted import (
@@ -38,6 +40,7 @@ from service.compute.calibration.hand_eye.weighted import (
     mahalanobis,
     select_scales,
     solve,
+    start_at,
 )
 from service.core.arms.model import ArmModel
 from service.core.errors import ComputeError
@@ -56,6 +59,7 @@ _MAX_EXCLUDED = 1 / 3
 _ARM_FLOOR_M = 3e-6  # no arm is more repeatable
 _MIN_ARM_VIEWS = 9
 _ROUNDS = 6
+ANY_SIZE = 1.0  # relative standard deviation of a board's size of which nothing is known
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +69,8 @@ class HandEyeSolution:
     Attributes:
         T_flange_camera: the calibration.
         T_base_board: the board's pose.
+        scale: of the board, its true size over the stated one.
+        scale_sigma: standard deviation of `scale`, by the noise model.
         views: the views with the arm parameters in use; weighted fit only.
         noise: weighted fit only.
         fit: weighted fit only.
@@ -73,6 +79,8 @@ class HandEyeSolution:
 
     T_flange_camera: Transform
     T_base_board: Transform
+    scale: float
+    scale_sigma: float
     views: BoardViews | None = None
     noise: Noise | None = None
     fit: Fit | None = None
@@ -81,7 +89,10 @@ class HandEyeSolution:
 
 @dataclass(frozen=True, slots=True)
 class HandEyeMeasurements:
-    """All measurements of N views; `corners` and `joints_rad` (N, J) if known."""
+    """All measurements of N views; `corners` and `joints_rad` (N, J) if known.
+
+    `size_sigma` is the relative standard deviation of the board's stated size.
+    """
 
     hands: Array
     boards: Array
@@ -89,6 +100,7 @@ class HandEyeMeasurements:
     corners: BoardCorners | None
     joints_rad: Array | None
     arm: ArmModel | None
+    size_sigma: float
 
     def take(self, which: NDArray[np.bool_]) -> HandEyeMeasurements:
         """Select these views."""
@@ -99,7 +111,15 @@ class HandEyeMeasurements:
             None if self.corners is None else self.corners.take(which),
             None if self.joints_rad is None else self.joints_rad[which],
             self.arm,
+            self.size_sigma,
         )
+
+    def resized(self, scale: float) -> HandEyeMeasurements:
+        """The measurements for a board that is `scale` times as large."""
+        corners = self.corners
+        if corners is not None:
+            corners = BoardCorners(scale * corners.points_m, corners.corners_px, corners.camera)
+        return dataclasses.replace(self, boards=scaled(self.boards, scale), corners=corners)
 
     def views(self, terms: ArmTerms) -> BoardViews:
         """The views for a weighted fit with these parameters of the arm."""
@@ -111,7 +131,7 @@ class HandEyeMeasurements:
             check_arm(self.arm, self.joints_rad, self.hands)
             kind = _kinds(self.arm, terms)
             design = correction_design(self.arm, self.joints_rad)[:, :, : len(kind)]
-        return BoardViews(self.hands, self.boards, self.covariance, design, kind)
+        return BoardViews(self.hands, self.boards, self.covariance, design, kind, self.size_sigma)
 
     def placed(self, answer: HandEyeSolution) -> Array:
         """(N, 4, 4) T_base_board from each view alone."""
@@ -119,7 +139,7 @@ class HandEyeMeasurements:
         if answer.correction is not None:
             assert self.joints_rad is not None
             hands = corrected_T_base_flange(self.joints_rad, hands, answer.correction)
-        return hands @ answer.T_flange_camera @ self.boards
+        return hands @ answer.T_flange_camera @ scaled(self.boards, answer.scale)
 
 
 def find_outliers(data: HandEyeMeasurements, rng: np.random.Generator) -> dict[int, str]:
@@ -128,28 +148,27 @@ def find_outliers(data: HandEyeMeasurements, rng: np.random.Generator) -> dict[i
     Raises:
         ComputeError: more than a third of the views disagree.
     """
-    views = data.views("none")
-    X, B = robust_start(data.hands, data.boards, rng)
-    e, _, _ = linearise(data.hands, data.boards, X, B)
-    noise = _median_noise(e)
-    fit = Fit(X, B, np.zeros(0), np.zeros((12, 12)))
-    keep = np.zeros(len(e), dtype=bool)
-    square = np.zeros(len(e))
+    # A board of another size must not make outliers of the views that would show it.
+    views = dataclasses.replace(data, size_sigma=ANY_SIZE).views("none")
+    fit = _near(robust_start(data.hands, data.boards, rng))
+    noise = _noise_at(data, fit)
+    keep = np.zeros(len(data.hands), dtype=bool)
+    square = np.zeros(len(keep))
     for round_ in range(_ROUNDS):
         square = mahalanobis(views, noise, fit, keep if round_ else None)
         now = square < 6 * _GROSS**2
-        if now.sum() < max(MIN_VIEWS, (1 - _MAX_EXCLUDED) * len(e)):
+        if now.sum() < max(MIN_VIEWS, (1 - _MAX_EXCLUDED) * len(keep)):
             raise ComputeError(
-                f"{np.count_nonzero(~now)} of {len(e)} board images disagree with the robot's poses",
+                f"{np.count_nonzero(~now)} of {len(keep)} board images disagree with the robot's poses",
                 remedy="Check that images and poses belong together, the board's size, and that the board lay still",
             )
         if np.array_equal(now, keep):
             break
         keep = now
         good = views.take(keep)
-        noise = estimate_noise(good, fit.T_flange_camera, fit.T_base_board, noise)
-        fit = solve(good, noise, fit.T_flange_camera, fit.T_base_board)
-    mm, deg = deviation(data.placed(HandEyeSolution(fit.T_flange_camera, fit.T_base_board)), fit.T_base_board)
+        noise = estimate_noise(good, fit, noise)
+        fit = solve(good, noise, fit)
+    mm, deg = deviation(data.placed(_answer_of(fit)), fit.T_base_board)
     return {
         int(
             i
@@ -158,8 +177,13 @@ def find_outliers(data: HandEyeMeasurements, rng: np.random.Generator) -> dict[i
     }
 
 
-def _median_noise(e: Array) -> Noise:
-    """A robust initial estimate of the noise from increments (N, 6)."""
+def _answer_of(fit: Fit) -> HandEyeSolution:
+    return HandEyeSolution(fit.T_flange_camera, fit.T_base_board, fit.scale, fit.scale_sigma)
+
+
+def _noise_at(data: HandEyeMeasurements, fit: Fit) -> Noise:
+    """A robust initial estimate of the noise from the increments near an answer."""
+    e, _, _ = linearise(data.hands, scaled(data.boards, fit.scale), fit.T_flange_camera, fit.T_base_board)
     lengths = np.linalg.norm(e.reshape(-1, 2, 3), axis=2)
     robot_m, robot_rad = (max(float(v) / _MEDIAN_NORM, FLOOR_M) for v in np.median(lengths, axis=0))
     return Noise(robot_m, robot_rad)
@@ -168,7 +192,7 @@ def _median_noise(e: Array) -> Noise:
 def turned_back(data: HandEyeMeasurements, answer: HandEyeSolution, T_board_turned: Transform) -> NDArray[np.bool_]:
     """(N,) views that fit the answer better with the board turned by half a turn."""
     apart = [
-        HandEyeMeasurements(data.hands, boards, data.covariance, None, data.joints_rad, data.arm).placed(answer)
+        dataclasses.replace(data, boards=boards, corners=None).placed(answer)
         for boards in (data.boards, data.boards @ T_board_turned)
     ]
     as_is, turned = (deviation(placed, answer.T_base_board)[0] for placed in apart)
@@ -186,28 +210,56 @@ def fit_method(data: HandEyeMeasurements, method: Method, start: HandEyeSolution
     Raises:
         ComputeError: the method has no answer.
     """
-    if method not in ("weighted", "reprojection"):
-        return fit_closed_form(data, method)
-    park = fit_closed_form(data, "park") if start is None else start
-    X, B = park.T_flange_camera, park.T_base_board
+    weighted = _fit_weighted(data, start)
+    return weighted if method == "weighted" else fit_resized(data, method, weighted, weighted.scale)
+
+
+def fit_resized(data: HandEyeMeasurements, method: Method, near: HandEyeSolution, scale: float) -> HandEyeSolution:
+    """An unweighted method's answer for a board that is `scale` times as large as stated.
+
+    These methods have no noise by which the stated size could be weighed against the views: the weighted fit tells
+    them the scale.
+
+    Raises:
+        ComputeError: the method has no answer.
+    """
+    resized = data.resized(scale)
     if method == "reprojection":
-        if data.corners is None:
+        if resized.corners is None:
             raise ComputeError("the method `reprojection` needs the corners, not only the board's poses")
-        return HandEyeSolution(*solve_reprojection(data.hands, data.corners, X, B))
+        two = solve_reprojection(resized.hands, resized.corners, near.T_flange_camera, near.T_base_board)
+        return HandEyeSolution(*two, scale, near.scale_sigma)
+    assert method != "weighted"
+    X = solve_closed_form(resized.hands, resized.boards, method)
+    return HandEyeSolution(X, mean_pose(resized.hands @ X @ resized.boards), scale, near.scale_sigma)
+
+
+def without_size(data: HandEyeMeasurements, answer: HandEyeSolution | None = None) -> HandEyeSolution:
+    """The weighted fit's answer if nothing were known of the board's size.
+
+    Args:
+        data: without outliers.
+        answer: with the arm's errors, whose noise is then kept; None: without them.
+
+    Raises:
+        ComputeError: the views do not determine the answer.
+    """
+    if answer is None or answer.correction is None:
+        return _fit_weighted(dataclasses.replace(data, size_sigma=ANY_SIZE), None)
+    assert answer.views is not None
+    assert answer.noise is not None
+    views = dataclasses.replace(answer.views, size_sigma=ANY_SIZE)
+    fit = solve(views, answer.noise, _near(answer))
+    return dataclasses.replace(_answer_of(fit), views=views, noise=answer.noise, fit=fit)
+
+
+def _fit_weighted(data: HandEyeMeasurements, start: HandEyeSolution | None) -> HandEyeSolution:
     views = data.views("none")
-    noise = start.noise if start is not None else None
-    if noise is None:
-        e, _, _ = linearise(data.hands, data.boards, X, B)
-        noise = _median_noise(e)
-    noise = estimate_noise(views, X, B, Noise(noise.robot_m, noise.robot_rad))
-    fit = solve(views, noise, X, B)
-    return HandEyeSolution(fit.T_flange_camera, fit.T_base_board, views, noise, fit)
-
-
-def fit_closed_form(data: HandEyeMeasurements, method: ClosedForm) -> HandEyeSolution:
-    """A closed form's answer, with the board at its mean pose."""
-    X = solve_closed_form(data.hands, data.boards, method)
-    return HandEyeSolution(X, mean_pose(data.hands @ X @ data.boards))
+    near = _near(solve_with_scale(data.hands, data.boards) if start is None else start)
+    noise = _noise_at(data, near) if start is None or start.noise is None else start.noise
+    noise = estimate_noise(views, near, Noise(noise.robot_m, noise.robot_rad))
+    fit = solve(views, noise, near)
+    return dataclasses.replace(_answer_of(fit), views=views, noise=noise, fit=fit)
 
 
 def arm_noise(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTerms) -> Noise:
@@ -220,7 +272,11 @@ def arm_noise(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTerms
     views = data.views(terms)
     scales = (1.0,) * (int(views.kind.max()) + 1)
     first = Noise(plain.noise.robot_m / 5, plain.noise.robot_rad / 5, scales)
-    return estimate_noise(views, plain.T_flange_camera, plain.T_base_board, first, floor_m=_ARM_FLOOR_M)
+    return estimate_noise(views, _near(plain), first, floor_m=_ARM_FLOOR_M)
+
+
+def _near(answer: HandEyeSolution | RobustStart) -> Fit:
+    return start_at(answer.T_flange_camera, answer.T_base_board, answer.scale)
 
 
 def fit_with_arm(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTerms, start: Noise) -> HandEyeSolution:
@@ -238,16 +294,15 @@ def fit_with_arm(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTe
     """
     assert data.arm is not None
     views, noise = data.views(terms), start
-    X, B = plain.T_flange_camera, plain.T_base_board
     if terms == "geometry+gears":
         groups = _groups(data.arm)
-        noise = select_scales(views, start, X, B, groups)
+        noise = select_scales(views, start, _near(plain), groups)
         views = dataclasses.replace(views, kind=groups)
-    fit = solve(views, noise, X, B)
+    fit = solve(views, noise, _near(plain))
     scaled = np.zeros(dh_count(data.arm) + gear_count(data.arm))
     scaled[: len(fit.arm)] = fit.arm
     correction = correction_of(data.arm, scaled, _observed(data.arm, fit, noise, views.kind))
-    return HandEyeSolution(fit.T_flange_camera, fit.T_base_board, views, noise, fit, correction)
+    return dataclasses.replace(_answer_of(fit), views=views, noise=noise, fit=fit, correction=correction)
 
 
 def _kinds(arm: ArmModel, terms: ArmTerms) -> NDArray[np.int64]:
@@ -266,7 +321,7 @@ def _groups(arm: ArmModel) -> NDArray[np.int64]:
 def _observed(arm: ArmModel, fit: Fit, noise: Noise, kind: NDArray[np.int64]) -> Array:
     """(J,) share of the prior variance that the data removed, joint by joint."""
     prior = np.array(noise.scales)[kind] ** 2
-    left = np.diag(fit.covariance)[12:]
+    left = np.diag(fit.covariance)[-len(kind) :]
     joints = np.arange(arm.axes)
     of = np.concatenate([np.repeat(joints, 4), np.repeat(joints, 2 * arm.tolerances.harmonics)])[: len(kind)]
     return np.array([1 - left[of == j].sum() / prior[of == j].sum() for j in joints])
@@ -310,7 +365,7 @@ def held_out(
     for k in range(int(folds.max()) + 1):
         test, train = folds == k, keep & (folds != k)
         learnt = data.take(train)
-        answer = fit_method(learnt, method, start[0] if method in ("weighted", "reprojection") else None)
+        answer = fit_method(learnt, method, start[0])
         if start[1] is not None:
             answer = fit_with_arm(learnt, answer, terms, start[1])
         mm[test], deg[test] = deviation(data.take(test).placed(answer), answer.T_base_board, point_m)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.board.board import BoardView
 from service.compute.calibration.hand_eye.closed_form import CLOSED_FORMS, solve_closed_form
-from service.compute.calibration.hand_eye.fit import HandEyeMeasurements, HandEyeSolution, Method, fit_closed_form
+from service.compute.calibration.hand_eye.fit import HandEyeMeasurements, HandEyeSolution, Method, fit_resized
 from service.compute.calibration.hand_eye.reprojection import BoardCorners, resample_reprojection
-from service.compute.calibration.hand_eye.weighted import resample
+from service.compute.calibration.hand_eye.weighted import resample, size_share
 from service.compute.calibration.intrinsics.adjustment import fit_pose, pose_matrix
 from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
@@ -28,23 +30,46 @@ def bootstrap_covariance(
     It also covers systematic errors, as far as they differ from pose to pose.
     """
     n = len(data.hands) if answer.views is None else len(answer.views.T_base_flange)
-    picks = [rng.integers(0, n, n) for _ in range(count)]
-    picks = [pick for pick in picks if len(np.unique(pick)) >= _MIN_DISTINCT]
-    counts = np.array([np.bincount(pick, minlength=n) for pick in picks], dtype=np.float64)
+    picks = bootstrap_picks(n, count, rng)
+    counts = bootstrap_counts(picks, n)
     X = answer.T_flange_camera
-    if method in CLOSED_FORMS:
-        replicas = [fit_closed_form(_repeat(data, pick), method).T_flange_camera for pick in picks]
-        turns = [Rotation.from_matrix(T[:3, :3] @ X[:3, :3].T).as_rotvec() for T in replicas]
-        steps = np.array([[*(T[:3, 3] - X[:3, 3]), *w] for T, w in zip(replicas, turns, strict=True)])
-    elif method == "reprojection":
-        assert data.corners is not None
-        steps = resample_reprojection(data.hands, data.corners, X, answer.T_base_board, counts)
-    else:
-        assert answer.views is not None
+    if answer.views is not None:
         assert answer.noise is not None
         assert answer.fit is not None
         steps = resample(answer.views, answer.noise, answer.fit, counts)
-    return np.cov(steps[:, :6].T)
+        return np.cov(steps[:, :6].T) + size_share(answer.views, answer.fit)[:6, :6]
+    resized = data.resized(answer.scale)
+    if method in CLOSED_FORMS:
+        replicas = [solve_closed_form(resized.hands[pick], resized.boards[pick], method) for pick in picks]
+        steps = np.array([_increment(T, X) for T in replicas])
+    else:
+        assert resized.corners is not None
+        steps = resample_reprojection(resized.hands, resized.corners, X, answer.T_base_board, counts)
+    return np.cov(steps[:, :6].T) + _resized_share(data, method, answer)
+
+
+def bootstrap_picks(n: int, count: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
+    """Up to `count` draws of n views with replacement; draws of too few different views are left out."""
+    picks = [rng.integers(0, n, n) for _ in range(count)]
+    return [pick for pick in picks if len(np.unique(pick)) >= _MIN_DISTINCT]
+
+
+def bootstrap_counts(picks: Sequence[NDArray[np.int64]], n: int) -> Array:
+    """(R, n) how often each view counts in each draw."""
+    return np.array([np.bincount(pick, minlength=n) for pick in picks], dtype=np.float64)
+
+
+def _resized_share(data: HandEyeMeasurements, method: Method, answer: HandEyeSolution) -> Array:
+    """(6, 6) covariance of T_flange_camera due to the uncertainty of the board's scale, for an unweighted method."""
+    other = fit_resized(data, method, answer, answer.scale + answer.scale_sigma)
+    step = _increment(other.T_flange_camera, answer.T_flange_camera)
+    return np.outer(step, step)
+
+
+def _increment(after: Transform, before: Transform) -> Array:
+    """(6,) shift in metres and turn in radians, in the outer axes."""
+    turn = Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec()
+    return np.concatenate([after[:3, 3] - before[:3, 3], turn])
 
 
 def camera_share(data: HandEyeMeasurements, known: CameraCovariance) -> Array:
@@ -61,9 +86,7 @@ def camera_share(data: HandEyeMeasurements, known: CameraCovariance) -> Array:
         boards = np.array(
             [_located(corners, k, T, camera) for k, T in enumerate(data.boards)],
         )
-        X = solve_closed_form(data.hands, boards, "park")
-        turn = Rotation.from_matrix(X[:3, :3] @ before[:3, :3].T).as_rotvec()
-        step = np.concatenate([X[:3, 3] - before[:3, 3], turn])
+        step = _increment(solve_closed_form(data.hands, boards, "park"), before)
         total += np.outer(step, step)
     return total
 
@@ -92,7 +115,3 @@ def not_below_held_out(covariance: Array, held_out_mm: Array, held_out_deg: Arra
     stated = np.sqrt([np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])])
     factor = np.repeat(np.maximum(1.0, least / np.maximum(stated, 1e-12)), 3)
     return covariance * np.outer(factor, factor)
-
-
-def _repeat(data: HandEyeMeasurements, pick: NDArray[np.int64]) -> HandEyeMeasurements:
-    return HandEyeMeasurements(data.hands[pick], data.boards[pick], data.covariance[pick], None, None, None)

@@ -4,11 +4,16 @@ According to the images, the flange's pose in view i is  T_base_board · inverse
 inverse(T_flange_camera).  Its increment e from the reported pose, in the flange's axes, is the sum of the robot's and
 the images' errors:
 
-    e_i(T_flange_camera, T_base_board) = G_i φ + a_i + J_i c_i,   a_i ~ N(0, diag(σ_t² 1, σ_r² 1)),  c_i ~ N(0, C_i)
+    e_i(T_flange_camera, T_base_board, κ) = G_i φ + a_i + J_i c_i,
+    a_i ~ N(0, diag(σ_t² 1, σ_r² 1)),  c_i ~ N(0, C_i)
 
 C_i is the covariance of the board's pose in the image; G_i φ is the arm's systematic error (arm.correction) with the
 prior φ ~ N(0, s²) in units of usual tolerances. The variances σ_t², σ_r² and s² maximise the restricted likelihood
 (REML; Patterson and Thompson 1971, by Henderson's mixed model equations).
+
+κ is the board's true size over the stated one, as the robot's lengths show it, with the prior κ ~ N(1, u²) from the
+board's tolerance. It scales the translation of T_camera_board. Without it, a board printed at 97 % moves the camera
+along its axis by 3 % of the distance, and where the distance hardly varies, no residual shows it.
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from service.compute.calibration.hand_eye.closed_form import scaled
 from service.compute.descent import gauss_newton, largest
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, increment, skew
@@ -32,6 +38,9 @@ _SETTLED_ARM = 1e-5  # likewise for the arm's parameters, in units of their tole
 _SELECTION_ROUNDS = 80
 _UNDETERMINED = "the views do not determine the hand-eye transform"
 _SINGULAR = 3e-7  # smallest accepted pivot of the scaled normal matrix
+_COMMON = 13  # parameters before the arm's: two transforms and the board's scale
+_SCALE = 12  # index of the board's scale among them
+_LEAST_SIGMA = 1e-9  # of the scale: a board known to 1e-9 is exactly known
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +53,7 @@ class BoardViews:
         covariance: (N, 6, 6) of T_camera_board: (d, w) in the camera's axes.
         design: (N, 6, K) derivative of the flange's increment by the arm's parameters; K may be 0.
         kind: (K,) index into `Noise.scales` of each parameter's prior scale.
+        size_sigma: relative standard deviation of the board's stated size.
     """
 
     T_base_flange: Array
@@ -51,6 +61,12 @@ class BoardViews:
     covariance: Array
     design: Array
     kind: NDArray[np.int64]
+    size_sigma: float
+
+    @property
+    def size_precision(self) -> float:
+        """Inverse variance of the board's stated size."""
+        return 1 / max(self.size_sigma, _LEAST_SIGMA) ** 2
 
     def take(self, which: NDArray[np.bool_]) -> BoardViews:
         """Select these views."""
@@ -60,6 +76,7 @@ class BoardViews:
             self.covariance[which],
             self.design[which],
             self.kind,
+            self.size_sigma,
         )
 
 
@@ -74,12 +91,18 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """An answer: the two transforms, the arm's parameters (K,) and their joint covariance."""
+    """An answer: the two transforms, the board's scale, the arm's parameters (K,) and their joint covariance."""
 
     T_flange_camera: Transform
     T_base_board: Transform
+    scale: float  # of the board: true size over the stated one
     arm: Array
-    covariance: Array  # (12 + K, 12 + K): T_flange_camera, T_base_board, each (d, w) in its outer axes; arm
+    covariance: Array  # (13 + K, 13 + K): T_flange_camera, T_base_board, each (d, w) in its outer axes; scale; arm
+
+    @property
+    def scale_sigma(self) -> float:
+        """Standard deviation of the board's scale, by the noise model."""
+        return float(np.sqrt(self.covariance[_SCALE, _SCALE]))
 
 
 def linearise(hands: Array, boards: Array, X: Transform, B: Transform) -> tuple[Array, Array, Array]:
@@ -114,12 +137,27 @@ def linearise(hands: Array, boards: Array, X: Transform, B: Transform) -> tuple[
     return e, J, JM
 
 
-def _grams(views: BoardViews, noise: Noise, X: Transform, B: Transform) -> tuple[Array, Array]:
-    """(N, P + 1, P + 1) Gram matrices of each view's whitened rows [J | e], and (N,) ½ log|V|; P = 12 + K."""
-    e, J, JM = linearise(views.T_base_flange, views.T_camera_board, X, B)
-    L = np.linalg.cholesky(_robot(noise) + JM @ views.covariance @ np.swapaxes(JM, 1, 2))
-    white = np.linalg.solve(L, np.concatenate([J, -views.design, e[:, :, None]], axis=2))
-    return np.swapaxes(white, 1, 2) @ white, np.sum(np.log(np.diagonal(L, axis1=1, axis2=2)), axis=1)
+def _rows(views: BoardViews, fit: Fit) -> tuple[Array, Array]:
+    """(N, 6, P + 1) rows [J | e] of each view at an answer, P = 13 + K, and the images' covariance (N, 6, 6) of e."""
+    boards = scaled(views.T_camera_board, fit.scale)
+    e, J, JM = linearise(views.T_base_flange, boards, fit.T_flange_camera, fit.T_base_board)
+    by_scale = np.einsum("nij,nj->ni", JM[:, :, :3], views.T_camera_board[:, :3, 3])
+    rows = np.concatenate([J, by_scale[:, :, None], -views.design, e[:, :, None]], axis=2)
+    return rows, JM @ views.covariance @ np.swapaxes(JM, 1, 2)
+
+
+def _grams(views: BoardViews, noise: Noise, fit: Fit) -> Array:
+    """(N, P + 1, P + 1) Gram matrices of each view's whitened rows."""
+    rows, images = _rows(views, fit)
+    white = np.linalg.solve(np.linalg.cholesky(_robot(noise) + images), rows)
+    return np.swapaxes(white, 1, 2) @ white
+
+
+def _with_prior(gram: Array, views: BoardViews, scale: float) -> Array:
+    """A summed Gram matrix with the board's stated size as one more row."""
+    row = np.zeros(len(gram))
+    row[_SCALE], row[-1] = 1.0, scale - 1
+    return gram + views.size_precision * np.outer(row, row)
 
 
 def _robot(noise: Noise) -> Array:
@@ -137,7 +175,7 @@ def _minimum(gram: Array, prior: Array) -> tuple[Array, Array, float]:
         ComputeError: the system is singular.
     """
     H = gram[:-1, :-1].copy()
-    H[np.arange(12, len(H)), np.arange(12, len(H))] += 1 / prior
+    H[np.arange(_COMMON, len(H)), np.arange(_COMMON, len(H))] += 1 / prior
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = 1 / np.sqrt(np.diag(H))  # brings metres, radians and tolerances to one size
         scaled = H * scale[:, None] * scale
@@ -159,14 +197,18 @@ def _factor(scaled: Array) -> Array:
     return L
 
 
-def solve(views: BoardViews, noise: Noise, X: Transform, B: Transform, *, iterations: int = _ITERATIONS) -> Fit:
+def start_at(X: Transform, B: Transform, scale: float, count: int = 0) -> Fit:
+    """T_flange_camera, T_base_board and the board's scale as a start, with `count` parameters of the arm."""
+    return Fit(X, B, scale, np.zeros(count), np.zeros((_COMMON + count,) * 2))
+
+
+def solve(views: BoardViews, noise: Noise, start: Fit, *, iterations: int = _ITERATIONS) -> Fit:
     """Gauss–Newton least squares weighted by `noise`, in increments scaled by the normal matrix.
 
     Args:
         views: the measurements.
         noise: standard deviations from `estimate_noise`.
-        X: initial T_flange_camera.
-        B: initial T_base_board.
+        start: from which transforms and scale to start.
         iterations: largest number.
 
     Raises:
@@ -176,39 +218,38 @@ def solve(views: BoardViews, noise: Noise, X: Transform, B: Transform, *, iterat
 
     def minimum_at(fit: Fit) -> tuple[Array, Array]:
         """The step from `fit` to the minimum of the linearised problem, and the covariance of all parameters."""
-        grams, _ = _grams(views, noise, fit.T_flange_camera, fit.T_base_board)
-        step, covariance, _ = _minimum(grams.sum(axis=0), prior)
-        return np.concatenate([step[:12], step[12:] - fit.arm]), covariance
+        gram = _with_prior(_grams(views, noise, fit).sum(axis=0), views, fit.scale)
+        step, covariance, _ = _minimum(gram, prior)
+        return np.concatenate([step[:_COMMON], step[_COMMON:] - fit.arm]), covariance
 
     def moved(fit: Fit, step: Array) -> Fit:
         return Fit(
             increment(fit.T_flange_camera, step[:3], step[3:6]),
             increment(fit.T_base_board, step[6:9], step[9:12]),
-            fit.arm + step[12:],
+            fit.scale + float(step[_SCALE]),
+            fit.arm + step[_COMMON:],
             fit.covariance,
         )
 
     def size(_fit: Fit, step: Array) -> float:
-        return max(largest(step[:12]) / _SETTLED, float(np.abs(step[12:]).max(initial=0.0)) / _SETTLED_ARM)
+        arm = float(np.abs(step[_COMMON:]).max(initial=0.0))
+        return max(largest(step[:_COMMON]) / _SETTLED, arm / _SETTLED_ARM)
 
-    start = Fit(X, B, np.zeros(len(prior)), np.zeros((12 + len(prior),) * 2))
+    start = start_at(start.T_flange_camera, start.T_base_board, start.scale, len(prior))
     fit = gauss_newton(start, lambda fit: minimum_at(fit)[0], moved, most=iterations, settled=1.0, size=size)
     return replace(fit, covariance=minimum_at(fit)[1])
 
 
-def estimate_noise(views: BoardViews, X: Transform, B: Transform, start: Noise, *, floor_m: float = FLOOR_M) -> Noise:
+def estimate_noise(views: BoardViews, near: Fit, start: Noise, *, floor_m: float = FLOOR_M) -> Noise:
     """Standard deviations that maximise the restricted likelihood, linearised near the answer.
 
     Args:
         views: without outliers.
-        X: T_flange_camera, approximately.
-        B: T_base_board, approximately.
+        near: the answer, approximately.
         start: initial values, with one scale for each kind of arm parameter.
         floor_m: smallest robot noise; the same number in radians for the rotation.
     """
-    e, J, JM = linearise(views.T_base_flange, views.T_camera_board, X, B)
-    rows = np.concatenate([J, -views.design, e[:, :, None]], axis=2)
-    images = JM @ views.covariance @ np.swapaxes(JM, 1, 2)
+    rows, images = _rows(views, near)
     members = np.array([views.kind == g for g in range(len(start.scales))], dtype=np.float64)
 
     def objective(logs: Array) -> tuple[float, Array]:
@@ -218,11 +259,12 @@ def estimate_noise(views: BoardViews, X: Transform, B: Transform, start: Noise, 
         L = np.linalg.cholesky(_robot(noise) + images)
         white = np.linalg.solve(L, rows)
         flat = white.reshape(-1, rows.shape[2])
-        step, covariance, log_H = _minimum(flat.T @ flat, prior)
+        step, covariance, log_H = _minimum(_with_prior(flat.T @ flat, views, near.scale), prior)
         u = np.concatenate([step, [1.0]])
         left = white @ u
         value = np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))) + 0.5 * np.sum(np.log(prior)) + log_H
-        value += 0.5 * (np.sum(left**2) + np.sum(step[12:] ** 2 / prior))
+        value += 0.5 * (np.sum(left**2) + np.sum(step[_COMMON:] ** 2 / prior))
+        value += 0.5 * views.size_precision * (near.scale - 1 + step[_SCALE]) ** 2
         # d/dV of each term, only the diagonal: the robot's variances are diagonal.
         inverse_L = np.linalg.inv(L)
         trace = np.sum(inverse_L**2, axis=1)
@@ -230,7 +272,7 @@ def estimate_noise(views: BoardViews, X: Transform, B: Transform, start: Noise, 
         A = solved[:, :, :-1]
         slope = trace - np.sum((A @ covariance) * A, axis=2) - solved[:, :, -1] ** 2
         robot = [noise.robot_m**2 * slope[:, :3].sum(), noise.robot_rad**2 * slope[:, 3:].sum()]
-        scales = members @ (1 - (np.diag(covariance)[12:] + step[12:] ** 2) / prior) if len(prior) else []
+        scales = members @ (1 - (np.diag(covariance)[_COMMON:] + step[_COMMON:] ** 2) / prior) if len(prior) else []
         return float(value), np.array([*robot, *scales])
 
     first = np.log([max(start.robot_m, floor_m), max(start.robot_rad, floor_m), *start.scales])
@@ -245,7 +287,7 @@ def _noise(logs: Array) -> Noise:
     return Noise(float(values[0]), float(values[1]), tuple(float(v) for v in values[2:]))
 
 
-def select_scales(views: BoardViews, noise: Noise, X: Transform, B: Transform, groups: NDArray[np.int64]) -> Noise:
+def select_scales(views: BoardViews, noise: Noise, near: Fit, groups: NDArray[np.int64]) -> Noise:
     """A prior scale for each group of arm parameters; those that the data do not need go to zero.
 
     Automatic relevance determination (MacKay 1992, Tipping 2001): expectation maximisation first, which is safe, then
@@ -255,20 +297,19 @@ def select_scales(views: BoardViews, noise: Noise, X: Transform, B: Transform, g
     Args:
         views: as for `solve`.
         noise: with the initial scales, in the groups of `views.kind`.
-        X: T_flange_camera, near the answer.
-        B: T_base_board, near the answer.
+        near: the answer, approximately.
         groups: (K,) group of each parameter.
 
     Returns:
         Noise whose scales are those of `groups`.
     """
-    gram = _grams(views, noise, X, B)[0].sum(axis=0)
+    gram = _with_prior(_grams(views, noise, near).sum(axis=0), views, near.scale)
     members = (groups == np.arange(groups.max() + 1)[:, None]).astype(np.float64)
     size = members.sum(axis=1)
     square = np.array([float(np.mean(_prior(noise, views.kind)[groups == g])) for g in range(len(size))])
     for round_ in range(_SELECTION_ROUNDS):
         step, covariance, _ = _minimum(gram, square[groups])
-        energy, spread = members @ step[12:] ** 2, members @ np.diag(covariance)[12:]
+        energy, spread = members @ step[_COMMON:] ** 2, members @ np.diag(covariance)[_COMMON:]
         if round_ < _SELECTION_ROUNDS // 2:
             square = (energy + spread) / size
         else:
@@ -278,15 +319,25 @@ def select_scales(views: BoardViews, noise: Noise, X: Transform, B: Transform, g
 
 
 def resample(views: BoardViews, noise: Noise, fit: Fit, counts: Array) -> Array:
-    """(R, 12 + K) increments of the answer if view i counts `counts[r, i]` times: the replicates of a bootstrap.
+    """(R, 13 + K) increments of the answer if view i counts `counts[r, i]` times: the replicates of a bootstrap.
 
     One Gauss-Newton step from the answer, which is exact to second order in the replicates' spread.
     """
-    grams, _ = _grams(views, noise, fit.T_flange_camera, fit.T_base_board)
+    grams = _grams(views, noise, fit)
     prior = _prior(noise, views.kind)
     flat = counts @ grams.reshape(len(grams), -1)
     size = grams.shape[1]
-    return np.array([_minimum(row.reshape(size, size), prior)[0] for row in flat])
+    return np.array([_minimum(_with_prior(row.reshape(size, size), views, fit.scale), prior)[0] for row in flat])
+
+
+def size_share(views: BoardViews, fit: Fit) -> Array:
+    """(13 + K, 13 + K) part of the answer's covariance that is due to the stated size of the board.
+
+    The images pull the scale away from the stated size only as far as they determine it; the rest of its error stays,
+    however often the images are resampled.
+    """
+    pull = fit.covariance[:, _SCALE]
+    return np.outer(pull, pull) * views.size_precision
 
 
 def mahalanobis(views: BoardViews, noise: Noise, fit: Fit, known: NDArray[np.bool_] | None = None) -> Array:
@@ -295,14 +346,12 @@ def mahalanobis(views: BoardViews, noise: Noise, fit: Fit, known: NDArray[np.boo
     With `known`, the fit's own uncertainty counts too: it is added to the noise of views not in the fit and
     subtracted from that of views in the fit (studentised residuals).
     """
-    grams, _ = _grams(views, noise, fit.T_flange_camera, fit.T_base_board)
-    v = np.concatenate([np.zeros(12), fit.arm, [1.0]])
     if known is None:
-        return np.einsum("i,nij,j->n", v, grams, v)
-    e, J, JM = linearise(views.T_base_flange, views.T_camera_board, fit.T_flange_camera, fit.T_base_board)
-    A = np.concatenate([J, -views.design], axis=2)
-    V = _robot(noise) + JM @ views.covariance @ np.swapaxes(JM, 1, 2)
+        v = np.concatenate([np.zeros(_COMMON), fit.arm, [1.0]])
+        return np.einsum("i,nij,j->n", v, _grams(views, noise, fit), v)
+    rows, images = _rows(views, fit)
+    A, V = rows[:, :, :-1], _robot(noise) + images
     sign = np.where(known, -1.0, 1.0)[:, None, None]
     spread = V + sign * (A @ fit.covariance @ np.swapaxes(A, 1, 2)) * (1 - 1e-6)
-    left = e - views.design @ fit.arm
+    left = rows[:, :, -1] - views.design @ fit.arm
     return np.einsum("ni,ni->n", left, np.linalg.solve(spread, left[:, :, None])[:, :, 0])

@@ -1,4 +1,4 @@
-"""Least squares over one camera and the board's pose in every view, with the poses eliminated."""
+"""Least squares over one camera, the board's bow and its pose in every view, with the poses eliminated."""
 
 from __future__ import annotations
 
@@ -25,23 +25,52 @@ PARAMETER_COUNT: dict[LensModel, int] = {"pinhole": 4, "radial2": 6, "opencv4": 
 _HUBER = 3.0  # standard deviations of one coordinate beyond which a corner is downweighted
 _MAX_ITERATIONS = 40
 _DAMPING = Damping(1e-4)
-# In px per unit of a term: pulls k3 … k6 towards 0 ± 3 with the weight of one corner of 0.03 px. If the images
+# In px per unit of a term: pulls k3 … k6 towards 0 ± 1 with the weight of one corner of 0.03 px. If the images
 # determine these terms, the effect vanishes; if not, it stops numerator and denominator from cancelling without
-# limit.
-_PRIOR = 0.03 / 3
+# limit, along a valley in which a weaker pull needs three times as many steps.
+_PRIOR = 0.03
+_SETTLED = 1e-6  # decrease of the cost, in squares of the corners' scale: a thousandth of a standard deviation
 _START_VIEWS = 20  # used by OpenCV's solver for a start; the others join in the adjustment
+
+
+@dataclass(frozen=True, slots=True)
+class BoardSurface:
+    """The points of a board that may be bent.
+
+    Attributes:
+        points: (K, 3) of the flat board, m.
+        bends: (K, S) displacement along z of each point by a unit of each term; S is 0 for a board that is flat.
+        sigma_m: standard deviation of each term, before any image.
+    """
+
+    points: Array
+    bends: Array
+    sigma_m: float
+
+    def bent(self, bow_m: Array) -> Array:
+        """(K, 3) points of the board with these terms (S,)."""
+        out = self.points.copy()
+        out[:, 2] += self.bends @ bow_m
+        return out
+
+
+def flat_surface(points: Array) -> BoardSurface:
+    """The surface of a board that is exactly as `points` (K, 3)."""
+    return BoardSurface(points, np.zeros((len(points), 0)), 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class ViewEquations:
     """One view linearised at the solution; the view's own pose is eliminated from the equations.
 
+    Its Q unknowns are the camera's P parameters and the S terms of the board's bow.
+
     Attributes:
         residual: (2M,) projection minus corner, px; x and y of each corner in turn.
         weighted: (2M,) residual times the root of its robust weight, without the part that a better pose would
             explain.
-        reduced: (2M, P) its derivative by the parameters, without the part that the pose can compensate.
-        compensation: (6, P + 1) change of the view's pose (rvec, tvec) with the parameters; the last column is the
+        reduced: (2M, Q) its derivative by the unknowns, without the part that the pose can compensate.
+        compensation: (6, Q + 1) change of the view's pose (rvec, tvec) with the unknowns; the last column is the
             pose's own correction.
         pose_normal: (6, 6) normal matrix of the pose alone.
     """
@@ -54,12 +83,12 @@ class ViewEquations:
 
     @property
     def normal(self) -> Array:
-        """(P, P) this view's part of the reduced normal matrix."""
+        """(Q, Q) this view's part of the reduced normal matrix."""
         return self.reduced.T @ self.reduced
 
     @property
     def gradient(self) -> Array:
-        """(P,) this view's part of the reduced gradient; the parts of all views sum to zero at the solution."""
+        """(Q,) this view's part of the reduced gradient; the parts of all views sum to zero at the solution."""
         return self.reduced.T @ self.weighted
 
     @property
@@ -70,10 +99,16 @@ class ViewEquations:
 
 @dataclass(frozen=True, slots=True)
 class Adjustment:
-    """A solution: parameters (P,), poses (N, 6) as rvec and tvec (m) of T_camera_board, and the equations there."""
+    """A solution: parameters (P,), poses (N, 6) as rvec and tvec (m) of T_camera_board, and the equations there.
+
+    `bow_m` (S,) is the board's bow, and `prior` (Q,) what is known before the images: the diagonal of its part of the
+    normal matrix.
+    """
 
     camera: CameraModel
     parameters: Array
+    bow_m: Array
+    prior: Array
     poses: Array
     views: tuple[ViewEquations, ...]
     sigma_px: float  # robust standard deviation of one coordinate
@@ -157,7 +192,11 @@ def start_pose(view: BoardView, points: Array, camera: CameraModel) -> Array:
         ComputeError: no pose explains the corners.
     """
     done, rvec, tvec = cv2.solvePnP(
-        points[view.indices], view.corners, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_IPPE
+        points[view.indices] * [1.0, 1.0, 0.0],
+        view.corners,
+        camera.matrix,
+        camera.distortion,
+        flags=cv2.SOLVEPNP_IPPE,
     )
     if not done:
         raise ComputeError("the board's pose could not be computed", remedy="Check the corner counts")
@@ -193,15 +232,18 @@ class _ViewPose:
 
 def adjust(
     views: Sequence[BoardView],
-    points: Array,
+    surface: BoardSurface,
     size: tuple[int, int],
     camera: CameraModel,
     poses: Array,
     *,
     parameters: int,
+    bow_m: Array | None = None,
     iterations: int = _MAX_ITERATIONS,
 ) -> Adjustment:
-    """Levenberg-Marquardt over the camera's first `parameters` PARAMETERS and every pose, with Huber weights.
+    """Levenberg-Marquardt over the camera's first `parameters` PARAMETERS, the board's bow and every pose.
+
+    Corners have Huber weights.
 
     Each view's pose is eliminated, so the cost of a step grows linearly with the number of views.
     Source: Zhang, "A flexible new technique for camera calibration", PAMI 2000, for the model; Triggs et al.,
@@ -209,36 +251,42 @@ def adjust(
 
     Args:
         views: (N) corners, px.
-        points: (K, 3) of the board, m.
+        surface: of the board.
         size: width and height, px.
         camera: initial camera.
         poses: (N, 6) initial rvec and tvec (m).
         parameters: number estimated; the others keep their values in `camera` (zero).
+        bow_m: (S,) initial bow; None: flat.
         iterations: largest number.
 
     Raises:
         ComputeError: the equations are singular, or the solution did not stay finite.
     """
-    prior = prior_precision(parameters)
+    terms = surface.bends.shape[1]
+
+    def prior_at(scale: float) -> Array:
+        return np.concatenate([prior_precision(parameters), np.full(terms, (scale / surface.sigma_m) ** 2)])
 
     def at(theta: Array, poses: Array, scale: float | None = None, step: Array | None = None) -> _Linearised:
-        equations, cost, present = _linearise(views, points, theta, poses, size, scale)
-        cost += float(prior @ theta**2)
-        return _Linearised(theta, poses, equations, cost, present if scale is None else scale, present, step)
+        equations, cost, present = _linearise(views, surface, theta, poses, size, scale)
+        used = present if scale is None else scale
+        cost += float(prior_at(used) @ theta**2)
+        return _Linearised(theta, poses, equations, cost, used, present, step)
 
     def candidate(here: _Linearised, damping: float) -> _Linearised:
+        prior = prior_at(here.scale)
         normal = np.sum([view.normal for view in here.equations], axis=0) + np.diag(prior)
         gradient = np.sum([view.gradient for view in here.equations], axis=0) + prior * here.theta
         shape = np.sqrt(np.diag(normal))
         if not np.isfinite(shape).all() or shape.min() <= 0:
             raise ComputeError("the views do not determine the camera", remedy="Take views with more tilt")
-        scaled = normal / np.outer(shape, shape) + damping * np.eye(parameters)
+        scaled = normal / np.outer(shape, shape) + damping * np.eye(len(prior))
         step = -np.linalg.solve(scaled, gradient / shape) / shape
         moved = np.stack([p + _pose_step(view, step) for p, view in zip(here.poses, here.equations, strict=True)])
         return at(here.theta + step, moved, here.scale, step)
 
     end = levenberg_marquardt(
-        at(parameters_of(camera, parameters), poses),
+        at(np.concatenate([parameters_of(camera, parameters), np.zeros(terms) if bow_m is None else bow_m]), poses),
         candidate,
         _gain,
         _settles,
@@ -248,10 +296,11 @@ def adjust(
         renewed=lambda here: at(here.theta, here.poses) if here.present < 0.7 * here.scale else here,
     ).state
     theta, poses = end.theta, end.poses
-    state, _, scale = _linearise(views, points, theta, poses, size)
+    state, _, scale = _linearise(views, surface, theta, poses, size)
     if not np.isfinite(theta).all() or theta[:2].min() <= 0:
         raise ComputeError("the calibration did not converge", remedy="Check the board's size and the views")
-    return Adjustment(camera_of(theta, size), theta, poses, state, scale)
+    lens, bow = np.split(theta, [parameters])
+    return Adjustment(camera_of(lens, size), lens, bow, prior_at(scale), poses, state, scale)
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,7 +331,7 @@ def _settles(here: _Linearised, there: _Linearised) -> bool:
     if _gain(here, there) < 0 or there.step is None:
         return False
     relative = np.abs(there.step / np.maximum(np.abs(here.theta), 1e-3)).max()
-    return bool(relative < 1e-9 or here.cost - there.cost < 1e-13 * here.cost)
+    return bool(relative < 1e-9 or here.cost - there.cost < _SETTLED * here.scale**2)
 
 
 def linearised(boards: Array, points: Array, camera: CameraModel, parameters: int) -> Adjustment:
@@ -297,8 +346,8 @@ def linearised(boards: Array, points: Array, camera: CameraModel, parameters: in
         BoardView(every, project_with_jacobian(points, pose, camera_of(theta, (camera.width, camera.height)))[0])
         for pose in poses
     ]
-    equations, _, _ = _linearise(views, points, theta, poses, (camera.width, camera.height))
-    return Adjustment(camera, theta, poses, equations, 1.0)
+    equations, _, _ = _linearise(views, flat_surface(points), theta, poses, (camera.width, camera.height))
+    return Adjustment(camera, theta, np.zeros(0), prior_precision(parameters), poses, equations, 1.0)
 
 
 def _pose_step(view: ViewEquations, step: Array) -> Array:
@@ -307,14 +356,16 @@ def _pose_step(view: ViewEquations, step: Array) -> Array:
 
 def _linearise(
     views: Sequence[BoardView],
-    points: Array,
+    surface: BoardSurface,
     theta: Array,
     poses: Array,
     size: tuple[int, int],
     scale: float | None = None,
 ) -> tuple[tuple[ViewEquations, ...], float, float]:
     """Equations of every view, Huber's cost at `scale` (default: the current one), and the current robust scale."""
-    camera = camera_of(theta, size)
+    terms = surface.bends.shape[1]
+    lens, bow = np.split(theta, [len(theta) - terms])
+    camera, points = camera_of(lens, size), surface.bent(bow)
     parts = [
         (*project_with_jacobian(points[view.indices], pose, camera), view.corners)
         for view, pose in zip(views, poses, strict=True)
@@ -324,12 +375,15 @@ def _linearise(
     limit = _HUBER * (present if scale is None else scale)
     equations: list[ViewEquations] = []
     cost = 0.0
-    for residual, (_, by_pose, by_camera, _) in zip(residuals, parts, strict=True):
+    for view, pose, residual, (_, by_pose, by_camera, _) in zip(views, poses, residuals, parts, strict=True):
         length = np.repeat(np.hypot(residual[::2], residual[1::2]), 2) / np.sqrt(2)
         root = np.sqrt(np.minimum(1.0, limit / np.maximum(length, 1e-12)))
         cost += float(np.sum(np.where(length <= limit, length**2, 2 * limit * length - limit**2)))
-        J_pose, J = by_pose * root[:, None], by_camera[:, : len(theta)] * root[:, None]
-        target = np.column_stack([J, residual * root])
+        J_pose, J = by_pose * root[:, None], by_camera[:, : len(lens)] * root[:, None]
+        # A point moved along the board's normal moves as the whole board would.
+        along = J_pose[:, 3:] @ pose_matrix(pose)[:3, 2]
+        bent = along[:, None] * np.repeat(surface.bends[view.indices], 2, axis=0)
+        target = np.column_stack([J, bent, residual * root])
         Q, R = np.linalg.qr(J_pose)
         inside = Q.T @ target
         free = target - Q @ inside

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,12 @@ from service.compute.calibration.intrinsics.adjustment import (
     PARAMETER_COUNT,
     PARAMETERS,
     Adjustment,
+    BoardSurface,
     LensModel,
     adjust,
     fit_pose,
+    flat_surface,
     pose_matrix,
-    prior_precision,
     start,
     start_pose,
 )
@@ -51,13 +52,15 @@ class IntrinsicsResult:
     Attributes:
         camera: the camera at the images' size.
         model: the lens model that was estimated.
-        board: the board in the views.
+        board: the board in the views, with the bow that they show.
         rms_px: root mean square of all corners' reprojection errors (two-dimensional).
         views: (N,) input indices of the views used.
         corners: (N) their corners.
         per_view_rms_px: (N,) the same for each view.
         parameters: (P) names, in the order of the covariance.
         covariance: (P, P), px and 1: from the corners' noise, estimated from the residuals, times `inflation`.
+        joint_covariance: (P + S, P + S) of the parameters and the S terms of the board's bow (m); S is 0 for a
+            board that is stated to be exactly flat.
         inflation: ratio of the variance to that from independent corners, at least 1. The corners of one image share
             errors (light, flatness of the board, lens model); the disagreement between images shows how large these
             are.
@@ -84,6 +87,7 @@ class IntrinsicsResult:
     per_view_rms_px: Array
     parameters: tuple[str, ...]
     covariance: Array
+    joint_covariance: Array
     inflation: float
     sigma: dict[str, float]
     sigma_independent: dict[str, float]
@@ -102,7 +106,10 @@ class IntrinsicsResult:
 def calibrate_intrinsics(
     views: Sequence[BoardView], board: Board, size: tuple[int, int], *, model: LensModel = "opencv4"
 ) -> IntrinsicsResult:
-    """Calibrate a camera from views of a flat board.
+    """Calibrate a camera from views of a board that is flat, or bent within its stated flatness.
+
+    The bow of a board acts on the views like another lens: a tenth of a millimetre changes the focal length by ten of
+    the standard deviations that a fit without it would state. So its two terms are estimated with the camera.
 
     Source: Zhang, "A flexible new technique for camera calibration", PAMI 22(11), 2000, with OpenCV's distortion.
     k3 … k6 have a weak prior (`prior_precision`), which takes effect only if the images do not determine them.
@@ -120,16 +127,16 @@ def calibrate_intrinsics(
         DataError: a view's corners do not belong to this board.
         ComputeError: too few views, or tilts so similar that the focal length is undetermined.
     """
-    points = board.points()
-    used, reasons = _usable(views, len(points))
-    solution, used = _solve_without_outliers(views, points, size, model, used, reasons)
+    surface = surface_of(board)
+    used, reasons = _usable(views, len(surface.points))
+    solution, used = _solve_without_outliers(views, surface, size, model, used, reasons)
     seen = tuple(views[k] for k in used)
     count = PARAMETER_COUNT[model]
     names = PARAMETERS[:count]
     corners_used = sum(len(view.indices) for view in seen)
-    freedom = 2 * corners_used - count - 6 * len(used)
+    freedom = 2 * corners_used - len(solution.prior) - 6 * len(used)
     variance = sum(float(view.weighted @ view.weighted) for view in solution.views) / max(freedom, 1)
-    root = _inverse_root(np.sum([view.normal for view in solution.views], axis=0) + np.diag(prior_precision(count)))
+    root = _inverse_root(np.sum([view.normal for view in solution.views], axis=0) + np.diag(solution.prior))
     independent = root @ root.T * variance
     inflation, by_image = _inflation(solution, root, variance)
     covariance = independent * inflation
@@ -139,18 +146,19 @@ def calibrate_intrinsics(
     return IntrinsicsResult(
         camera=solution.camera,
         model=model,
-        board=board,
+        board=bent(board, solution.bow_m),
         rms_px=float(np.sqrt(squares / corners_used)),
         views=np.array(used, dtype=np.int64),
         corners=seen,
         per_view_rms_px=np.array([view.rms_px for view in solution.views]),
         parameters=names,
-        covariance=covariance,
+        covariance=covariance[:count, :count],
+        joint_covariance=covariance,
         inflation=inflation,
-        sigma=_sigma(names, covariance),
-        sigma_independent=_sigma(names, independent),
-        sigma_by_image=_sigma(names, by_image),
-        leave_one_out=leave_one_out(solution),
+        sigma=_sigma(names, covariance[:count, :count]),
+        sigma_independent=_sigma(names, independent[:count, :count]),
+        sigma_by_image=_sigma(names, by_image[:count, :count]),
+        leave_one_out=leave_one_out(solution)[:, :count],
         sigma_corner_px=float(np.sqrt(variance)),
         T_camera_board=poses,
         coverage=float(np.count_nonzero(counts)) / counts.size,
@@ -173,15 +181,26 @@ def locate_view(view: BoardView, board: Board, camera: CameraModel) -> tuple[Tra
     return pose_matrix(pose), rms_px
 
 
+def surface_of(board: Board) -> BoardSurface:
+    """The board's surface as the stated flatness allows it to be bent."""
+    flat = replace(board, bow_m=(0.0, 0.0))
+    if board.flatness_m == 0:
+        return flat_surface(board.points())
+    return BoardSurface(flat.points(), flat.bends(), board.flatness_m / np.sqrt(3))
+
+
+def bent(board: Board, bow_m: Array) -> Board:
+    """The board with an estimated bow (2,), or as it is for none (0,)."""
+    return replace(board, bow_m=(float(bow_m[0]), float(bow_m[1]))) if len(bow_m) else board
+
+
 def leave_one_out(solution: Adjustment) -> Array:
-    """(N, P) change of the parameters without each view, by one Newton step of the equations at the solution.
+    """(N, P + S) change of the parameters and the bow without each view, by one Newton step at the solution.
 
     Without view i, the gradient at the solution is minus this view's part, g_i, and the normal matrix lacks its part,
     S_i: d = (S - S_i)^-1 g_i. NaN if the other views do not determine the camera.
     """
-    normal = np.sum([view.normal for view in solution.views], axis=0) + np.diag(
-        prior_precision(len(solution.parameters))
-    )
+    normal = np.sum([view.normal for view in solution.views], axis=0) + np.diag(solution.prior)
     scale = np.sqrt(np.diag(normal))
     changes = np.full((len(solution.views), len(scale)), np.nan)
     for k, view in enumerate(solution.views):
@@ -206,14 +225,14 @@ def _usable(views: Sequence[BoardView], n_points: int) -> tuple[list[int], dict[
 
 def _solve_without_outliers(
     views: Sequence[BoardView],
-    points: Array,
+    surface: BoardSurface,
     size: tuple[int, int],
     model: LensModel,
     used: list[int],
     reasons: dict[int, str],
 ) -> tuple[Adjustment, list[int]]:
     """The solution and the views used; the reasons for the others are added to `reasons`."""
-    count = PARAMETER_COUNT[model]
+    count, points = PARAMETER_COUNT[model], surface.points
     suspects: list[int] = []
     begin: tuple[CameraModel, Array] | None = None
     while True:
@@ -227,7 +246,7 @@ def _solve_without_outliers(
         if begin is None:
             _check_tilt(chosen, points, size)
             begin = start(chosen, points, size, model)
-        solution = adjust(chosen, points, size, *begin, parameters=count)
+        solution = adjust(chosen, surface, size, *begin, parameters=count)
         errors = np.array([view.rms_px for view in solution.views])
         limit = max(_OUTLIER * float(np.median(errors)), _OUTLIER_FLOOR_PX)
         # One bad view raises the errors of good ones: exclude only those near the worst in each round.
@@ -239,6 +258,7 @@ def _solve_without_outliers(
         suspects += [used[k] for k in np.flatnonzero(bad)]
         used = [index for k, index in enumerate(used) if not bad[k]]
         begin = None
+    points = surface.bent(solution.bow_m)
     back = [k for k in suspects if _fits(views[k], points, solution.camera, limit)]
     if not back:
         return solution, used
@@ -247,7 +267,7 @@ def _solve_without_outliers(
     used = sorted([*used, *back])
     chosen = [views[k] for k in used]
     poses = np.stack([start_pose(view, points, solution.camera) for view in chosen])
-    return adjust(chosen, points, size, solution.camera, poses, parameters=count), used
+    return adjust(chosen, surface, size, solution.camera, poses, parameters=count, bow_m=solution.bow_m), used
 
 
 def _fits(view: BoardView, points: Array, camera: CameraModel, limit_px: float) -> bool:

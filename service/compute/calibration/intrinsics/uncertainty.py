@@ -9,7 +9,7 @@ import numpy as np
 
 from service.compute.calibration.board.board import Board, BoardView
 from service.compute.calibration.intrinsics.adjustment import Adjustment, project_with_jacobian
-from service.compute.calibration.intrinsics.estimate import IntrinsicsResult
+from service.compute.calibration.intrinsics.estimate import IntrinsicsResult, surface_of
 from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.core.geometry import Array, place_jacobian
@@ -50,11 +50,12 @@ class EstimatedCamera:
     """A camera as determined by board images: the input of its projection uncertainty.
 
     Attributes:
-        camera: with `len(covariance)` estimated parameters.
+        camera: with `len(adjustment.parameters)` estimated parameters.
         board: the board in the images.
         corners: (N) the board's points in each image.
         adjustment: the equations at the solution.
-        covariance: (P, P) of the parameters.
+        covariance: (Q, Q) of the unknowns: the parameters, then the terms of the board's bow.
+        bends: (K, S) displacement along the board's normal of each of its points by these terms; S may be 0.
         variance: of one coordinate of a corner, px².
     """
 
@@ -63,6 +64,7 @@ class EstimatedCamera:
     corners: tuple[BoardView, ...]
     adjustment: Adjustment
     covariance: Array
+    bends: Array
     variance: float
 
 
@@ -100,7 +102,13 @@ def projection_uncertainty(
     """
     variance = result.sigma_corner_px**2 * result.inflation
     known = EstimatedCamera(
-        result.camera, result.board, result.corners, result.adjustment, result.covariance, variance
+        result.camera,
+        result.board,
+        result.corners,
+        result.adjustment,
+        result.joint_covariance,
+        surface_of(result.board).bends,
+        variance,
     )
     return uncertainty_of(known, distance_m, columns=columns, rows=rows)
 
@@ -123,7 +131,9 @@ def uncertainty_of(
     _, by_pose, by_camera = project_with_jacobian(points, np.zeros(6), camera)
     # At a zero rvec, OpenCV's derivatives by rvec and tvec are those of a small rotation and shift of the points.
     J_motion = np.column_stack([by_pose[:, 3:], by_pose[:, :3]]).reshape(-1, 2, 6)
-    J_camera = by_camera[:, : len(result.covariance)].reshape(-1, 2, len(result.covariance))
+    count, every = len(result.adjustment.parameters), len(result.covariance)
+    J_camera = np.zeros((len(pixels), 2, every))
+    J_camera[:, :, :count] = by_camera[:, :count].reshape(-1, 2, count)
     A = J_camera + J_motion @ K
     covariance = A @ result.covariance @ A.swapaxes(1, 2) + J_motion @ noise @ J_motion.swapaxes(1, 2)
     sigma_px = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
@@ -147,7 +157,7 @@ def uncertainty_of(
 
 
 def _implied_motion(result: EstimatedCamera) -> tuple[Array, Array]:
-    """K (6, P), and the covariance (6, 6) that the poses' own noise adds; motion (d, w) in metres and radians.
+    """K (6, Q), and the covariance (6, 6) that the poses' own noise adds; motion (d, w) in metres and radians.
 
     A point p in the camera frame before a change of parameters and poses is at p + d + w x p after it.
     """
@@ -165,6 +175,7 @@ def _implied_motion(result: EstimatedCamera) -> tuple[Array, Array]:
         pull = M.T @ L
         normal += M.T @ M
         by_parameters += pull @ view.compensation[:, :-1]
+        by_parameters[:, count - result.bends.shape[1] :] += M.T @ np.kron(result.bends[corners.indices], T[:3, 2:3])
         spread += pull @ np.linalg.solve(view.pose_normal, pull.T)
     H = np.linalg.inv(normal)
     return H @ by_parameters, result.variance * H @ spread @ H

@@ -9,10 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.calibration.intrinsics.adjustment import adjust, fit_pose, rms
-from service.compute.calibration.intrinsics.estimate import IntrinsicsResult
+from service.compute.calibration.intrinsics.estimate import (
+    IntrinsicsResult,
+    calibrate_intrinsics,
+    leave_one_out,
+    surface_of,
+)
 from service.compute.calibration.intrinsics.uncertainty import ProjectionUncertainty
 from service.core.errors import ComputeError
 from service.core.geometry import Array
+from service.core.units import mm
 
 MIN_VIEWS_TO_VALIDATE = 4
 _FOLDS = 5
@@ -23,6 +29,8 @@ _COVERAGE = 0.9
 _TILT_DEG = 30.0
 _HELD_OUT_FACTOR = 1.3
 _INFLATION = 4.0
+_SIMPLE = ("pinhole", "radial2", "opencv4", "opencv5")  # models that a wide lens does not follow
+_WIDE = 0.5  # times as large residuals with the rational model tell a wide lens
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +61,7 @@ def cross_validate(result: IntrinsicsResult, *, seed: int = 0) -> CrossValidatio
     n = len(result.corners)
     if n < MIN_VIEWS_TO_VALIDATE:
         raise ComputeError(f"{n} views cannot be cross-validated", remedy="Take more board images")
-    points = result.board.points()
+    surface = surface_of(result.board)
     size = (result.camera.width, result.camera.height)
     folds = min(_FOLDS, n)
     fold = np.random.default_rng(seed).permutation(n) % folds
@@ -63,19 +71,21 @@ def cross_validate(result: IntrinsicsResult, *, seed: int = 0) -> CrossValidatio
         train = np.flatnonzero(fold != k)
         without = adjust(
             [result.corners[i] for i in train],
-            points,
+            surface,
             size,
             solution.camera,
             solution.poses[train],
             parameters=len(result.parameters),
+            bow_m=solution.bow_m,
             iterations=6,
         )
+        points = surface.bent(without.bow_m)
         for i in np.flatnonzero(fold == k):
             held_out[i] = fit_pose(result.corners[i], points, without.camera, solution.poses[i])[1]
     one_out = np.array(
         [
             rms(view.residual + view.reduced @ change)
-            for view, change in zip(solution.views, result.leave_one_out, strict=True)
+            for view, change in zip(solution.views, leave_one_out(solution), strict=True)
         ]
     )
     counts = np.array([len(view.indices) for view in result.corners])
@@ -103,6 +113,38 @@ def residual_field(result: IntrinsicsResult, columns: int = 24, rows: int = 16) 
     return mean.reshape(rows, columns, 2), count.reshape(rows, columns).astype(np.int64)
 
 
+def _wide_lens(result: IntrinsicsResult) -> list[str]:
+    """The warning that a lens is too wide for its model, if the rational one fits the same views far better."""
+    size = (result.camera.width, result.camera.height)
+    try:
+        wide = calibrate_intrinsics(result.corners, result.board, size, model="rational")
+    except ComputeError:  # these views do not determine so many terms
+        return []
+    if wide.rms_px > _WIDE * result.rms_px or len(wide.views) < len(result.views) - 1:
+        return []
+    return [
+        f"a wide lens: the model {result.model} fits to {result.rms_px:.2f} px, rational to {wide.rms_px:.2f} px "
+        f"(fx {wide.camera.fx:.1f} ± {wide.sigma['fx']:.1f}): calibrate with --model rational"
+    ]
+
+
+def _undetermined(result: IntrinsicsResult, uncertainty: ProjectionUncertainty) -> list[str]:
+    """Warnings that the images do not determine terms of the distortion."""
+    if result.model == "rational":
+        # Terms of a quotient may cancel each other: what they mean together is in the projection's uncertainty.
+        if uncertainty.worst_px <= _RMS_PX:
+            return []
+        return [
+            "the quotient of k1 … k6 is not determined in all of the image: show the board in its corners, or use "
+            "fewer terms"
+        ]
+    return [
+        f"{name} is not determined ({getattr(result.camera, name):.3g} ± {sigma:.2g}): use fewer terms"
+        for name, sigma in result.sigma.items()
+        if name in ("k2", "k3") and sigma > abs(getattr(result.camera, name))
+    ]
+
+
 def calibration_warnings(
     result: IntrinsicsResult, validation: CrossValidation | None, uncertainty: ProjectionUncertainty
 ) -> tuple[str, ...]:
@@ -123,11 +165,15 @@ def calibration_warnings(
             f"images disagree {np.sqrt(result.inflation):.1f} times as much as their corners' noise explains "
             "(light, a bent board or a wrong model); the sigmas are enlarged by this"
         )
-    for name, sigma in result.sigma.items():
-        if name in ("k2", "k3", "k4", "k5", "k6") and sigma > abs(getattr(result.camera, name)):
-            found.append(
-                f"{name} is not determined ({getattr(result.camera, name):.3g} ± {sigma:.2g}): use fewer terms"
-            )
+    if result.model in _SIMPLE and (result.rms_px > _RMS_PX or result.inflation > _INFLATION):
+        found += _wide_lens(result)
+    found += _undetermined(result, uncertainty)
+    bow_m = max(result.board.bow_m, key=abs)
+    if abs(bow_m) > result.board.flatness_m:
+        found.append(
+            f"the board is bent by {mm(abs(bow_m)):.2f} mm, more than its stated flatness of "
+            f"{mm(result.board.flatness_m):g} mm: the camera is corrected for an even bow, not for waves"
+        )
     if result.board.pattern == "circles":
         found.append("the middle of a tilted circle's image is not its centre: a checkerboard is more accurate")
     if validation is None:

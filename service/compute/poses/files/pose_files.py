@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -87,14 +87,26 @@ def posed_images(
     Raises:
         DataError: as `read_poses`; no image has a pose; or, with `strict`, one has none.
     """
+    chosen, _ = _matched(read_poses(path), [file.name for file in images.files], path)
+    return chosen, only_posed(images, chosen, path, folder, strict=strict)
+
+
+def only_posed(
+    images: ImageFolder, posed: Collection[str], path: Path, folder: Path, *, strict: bool = False
+) -> ImageFolder:
+    """The images whose names are among those with a pose in the file `path`; the others are left out.
+
+    Raises:
+        DataError: no image has a pose; or, with `strict`, one has none.
+    """
     names = [file.name for file in images.files]
-    chosen, missing = _matched(read_poses(path), names, path)
-    if not chosen:
+    missing = [name for name in names if name not in posed]
+    if len(missing) == len(names):
         raise _without_pose(missing, names, path)
     reasons = dict.fromkeys(missing, f"no pose in {path.name}")
     if reasons and strict:
         raise strict_refusal(reasons, folder)
-    return chosen, images.without(reasons)
+    return images.without(reasons)
 
 
 def _select(poses: Mapping[str, Transform], images: Sequence[str], path: Path) -> dict[str, Transform]:

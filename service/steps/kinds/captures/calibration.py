@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -87,6 +87,7 @@ class Measures(CaptureMeasures):
     uncertainty_centre_mm: Annotated[float | None, Measure("mm", 1e-4, 10), "the same in the centre of the image"] = (
         None
     )
+    board_bow_mm: Annotated[float | None, Measure("mm", 0, 5), "the larger of the board's two bows"] = None
     hand_eye_sigma_mm: Annotated[
         float | None, Measure("mm", 1e-4, 20), "standard deviation of the camera's position on the flange"
     ] = None
@@ -110,6 +111,12 @@ class Measures(CaptureMeasures):
     hand_eye_condition: Annotated[float | None, Measure("", 1, 1e6), "condition number of the hand-eye equations"] = (
         None
     )
+    hand_eye_board_size_percent: Annotated[
+        float | None,
+        Measure("%", -20, 20),
+        "by how much the board is larger by the robot's lengths than it is stated to be",
+    ] = None
+    hand_eye_findings: Annotated[Count, "contradictions between robot and images, in words in the result"] = None
     rotation_spread_deg: Annotated[float | None, Measure("°", 0, 180), "largest rotation between two views"] = None
     robot_noise_mm: Annotated[FineMm, "standard deviation of the arm's remaining position error, along each axis"] = (
         None
@@ -227,6 +234,7 @@ def _solve(
         **board_arguments(board),
         camera=None if camera is None else camera.answer.camera,
     )
+    arguments = arguments.model_copy(update=_stated_of_board(context, camera))
     references = {} if camera is None else {"camera": camera.reference("camera")}
     if capture is not None:
         corners = tuple(looks[image.sha256].corners_sha256 if image.sha256 in looks else None for image in images)
@@ -237,6 +245,20 @@ def _solve(
         arguments = arguments.model_copy(update=more)
     (answer,) = context.evidence.run_jobs(JobRequest.of(calibrate.KIND, arguments, references))
     return answer
+
+
+def _stated_of_board(context: StepContext, camera: EarlierAnswer[calibrate.Answer] | None) -> dict[str, Any]:
+    """What the protocol states of its board, and how the calibration of the camera has seen it, where they do."""
+    board = context.protocol.board
+    stated: dict[str, Any] = {}
+    if board is not None and board.size_tolerance_percent is not None:
+        stated["size_tolerance"] = board.size_tolerance_percent / 100
+    if board is not None and board.flatness_mm is not None:
+        stated["flatness_mm"] = board.flatness_mm
+    solved = None if camera is None else camera.answer.details.intrinsics
+    if solved is not None and solved.board is not None:
+        stated["seen"] = solved.board
+    return stated
 
 
 def _known(knowledge: BoardKnowledge) -> KnownBoard:
