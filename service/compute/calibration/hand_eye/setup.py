@@ -140,9 +140,11 @@ def check_setup(
             remedy="A row of the poses, or an image, is missing or there twice: give each image its own pose",
         )
     if not as_read.fits:
+        apart = f"half of them place the board more than {as_read} from its place"
         raise ComputeError(
-            f"the robot's poses do not fit the images: half of them place the board more than {as_read} from "
-            "its place, even with the poses inverted, in another unit, or with the rotations written in another way",
+            "the robot's poses do not fit the images: "
+            f"{apart if np.isfinite(as_read.mm) else 'no place of the board fits even half of them'}, even with the "
+            "poses inverted, in another unit, or with the rotations written in another way",
             remedy="Check that each image has its own pose (order, names), that the pose is the flange's, the "
             "order qx,qy,qz,qw, the board's square, camera.json, and that the board lay still",
         )
