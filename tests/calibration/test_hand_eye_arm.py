@@ -156,6 +156,9 @@ def test_the_arms_own_error_is_found_and_pays_on_viewpoints_it_never_saw() -> No
     assert error < 0.05
     assert result.corrected.robot_noise_mm == pytest.approx(0.0115, rel=0.4)  # the simulated arm's repeatability
     assert np.median(result.corrected.held_out_mm) < 0.1 * np.median(result.held_out_mm)
+    # What the images do not determine of the arm's errors stays in the camera's place.
+    away_mm = 1e3 * np.linalg.norm((result.corrected.T_flange_camera - scene.T_flange_camera)[:3, 3])
+    assert away_mm < 3 * result.corrected.sigma_mm
     assert result.arm_held_out_mm["geometry+gears"] < result.arm_held_out_mm["geometry"]
     assert np.all((np.array(record.observed) >= 0) & (corrected.correction.observed <= 1))
 

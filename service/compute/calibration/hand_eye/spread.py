@@ -12,7 +12,7 @@ from service.compute.calibration.board.board import BoardView
 from service.compute.calibration.hand_eye.closed_form import CLOSED_FORMS, solve_closed_form
 from service.compute.calibration.hand_eye.fit import HandEyeMeasurements, HandEyeSolution, Method, fit_resized
 from service.compute.calibration.hand_eye.reprojection import BoardCorners, resample_reprojection
-from service.compute.calibration.hand_eye.weighted import resample, size_share
+from service.compute.calibration.hand_eye.weighted import prior_share, resample
 from service.compute.calibration.intrinsics.adjustment import fit_pose, pose_matrix
 from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
@@ -37,7 +37,7 @@ def bootstrap_covariance(
         assert answer.noise is not None
         assert answer.fit is not None
         steps = resample(answer.views, answer.noise, answer.fit, counts)
-        return np.cov(steps[:, :6].T) + size_share(answer.views, answer.fit)[:6, :6]
+        return np.cov(steps[:, :6].T) + prior_share(answer.views, answer.noise, answer.fit)[:6, :6]
     resized = data.resized(answer.scale)
     if method in CLOSED_FORMS:
         replicas = [solve_closed_form(resized.hands[pick], resized.boards[pick], method) for pick in picks]

@@ -330,14 +330,15 @@ def resample(views: BoardViews, noise: Noise, fit: Fit, counts: Array) -> Array:
     return np.array([_minimum(_with_prior(row.reshape(size, size), views, fit.scale), prior)[0] for row in flat])
 
 
-def size_share(views: BoardViews, fit: Fit) -> Array:
-    """(13 + K, 13 + K) part of the answer's covariance that is due to the stated size of the board.
+def prior_share(views: BoardViews, noise: Noise, fit: Fit) -> Array:
+    """(13 + K, 13 + K) part of the answer's covariance that is due to what was known before the images.
 
-    The images pull the scale away from the stated size only as far as they determine it; the rest of its error stays,
-    however often the images are resampled.
+    The images pull the board's size and the arm's parameters away from their stated values only as far as they
+    determine them. The rest of their errors stays, however often the images are resampled.
     """
-    pull = fit.covariance[:, _SCALE]
-    return np.outer(pull, pull) * views.size_precision
+    pull = fit.covariance[:, _SCALE:]
+    precision = np.concatenate([[views.size_precision], 1 / _prior(noise, views.kind)])
+    return (pull * precision) @ pull.T
 
 
 def mahalanobis(views: BoardViews, noise: Noise, fit: Fit, known: NDArray[np.bool_] | None = None) -> Array:
