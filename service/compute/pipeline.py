@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.evaluation.accuracy import Evaluation, evaluate
+from service.compute.evaluation.accuracy import Evaluation
+from service.compute.evaluation.control_spheres import ControlEvaluation, SearchNearby, evaluate_controls
 from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.image_files import detect_all, locate_outlines
 from service.compute.registration.identification.identity import Assignment, identify
-from service.compute.registration.identification.pairing import CONTROL_GATE, paired
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import OutlineResidual, RegistrationResult, register
 from service.compute.scene import PosedImages, ScanSpheres
-from service.core.geometry import Array, Transform, inverse
+from service.core.geometry import Array, Transform
 from service.core.units import mm
 
 __all__ = ["Detection", "ImageDetections", "PipelineResult", "detect_all", "locate_outlines", "register_images"]
@@ -46,15 +46,24 @@ class ImageDetections:
 
 @dataclass(frozen=True, slots=True)
 class PipelineResult:
-    """The results for result.json and the report. `evaluation` is None if there are no control spheres."""
+    """The results for result.json and the report. `controls` is None if there are no control spheres."""
 
     registration: RegistrationResult
-    evaluation: Evaluation | None
+    controls: ControlEvaluation | None
     images: tuple[ImageDetections, ...]
     markers: tuple[int, ...]  # registration spheres used
     assignments: tuple[Assignment, ...] = field(repr=False)
-    control_assignments: tuple[Assignment, ...] = field(repr=False)
     centre_scan_m: Array = field(repr=False)  # (3,) mean of the registration spheres: the scene's centre
+
+    @property
+    def evaluation(self) -> Evaluation | None:
+        """The paper's errors; None if no control sphere was measured."""
+        return None if self.controls is None else self.controls.means
+
+    @property
+    def control_assignments(self) -> tuple[Assignment, ...]:
+        """Per image, outline → control sphere; the outlines are those of `controls`."""
+        return tuple(Assignment() for _ in self.images) if self.controls is None else self.controls.assignments
 
     def as_json(self, camera: CameraModel) -> dict[str, object]:
         """The content of result.json: metres, row-major 4×4 matrices, pixels of the images as captured."""
@@ -82,10 +91,19 @@ class PipelineResult:
                 for mine in [[x for x in r.residuals if x.marker == m and not x.excluded]]
             ],
             "control_spheres": []
-            if self.evaluation is None
+            if self.controls is None
             else [
-                {"index": s, "radial_error_mm": radial, "reprojection_error_px": px, "n_images": n}
-                for s, (radial, px, n) in self.evaluation.per_sphere().items()
+                {
+                    "index": s.index,
+                    "radial_error_mm": s.radial_error_mm,
+                    "reprojection_error_px": s.reprojection_error_px,
+                    "n_images": s.measured,
+                    "n_expected": s.expected,
+                    "displacement_mm": s.displacement_mm,
+                    "displacement_sigma_mm": s.displacement_sigma_mm,
+                    "finding": s.finding,
+                }
+                for s in self.controls.spheres
             ],
             "images": [
                 {
@@ -122,6 +140,7 @@ def register_images(
     settings: RegistrationSettings = _DEFAULT,
     *,
     assignments: Sequence[Assignment] | None = None,
+    search: SearchNearby | None = None,
 ) -> PipelineResult:
     """Identify, register and evaluate detected outlines.
 
@@ -132,6 +151,7 @@ def register_images(
         settings: as for `register`.
         assignments: per image, which outlines are which registration spheres, if `locate_outlines` knows it; None:
             identified here.
+        search: searches images for control spheres that the outlines lack; None: they count as not measured.
 
     Raises:
         DataError: the lengths do not agree, or a pose is not finite.
@@ -141,24 +161,25 @@ def register_images(
     if assignments is None:
         assignments = identify(outlines, images, spheres)
     registration = register(outlines, assignments, images, spheres, settings)
-    control = _find_controls(outlines, assignments, registration, images.camera, spheres)
-    evaluation = None
-    if any(a.markers for a in control):
+    controls = None
+    if len(spheres.control_m):
         registered = PosedImages(registration.T_scan_camera, images.camera)
-        evaluation = evaluate(outlines, control, registered, ScanSpheres(spheres.control_m, spheres.radius_m))
+        controls = evaluate_controls(outlines, assignments, registered, spheres, search=search)
+    shown = outlines if controls is None else controls.outlines
+    named = [Assignment()] * len(shown) if controls is None else controls.assignments
     labels = images.labels
     records = {(r.image, r.outline): r for r in registration.residuals}
     detections = tuple(
         ImageDetections(
             labels[i],
-            tuple(_detection(o, j, records.get((i, j)), control[i]) for j, o in enumerate(found)),
+            tuple(_detection(o, j, records.get((i, j)), named[i]) for j, o in enumerate(found)),
             registration.T_scan_camera[i],
         )
-        for i, found in enumerate(outlines)
+        for i, found in enumerate(shown)
     )
     used = tuple(sorted({r.marker for r in registration.residuals if not r.excluded}))
     centre = np.asarray(spheres.centres_m, dtype=np.float64).mean(axis=0)
-    return PipelineResult(registration, evaluation, detections, used, tuple(assignments), control, centre)
+    return PipelineResult(registration, controls, detections, used, tuple(assignments), centre)
 
 
 def _detection(outline: SphereOutline, index: int, record: OutlineResidual | None, control: Assignment) -> Detection:
@@ -169,25 +190,3 @@ def _detection(outline: SphereOutline, index: int, record: OutlineResidual | Non
         None if record is None else record.rms_px,
         "" if record is None else record.reason,
     )
-
-
-def _find_controls(
-    outlines: Sequence[Sequence[SphereOutline]],
-    assignments: Sequence[Assignment],
-    registration: RegistrationResult,
-    camera: CameraModel,
-    spheres: ScanSpheres,
-) -> tuple[Assignment, ...]:
-    """Match outlines not used by the registration to the control spheres' predicted positions."""
-    out: list[Assignment] = []
-    for i, found in enumerate(outlines):
-        T = registration.T_scan_camera[i]
-        free = [j for j in range(len(found)) if j not in assignments[i].markers]
-        if len(spheres.control_m) == 0 or not free or not np.all(np.isfinite(T)):
-            out.append(Assignment())
-            continue
-        pairs = paired(
-            [found[j] for j in free], inverse(T), spheres.control_m, spheres.radius_m, camera, CONTROL_GATE
-        )
-        out.append(Assignment({free[d]: m for d, m in pairs.items()}, inverse(T), registration.scale))
-    return tuple(out)

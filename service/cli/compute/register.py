@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,15 +24,18 @@ from service.cli.common import (
     tell_left_out,
 )
 from service.cli.compute.spheres import SeedsOption, spheres_of
+from service.compute.evaluation.control_spheres import ExpectedNearby
 from service.compute.images.folder import image_folder
 from service.compute.markers.detectors import options_for
 from service.compute.markers.grounded.detector import GroundedDetector
 from service.compute.markers.grounded.weights import VARIABLE, weights_in
+from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.image_files import (
     DetectFile,
     LocatedOutlines,
     detect_all,
     locate_outlines,
+    search_nearby,
     searched_whole,
 )
 from service.compute.markers.search.paper_files import detect_file_by_masks, read_boxes
@@ -140,8 +143,16 @@ def register_command(
                 searchers = 1 if detector in ("grounded", "vote") else processes
                 located = searched_whole(detect_all(files, model, options, searchers, show, detect=detect))
             else:
-                located = locate_outlines(files, posed, scanned, options=options, workers=processes, progress=show)
-        result = register_images(located.outlines, posed, scanned, assignments=located.assignments)
+                # Control spheres take no part in choosing outlines: they are searched for once the poses are known.
+                chosen = ScanSpheres(registration_m, radius_m)
+                located = locate_outlines(files, posed, chosen, options=options, workers=processes, progress=show)
+
+            def search(expected: ExpectedNearby) -> Sequence[Sequence[SphereOutline]]:
+                tasks = [(files[i], around) for i, around in expected]
+                told = partial(progress, "control spheres")
+                return search_nearby(tasks, model, options, min(processes, len(tasks)), told)
+
+            result = register_images(located.outlines, posed, scanned, assignments=located.assignments, search=search)
         record = result.as_json(model)
         record["spheres_mm"] = {"registration": mm(registration_m).tolist(), "control": mm(control_m).tolist()}
         record["left_out"] = folder.left_out

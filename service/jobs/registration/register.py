@@ -91,5 +91,6 @@ KIND = JobKind(
     answer=Registration,
     compute="service.worker.registration.register:register",
     words="registration",
+    version=3,
     order=61,
 )
