@@ -171,3 +171,15 @@ def test_a_control_sphere_that_was_taken_away_is_not_counted_as_measured(
     (row,) = answer["table"]
     assert [s["measured"] > 0 for s in row["control_spheres"]].count(False) == 1
     assert "found in none of" in next(s["finding"] for s in row["control_spheres"] if s["finding"])
+
+
+def test_an_image_whose_pose_contradicts_the_others_is_left_out_of_the_job_and_named(controlled: Bench) -> None:
+    poses = {f"v{i}": T.copy() for i, T in enumerate(controlled.made.T_world_camera)}
+    poses["v2"][:3, 3] += 5e-3
+    model = controlled.keep({"T_world_camera": {name: T.tolist() for name, T in poses.items()}})
+    colmap = controlled.register(model=model)
+    assert list(colmap["left_out"]) == ["v2"]
+    assert "v2 is left out: its pose is" in colmap["left_out"]["v2"]
+    assert [one["kind"] for one in colmap["findings"]] == ["image left out"]
+    assert sorted(colmap["T_scan_camera"]) == ["v0", "v1", "v3", "v4", "v5"]
+    assert {"growth_px", "focal_x"} <= {one["name"] for one in colmap["common_errors"]}

@@ -48,7 +48,7 @@ from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.photographs import photographs_at
 from service.worker.registration.outlines import read_outlines
 
-_COMMON = ("common", "intrinsics")  # components that move all spheres equally
+_COMMON = ("common", "intrinsics", "unexplained")  # components that move all spheres equally
 
 
 @dataclass(frozen=True, slots=True)

@@ -105,6 +105,8 @@ class OneRegistration(MeasureRecord):
     markers: Annotated[Count, "spheres that take part"] = None
     images: Annotated[Count, "images that take part"] = None
     excluded_outlines: Annotated[Count, "outlines left out as outliers"] = None
+    images_left_out: Annotated[Count, "images left out because they contradict the others"] = None
+    contradictions: Annotated[Count, "contradictions between the inputs that somebody has to look at"] = None
     predicted_error_mm: Annotated[ErrorMm, "predicted error at the centre of the spheres"] = None
     leave_one_out_mm: Annotated[ErrorMm, "mean radial error of each registration sphere as the others predict it"] = (
         None
