@@ -115,8 +115,12 @@ def _principal_point(inputs: Inputs) -> None:
     inputs.camera["cx"] += 2.0 * inputs.pixels
 
 
+def _copied(before: Path, after: Path) -> None:
+    shutil.copy(before, after)
+
+
 def _foreign(inputs: Inputs) -> None:
-    inputs.own_images(lambda before, after: shutil.copy(before, after))
+    inputs.own_images(_copied)
     names = sorted(file.name for file in inputs.images.iterdir())
     shutil.copy(inputs.foreign / names[5], inputs.images / names[5])
 
@@ -306,8 +310,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
             f"## {clean['scenes']} clean scenes",
             "",
             f"{clean['refused']} refused, {clean['with_findings']} with a finding; stated sigma "
-            f"{clean['median_sigma_mm']:.4f} mm and true error {clean['median_true_error_mm']:.4f} mm in the median; at "
-            f"most {clean['worst_errors_in_sigma']:.1f} sigmas.",
+            f"{clean['median_sigma_mm']:.4f} mm and true error {clean['median_true_error_mm']:.4f} mm in the median; "
+            f"at most {clean['worst_errors_in_sigma']:.1f} sigmas.",
         ]
     return "\n".join(lines) + "\n"
 

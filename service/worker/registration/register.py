@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 
-from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.capture.located import poses_by_spheres
 from service.compute.contradictions.common_errors import UNEXPLAINED, added_covariance
@@ -30,9 +29,9 @@ from service.core.records.events import ArtefactRef
 from service.core.units import mm
 from service.jobs.poses.hybrid import HybridModel
 from service.jobs.poses.structure_from_motion import ModelFile
-from service.jobs.records import ParameterCovariance, PosedPhotograph, has_poses, matrices, matrix
+from service.jobs.records import PosedPhotograph, has_poses, matrices, matrix
 from service.jobs.registration import register as job
-from service.worker.camera import camera_record, camera_reduced, camera_used
+from service.worker.camera import camera_record, camera_reduced, camera_used, lens_covariance
 from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.models import joint_pose_covariance
 from service.worker.poses.robot_poses import robot_camera_poses
@@ -52,7 +51,7 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
     if free and not images.located:
         images = images.locatable(spheres)
     posed = images.posed(metric=source in (*job.ARM, "spheres", "hybrid"))
-    lens = _intrinsics_covariance(arguments)
+    lens = None if arguments.reduced else lens_covariance(arguments.intrinsics_covariance)
     solved = register_images(images.outlines, posed, spheres, calibrated=lens)
     images = replace(images, left_out=dict(solved.left_out))
     answer = placing = solved.registration
@@ -337,16 +336,6 @@ def _leave_one_out(answer: RegistrationResult, *, refined: bool) -> job.LeaveOne
         mean_reprojection_error_px=left_out.mean_reprojection_error_px,
         spheres={str(m): row for m, row in left_out.per_sphere().items()},
     )
-
-
-def _intrinsics_covariance(arguments: job.Arguments) -> Array | None:
-    """(8, 8) of the intrinsics; None if it is unknown, or belongs to another lens model or image size."""
-    record = arguments.intrinsics_covariance
-    if record is None or arguments.reduced:
-        return None
-    if not isinstance(record, ParameterCovariance):
-        return np.array(record)
-    return CameraCovariance(record.parameters, np.array(record.matrix)).of_lens()
 
 
 def _residuals(answer: RegistrationResult, names: Sequence[str]) -> dict[str, object]:
