@@ -26,8 +26,3 @@ class Finding:
     what: str
     remedy: str
     refuses: bool = False
-
-    @property
-    def text(self) -> str:
-        """Both parts, as a line of a terminal or a report."""
-        return f"{self.what}. {self.remedy}"

@@ -44,6 +44,11 @@ class Finding(JobRecord):
     remedy: str
     refuses: bool = False
 
+    @property
+    def text(self) -> str:
+        """Both parts, as a line of a report."""
+        return f"{self.what}. {self.remedy}"
+
 
 class CommonError(JobRecord):
     """An error that all outlines share, as they have it: in px, or for `focal_x` and `focal_y` relative.

@@ -95,6 +95,9 @@ def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | N
         )
     )
     own = _best_row(summary)
+    if own is not None and own.poses in summary.registrations():
+        found = summary.registrations()[own.poses].findings
+        blocks += [Paragraph(f"{one.text}.", "attention") for one in found]
     if own is not None and own.control_spheres:
         blocks += [Paragraph(f"{text[0].upper()}{text[1:]}.", "attention") for text in own.findings]
         blocks.append(_control_spheres(own))

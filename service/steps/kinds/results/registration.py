@@ -170,8 +170,10 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
                 )
         context.progress(_words(found), len(found.arrived.keys() & set(waited)), len(waited))
         if all(name in found.arrived for name in waited):
+            outcome = _outcome(found)
+            _tell_findings(context, outcome)
             return _with_further_cameras(
-                _outcome(found),
+                outcome,
                 locate_further_cameras(
                     context, params.images_of, outlines, found.arrived, on_raw=params.measure_on == "raw"
                 ),
@@ -259,6 +261,17 @@ def _outcome(found: RegistrationJobs) -> StepOutcome:
     artefacts = tuple(ref for _, job in done for ref in job.artefacts)
     sources = (ComputedBy(job=job.job, prefix=f"{name}_") for name, job in found.arrived.items())
     return StepOutcome(measures, artefacts, result, computed_by=(ComputedBy(job=outlines.job), *sources))
+
+
+def _tell_findings(context: StepContext, outcome: StepOutcome) -> None:
+    """Tell what contradicts in the inputs, once for registrations that show the same."""
+    assert isinstance(outcome.result, Result)
+    shown: dict[str, list[str]] = {}
+    for name, record in outcome.result.registrations.items():
+        for one in record.findings:
+            shown.setdefault(one.text, []).append(name)
+    for text, names in shown.items():
+        context.tell(f"{', '.join(names)}: {text}")
 
 
 def _with_further_cameras(outcome: StepOutcome, located: Mapping[str, JobResult]) -> StepOutcome:
