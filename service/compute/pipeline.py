@@ -14,7 +14,7 @@ from service.compute.contradictions.common_errors import (
     beyond_model,
     held_lens_covariance,
 )
-from service.compute.contradictions.findings import Finding
+from service.compute.contradictions.findings import Contradiction
 from service.compute.contradictions.odd_images import describe_left_out, odd_images, too_many
 from service.compute.contradictions.odd_spheres import odd_spheres, require_handedness
 from service.compute.evaluation.accuracy import Evaluation
@@ -66,7 +66,7 @@ class PipelineResult:
     markers: tuple[int, ...]  # registration spheres used
     assignments: tuple[Assignment, ...] = field(repr=False)
     centre_scan_m: Array = field(repr=False)  # (3,) mean of the registration spheres: the scene's centre
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Contradiction, ...] = ()
     left_out: Mapping[int, str] = field(default_factory=dict[int, str])  # images that contradict the others, and why
     beyond: BeyondModel | None = None  # None: not checked
 
@@ -206,10 +206,14 @@ def register_images(
         ComputeError: too few spheres, or an ambiguous or contradictory assignment.
     """
     images.require(len(outlines))
-    if assignments is None:
-        assignments = _identified(outlines, images, spheres)
-    registration = register(outlines, assignments, images, spheres, settings)
-    findings: list[Finding] = []
+    try:
+        if assignments is None:
+            assignments = identify(outlines, images, spheres)
+        registration = register(outlines, assignments, images, spheres, settings)
+    except ComputeError:
+        require_handedness(outlines, images, spheres)  # says so if the list is mirrored
+        raise
+    findings: list[Contradiction] = []
     left_out: dict[int, str] = {}
     beyond = None
     if check:
@@ -265,21 +269,6 @@ def register_images(
     return PipelineResult(
         registration, controls, detections, used, tuple(assignments), centre, tuple(findings), left_out, beyond
     )
-
-
-def _identified(
-    outlines: Sequence[Sequence[SphereOutline]], images: PosedImages, spheres: ScanSpheres
-) -> tuple[Assignment, ...]:
-    """The assignments of all images.
-
-    Raises:
-        ComputeError: there are none; if the list of spheres is mirrored, the message says so.
-    """
-    try:
-        return identify(outlines, images, spheres)
-    except ComputeError:
-        require_handedness(outlines, images, spheres)
-        raise
 
 
 def _without(T_scan_camera: Array, left_out: Mapping[int, str]) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from service.compute.contradictions.findings import Finding
+from service.compute.contradictions.findings import Contradiction
 from service.compute.markers.outlines.refine import SYSTEMATIC_PER_BLUR
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.identification.identity import Assignment
@@ -75,7 +75,7 @@ class BeyondModel:
     errors: tuple[CommonError, ...]
     blur_px: float
     component: Array
-    findings: tuple[Finding, ...]
+    findings: tuple[Contradiction, ...]
 
 
 def beyond_model(
@@ -191,8 +191,8 @@ def _light_px(growth: CommonError | None, blur_px: float, common: CommonErrors) 
 
 def _findings(
     significant: dict[CommonErrorName, CommonError], blur_px: float, held: RegistrationResult, f: float
-) -> tuple[Finding, ...]:
-    out: list[Finding] = []
+) -> tuple[Contradiction, ...]:
+    out: list[Contradiction] = []
     focal = [significant[name] for name in ("focal_x", "focal_y") if name in significant]
     if focal:
         sizes = " and ".join(
@@ -201,7 +201,7 @@ def _findings(
             for e in focal
         )
         out.append(
-            Finding(
+            Contradiction(
                 "focal length",
                 f"The outlines contradict the focal length: {sizes}, if the camera positions are right",
                 "Calibrate the camera at this focus and zoom. If it is right, the cameras are nearer or farther "
@@ -217,7 +217,7 @@ def _findings(
             for e in shift
         )
         out.append(
-            Finding(
+            Contradiction(
                 "principal point",
                 f"The outlines are shifted as by a wrong principal point: {sizes}",
                 "Calibrate the camera, and check that the images are neither cropped nor shifted by a stabiliser. "
@@ -230,7 +230,7 @@ def _findings(
         out.append(_size_finding(growth, blur_px, held, f))
     elif blur_px > _NAMED_BLUR * _SHARP_PX:
         out.append(
-            Finding(
+            Contradiction(
                 "blur",
                 f"The outlines are blurred over {blur_px:.1f} px; the stated sigma is larger for it",
                 "Focus, and expose for less time or with the camera at rest",
@@ -239,14 +239,14 @@ def _findings(
     return tuple(out)
 
 
-def _size_finding(growth: CommonError, blur_px: float, held: RegistrationResult, f: float) -> Finding:
+def _size_finding(growth: CommonError, blur_px: float, held: RegistrationResult, f: float) -> Contradiction:
     problem = held.solution.problem
     radius_px = f * float(np.median(problem.cones.half_angles))
     given_mm = mm(problem.radius_m)
     true_mm, sigma_mm = given_mm * (1 + growth.value / radius_px), given_mm * growth.uncertainty / radius_px
     larger = "larger" if growth.value > 0 else "smaller"
     blurred = f" (they are blurred over {blur_px:.1f} px)" if blur_px > _SHARP_PX else ""
-    return Finding(
+    return Contradiction(
         "size of outlines",
         f"All outlines are {abs(growth.value):.2f} px ± {growth.uncertainty:.2f} {larger} than spheres of radius "
         f"{given_mm:.2f} mm appear{blurred}: by the images the radius is {true_mm:.2f} mm ± {sigma_mm:.2f}",

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-FindingKind = Literal[
+ContradictionKind = Literal[
     "image left out", "images contradict", "sphere not found", "spheres not found", "focal length",
     "principal point", "size of outlines", "blur",
 ]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Contradiction:
     """One fault.
 
     Attributes:
@@ -22,7 +22,7 @@ class Finding:
         refuses: whether the result must not be used before somebody has looked at this.
     """
 
-    kind: FindingKind
+    kind: ContradictionKind
     what: str
     remedy: str
     refuses: bool = False

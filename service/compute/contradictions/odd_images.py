@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from service.compute.contradictions.findings import Finding
+from service.compute.contradictions.findings import Contradiction
 from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.predicted import visible_cones
 from service.compute.registration.identification.hypotheses import image_hypotheses, rivals
@@ -44,7 +44,7 @@ def odd_images(
     return frozenset(far | blind)
 
 
-def too_many(odd: Collection[int], images: PosedImages) -> Finding | None:
+def too_many(odd: Collection[int], images: PosedImages) -> Contradiction | None:
     """The finding that so many images contradict one another that none can be left out; None if they are few."""
     n = len(images.poses)
     if len(odd) <= MOST_LEFT_OUT * n:
@@ -52,7 +52,7 @@ def too_many(odd: Collection[int], images: PosedImages) -> Finding | None:
     named = ", ".join(images.labels[i] for i in sorted(odd)[:_NAMED]) + (" and others" if len(odd) > _NAMED else "")
     what = f"{len(odd)} of {n} images contradict the others ({named}), too many to leave them out"
     remedy = "Check that images and poses belong together, and that both are of this scan's scene"
-    return Finding("images contradict", what, remedy, refuses=True)
+    return Contradiction("images contradict", what, remedy, refuses=True)
 
 
 def describe_left_out(
@@ -61,7 +61,7 @@ def describe_left_out(
     images: PosedImages,
     spheres: ScanSpheres,
     registration: RegistrationResult,
-) -> dict[int, Finding]:
+) -> dict[int, Contradiction]:
     """What is wrong with each image that was left out of a registration, by its index."""
     own = {i: _own_pose(outlines[i], images, spheres) for i in sorted(left_out)}
     return {i: _finding(i, own, outlines, images, registration) for i in own}
@@ -99,7 +99,7 @@ def _finding(
     outlines: Sequence[Sequence[SphereOutline]],
     images: PosedImages,
     registration: RegistrationResult,
-) -> Finding:
+) -> Contradiction:
     label, mine, given = images.labels[i], own[i], registration.T_scan_camera
     if mine is None:
         what = f"{label} is left out: "
@@ -109,7 +109,7 @@ def _finding(
         else:
             what += f"{len(outlines[i])} spheres were found in it, far fewer than its pose lets it show"
             remedy = "Check that it is an image of this scene, and that its pose is its own"
-        return Finding("image left out", what, remedy)
+        return Contradiction("image left out", what, remedy)
     partner = _with_pose(mine, given, i)
     if partner is not None:
         theirs = own.get(partner)
@@ -117,7 +117,7 @@ def _finding(
         other = images.labels[partner]
         what = f"{label} is left out: its spheres fit the pose of {other}"
         what += f", and those of {other} fit its pose: the two are exchanged" if mutual else ""
-        return Finding("image left out", what, "Correct the names of the images, or the order of the poses")
+        return Contradiction("image left out", what, "Correct the names of the images, or the order of the poses")
     off_mm = mm(float(np.linalg.norm(mine[:3, 3] - given[i][:3, 3])))
     turned = np.degrees(rotation_angle_rad(mine[:3, :3].T @ given[i][:3, :3]))
     typical_px = float(np.median(list(_gaps(registration).values())))
@@ -125,7 +125,7 @@ def _finding(
         f"{label} is left out: its pose is {off_mm:.1f} mm and {turned:.2f}° from where its own spheres put it; the "
         f"other images agree with theirs within {typical_px:.2f} px"
     )
-    return Finding("image left out", what, "Check the pose of this image; the camera or the arm may have moved")
+    return Contradiction("image left out", what, "Check the pose of this image; the camera or the arm may have moved")
 
 
 def _with_pose(mine: Transform, given: Array, i: int) -> int | None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.compute.contradictions.findings import Finding
+from service.compute.contradictions.findings import Contradiction
 from service.compute.evaluation.control_spheres import SearchNearby, evaluate_controls
 from service.compute.evaluation.seen_places import WINDOW_M
 from service.compute.markers.records import SphereOutline
@@ -34,7 +34,7 @@ def odd_spheres(
     spheres: ScanSpheres,
     registration: RegistrationResult,
     search: SearchNearby | None,
-) -> tuple[Finding, ...]:
+) -> tuple[Contradiction, ...]:
     """Spheres of the list that hardly any image shows where it is, and where they are, if the images tell.
 
     Raises:
@@ -65,7 +65,7 @@ def odd_spheres(
     listed = ScanSpheres(spheres.centres_m[rest], spheres.radius_m, control_m=spheres.centres_m[odd])
     sought = evaluate_controls(outlines, taken, registered, listed, search=search)
     found = {odd[s.index]: s for s in sought.spheres}
-    findings: list[Finding] = []
+    findings: list[Contradiction] = []
     for m in odd:
         there = found.get(m)
         off_mm = None if there is None or 2 * there.measured < there.expected else there.displacement_mm
@@ -76,11 +76,11 @@ def odd_spheres(
         else:
             what = f"Sphere {m} is {off_mm:.2f} mm from where the list has it, by {images_of}; it was not used"
             remedy = "It was moved between scan and images, or its place in the list is wrong: scan again"
-        findings.append(Finding("sphere not found", what, remedy))
+        findings.append(Contradiction("sphere not found", what, remedy))
     if len(odd) > _MOST_LACKING * len(expected):
         what = f"{len(odd)} of the {counted(len(expected), 'sphere')} of the list are not where it has them"
         remedy = "Check the list, its unit and its scene: the rest may fit by chance"
-        findings.insert(0, Finding("spheres not found", what, remedy, refuses=True))
+        findings.insert(0, Contradiction("spheres not found", what, remedy, refuses=True))
     return tuple(findings)
 
 

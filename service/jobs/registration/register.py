@@ -36,7 +36,7 @@ class LeaveOneOut(JobRecord):
     spheres: dict[str, tuple[float | int, ...]]
 
 
-class Finding(JobRecord):
+class Contradiction(JobRecord):
     """A contradiction between the inputs, in words, and what to do; `refuses`: before the result is used."""
 
     kind: str
@@ -110,7 +110,7 @@ class Registration(JobRecord):
     leave_one_out: LeaveOneOut | None = None
     pose_sigma_m: float | None = None
     pose_sigma_rad: float | None = None
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Contradiction, ...] = ()
     left_out: dict[str, str] = Field(default_factory=dict[str, str])
     common_errors: tuple[CommonError, ...] = ()
     blur_px: float | None = None

@@ -312,7 +312,7 @@ def _with_contradictions(
     """The record with what contradicts in the inputs."""
     beyond = solved.beyond
     found: dict[str, object] = {
-        "findings": tuple(job.Finding(**asdict(one)) for one in solved.findings),
+        "findings": tuple(job.Contradiction(**asdict(one)) for one in solved.findings),
         "left_out": {images.names[i]: why for i, why in images.left_out.items()},
     }
     if beyond is not None:
