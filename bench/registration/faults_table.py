@@ -235,7 +235,7 @@ def measured(case: Case, folder: Path, foreign: Path, workers: int) -> dict[str,
         answer = CliRunner().invoke(app, [str(word) for word in words])
         said = " ".join(answer.output.split())
         row: dict[str, Any] = {"case": case.name, "scene": folder.name, "status": answer.exit_code, "said": said}
-        row["named"] = not case.named or any(word in said for word in case.named)
+        row["named"] = not case.named or any(word in said.lower() for word in case.named)
         if not (scratch / "result.json").is_file():
             return {**row, "good": bool(case.named) and row["named"]}
         result = json.loads((scratch / "result.json").read_text())
@@ -247,7 +247,8 @@ def measured(case: Case, folder: Path, foreign: Path, workers: int) -> dict[str,
     row["sigma_mm"] = float(result["predicted_error_mm"])
     row["errors_in_sigma"] = row["true_error_mm"] / row["sigma_mm"]
     row["worst_control_mm"] = max((c["radial_error_mm"] or 0.0 for c in result["control_spheres"]), default=None)
-    row["findings"] = [one["what"] for one in result.get("findings", [])]
+    row["findings"] = [one["what"] for one in result["findings"]]
+    row["findings"] += [c["finding"] for c in result["control_spheres"] if c["finding"]]
     # One that is refused by name may have any error; one that passes may not.
     refused = answer.exit_code != 0 and row["named"]
     clean = case.change is _nothing
@@ -283,7 +284,7 @@ def _line(row: Mapping[str, Any]) -> str:
 
 def _verdict(row: Mapping[str, Any]) -> str:
     said = "passed" if row["status"] == 0 else "refused" if "true_error_mm" not in row else "not passed"
-    return said + ("" if row["good"] else " **wrong**")
+    return said + ("" if row["named"] else ", not named") + ("" if row["good"] else " **wrong**")
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:

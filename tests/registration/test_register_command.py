@@ -234,7 +234,7 @@ def test_a_displaced_control_sphere_is_measured_told_and_not_passed(
 ) -> None:
     """One displaced by 2 mm had 0.04 mm in 1 of 18 images, since an outline off the common pose was not believed."""
     listed = capture.spheres_json()
-    listed["control_mm"][0] = ([*np.array(listed["control_mm"][0]), 2.0, 3.0, 3.5]).tolist()
+    listed["control_mm"][0] = np.add(listed["control_mm"][0], [2.0, 3.0, 3.5]).tolist()
     (tmp_path / "spheres.json").write_text(json.dumps(listed))
     stated = json.loads((capture.folder / "camera.json").read_text())
     stated["covariance"] = {"parameters": ["fx", "fy"], "matrix": [[0.04, 0.0], [0.0, 0.04]]}
@@ -253,7 +253,7 @@ def test_a_displaced_control_sphere_is_measured_told_and_not_passed(
     said = " ".join(result.output.split())
     assert "Control sphere 0 is" in said
     assert "outside its limit: worst_control_sphere_mm" in said
-    assert said.endswith(f"not passed written: {out}") or "not passed" in said
+    assert "not passed written:" in said
     # The covariance that the calibration states is counted.
     assert record["components_mm"]["intrinsics"] > 0
 
