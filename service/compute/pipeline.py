@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.evaluation.accuracy import Evaluation, evaluate
+from service.compute.contradictions.common_errors import (
+    UNEXPLAINED,
+    BeyondModel,
+    beyond_model,
+    held_lens_covariance,
+)
+from service.compute.contradictions.findings import Contradiction
+from service.compute.contradictions.odd_images import describe_left_out, odd_images, too_many
+from service.compute.contradictions.odd_spheres import odd_spheres, require_handedness
+from service.compute.evaluation.accuracy import Evaluation
+from service.compute.evaluation.control_spheres import ControlEvaluation, SearchNearby, evaluate_controls
 from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.image_files import detect_all, locate_outlines
 from service.compute.registration.identification.identity import Assignment, identify
-from service.compute.registration.identification.pairing import CONTROL_GATE, paired
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import OutlineResidual, RegistrationResult, register
 from service.compute.scene import PosedImages, ScanSpheres
-from service.core.geometry import Array, Transform, inverse
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform
 from service.core.units import mm
 
 __all__ = ["Detection", "ImageDetections", "PipelineResult", "detect_all", "locate_outlines", "register_images"]
 
+INTRINSICS = "intrinsics"  # name of the component of the covariance
+_CHECKED_TIMES = 3  # an image far off can hide another
 _DEFAULT = RegistrationSettings()
 
 
@@ -46,15 +58,39 @@ class ImageDetections:
 
 @dataclass(frozen=True, slots=True)
 class PipelineResult:
-    """The results for result.json and the report. `evaluation` is None if there are no control spheres."""
+    """The results for result.json and the report. `controls` is None if there are no control spheres."""
 
     registration: RegistrationResult
-    evaluation: Evaluation | None
+    controls: ControlEvaluation | None
     images: tuple[ImageDetections, ...]
     markers: tuple[int, ...]  # registration spheres used
     assignments: tuple[Assignment, ...] = field(repr=False)
-    control_assignments: tuple[Assignment, ...] = field(repr=False)
     centre_scan_m: Array = field(repr=False)  # (3,) mean of the registration spheres: the scene's centre
+    findings: tuple[Contradiction, ...] = ()
+    left_out: Mapping[int, str] = field(default_factory=dict[int, str])  # images that contradict the others, and why
+    beyond: BeyondModel | None = None  # None: not checked
+
+    @property
+    def evaluation(self) -> Evaluation | None:
+        """The paper's errors; None if no control sphere was measured."""
+        return None if self.controls is None else self.controls.means
+
+    @property
+    def control_assignments(self) -> tuple[Assignment, ...]:
+        """Per image, outline → control sphere; the outlines are those of `controls`."""
+        return tuple(Assignment() for _ in self.images) if self.controls is None else self.controls.assignments
+
+    def measures(self) -> dict[str, float]:
+        """The figures that gates judge, by their names in a run."""
+        out = {
+            "predicted_error_mm": mm(self.registration.sigma_at_m(self.centre_scan_m)),
+            "contradictions": float(sum(one.refuses for one in self.findings)),
+        }
+        if self.controls is not None:
+            out |= self.controls.measures()
+        if self.evaluation is not None:
+            out["best_mean_radial_error_mm"] = self.evaluation.mean_radial_error_mm
+        return out
 
     def as_json(self, camera: CameraModel) -> dict[str, object]:
         """The content of result.json: metres, row-major 4×4 matrices, pixels of the images as captured."""
@@ -72,6 +108,20 @@ class PipelineResult:
             else self.evaluation.mean_reprojection_error_px,
             "predicted_error_mm": mm(r.sigma_at_m(self.centre_scan_m)),
             "n_images": r.n_images,
+            "components_mm": {
+                name: mm(float(np.sqrt(np.trace(r.part_at_m2(name, self.centre_scan_m))))) for name in r.components
+            },
+            "common_errors": []
+            if self.beyond is None
+            else [
+                {"name": e.name, "value": e.value, "sigma": e.sigma, "expected": e.expected, "named": e.significant}
+                for e in self.beyond.errors
+            ],
+            "blur_px": None if self.beyond is None else self.beyond.blur_px,
+            "findings": [
+                {"kind": one.kind, "what": one.what, "remedy": one.remedy, "refuses": one.refuses}
+                for one in self.findings
+            ],
             "markers": [
                 {
                     "index": m,
@@ -82,10 +132,19 @@ class PipelineResult:
                 for mine in [[x for x in r.residuals if x.marker == m and not x.excluded]]
             ],
             "control_spheres": []
-            if self.evaluation is None
+            if self.controls is None
             else [
-                {"index": s, "radial_error_mm": radial, "reprojection_error_px": px, "n_images": n}
-                for s, (radial, px, n) in self.evaluation.per_sphere().items()
+                {
+                    "index": s.index,
+                    "radial_error_mm": s.radial_error_mm,
+                    "reprojection_error_px": s.reprojection_error_px,
+                    "n_images": s.measured,
+                    "n_expected": s.expected,
+                    "displacement_mm": s.displacement_mm,
+                    "displacement_sigma_mm": s.displacement_sigma_mm,
+                    "finding": s.finding,
+                }
+                for s in self.controls.spheres
             ],
             "images": [
                 {
@@ -122,6 +181,10 @@ def register_images(
     settings: RegistrationSettings = _DEFAULT,
     *,
     assignments: Sequence[Assignment] | None = None,
+    search: SearchNearby | None = None,
+    lens_covariance: Array | None = None,
+    calibrated: Array | None = None,
+    check: bool = True,
 ) -> PipelineResult:
     """Identify, register and evaluate detected outlines.
 
@@ -132,33 +195,97 @@ def register_images(
         settings: as for `register`.
         assignments: per image, which outlines are which registration spheres, if `locate_outlines` knows it; None:
             identified here.
+        search: searches images for control spheres that the outlines lack; None: they count as not measured.
+        lens_covariance: (8, 8) of the calibration, which adds the component INTRINSICS to the covariance.
+        calibrated: (8, 8) of the calibration, with which the check compares; None: `lens_covariance`.
+        check: whether to look for contradictions: images that contradict the others are left out, and what the model
+            does not explain adds the component UNEXPLAINED.
 
     Raises:
         DataError: the lengths do not agree, or a pose is not finite.
         ComputeError: too few spheres, or an ambiguous or contradictory assignment.
     """
     images.require(len(outlines))
-    if assignments is None:
-        assignments = identify(outlines, images, spheres)
-    registration = register(outlines, assignments, images, spheres, settings)
-    control = _find_controls(outlines, assignments, registration, images.camera, spheres)
-    evaluation = None
-    if any(a.markers for a in control):
+    try:
+        if assignments is None:
+            assignments = identify(outlines, images, spheres)
+        registration = register(outlines, assignments, images, spheres, settings)
+    except ComputeError:
+        require_handedness(outlines, images, spheres)  # says so if the list is mirrored
+        raise
+    findings: list[Contradiction] = []
+    left_out: dict[int, str] = {}
+    beyond = None
+    if check:
+        odd: frozenset[int] = frozenset()
+        of_all = assignments, registration
+        for _ in range(_CHECKED_TIMES):
+            new = odd_images(outlines, images, spheres, registration) - odd
+            excess = too_many(odd | new, images)
+            if excess is not None:
+                findings.append(excess)
+                odd, (assignments, registration) = frozenset(), of_all
+            if not new or excess is not None:
+                break
+            odd |= new
+            assignments = [Assignment() if i in odd else a for i, a in enumerate(assignments)]
+            registration = register(outlines, assignments, images, spheres, settings)
+        described = describe_left_out(odd, outlines, images, spheres, registration)
+        findings += described.values()
+        left_out = {i: one.what for i, one in described.items()}
+        registration = replace(
+            registration,
+            T_scan_camera=_without(registration.T_scan_camera, left_out),
+            T_scan_camera_refined=_without(registration.T_scan_camera_refined, left_out),
+        )
+        findings += odd_spheres(outlines, images, spheres, registration, search)
+        known = lens_covariance if calibrated is None else calibrated
+        beyond = beyond_model(outlines, assignments, images, spheres, registration, settings, lens_covariance=known)
+        findings += beyond.findings
+        registration = _with_component(registration, UNEXPLAINED, beyond.component)
+    if lens_covariance is not None:
+        uncertain = replace(settings, intrinsics_covariance=lens_covariance)
+        more = register(outlines, assignments, images, spheres, uncertain)
+        caused = held_lens_covariance(more, lens_covariance)
+        registration = _with_component(registration, INTRINSICS, caused)
+    controls = None
+    if len(spheres.control_m):
         registered = PosedImages(registration.T_scan_camera, images.camera)
-        evaluation = evaluate(outlines, control, registered, ScanSpheres(spheres.control_m, spheres.radius_m))
+        controls = evaluate_controls(outlines, assignments, registered, spheres, search=search)
+    shown = outlines if controls is None else controls.outlines
+    named = [Assignment()] * len(shown) if controls is None else controls.assignments
     labels = images.labels
     records = {(r.image, r.outline): r for r in registration.residuals}
     detections = tuple(
         ImageDetections(
             labels[i],
-            tuple(_detection(o, j, records.get((i, j)), control[i]) for j, o in enumerate(found)),
+            tuple(_detection(o, j, records.get((i, j)), named[i]) for j, o in enumerate(found)),
             registration.T_scan_camera[i],
         )
-        for i, found in enumerate(outlines)
+        for i, found in enumerate(shown)
     )
     used = tuple(sorted({r.marker for r in registration.residuals if not r.excluded}))
     centre = np.asarray(spheres.centres_m, dtype=np.float64).mean(axis=0)
-    return PipelineResult(registration, evaluation, detections, used, tuple(assignments), control, centre)
+    return PipelineResult(
+        registration, controls, detections, used, tuple(assignments), centre, tuple(findings), left_out, beyond
+    )
+
+
+def _without(T_scan_camera: Array, left_out: Mapping[int, str]) -> Array:
+    """The poses, with NaN for images that were left out."""
+    out = T_scan_camera.copy()
+    out[list(left_out)] = np.nan
+    return out
+
+
+def _with_component(registration: RegistrationResult, name: str, part: Array) -> RegistrationResult:
+    """The registration with a further (6, 6) part of its covariance; unchanged if the part is zero."""
+    if not part.any():
+        return registration
+    whole = np.zeros_like(registration.covariance)
+    whole[:6, :6] = part[:6, :6]
+    components = registration.components | {name: whole}
+    return replace(registration, covariance=registration.covariance + whole, components=components)
 
 
 def _detection(outline: SphereOutline, index: int, record: OutlineResidual | None, control: Assignment) -> Detection:
@@ -169,25 +296,3 @@ def _detection(outline: SphereOutline, index: int, record: OutlineResidual | Non
         None if record is None else record.rms_px,
         "" if record is None else record.reason,
     )
-
-
-def _find_controls(
-    outlines: Sequence[Sequence[SphereOutline]],
-    assignments: Sequence[Assignment],
-    registration: RegistrationResult,
-    camera: CameraModel,
-    spheres: ScanSpheres,
-) -> tuple[Assignment, ...]:
-    """Match outlines not used by the registration to the control spheres' predicted positions."""
-    out: list[Assignment] = []
-    for i, found in enumerate(outlines):
-        T = registration.T_scan_camera[i]
-        free = [j for j in range(len(found)) if j not in assignments[i].markers]
-        if len(spheres.control_m) == 0 or not free or not np.all(np.isfinite(T)):
-            out.append(Assignment())
-            continue
-        pairs = paired(
-            [found[j] for j in free], inverse(T), spheres.control_m, spheres.radius_m, camera, CONTROL_GATE
-        )
-        out.append(Assignment({free[d]: m for d, m in pairs.items()}, inverse(T), registration.scale))
-    return tuple(out)

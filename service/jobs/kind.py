@@ -34,6 +34,7 @@ class NoAnswer(JobRecord):
 
 
 _NO_JOBS: Jobs = {}
+_FIRST_NUMBERS = 2  # versions up to this one differ in their arguments alone
 A = TypeVar("A", bound=JobRecord)
 R = TypeVar("R", bound=JobRecord)
 _T = TypeVar("_T", bound=JobRecord)
@@ -50,7 +51,8 @@ class JobKind(Generic[A, R]):
         compute: `module:function`, imported at the first such job. The function takes a JobContext[arguments] and
             returns a JobAnswer (service/worker/job.py).
         words: its name for people.
-        version: of the arguments. 1 holds copies of earlier results, 2 references to them; both are read.
+        version: of the computation. In version 1 the arguments hold copies of earlier results, since then references
+            to them; all are read. From version 3 on, each gives other numbers than the one before.
         order: position among the kinds in lists and texts, as a run uses them.
         replayed: whether a replay recomputes it by default; not for kinds that only help during a capture.
         aside: whether the provenance drawing omits it, because no result depends on it.
@@ -65,6 +67,15 @@ class JobKind(Generic[A, R]):
     order: int = 100
     replayed: bool = True
     aside: bool = False
+
+    def other_numbers(self, recorded_version: int) -> str:
+        """That another version computed a recorded job, with other numbers; "" if this one did."""
+        if max(recorded_version, _FIRST_NUMBERS) == max(self.version, _FIRST_NUMBERS):
+            return ""
+        return (
+            f"computed by version {recorded_version} of the {self.words}; this program has version {self.version}, "
+            "whose numbers differ"
+        )
 
     def read_arguments(self, recorded: Mapping[str, Any], jobs: Jobs = _NO_JOBS) -> A:
         """The arguments of a recorded job of any version. Raises IntegrityError."""

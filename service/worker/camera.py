@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.images.resolution import camera_at
-from service.jobs.records import Camera, ImagesCamera
+from service.core.geometry import Array
+from service.jobs.records import Camera, ImagesCamera, Matrix, ParameterCovariance
 
 
 def camera_of(record: Camera) -> CameraModel:
@@ -15,6 +19,15 @@ def camera_of(record: Camera) -> CameraModel:
 def camera_record(camera: CameraModel) -> Camera:
     """The record of a camera model."""
     return Camera.model_validate(camera.record())
+
+
+def lens_covariance(record: Matrix | ParameterCovariance | None) -> Array | None:
+    """(8, 8) covariance of the intrinsics in a record; None if it is unknown, or belongs to another lens model."""
+    if record is None:
+        return None
+    if not isinstance(record, ParameterCovariance):
+        return np.array(record)
+    return CameraCovariance(record.parameters, np.array(record.matrix)).of_lens()
 
 
 def camera_used(arguments: ImagesCamera) -> CameraModel:

@@ -38,6 +38,7 @@ from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.pages.web import PIN, QUICK_HASHES, password_of
+from tests.support.recorded import reported_run
 from tests.support.recorded.reported_run import record_reported_run
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
@@ -150,6 +151,34 @@ def test_outside_its_limit_it_says_so(tmp_path: Path) -> None:
     html = words_of(render_html(report))
     assert "best_mean_radial_error_mm 0.41 mm, allowed ≤ 0.35" in html
     assert "the step is recovering" in html
+
+
+def test_a_displaced_control_sphere_and_contradicting_inputs_are_said_in_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, found = reported_run.evaluation, reported_run.registration_record
+    moved = "control sphere 1 is 8.00 mm from where scan and registration put it"
+    spheres = [
+        {"index": 0, "expected": 18, "measured": 18, "radial_error_mm": 0.03},
+        {"index": 1, "expected": 18, "measured": 17, "radial_error_mm": 2.37, "displacement_mm": 8.0,
+         "displacement_sigma_mm": 0.02, "finding": moved},
+    ]  # fmt: skip
+
+    def evaluation(error_mm: float) -> dict[str, Any]:
+        result = plain(error_mm)
+        result["table"][0]["control_spheres"] = spheres
+        return result
+
+    def registration(*arguments: Any, **fields: Any) -> dict[str, Any]:
+        one = {"kind": "image left out", "what": "v003 is left out", "remedy": "Check its pose"}
+        return {**found(*arguments, **fields), "findings": [one]}
+
+    monkeypatch.setattr(reported_run, "evaluation", evaluation)
+    monkeypatch.setattr(reported_run, "registration_record", registration)
+    record_reported_run(tmp_path, registered=True)
+    html = words_of(render_html(report_of(tmp_path / "data")))
+    for text in ("Control sphere 1 is 8.00 mm from where", "17 of 18", "2.370", "v003 is left out. Check its pose."):
+        assert text in html, text
 
 
 def test_evidence_that_does_not_verify_is_said_first_and_loudest(folder: Path, tmp_path: Path) -> None:

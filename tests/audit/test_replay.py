@@ -73,6 +73,16 @@ def test_the_same_again_bit_for_bit_and_nothing_written(folder: Path) -> None:
     assert contents(folder / "data") == before
 
 
+def test_a_job_of_an_earlier_version_is_named_with_both_versions(folder: Path) -> None:
+    located, _, registered = again(folder).jobs
+    assert registered.computed_by == (
+        "computed by version 1 of the registration; this program has version 3, whose numbers differ"
+    )
+    assert located.computed_by == ""
+    told = CliRunner().invoke(app, ["replay", "latest", "--data", str(folder / "data")])
+    assert "computed by version 1 of the registration" in " ".join(told.output.split())
+
+
 def test_a_superseded_attempt_is_not_replayed(folder: Path) -> None:
     attempts = [job.attempt for job in again(folder, step="first_scan").jobs]
     assert attempts == [2]

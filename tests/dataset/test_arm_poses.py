@@ -20,6 +20,8 @@ from service.worker.job import JobAnswer
 from tests.support.recorded.recomputed import ARM, arm_jobs, computed, without_mount
 from tests.support.recorded.unpacked_run import unpack_recorded_run
 
+IN_LATER_VERSIONS = ("findings", "left_out", "common_errors", "blur_px")  # what contradicts, since version 3
+
 pytestmark = pytest.mark.timeout(300)
 
 
@@ -99,11 +101,13 @@ def test_the_outlines_of_each_image_are_in_the_covariance_of_poses_by_the_sphere
 
 
 @pytest.mark.parametrize("name", ARM)
-def test_a_job_of_an_earlier_version_answers_as_it_did(run: RecordedRun, name: str, tmp_path: Path) -> None:
+def test_a_job_of_an_earlier_version_answers_as_it_did_but_for_what_contradicts(
+    run: RecordedRun, name: str, tmp_path: Path
+) -> None:
     job = arm_jobs(run)[name]
     assert "state_pose_errors" not in job.arguments
     again = computed(run, job, tmp_path, {})
-    assert set(again.result) == set(job.result)
+    assert set(again.result) == {*job.result, *IN_LATER_VERSIONS}
     assert [ref.original_name for ref in again.artefacts] == [ref.original_name for ref in job.artefacts]
 
 

@@ -139,3 +139,47 @@ def test_a_registration_without_poses_of_the_control_images_is_refused(controlle
     colmap = {**controlled.register(), "T_scan_camera": {}}
     with pytest.raises(ComputeError, match="none of the control images"):
         controlled.evaluate({"colmap": colmap}, control_scan=spheres(np.vstack([REGISTRATION_M, CONTROL_M]), 2))
+
+
+def test_a_displaced_control_sphere_fails_its_own_gate_and_is_told(controlled: Bench) -> None:
+    colmap = controlled.register()
+    figures: list[float] = []
+    for by_mm in (0.0, 2.0, 8.0, 10.0, 30.0):
+        listed = np.vstack([REGISTRATION_M, CONTROL_M])
+        listed[-1] += [1e-3 * by_mm, 0.0, 0.0]
+        answer = controlled.evaluate({"colmap": colmap}, control_scan=spheres(listed, 2))
+        figures.append(answer["measures"]["worst_control_sphere_mm"])
+        (row,) = answer["table"]
+        told = [sphere["finding"] for sphere in row["control_spheres"] if sphere["finding"]]
+        assert len(told) == (by_mm > 0)
+        assert answer["measures"]["control_spheres"] == 3
+    assert figures == sorted(figures)
+    assert figures[0] < 0.1
+    assert figures[1] > 0.5
+
+
+def test_a_control_sphere_that_was_taken_away_is_not_counted_as_measured(
+    controlled: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.worker.registration.evaluate.os.cpu_count", lambda: 1)
+    elsewhere = np.array([[0.0, 0.09, 0.07]])
+    listed = spheres(np.vstack([REGISTRATION_M, CONTROL_M, elsewhere]), 2)
+    answer = controlled.evaluate({"colmap": controlled.register()}, control_scan=listed)
+    assert answer["measures"]["control_spheres"] == 3
+    assert answer["measures"]["control_spheres_expected"] == 4
+    assert answer["measures"]["control_outlines_share"] == 0
+    (row,) = answer["table"]
+    assert [s["measured"] > 0 for s in row["control_spheres"]].count(False) == 1
+    assert "found in none of" in next(s["finding"] for s in row["control_spheres"] if s["finding"])
+
+
+def test_an_image_whose_pose_contradicts_the_others_is_left_out_of_the_job_and_named(controlled: Bench) -> None:
+    poses = {f"v{i}": T.copy() for i, T in enumerate(controlled.made.T_world_camera)}
+    poses["v2"][:3, 3] += 5e-3
+    model = controlled.keep({"T_world_camera": {name: T.tolist() for name, T in poses.items()}})
+    colmap = controlled.register(model=model)
+    assert list(colmap["left_out"]) == ["v2"]
+    assert "v2 is left out: its pose is" in colmap["left_out"]["v2"]
+    assert [one["kind"] for one in colmap["findings"]] == ["image left out"]
+    assert sorted(colmap["T_scan_camera"]) == ["v0", "v1", "v3", "v4", "v5"]
+    assert {"growth_px", "focal_x"} <= {one["name"] for one in colmap["common_errors"]}

@@ -22,6 +22,7 @@ from service.compute.markers.search.anchors import spread_views
 from service.compute.markers.search.cone_pose import fit_pose
 from service.compute.markers.search.image_files import LocatedOutlines, detect_all, locate_outlines
 from service.compute.markers.search.predicted import (
+    NEAR,
     WIDE,
     PredictedSpheres,
     locate_predicted,
@@ -229,6 +230,25 @@ def test_what_is_not_where_it_is_predicted_is_missing(captured: Captured) -> Non
     assert set(located.missing) == {moved, gone, blue}
     assert set(located.outlines) == set(shown) - {moved, gone, blue}
     assert "colour" in located.missing[blue]
+
+
+def test_spheres_without_a_vote_change_no_outline_of_the_others(captured: Captured) -> None:
+    """Control spheres, here displaced by 0.5 mm, had helped to choose the outlines that they are to judge."""
+    made, _, whole = captured
+    there = np.array(made.centres_camera(0, EVERYTHING))
+    first = len(REGISTRATION_M)
+    there[first:] += 5e-4 * np.array([0.7, 0.7, 0.0])
+    picture = render(made.camera, there, 0, oversample=2)
+    T = inverse(made.T_world_camera[0]) @ made.T_world_scan
+    both = PredictedSpheres(T, EVERYTHING, RADIUS_M, NEAR, tone_of(whole[0]), first)
+    alone = locate_predicted(picture, made.camera, dataclasses.replace(both, centres_m=REGISTRATION_M))
+    beside = locate_predicted(picture, made.camera, both)
+    assert np.array_equal(alone.T_camera_scan, beside.T_camera_scan)
+    for m, outline in alone.outlines.items():
+        assert np.linalg.norm(beside.outlines[m].cone.axis - outline.cone.axis) * made.camera.fx < 0.01
+    for m in set(beside.outlines) - set(alone.outlines):
+        off = beside.outlines[m].cone.axis - there[m] / np.linalg.norm(there[m])
+        assert np.linalg.norm(off) * made.camera.fx < 0.6
 
 
 def test_a_sphere_behind_another_or_outside_is_not_expected() -> None:

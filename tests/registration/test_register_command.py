@@ -229,6 +229,35 @@ def test_scale_of_poses_that_are_not_metric(capture: Capture, few: Path, tmp_pat
     refused(register(capture, tmp_path / "none.json", **options), tmp_path / "none.json", "poses contradict", "unit")
 
 
+def test_a_displaced_control_sphere_is_measured_told_and_not_passed(
+    capture: Capture, few: Path, tmp_path: Path
+) -> None:
+    """One displaced by 2 mm had 0.04 mm in 1 of 18 images, since an outline off the common pose was not believed."""
+    listed = capture.spheres_json()
+    listed["control_mm"][0] = np.add(listed["control_mm"][0], [2.0, 3.0, 3.5]).tolist()
+    (tmp_path / "spheres.json").write_text(json.dumps(listed))
+    stated = json.loads((capture.folder / "camera.json").read_text())
+    stated["covariance"] = {"parameters": ["fx", "fy"], "matrix": [[0.04, 0.0], [0.0, 0.04]]}
+    (tmp_path / "camera.json").write_text(json.dumps(stated))
+    out = tmp_path / "result.json"
+    changes = {"images": few, "spheres": tmp_path / "spheres.json", "camera": tmp_path / "camera.json"}
+    result = register(capture, out, **changes)
+    assert result.exit_code == 1
+    record = json.loads(out.read_text())
+    assert record["verdict"] == "not passed"
+    assert [g["measure"] for g in record["gates"] if not g["passed"]][-1] == "worst_control_sphere_mm"
+    first, *others = record["control_spheres"]
+    assert first["n_images"] == first["n_expected"] > 0
+    assert first["displacement_mm"] == pytest.approx(5.0, abs=0.4)
+    assert all(one["finding"] == "" for one in others)
+    said = " ".join(result.output.split())
+    assert "Control sphere 0 is" in said
+    assert "outside its limit: worst_control_sphere_mm" in said
+    assert "not passed written:" in said
+    # The covariance that the calibration states is counted.
+    assert record["components_mm"]["intrinsics"] > 0
+
+
 # --- what it refuses --------------------------------------------------------------------------------------
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from service.compute.camera_model import CameraModel
+from service.compute.markers.cones import Cone
+from service.compute.markers.records import SphereOutline
 from service.compute.planning.coverage import (
     CoverageLimits,
     CoverageSurface,
@@ -15,6 +20,7 @@ from service.compute.planning.coverage import (
     seen,
 )
 from service.compute.planning.information import (
+    lens_covariance_of_pose,
     mounting_covariance,
     point_sigmas_m,
     pose_covariance,
@@ -23,6 +29,9 @@ from service.compute.planning.information import (
     view_information,
 )
 from service.compute.planning.next_best_view import CurrentInformation, ViewGain, next_best_views
+from service.compute.registration.identification.identity import Assignment
+from service.compute.registration.settings import CommonErrors, RegistrationSettings
+from service.compute.registration.solve import register
 from service.compute.scene import ScanSpheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
@@ -55,6 +64,35 @@ def test_the_predicted_covariance_is_that_of_many_repetitions() -> None:
     spread = np.cov(np.array(answers).T)
     assert np.sqrt(np.trace(spread[:3, :3]) / np.trace(predicted[:3, :3])) == pytest.approx(1.0, abs=0.15)
     assert np.sqrt(np.trace(spread[3:, 3:]) / np.trace(predicted[3:, 3:])) == pytest.approx(1.0, abs=0.2)
+
+
+def test_the_calibrations_share_is_how_far_a_wrong_focal_length_moves_the_scan() -> None:
+    share = 1e-3
+    made = dataclasses.replace(scene(6, seed=3), camera=CameraModel(1536, 1024, 1200.0, 1200.0, 768.0, 512.0))
+    centre = apply(made.T_world_scan, CENTRE_M)
+
+    def through_wrong_lens(outline: SphereOutline) -> SphereOutline:
+        axis = outline.cone.axis / [1 + share, 1 + share, 1.0]
+        cone = Cone(axis / np.linalg.norm(axis), outline.cone.half_angle_rad / (1 + share))
+        return dataclasses.replace(outline, cone=cone)
+
+    found = [exact_outlines(made, i, SPHERES_M, 0.02, seed=1) for i in range(6)]
+    assignments = [
+        Assignment(dict(enumerate(which)), inverse(T) @ made.T_world_scan)
+        for (_, which), T in zip(found, made.T_world_camera, strict=True)
+    ]
+    solved = register(
+        [tuple(map(through_wrong_lens, outlines)) for outlines, _ in found],
+        assignments,
+        made.images,
+        ScanSpheres(SPHERES_M, RADIUS_M),
+        RegistrationSettings(pose_covariance="exact", robust=False, common_errors=CommonErrors(1e-5, 1e-5, 1e-5)),
+    )
+    moved = np.linalg.norm(apply(solved.T_world_scan, CENTRE_M) - centre)
+    error = share * np.array([made.camera.fx, made.camera.fy, 0.0, 0.0])
+    views = zip((v.information for v in informations(made)), made.T_world_camera, strict=True)
+    predicted = lens_covariance_of_pose(views, made.camera, np.outer(error, error), centre)
+    assert np.sqrt(np.trace(predicted[:3, :3])) == pytest.approx(moved, rel=0.25)
 
 
 def test_the_scatter_of_the_views_shows_how_much_the_arm_errs() -> None:

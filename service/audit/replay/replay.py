@@ -26,7 +26,7 @@ from service.audit.replay.scratch import ScratchStore
 from service.core.errors import ConfigurationError, IntegrityError, OrthocaptureError
 from service.core.gates.verdict import evaluate_gates
 from service.core.jobs.references import jobs_of, resolve
-from service.core.records.events import ArtefactRef, JobFinished, SessionStarted
+from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished, SessionStarted
 from service.core.run.state import JobState
 from service.jobs import job_kinds
 from service.runner.software import software_versions
@@ -155,6 +155,7 @@ def _replay_job(
         attempt=job.attempt,
         label=str(job.arguments.get("poses", "")),
         verdict="not_replayed",
+        computed_by=job_kinds()[job.kind].other_numbers(_version(run, job)),
     )
     started_s = time.monotonic()
     try:
@@ -205,6 +206,12 @@ def _finished(run: RecordedRun, job: JobState) -> JobFinished:
     """The event whose result counts: the first one, when a second worker finished it too."""
     events = (event.payload for event in run.events)
     return next(p for p in events if isinstance(p, JobFinished) and p.job == job.job)
+
+
+def _version(run: RecordedRun, job: JobState) -> int:
+    """The version of the computation that was enqueued."""
+    events = (event.payload for event in run.events)
+    return next(p.version for p in events if isinstance(p, JobEnqueued) and p.job == job.job)
 
 
 def _as_recorded(recorded: JobFinished, answer: JobAnswer) -> JobFinished:

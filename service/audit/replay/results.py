@@ -48,6 +48,7 @@ class JobReplay:
     artefacts: tuple[ArtefactReplay, ...] = ()
     duration_s: float = 0.0
     error: str = ""  # why it could not be replayed
+    computed_by: str = ""  # the version that computed it, in words, if this program's gives other numbers
 
     @property
     def differences(self) -> tuple[Difference, ...]:

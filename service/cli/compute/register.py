@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json as json_module
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
+from rich.markup import escape
 
 from drivers.meshes.mesh_file import MeshUnit
 from service.cli.common import (
@@ -24,15 +25,19 @@ from service.cli.common import (
     tell_left_out,
 )
 from service.cli.compute.spheres import SeedsOption, spheres_of
+from service.compute.camera_covariance import read_camera_covariance
+from service.compute.evaluation.control_spheres import LEAST_SHARE, MOST_WORST_MM, ExpectedNearby
 from service.compute.images.folder import image_folder
 from service.compute.markers.detectors import options_for
 from service.compute.markers.grounded.detector import GroundedDetector
 from service.compute.markers.grounded.weights import VARIABLE, weights_in
+from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.image_files import (
     DetectFile,
     LocatedOutlines,
     detect_all,
     locate_outlines,
+    search_nearby,
     searched_whole,
 )
 from service.compute.markers.search.paper_files import detect_file_by_masks, read_boxes
@@ -41,9 +46,13 @@ from service.compute.poses.files.camera_files import read_camera_json, read_sphe
 from service.compute.poses.files.pose_files import posed_images
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ConfigurationError
+from service.core.gates.verdict import describe_judged, judge
 from service.core.geometry import Array
+from service.core.protocol.models import Gate
+from service.core.records.events import GateVerdict
 from service.core.units import metres, mm
 
+_MOST_MM = 0.35  # the paper's mean radial error
 DetectorName = Literal["classical", "paper", "grounded", "vote"]
 
 
@@ -113,10 +122,14 @@ def register_command(
     strict: StrictOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Register posed images with a scan by the spheres visible in both, and report the accuracy."""
+    """Register posed images with a scan by the spheres visible in both, and report the accuracy.
+
+    The exit status is 0 if the figures are within their limits and nothing in the inputs contradicts the rest, else
+    1; the result file says which.
+    """
     with reporting_errors(json):
         require_writable(out)
-        model = read_camera_json(camera)
+        model, stated = read_camera_json(camera), read_camera_covariance(camera)
         folder = image_folder(images, size=(model.width, model.height), strict=strict)
         known, folder = posed_images(poses, folder, images, strict=strict)
         files = list(folder.files)
@@ -140,32 +153,78 @@ def register_command(
                 searchers = 1 if detector in ("grounded", "vote") else processes
                 located = searched_whole(detect_all(files, model, options, searchers, show, detect=detect))
             else:
-                located = locate_outlines(files, posed, scanned, options=options, workers=processes, progress=show)
-        result = register_images(located.outlines, posed, scanned, assignments=located.assignments)
+                # Control spheres take no part in choosing outlines: they are searched for once the poses are known.
+                chosen = ScanSpheres(registration_m, radius_m)
+                located = locate_outlines(files, posed, chosen, options=options, workers=processes, progress=show)
+
+            def search(expected: ExpectedNearby) -> Sequence[Sequence[SphereOutline]]:
+                tasks = [(files[i], around) for i, around in expected]
+                told = partial(progress, "control spheres")
+                return search_nearby(tasks, model, options, min(processes, len(tasks)), told)
+
+            result = register_images(
+                located.outlines,
+                posed,
+                scanned,
+                assignments=located.assignments,
+                search=search,
+                lens_covariance=None if stated is None else stated.of_lens(),
+            )
+        verdicts = judge(_gates(result), result.measures())
+        passed = all(verdict.passed for verdict in verdicts)
         record = result.as_json(model)
+        record["verdict"] = "passed" if passed else "not passed"
+        record["gates"] = [verdict.model_dump(mode="json") for verdict in verdicts]
         record["spheres_mm"] = {"registration": mm(registration_m).tolist(), "control": mm(control_m).tolist()}
-        record["left_out"] = folder.left_out
+        record["left_out"] = folder.left_out | {names[i]: why for i, why in result.left_out.items()}
         record["search"] = _search(located, names)
         record["detector"] = {"name": detector, "weights_sha256": found_by}
         out.write_text(json_module.dumps(record, indent=1), encoding="utf-8")
         if json:
             print_json(record)
-            return
-        _tell(result, record)
-        console.print(f"written: {out}")
+        else:
+            _tell(result, record, verdicts)
+            console.print(f"written: {out}")
+        if not passed:
+            raise typer.Exit(1)
 
 
-def _tell(result: PipelineResult, record: dict[str, Any]) -> None:
+def _gates(result: PipelineResult) -> list[Gate]:
+    """The limits of a registration: those of the shipped protocols' evaluation, and that nothing contradicts."""
+    gates = [
+        Gate(measure="contradictions", max=0, unit="", why="inputs that contradict one another give no registration"),
+        Gate(measure="predicted_error_mm", max=_MOST_MM, unit="mm", why="the paper's figure"),
+    ]
+    if result.controls is None:
+        return gates
+    return [
+        *gates,
+        Gate(measure="best_mean_radial_error_mm", max=_MOST_MM, unit="mm", why="the paper's figure"),
+        Gate(measure="worst_control_sphere_mm", max=MOST_WORST_MM, unit="mm", why="a mean hides one that was moved"),
+        Gate(measure="control_outlines_share", min=LEAST_SHARE, unit="", why="what no image shows confirms nothing"),
+    ]
+
+
+def _tell(result: PipelineResult, record: dict[str, Any], verdicts: Sequence[GateVerdict]) -> None:
     console.print(
         f"{record['n_images']} images, {len(result.markers)} spheres, {result.registration.rms_px:.3f} px rms, "
         f"predicted error at their centre {record['predicted_error_mm']:.3f} mm"
     )
-    if result.evaluation is not None:
-        evaluation = result.evaluation
+    controls = result.controls
+    if controls is not None and result.evaluation is not None:
         console.print(
-            f"control spheres: {evaluation.mean_radial_error_mm:.3f} mm mean radial error, "
-            f"{evaluation.mean_reprojection_error_px:.2f} px mean reprojection error"
+            f"control spheres: {result.evaluation.mean_radial_error_mm:.3f} mm mean radial error, "
+            f"{result.evaluation.mean_reprojection_error_px:.2f} px mean reprojection error, worst sphere "
+            f"{controls.worst_mm or 0.0:.3f} mm; {controls.measured} of {len(controls.spheres)} measured"
         )
+    for one in result.findings:
+        console.print(f"[bold]{escape(one.what)}.[/] {escape(one.remedy)}.")
+    for text in () if controls is None else controls.findings:
+        console.print(f"[bold]{escape(text[0].upper() + text[1:])}.[/]")
+    outside = [verdict for verdict in verdicts if not verdict.passed]
+    for verdict in outside:
+        console.print(f"outside its limit: {escape(describe_judged(verdict))}")
+    console.print("[bold red]not passed[/]" if outside else "[bold green]passed[/]")
 
 
 def _file_detector(

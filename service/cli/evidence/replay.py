@@ -125,7 +125,7 @@ def _print(report: ReplayReport) -> None:
     _print_versions(report)
     _print_table(report)
     for job in report.jobs:
-        if job.error or job.differences:
+        if job.error or job.differences or job.computed_by:
             _print_job(job)
     _print_gates(report)
     for drift in report.drifts:
@@ -174,8 +174,8 @@ def _print_gates(report: ReplayReport) -> None:
 
 def _print_job(job: JobReplay) -> None:
     console.print(f"\n[bold]{escape(f'{job.step}: {job.kind} {job.label}'.strip())}[/]")
-    if job.error:
-        console.print(f"  {escape(job.error)}")
+    for text in filter(None, (job.computed_by, job.error)):
+        console.print(f"  {escape(text)}")
     shown: Sequence[Difference] = job.differences[:_SHOWN]
     for d in shown:
         off = [] if d.difference is None else [f"difference {d.difference:.3g} {d.unit}".strip()]

@@ -23,6 +23,7 @@ _HOW = {
     "outlines": "covariances of the outlines from their edge points, scaled to the residuals",
     "common": "errors that all outlines of the capture may share (edge bias)",
     "intrinsics": "covariance of the camera calibration, poses fixed (poses from the same images absorb part)",
+    "unexplained": "how far the scan moves if the errors that all outlines share are left free, and bias by blur",
     "outlines and poses": "covariances of the outlines, scaled to the residuals, each camera pose refined by its own",
     "poses": "covariance of the camera poses, their scatter estimated from the spheres' residuals",
     "spheres": "covariances of the sphere centres in the scan",

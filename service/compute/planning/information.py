@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.observed_cones import ObservedCones
 from service.compute.markers.records import SphereOutline
@@ -147,6 +148,33 @@ def mounting_covariance(
     d = np.sqrt(np.diag(normal))
     M = np.linalg.solve(normal / np.outer(d, d), moved / d[:, None]) / d[:, None]
     return M @ covariance @ M.T
+
+
+def lens_covariance_of_pose(
+    views: Iterable[tuple[Array, Transform]], camera: CameraModel, covariance: Array, centre_m: Array
+) -> Array:
+    """Covariance (6, 6) of the scan's pose due to the uncertain calibration, which all views share.
+
+    A focal length too long by a share puts the scan nearer by this share of its distance, and a principal point that
+    is off puts it aside.
+
+    Args:
+        views: information (6, 6) and T_base_camera of each; together they must determine the pose.
+        camera: intrinsics.
+        covariance: (4, 4) of fx, fy, cx, cy or (8, 8) with the distortion, which counts for nothing at the centre.
+        centre_m: (3,) base frame.
+    """
+    normal, moved = np.zeros((6, 6)), np.zeros((6, 4))
+    for information, T_base_camera in views:
+        c = apply(inverse(T_base_camera), centre_m)
+        aside = np.zeros((3, 4))
+        aside[2, :2] = -c[2] / (2 * np.array([camera.fx, camera.fy]))
+        aside[:2, 2:] = -c[2] * np.diag([1 / camera.fx, 1 / camera.fy])
+        normal += information
+        moved += information[:, :3] @ T_base_camera[:3, :3] @ aside
+    d = np.sqrt(np.diag(normal))
+    M = np.linalg.solve(normal / np.outer(d, d), moved / d[:, None]) / d[:, None]
+    return M @ covariance[:4, :4] @ M.T
 
 
 def point_sigmas_m(covariance: Array, points_m: Array) -> Array:

@@ -50,8 +50,8 @@ class RegistrationResult:
     multiplied by `scale`. `T_world_group[g]` maps base frame g to the world. `covariance` is (6, 6), or (7, 7) with
     scale, of (x, y, z in metres, rotation vector in radians[, ln scale]) of a perturbation exp(w) R, t + d in world
     axes. It is the sum of `components`: "outlines" (their own noise), "common" (errors shared by all outlines, and
-    the intrinsics if their covariance was given), "poses", "spheres" (errors of the scan's centres). `rms_px` is over
-    the outlines that were not excluded, with the camera poses as given.
+    the intrinsics if their covariance was given), "poses", "spheres" (errors of the scan's centres), and those that
+    `register_images` adds. `rms_px` is over the outlines that were not excluded, with the camera poses as given.
     """
 
     T_world_scan: Transform
@@ -122,8 +122,20 @@ class RegistrationResult:
 
     def covariance_at_m2(self, point_scan_m: Array) -> Array:
         """(3, 3) covariance in m², world axes, of the position of a point (3,) of the scan."""
+        return self._at_m2(self.covariance, point_scan_m)
+
+    def part_at_m2(self, component: str, point_scan_m: Array) -> Array:
+        """(3, 3) the part of `covariance_at_m2` that a component causes."""
+        return self._at_m2(self.components[component], point_scan_m)
+
+    def _at_m2(self, covariance: Array, point_scan_m: Array) -> Array:
         J = np.hstack([np.eye(3), -skew(self.T_world_scan[:3, :3] @ point_scan_m)])
-        return np.asarray(J @ self.covariance[:6, :6] @ J.T, dtype=np.float64)
+        return np.asarray(J @ covariance[:6, :6] @ J.T, dtype=np.float64)
+
+    @property
+    def solution_covariance(self) -> Array:
+        """(6, 6) covariance of T_world_scan by the solution alone, without components added to it."""
+        return self.solution.covariance[:6, :6]
 
 
 def _variance_m2(turned: Array, covariance: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Literal
 
 from service.core.protocol.models import Gate, Step
@@ -38,11 +38,17 @@ def evaluate_gates(
         uncertainties: measure → uncertainty, where one is known.
     """
     gates = [gate for gate in step.gates if gate.unless_skipped is None or gate.unless_skipped not in skipped]
-    verdicts = tuple(
-        _verdict(gate, measures.get(gate.measure), (uncertainties or {}).get(gate.measure)) for gate in gates
-    )
+    verdicts = judge(gates, measures, uncertainties)
     passed = all(verdict.passed for verdict in verdicts)
     return GatesEvaluated(step=step.id, attempt=attempt, verdicts=verdicts, passed=passed)
+
+
+def judge(
+    gates: Iterable[Gate], measures: Mapping[str, float], uncertainties: Mapping[str, Uncertainty] | None = None
+) -> tuple[GateVerdict, ...]:
+    """Judge measures by gates, as `evaluate_gates` judges those of a step."""
+    known = uncertainties or {}
+    return tuple(_verdict(gate, measures.get(gate.measure), known.get(gate.measure)) for gate in gates)
 
 
 def _verdict(gate: Gate, value: float | None, known: Uncertainty | None) -> GateVerdict:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from service.jobs.kind import JobKind, JobRecord
-from service.jobs.records import Camera, Hash, Limits, Matrix, Point
+from service.jobs.records import Camera, Hash, Limits, Matrix, ParameterCovariance, Point
 
 
 class HeldImage(JobRecord):
@@ -47,7 +47,10 @@ class HeldArguments(HemisphereArguments):
 
 
 class SpecimenArguments(HemisphereArguments):
-    """What the jobs on all images of the specimen share: the camera, the spheres and the limits."""
+    """What the jobs on all images of the specimen share: the camera, the spheres and the limits.
+
+    Jobs of earlier versions predicted errors without those of the calibration and of the scan.
+    """
 
     camera: Camera
     spheres_m: tuple[Point, ...]
@@ -57,6 +60,8 @@ class SpecimenArguments(HemisphereArguments):
     limit_m: float
     min_coverage: float
     colour: str | None = None
+    intrinsics_covariance: Matrix | ParameterCovariance | None = None
+    scan_sigma_m: float = 0.0
 
 
 class Arguments(HeldArguments, SpecimenArguments):
@@ -95,6 +100,7 @@ KIND = JobKind(
     answer=Answer,
     compute="service.worker.capture.hand_view:hand_view",
     words="images taken by hand",
+    version=3,
     order=33,
     replayed=False,
 )

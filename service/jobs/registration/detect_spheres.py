@@ -50,5 +50,6 @@ KIND = JobKind(
     answer=NoAnswer,
     compute="service.worker.registration.outlines:detect_spheres",
     words="spheres in images",
+    version=3,
     order=60,
 )

@@ -10,7 +10,7 @@ from service.jobs.registration.register import Registration
 
 
 class Arguments(JobRecord):
-    """Control captures, registrations by name, and the spheres as scanner and CT measured them."""
+    """Control captures, registrations by name, and the spheres as scanner and CT measured them; their colour."""
 
     images: tuple[PosedPhotograph, ...]
     registrations: dict[str, Registration]
@@ -18,6 +18,31 @@ class Arguments(JobRecord):
     control_scan: SpheresFound | None = None
     ct: SpheresFound | None = None
     radius_m: float
+    colour: str | None = None
+
+
+class ControlSphere(JobRecord):
+    """What one control sphere shows of a registration.
+
+    Attributes:
+        index: number in the list of control spheres, from 0.
+        expected: number of images that should show it.
+        measured: number of images in which it was measured.
+        radial_error_mm: mean over its outlines; None if it was not measured.
+        reprojection_error_px: mean over its outlines.
+        displacement_mm: from where scan and registration put it to where the images see it.
+        displacement_sigma_mm: of the displacement, as far as the outlines determine it.
+        finding: what is wrong, in words; empty if nothing is.
+    """
+
+    index: int
+    expected: int
+    measured: int
+    radial_error_mm: float | None = None
+    reprojection_error_px: float | None = None
+    displacement_mm: float | None = None
+    displacement_sigma_mm: float | None = None
+    finding: str = ""
 
 
 class Row(JobRecord):
@@ -35,6 +60,7 @@ class Row(JobRecord):
         mean_reprojection_error_px: as the paper defines it.
         evaluated_on: `control spheres`, or `each sphere left out`.
         control_outlines: number of outlines compared.
+        control_spheres: each control sphere by itself; empty in jobs of earlier versions.
         late: when the row arrived, in words, if that was after the evaluation.
     """
 
@@ -49,7 +75,13 @@ class Row(JobRecord):
     mean_reprojection_error_px: float | None = None
     evaluated_on: str = "control spheres"
     control_outlines: int = 0
+    control_spheres: tuple[ControlSphere, ...] = ()
     late: str = ""
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What is wrong with control spheres, in words."""
+        return tuple(sphere.finding for sphere in self.control_spheres if sphere.finding)
 
 
 class Contribution(JobRecord):
@@ -94,5 +126,6 @@ KIND = JobKind(
     answer=Answer,
     compute="service.worker.registration.evaluate:evaluate",
     words="evaluation",
+    version=3,
     order=70,
 )

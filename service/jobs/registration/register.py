@@ -36,6 +36,36 @@ class LeaveOneOut(JobRecord):
     spheres: dict[str, tuple[float | int, ...]]
 
 
+class Contradiction(JobRecord):
+    """A contradiction between the inputs, in words, and what to do; `refuses`: before the result is used."""
+
+    kind: str
+    what: str
+    remedy: str
+    refuses: bool = False
+
+    @property
+    def text(self) -> str:
+        """Both parts, as a line of a report."""
+        return f"{self.what}. {self.remedy}"
+
+
+class CommonError(JobRecord):
+    """An error that all outlines share, as they have it: in px, or for `focal_x` and `focal_y` relative.
+
+    Attributes:
+        name: of the error.
+        value: as a fit that leaves it free has it.
+        sigma: of the value.
+        expected: standard deviation by which it may differ from zero.
+    """
+
+    name: str
+    value: float
+    sigma: float
+    expected: float
+
+
 class Registration(JobRecord):
     """A registration.
 
@@ -57,6 +87,10 @@ class Registration(JobRecord):
         leave_one_out: None if a station sees too few spheres for it.
         pose_sigma_m: of a single pose of the arm, along each axis, before the outlines refined it; None: not stated.
         pose_sigma_rad: of its rotation vector.
+        findings: contradictions between the inputs; empty in jobs of earlier versions, as the next three.
+        left_out: images that contradict the others, and why; they have no pose.
+        common_errors: of the outlines, whose part beyond the model is the component `unexplained`.
+        blur_px: of the outlines' edges, in the median.
     """
 
     poses: str
@@ -76,6 +110,10 @@ class Registration(JobRecord):
     leave_one_out: LeaveOneOut | None = None
     pose_sigma_m: float | None = None
     pose_sigma_rad: float | None = None
+    findings: tuple[Contradiction, ...] = ()
+    left_out: dict[str, str] = Field(default_factory=dict[str, str])
+    common_errors: tuple[CommonError, ...] = ()
+    blur_px: float | None = None
 
 
 class Registrations(JobRecord):
@@ -91,5 +129,6 @@ KIND = JobKind(
     answer=Registration,
     compute="service.worker.registration.register:register",
     words="registration",
+    version=3,
     order=61,
 )

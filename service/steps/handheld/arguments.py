@@ -17,7 +17,7 @@ from service.jobs.surfaces import layout
 from service.steps.capture.live_numbers import COVERAGE, ERROR
 from service.steps.context import StepContext
 from service.steps.handheld.records import Params
-from service.steps.inputs import earlier_answer
+from service.steps.inputs import earlier_answer, intrinsics_covariance_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,11 +109,17 @@ def _of_specimen(context: StepContext, params: Params) -> CommonArguments:
         pose_sigma_rad=rad_of_mrad(params.pose_sigma_mrad),
         limit_m=metres(error.max if error and error.max is not None else 0.35),
         min_coverage=covers.min if covers and covers.min is not None else 0.0,
+        scan_sigma_m=metres(params.scan_sigma_mm),
     )
+    references = {"camera": calibration.reference("camera"), "spheres_m": spheres_from}
+    lens = intrinsics_covariance_of(calibration)
+    if lens is not None:
+        values = values.model_copy(update={"intrinsics_covariance": lens})
+        references["intrinsics_covariance"] = calibration.reference("details/intrinsics/covariance")
     colour = context.protocol.spheres.colour
     if colour is not None:  # a field that is not set is not recorded
         values = values.model_copy(update={"colour": colour})
-    return CommonArguments(values, {"camera": calibration.reference("camera"), "spheres_m": spheres_from})
+    return CommonArguments(values, references)
 
 
 def _spheres(context: StepContext, params: Params) -> tuple[tuple[Point, ...], bool, Reference | None]:

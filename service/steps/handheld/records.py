@@ -58,6 +58,7 @@ class Params(StepParams):
     coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
     pose_sigma_mm: Annotated[float, Field(gt=0)] = 0.05  # expected position error of structure from motion
     pose_sigma_mrad: Annotated[float, Field(gt=0)] = 0.1  # expected rotation error of structure from motion
+    scan_sigma_mm: Annotated[float, Field(ge=0)] = 0.03  # expected error of the scan's own points, for predictions
     wait_s: Annotated[float, Field(gt=0)] = 600.0  # longest wait for the next image before the step stops
 
     @property

@@ -10,12 +10,14 @@ import numpy as np
 from service.compute.capture.live import expected_spheres
 from service.compute.planning.coverage import covered_fraction
 from service.compute.planning.hand_guidance import WantedView, covered, nearest, place_at, words
-from service.compute.planning.information import predicted_information
+from service.compute.planning.information import lens_covariance_of_pose, predicted_information
 from service.compute.planning.next_best_view import CurrentInformation, ViewGain, next_best_views
-from service.core.geometry import Transform, inverse
+from service.compute.registration.settings import EXPECTED_COMMON_ERRORS
+from service.core.geometry import Array, Transform, inverse
 from service.core.units import mm
 from service.jobs.capture import hand_view as job
 from service.jobs.capture.hand_view import HeldArguments, PlannedPlace
+from service.worker.camera import lens_covariance
 from service.worker.capture.held_images import HandheldImage
 from service.worker.capture.scene import CaptureScene
 
@@ -104,7 +106,23 @@ class HandGuide:
             self.scene.targets_m() - self.scene.spheres_m.mean(axis=0),
             seen.sum(axis=0),
             arguments.limits.min_views,
+            self._shared(arguments),
         )
+
+    def _shared(self, arguments: job.Arguments) -> Array:
+        """(6, 6) covariance that all images share, as the error budget counts it: edges, calibration and scan."""
+        scene, centre_m = self.scene, self.scene.spheres_m.mean(axis=0)
+        placed = [(v.information, v.T_scene_camera) for v in self.good if v.T_scene_camera is not None]
+        if not placed:
+            return np.zeros((6, 6))
+        distance_m = float(np.mean([np.linalg.norm(T[:3, 3] - centre_m) for _, T in placed]))
+        light_m = EXPECTED_COMMON_ERRORS.light_px * distance_m / scene.camera.fx
+        shared = np.zeros((6, 6))
+        shared[:3, :3] = (light_m**2 + arguments.scan_sigma_m**2 / 3) * np.eye(3)
+        lens = lens_covariance(arguments.intrinsics_covariance)
+        if lens is None or not np.all(np.diag(sum((i for i, _ in placed), np.zeros((6, 6)))) > 0):
+            return shared
+        return shared + lens_covariance_of_pose(placed, scene.camera, lens, centre_m)
 
     def _most_helpful(self, arguments: job.Arguments, T_scene_level: Transform) -> WantedView | None:
         """The most helpful view of a denser hemisphere, once every planned place has its image."""

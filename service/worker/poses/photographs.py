@@ -15,21 +15,28 @@ import cv2
 from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_image
 from service.compute.images.resolution import resample
+from service.jobs.kind import JobRecord
 from service.jobs.records import ImageFile, ImagesCamera
 from service.worker.camera import camera_reduced, camera_used
 from service.worker.job import JobContext
 
 _A = TypeVar("_A", bound=ImagesCamera)
+_J = TypeVar("_J", bound=JobRecord)
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 
 def photographs(context: JobContext[_A], images: Sequence[ImageFile]) -> list[Path]:
     """One file per image: the original, or a reduced copy if the job asks for it."""
+    return photographs_at(context, images, camera_used(context.arguments), camera_reduced(context.arguments))
+
+
+def photographs_at(
+    context: JobContext[_J], images: Sequence[ImageFile], camera: CameraModel, full: CameraModel | None
+) -> list[Path]:
+    """One file per image at a camera's size: the original, or a copy reduced from that of the `full` camera."""
     originals = [context.input(image.sha256) for image in images]
-    full = camera_reduced(context.arguments)
     if full is None:
         return originals
-    camera = camera_used(context.arguments)
     folder = context.scratch / f"{camera.width}x{camera.height}"
     folder.mkdir(exist_ok=True)
     copies = [folder / f"{image.viewpoint}.jpg" for image in images]

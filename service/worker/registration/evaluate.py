@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache, partial
 from typing import Any
 
@@ -11,8 +12,8 @@ import cv2
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.evaluation.accuracy import evaluate as evaluate_controls
 from service.compute.evaluation.closure import Alignment, compare_shapes, locate_in_images
+from service.compute.evaluation.control_spheres import ControlEvaluation, ExpectedNearby, evaluate_controls
 from service.compute.evaluation.error_budget import (
     CONTROL_SPHERES,
     ErrorBudget,
@@ -24,7 +25,10 @@ from service.compute.evaluation.error_budget import (
 )
 from service.compute.images.files import read_image
 from service.compute.images.resolution import resample
+from service.compute.markers.cones import Cone
+from service.compute.markers.detectors import options_for
 from service.compute.markers.records import SphereOutline
+from service.compute.markers.search.image_files import search_nearby
 from service.compute.overlay import draw_overlay
 from service.compute.pipeline import Detection
 from service.compute.registration.identification.identity import Assignment
@@ -41,9 +45,10 @@ from service.jobs.registration import evaluate as job
 from service.jobs.registration.register import Registration
 from service.worker.camera import camera_of
 from service.worker.job import JobAnswer, JobContext
+from service.worker.poses.photographs import photographs_at
 from service.worker.registration.outlines import read_outlines
 
-_COMMON = ("common", "intrinsics")  # components that move all spheres equally
+_COMMON = ("common", "intrinsics", "unexplained")  # components that move all spheres equally
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +71,7 @@ class _Registered:
     outlines: Sequence[Sequence[SphereOutline]]
     T_scan_camera: Array
     markers: Sequence[Assignment]
-    controls: Sequence[Assignment]
+    controls: ControlEvaluation
 
 
 def evaluate(context: JobContext[job.Arguments]) -> JobAnswer:
@@ -78,11 +83,14 @@ def evaluate(context: JobContext[job.Arguments]) -> JobAnswer:
     budgets: dict[str, job.ErrorBudget] = {}
     pictures: dict[str, Callable[[], list[ArtefactRef]]] = {}
     read = cache(context.input_json)  # registrations share their file of outlines
+    searched = _Searched(context)
+    controls: dict[str, ControlEvaluation] = {}
     for name, record in arguments.registrations.items():
-        registered = _registered(arguments, name, record, measured, read)
+        registered = _registered(arguments, name, record, measured, read, searched)
+        controls[name] = registered.controls
         budget = _budget(registered, measured, radius_m)
         budgets[name] = budget_record(budget)
-        table.append(_row(registered, budget, _errors(registered, measured, radius_m)))
+        table.append(_row(registered, budget, _errors(registered, measured)))
         pictures[name] = partial(_overlays, context, registered, measured, radius_m)
     best = best_row(table)
     # Overlays of the best source and of the reported robot poses, to show the difference.
@@ -95,7 +103,7 @@ def evaluate(context: JobContext[job.Arguments]) -> JobAnswer:
     numbers["best_predicted_error_mm"] = best.predicted_error_mm
     numbers["control_normalised_chi2"] = best.control_normalised_chi2
     measures = {name: number for name, number in numbers.items() if number is not None}
-    measures["control_spheres"] = float(len(measured.control.centres_m))
+    measures |= controls[best.poses].measures() if len(measured.control.centres_m) else {"control_spheres": 0.0}
     answer = job.Answer(table=tuple(table), budgets=budgets)
     refs.append(context.keep_json(answer.plain()["table"], kind="evaluation", name="evaluation.json"))
     refs.append(context.keep_json(answer.plain()["budgets"], kind="error_budget", name="error_budget.json"))
@@ -140,6 +148,7 @@ def _row(registered: _Registered, budget: ErrorBudget, errors: _Errors) -> job.R
         mean_reprojection_error_px=errors.mean_reprojection_px,
         evaluated_on=errors.evaluated_on,
         control_outlines=errors.control_outlines,
+        control_spheres=tuple(job.ControlSphere(**asdict(sphere)) for sphere in registered.controls.spheres),
     )
 
 
@@ -153,7 +162,7 @@ class _Errors:
     control_outlines: int
 
 
-def _errors(registered: _Registered, measured: _ScanAndCtSpheres, radius_m: float) -> _Errors:
+def _errors(registered: _Registered, measured: _ScanAndCtSpheres) -> _Errors:
     """The paper's two errors: on the control spheres or, without any, on each sphere predicted from the others."""
     if not len(measured.control.centres_m):
         left_out = registered.record.leave_one_out
@@ -163,12 +172,13 @@ def _errors(registered: _Registered, measured: _ScanAndCtSpheres, radius_m: floa
                 remedy="Place control spheres, or more registration spheres",
             )
         return _Errors(left_out.mean_radial_error_mm, left_out.mean_reprojection_error_px, "each sphere left out", 0)
-    answer = evaluate_controls(
-        registered.outlines,
-        registered.controls,
-        PosedImages(registered.T_scan_camera, registered.camera),
-        ScanSpheres(measured.control.centres_m, radius_m),
-    )
+    answer = registered.controls.means
+    if answer is None:
+        raise ComputeError(
+            f"no control sphere was found in any image; {'; '.join(registered.controls.findings)}",
+            where=registered.name,
+            remedy="Capture control images before the spheres are removed, and check the control scan",
+        )
     return _Errors(
         answer.mean_radial_error_mm, answer.mean_reprojection_error_px, "control spheres", len(answer.errors)
     )
@@ -226,6 +236,7 @@ def _registered(
     record: Registration,
     measured: _ScanAndCtSpheres,
     read: Callable[[Hash], Any],
+    searched: _Searched,
 ) -> _Registered:
     camera = camera_of(record.camera)
     cameras = record.T_scan_camera
@@ -234,15 +245,65 @@ def _registered(
         raise ComputeError(f"registration {name!r} has a pose for none of the control images")
     outlines = read_outlines(read, record.outlines, images, camera)
     T_scan_camera = np.array([cameras[image.viewpoint] for image in images])
-    n = len(measured.scan.centres_m)
-    centres = np.vstack([measured.scan.centres_m, measured.control.centres_m])
-    markers: list[Assignment] = []
-    controls: list[Assignment] = []
-    for mine, T in zip(outlines, T_scan_camera, strict=True):
-        pairs = paired(mine, inverse(T), centres, arguments.radius_m, camera, CONTROL_GATE).items()
-        markers.append(Assignment({outline: m for outline, m in pairs if m < n}, inverse(T)))
-        controls.append(Assignment({outline: m - n for outline, m in pairs if m >= n}, inverse(T)))
-    return _Registered(name, record, camera, images, outlines, T_scan_camera, markers, controls)
+    found = [
+        paired(mine, inverse(T), measured.scan.centres_m, arguments.radius_m, camera, CONTROL_GATE)
+        for mine, T in zip(outlines, T_scan_camera, strict=True)
+    ]
+    markers = [Assignment(pairs, inverse(T)) for pairs, T in zip(found, T_scan_camera, strict=True)]
+    steps = sorted({image.step for image in images})
+    controls = evaluate_controls(
+        outlines,
+        markers,
+        PosedImages(T_scan_camera, camera),
+        ScanSpheres(measured.scan.centres_m, arguments.radius_m, control_m=measured.control.centres_m),
+        captures=[steps.index(image.step) for image in images],
+        search=partial(searched.around, images, camera, record),
+    )
+    return _Registered(name, record, camera, images, controls.outlines, T_scan_camera, markers, controls)
+
+
+class _Searched:
+    """What searches of the photographs found around control spheres, which registrations share."""
+
+    def __init__(self, context: JobContext[job.Arguments]) -> None:
+        self._context = context
+        self._known: dict[tuple[str, int], list[tuple[Cone, float, tuple[SphereOutline, ...]]]] = {}
+
+    def around(
+        self, images: Sequence[PosedPhotograph], camera: CameraModel, record: Registration, expected: ExpectedNearby
+    ) -> list[tuple[SphereOutline, ...]]:
+        """The outlines in images, by index, around cones; photographs are read only where this was not searched."""
+        new: list[tuple[int, list[tuple[Cone, float]]]] = []
+        for i, around in expected:
+            known = self._known.setdefault((images[i].viewpoint, camera.width), [])
+            lacking = [one for one in around if not any(_covers(entry, *one) for entry in known)]
+            if lacking:
+                new.append((i, lacking))
+        if new:
+            context = self._context
+            full = None if record.full_camera is None else camera_of(record.full_camera)
+            files = photographs_at(context, [images[i] for i, _ in new], camera, full)
+            tasks = [(file, lacking) for file, (_, lacking) in zip(files, new, strict=True)]
+            found = search_nearby(
+                tasks,
+                camera,
+                options_for(context.arguments.colour),
+                min(len(tasks), os.cpu_count() or 1),
+                lambda done, total: context.progress("control spheres", done, total),
+            )
+            for (i, lacking), outlines in zip(new, found, strict=True):
+                known = self._known[images[i].viewpoint, camera.width]
+                known += [(cone, window_rad, outlines) for cone, window_rad in lacking]
+        return [
+            tuple(o for _, _, outlines in self._known[images[i].viewpoint, camera.width] for o in outlines)
+            for i, _ in expected
+        ]
+
+
+def _covers(entry: tuple[Cone, float, tuple[SphereOutline, ...]], cone: Cone, window_rad: float) -> bool:
+    """Whether an earlier search looked wherever one around a cone would."""
+    there, wide_rad, _ = entry
+    return window_rad + float(np.linalg.norm(there.axis - cone.axis)) < 1.2 * wide_rad
 
 
 def _budget(registered: _Registered, measured: _ScanAndCtSpheres, radius_m: float) -> ErrorBudget:
@@ -259,14 +320,7 @@ def _budget(registered: _Registered, measured: _ScanAndCtSpheres, radius_m: floa
     }
     # To locate a sphere takes three images; with fewer control images, two have to suffice.
     least = min(3, len(registered.images))
-    controls = locate_in_images(
-        registered.outlines,
-        registered.controls,
-        registered.T_scan_camera,
-        measured.control.centres_m,
-        radius_m,
-        least_images=least,
-    )
+    controls = {s: one for s, one in registered.controls.located.items() if one.n_images >= least}
     observations: list[Observation] = []
     if controls:
         own = [c.covariance for name, c in components.items() if name not in _COMMON] or [np.zeros((6, 6))]
@@ -293,7 +347,7 @@ def _overlays(
         first.setdefault(image.station, i)
     refs: list[ArtefactRef] = []
     for i in first.values():
-        markers, controls = registered.markers[i].markers, registered.controls[i].markers
+        markers, controls = registered.markers[i].markers, registered.controls.assignments[i].markers
         detections = [
             Detection(outline, markers.get(j), controls.get(j), None)
             for j, outline in enumerate(registered.outlines[i])

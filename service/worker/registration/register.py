@@ -5,18 +5,18 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
-from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.capture.located import poses_by_spheres
+from service.compute.contradictions.common_errors import UNEXPLAINED, added_covariance
 from service.compute.evaluation.accuracy import leave_one_out
 from service.compute.evaluation.closure import Alignment
 from service.compute.markers.records import SphereOutline
-from service.compute.pipeline import register_images
+from service.compute.pipeline import INTRINSICS, PipelineResult, register_images
 from service.compute.registration.camera_errors import camera_errors
 from service.compute.registration.identification.identity import identify
 from service.compute.registration.joint_poses import with_joint_pose_covariance
@@ -29,9 +29,9 @@ from service.core.records.events import ArtefactRef
 from service.core.units import mm
 from service.jobs.poses.hybrid import HybridModel
 from service.jobs.poses.structure_from_motion import ModelFile
-from service.jobs.records import ParameterCovariance, PosedPhotograph, has_poses, matrices, matrix
+from service.jobs.records import PosedPhotograph, has_poses, matrices, matrix
 from service.jobs.registration import register as job
-from service.worker.camera import camera_record, camera_reduced, camera_used
+from service.worker.camera import camera_record, camera_reduced, camera_used, lens_covariance
 from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.models import joint_pose_covariance
 from service.worker.poses.robot_poses import robot_camera_poses
@@ -51,21 +51,28 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
     if free and not images.located:
         images = images.locatable(spheres)
     posed = images.posed(metric=source in (*job.ARM, "spheres", "hybrid"))
-    solved = register_images(images.outlines, posed, spheres)
+    lens = None if arguments.reduced else lens_covariance(arguments.intrinsics_covariance)
+    solved = register_images(images.outlines, posed, spheres, calibrated=lens)
+    images = replace(images, left_out=dict(solved.left_out))
     answer = placing = solved.registration
-    again = partial(register_images, images.outlines, posed, spheres, assignments=solved.assignments)
+    again = partial(register_images, images.outlines, posed, spheres, assignments=solved.assignments, check=False)
     settings = RegistrationSettings(pose_covariance="free" if free else "estimate")
     if free:
         placing = again(settings).registration
     placed = _placed(context, images, answer, placing)
     components, judged = placed.components, placing
-    if (lens := _intrinsics_covariance(arguments)) is not None:
+    if UNEXPLAINED in answer.components:
+        components = components | {UNEXPLAINED: answer.components[UNEXPLAINED][:6, :6]}
+    if lens is not None:
         judged = again(replace(settings, intrinsics_covariance=lens)).registration
-        components = components | {"intrinsics": _added(placing, judged, refined=refined)}
+        both = [r.refined_covariance if refined else r.solution_covariance for r in (placing, judged)]
+        components = components | {INTRINSICS: added_covariance(*both)}
     covariance = np.sum(list(components.values()), axis=0)
     # Unless they are free, the poses of located images know every sphere: none is left out of them.
     left_out = None if images.located and not free else _leave_one_out(placing, refined=refined)
-    record = _record(arguments, images, answer, _Judged(placed, components, covariance, left_out))
+    record = _with_contradictions(
+        _record(arguments, images, answer, _Judged(placed, components, covariance, left_out)), images, solved
+    )
     alignment = Alignment(placed.T_world_scan, covariance)
     centre_m = np.array(arguments.spheres_m).mean(axis=0)
     measures = {
@@ -74,6 +81,8 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
         "markers": float(len(solved.markers)),
         "images": float(answer.n_images),
         "excluded_outlines": float(len(answer.excluded)),
+        "images_left_out": float(len(images.left_out)),
+        "contradictions": solved.measures()["contradictions"],
         "predicted_error_mm": mm(float(np.sqrt(np.trace(alignment.covariance_at_m2(centre_m[None])[0])))),
     }
     if left_out is not None:
@@ -81,15 +90,16 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
     kept = {**record.plain(), **_residuals(answer, images.names)}
     files = [context.keep_json(kept, kind="registration", name=f"{source}.json")]
     if arguments.state_pose_errors:
-        files.append(_kept_pose_errors(context, images.names, camera_errors(judged, refined=refined)))
+        files.append(_kept_pose_errors(context, images, camera_errors(judged, refined=refined)))
     return JobAnswer(measures, tuple(files), record)
 
 
-def _kept_pose_errors(context: JobContext[job.Arguments], names: Sequence[str], joint: Array) -> ArtefactRef:
+def _kept_pose_errors(context: JobContext[job.Arguments], images: _ImagesToRegister, joint: Array) -> ArtefactRef:
     """Store the joint covariance (6 N, 6 N) of T_scan_camera of the images that are placed, with their names."""
     placed = np.isfinite(np.diag(joint))
+    placed[[6 * i + k for i in images.left_out for k in range(6)]] = False
     buffer = io.BytesIO()
-    listed = json.dumps([name for name, stated in zip(names, placed[::6], strict=True) if stated])
+    listed = json.dumps([name for name, stated in zip(images.names, placed[::6], strict=True) if stated])
     np.savez(buffer, names=np.array(listed), covariance=joint[np.ix_(placed, placed)])
     return context.keep_bytes(
         buffer.getvalue(),
@@ -110,6 +120,7 @@ class _ImagesToRegister:
         camera: at the size of the images.
         outlines: of each image.
         located: whether the poses come from the spheres that are registered.
+        left_out: those that contradict the others, and why; they have no pose.
     """
 
     images: Sequence[PosedPhotograph]
@@ -118,6 +129,7 @@ class _ImagesToRegister:
     camera: CameraModel
     outlines: Sequence[Sequence[SphereOutline]]
     located: bool = False
+    left_out: Mapping[int, str] = field(default_factory=dict[int, str])
 
     @property
     def names(self) -> list[str]:
@@ -141,8 +153,8 @@ class _ImagesToRegister:
 
     def known(self, T_scan_camera: Array) -> dict[str, Transform]:
         """The poses that are known, by image."""
-        pairs = zip(self.names, T_scan_camera, strict=True)
-        return {name: T for name, T in pairs if np.isfinite(T).all()}
+        pairs = enumerate(zip(self.names, T_scan_camera, strict=True))
+        return {name: T for i, (name, T) in pairs if i not in self.left_out and np.isfinite(T).all()}
 
     def station(self, group: int) -> str:
         """The station whose images form a group."""
@@ -294,6 +306,25 @@ def _record(
     return record.model_copy(update=given)
 
 
+def _with_contradictions(
+    record: job.Registration, images: _ImagesToRegister, solved: PipelineResult
+) -> job.Registration:
+    """The record with what contradicts in the inputs."""
+    beyond = solved.beyond
+    found: dict[str, object] = {
+        "findings": tuple(job.Contradiction(**asdict(one)) for one in solved.findings),
+        "left_out": {images.names[i]: why for i, why in images.left_out.items()},
+    }
+    if beyond is not None:
+        errors = ((e.name, e.value, e.sigma, e.expected) for e in beyond.errors)
+        found["common_errors"] = tuple(
+            job.CommonError(name=name, value=value, sigma=sigma, expected=expected)
+            for name, value, sigma, expected in errors
+        )
+        found["blur_px"] = beyond.blur_px
+    return record.model_copy(update=found)
+
+
 def _leave_one_out(answer: RegistrationResult, *, refined: bool) -> job.LeaveOneOut | None:
     """Errors of each sphere predicted from the others; None if a station sees too few spheres for that."""
     try:
@@ -305,26 +336,6 @@ def _leave_one_out(answer: RegistrationResult, *, refined: bool) -> job.LeaveOne
         mean_reprojection_error_px=left_out.mean_reprojection_error_px,
         spheres={str(m): row for m, row in left_out.per_sphere().items()},
     )
-
-
-def _added(exact: RegistrationResult, uncertain: RegistrationResult, *, refined: bool) -> Array:
-    """(6, 6) What uncertain intrinsics add to the covariance with the poses held fixed; positive semidefinite."""
-    both = [r.refined_covariance if refined else r.covariance[:6, :6] for r in (exact, uncertain)]
-    unit = np.sqrt(np.diag(both[0]))  # so that metres and radians are comparable
-    more = (both[1] - both[0]) / np.outer(unit, unit)
-    values, vectors = np.linalg.eigh((more + more.T) / 2)
-    kept = (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(unit, unit)
-    return np.asarray(kept, dtype=np.float64)
-
-
-def _intrinsics_covariance(arguments: job.Arguments) -> Array | None:
-    """(8, 8) of the intrinsics; None if it is unknown, or belongs to another lens model or image size."""
-    record = arguments.intrinsics_covariance
-    if record is None or arguments.reduced:
-        return None
-    if not isinstance(record, ParameterCovariance):
-        return np.array(record)
-    return CameraCovariance(record.parameters, np.array(record.matrix)).of_lens()
 
 
 def _residuals(answer: RegistrationResult, names: Sequence[str]) -> dict[str, object]:

@@ -94,6 +94,13 @@ def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | N
             "only at the same width."
         )
     )
+    own = _best_row(summary)
+    if own is not None and own.poses in summary.registrations():
+        found = summary.registrations()[own.poses].findings
+        blocks += [Paragraph(f"{one.text}.", "attention") for one in found]
+    if own is not None and own.control_spheres:
+        blocks += [Paragraph(f"{text[0].upper()}{text[1:]}.", "attention") for text in own.findings]
+        blocks.append(_control_spheres(own))
     note = shared_adjustment_note(summary.protocol, summary.state)
     if note:
         blocks.append(Paragraph(note))
@@ -119,6 +126,28 @@ def _table(rows: Sequence[Row], own: str | None, true_error_mm: Mapping[str, flo
     )
     strong = frozenset(number for number, row in enumerate(rows) if row.poses == own)
     return Table(tuple(columns), shown, strong)
+
+
+def _control_spheres(row: Row) -> Table:
+    """Each control sphere by itself, with the run's own registration."""
+    columns = (
+        Column("control sphere", 1.0),
+        Column("radial error (mm)", 1.0, "number"),
+        Column("outlines measured of expected", 1.3, "number"),
+        Column("from its place in the scan (mm)", 1.3, "number"),
+    )
+    rows = tuple(
+        (
+            str(sphere.index),
+            mm(sphere.radial_error_mm),
+            f"{sphere.measured} of {sphere.expected}",
+            "–"
+            if sphere.displacement_mm is None
+            else f"{sphere.displacement_mm:.3f} ± {mm(sphere.displacement_sigma_mm)}",
+        )
+        for sphere in row.control_spheres
+    )
+    return Table(columns, rows)
 
 
 def _texts(row: Row, *, best: bool) -> tuple[str, ...]:

@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_image_of
+from service.compute.markers.cones import Cone
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 from service.compute.markers.search.anchors import AnchorRegistration, MapFunction, register_anchors
-from service.compute.markers.search.predicted import (
-    ImageOutlines,
-    PredictedSpheres,
-    find_outlines,
-)
+from service.compute.markers.search.nearby import find_nearby
+from service.compute.markers.search.predicted import ImageOutlines, PredictedSpheres, find_outlines
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.identification.pairing import paired
 from service.compute.scene import PosedImages, ScanSpheres
@@ -157,9 +155,10 @@ def locate_outlines(
         if first is None:
             found = tuple(_counted(map_over(look, [_Task(path) for path in image_paths]), n, progress))
             return searched_whole([f.outlines for f in found])
+        known = len(spheres.centres_m)
         centres = np.vstack([spheres.centres_m, spheres.control_m, first.unlisted_m])
         tasks = [
-            _Task(path, PredictedSpheres(inverse(T), centres, spheres.radius_m, first.margin, first.tone))
+            _Task(path, PredictedSpheres(inverse(T), centres, spheres.radius_m, first.margin, first.tone, known))
             for path, T in zip(image_paths, first.T_scan_camera, strict=True)
         ]
         found = tuple(_counted(map_over(look, tasks), n, progress))
@@ -194,6 +193,30 @@ def _located(
         ),
         first.anchors,
     )
+
+
+def search_nearby(
+    expected: Sequence[tuple[Path, Sequence[tuple[Cone, float]]]],
+    camera: CameraModel,
+    options: DetectionOptions = DEFAULTS,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> tuple[tuple[SphereOutline, ...], ...]:
+    """The outlines around expected spheres of image files, as `find_nearby` finds them in each.
+
+    Raises:
+        DataError: an image cannot be used; the message names the first one.
+    """
+    with _mapping(workers, len(expected)) as map_over:
+        work = partial(_nearby, camera=camera, options=options)
+        return tuple(_counted(map_over(work, expected), len(expected), progress))
+
+
+def _nearby(
+    task: tuple[Path, Sequence[tuple[Cone, float]]], camera: CameraModel, options: DetectionOptions
+) -> tuple[SphereOutline, ...]:
+    path, expected = task
+    return find_nearby(read_image_of(path, camera), camera, expected, options)
 
 
 def searched_whole(outlines: Sequence[tuple[SphereOutline, ...]]) -> LocatedOutlines:

@@ -63,32 +63,41 @@ def _chromaticity(outlines: Sequence[SphereOutline]) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class PredictedSpheres:
-    """Expected positions of the spheres `centres_m` (M, 3), scan frame, and their tolerance `margin` in radii."""
+    """Expected positions of the spheres `centres_m` (M, 3), scan frame, and their tolerance `margin` in radii.
+
+    Only the first `voting` spheres decide which outlines agree with one another, since the places of the others are
+    not known from the scan; None: all do.
+    """
 
     T_camera_scan: Transform = field(repr=False)
     centres_m: Array = field(repr=False)
     radius_m: float
     margin: float
     tone: Tone
+    voting: int | None = None
+
+    def votes(self, sphere: int) -> bool:
+        """Whether a sphere takes part in choosing outlines."""
+        return self.voting is None or sphere < self.voting
 
 
 @dataclass(frozen=True, slots=True)
 class PredictedOutlines:
-    """Outlines by sphere; reasons for spheres expected but not found; the image's own pose."""
+    """Outlines by sphere; reasons for spheres expected but not found; the image's own pose; the spheres that vote."""
 
     outlines: dict[int, SphereOutline]
     missing: dict[int, str]
     T_camera_scan: Transform = field(repr=False)
-
-    @property
-    def expected(self) -> int:
-        """Number of spheres that the image should show."""
-        return len(self.outlines) + len(self.missing)
+    voting: int | None = None
 
     @property
     def convincing(self) -> bool:
-        """Whether so many spheres were found where predicted that the prediction must be right."""
-        return len(self.outlines) >= max(min(4, self.expected), 0.5 * self.expected)
+        """Whether so many voting spheres were found where predicted that the prediction must be right."""
+        found, lacking = (
+            sum(self.voting is None or m < self.voting for m in part) for part in (self.outlines, self.missing)
+        )
+        expected = found + lacking
+        return found >= max(min(4, expected), 0.5 * expected)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,15 +175,15 @@ def _attempt(
             missing[m] = "not of the markers' colour"
         else:
             outlines[m] = outline
-    cones = {m: o.cone for m, o in outlines.items()}
+    cones = {m: o.cone for m, o in outlines.items() if expected.votes(m)}
     agreed = _agreed_pose(cones, expected, pose, _GATE.place, 0.5 * len(cones))
     pose = pose if agreed is None else agreed
     for m, outline in list(outlines.items()):
         there = cone_of_sphere(apply(pose, centres[m]), radius_m)
-        if not _within_gate(outline.cone, there, max(outline.coverage, 0.2)):
+        if expected.votes(m) and not _within_gate(outline.cone, there, max(outline.coverage, 0.2)):
             del outlines[m]
             missing[m] = "not where the image's other spheres predict it"
-    return PredictedOutlines(outlines, missing, pose)
+    return PredictedOutlines(outlines, missing, pose, expected.voting)
 
 
 def _starts(
@@ -192,14 +201,16 @@ def _starts(
     shown = visible_cones(pose, centres, radius_m, camera)
     near = approach_outlines(image, camera, list(shown.values()), options)
     approached = {m: a for m, a in zip(shown, near, strict=True) if a is not None}
-    cones = {m: a.cone for m, a in approached.items()}
-    agreed = _agreed_pose(cones, expected, pose, _APPROACH_GATE, max(0.5 * len(shown), _POSE_SPHERES))
+    cones = {m: a.cone for m, a in approached.items() if expected.votes(m)}
+    voters = sum(map(expected.votes, shown))
+    agreed = _agreed_pose(cones, expected, pose, _APPROACH_GATE, max(0.5 * voters, _POSE_SPHERES))
     if agreed is None:
         return None
     out: dict[int, AveragedCone] = {}
     for m, cone in visible_cones(agreed, centres, radius_m, camera).items():
         own = approached.get(m)
-        out[m] = own if own is not None and _within_gate(own.cone, cone) else AveragedCone(cone)
+        believed = own is not None and (not expected.votes(m) or _within_gate(own.cone, cone))
+        out[m] = own if own is not None and believed else AveragedCone(cone)
     return out
 
 
@@ -217,9 +228,14 @@ def deviation(cone: Cone, predicted: Cone) -> tuple[float, float]:
 
 
 def visible_cones(
-    T_camera_scan: Transform, centres_scan_m: Array, radius_m: float, camera: CameraModel
+    T_camera_scan: Transform,
+    centres_scan_m: Array,
+    radius_m: float,
+    camera: CameraModel,
+    *,
+    least: float = _LEAST_PART,
 ) -> dict[int, Cone]:
-    """Cones of the spheres whose outline is mostly in the image and not behind another sphere."""
+    """Cones of the spheres of whose outline the `least` share is in the image and not behind another sphere."""
     centres = apply(T_camera_scan, centres_scan_m)
     distance = np.linalg.norm(centres, axis=1)
     cones = {
@@ -242,7 +258,7 @@ def visible_cones(
         for k, other in cones.items():
             if distance[k] < distance[m] - 0.5 * radius_m:
                 seen &= rays @ other.axis < np.cos(other.half_angle_rad)
-        if seen.mean() >= _LEAST_PART:
+        if seen.mean() >= least:
             out[m] = cone
     return out
 
@@ -292,7 +308,7 @@ def _approached_pose(
     image: NDArray[np.uint8], camera: CameraModel, expected: PredictedSpheres, shown: dict[int, Cone]
 ) -> Transform:
     """The image's pose from circles near the predicted ones: from a few spheres, or from all if those disagree."""
-    order = _spread(shown)
+    order = _spread({m: cone for m, cone in shown.items() if expected.votes(m)})
     roughs: dict[int, Cone] = {}
     for part, agreeing in ((order[:_APPROACHED], 4), (order[_APPROACHED:], 3)):
         for m in part:

@@ -24,7 +24,7 @@ class MatchGate:
 
 
 ROBOT_GATE = MatchGate(0.5, 0.12)  # wide enough for a robot that is off by millimetres
-CONTROL_GATE = MatchGate(0.5, 0.15)  # if a control sphere is farther from its prediction, the registration is wrong
+CONTROL_GATE = MatchGate(0.5, 0.15)  # if a sphere is farther from its prediction, the registration is wrong
 
 
 @dataclass(frozen=True, slots=True)

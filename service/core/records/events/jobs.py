@@ -20,7 +20,7 @@ class JobEnqueued(Record):
     idempotency_key: str
     arguments: dict[str, Any]
     priority: int = 1  # smaller goes first: see service.core.jobs.priorities
-    version: int = 1  # of the arguments: 1 has copies of earlier results, 2 references to them
+    version: int = 1  # of the computation (JobKind.version): 1 copies earlier results, later ones refer to them
 
 
 class JobFinished(Record):

@@ -25,7 +25,7 @@ from service.jobs.registration import evaluate, register
 from service.jobs.surfaces import locate_spheres
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, earlier_answer, earlier_result
-from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures
+from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures, Share
 from service.steps.poses.registration_jobs import recorded_registration_jobs
 
 _SCAN, _CONTROL, _CT = "scan", "control_scan", "ct"  # fields of the job's arguments
@@ -65,6 +65,11 @@ class Measures(RegistrationMeasures[EvaluatedRegistration]):
         Ratio, "radial errors against their predicted standard deviations: near 1 if those are right"
     ] = None
     control_spheres: Annotated[Count, "control spheres that were seen and measured"] = None
+    control_spheres_expected: Annotated[Count, "control spheres that some image should show"] = None
+    control_outlines_share: Annotated[
+        Share, "measured of expected outlines, for the control sphere with the smallest share"
+    ] = None
+    worst_control_sphere_mm: Annotated[ErrorMm, "radial error of the worst control sphere"] = None
 
 
 class Result(Record):
@@ -106,8 +111,12 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         ct=spheres[_CT],
         radius_m=metres(context.protocol.spheres.radius_mm),
     )
+    if context.protocol.spheres.colour is not None:
+        arguments = arguments.model_copy(update={"colour": context.protocol.spheres.colour})
     (answer,) = context.evidence.run_jobs(JobRequest.of(evaluate.KIND, arguments, references))
     result = Result.model_validate(answer.result)
+    for finding in min(result.table, key=lambda row: row.mean_radial_error_mm).findings:
+        context.tell(f"{finding[0].upper()}{finding[1:]}")
     measures = Measures.read_all(answer.measures, registrations)
     return StepOutcome(measures, answer.artefacts, result, computed_by=(answer.source,))
 

@@ -105,6 +105,8 @@ class OneRegistration(MeasureRecord):
     markers: Annotated[Count, "spheres that take part"] = None
     images: Annotated[Count, "images that take part"] = None
     excluded_outlines: Annotated[Count, "outlines left out as outliers"] = None
+    images_left_out: Annotated[Count, "images left out because they contradict the others"] = None
+    contradictions: Annotated[Count, "contradictions between the inputs that somebody has to look at"] = None
     predicted_error_mm: Annotated[ErrorMm, "predicted error at the centre of the spheres"] = None
     leave_one_out_mm: Annotated[ErrorMm, "mean radial error of each registration sphere as the others predict it"] = (
         None
@@ -168,8 +170,10 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
                 )
         context.progress(_words(found), len(found.arrived.keys() & set(waited)), len(waited))
         if all(name in found.arrived for name in waited):
+            outcome = _outcome(found)
+            _tell_findings(context, outcome)
             return _with_further_cameras(
-                _outcome(found),
+                outcome,
                 locate_further_cameras(
                     context, params.images_of, outlines, found.arrived, on_raw=params.measure_on == "raw"
                 ),
@@ -257,6 +261,17 @@ def _outcome(found: RegistrationJobs) -> StepOutcome:
     artefacts = tuple(ref for _, job in done for ref in job.artefacts)
     sources = (ComputedBy(job=job.job, prefix=f"{name}_") for name, job in found.arrived.items())
     return StepOutcome(measures, artefacts, result, computed_by=(ComputedBy(job=outlines.job), *sources))
+
+
+def _tell_findings(context: StepContext, outcome: StepOutcome) -> None:
+    """Tell what contradicts in the inputs, once for registrations that show the same."""
+    assert isinstance(outcome.result, Result)
+    shown: dict[str, list[str]] = {}
+    for name, record in outcome.result.registrations.items():
+        for one in record.findings:
+            shown.setdefault(one.text, []).append(name)
+    for text, names in shown.items():
+        context.tell(f"{', '.join(names)}: {text}")
 
 
 def _with_further_cameras(outcome: StepOutcome, located: Mapping[str, JobResult]) -> StepOutcome:

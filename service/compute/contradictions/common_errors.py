@@ -1,0 +1,255 @@
+"""Errors that all outlines share and that the model takes as small: found by a fit that leaves them free.
+
+A registration holds the camera as calibrated, and common shifts and growths of the outlines near zero. If the
+outlines say otherwise, its residuals may look harmless while the scan is misplaced by more than the stated sigma. A
+second fit with these errors free tells how large they are, and how far the scan moves with them: that much is
+uncertain, since the outlines alone do not tell which of several inputs is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+
+from service.compute.contradictions.findings import Contradiction
+from service.compute.markers.outlines.refine import SYSTEMATIC_PER_BLUR
+from service.compute.markers.records import SphereOutline
+from service.compute.registration.identification.identity import Assignment
+from service.compute.registration.result import RegistrationResult
+from service.compute.registration.settings import CommonErrors, RegistrationSettings
+from service.compute.registration.solve import register
+from service.compute.scene import PosedImages, ScanSpheres
+from service.core.errors import ComputeError
+from service.core.geometry import Array, align_points
+from service.core.units import mm
+
+UNEXPLAINED = "unexplained"  # name of the component of the covariance
+_FREE_PX, _FREE_FOCAL = 20.0, 0.03  # widths of the fit that leaves the errors free: px, relative
+_SIGMAS = 5.0
+# Clean rendered scenes (bench/registration/faults_table.py) gave a relative error of the focal length of at most
+# 0.8e-4, by what single outlines share: a calibration is not expected to be better.
+_EXPECTED_FOCAL = 0.5e-4
+_SHARP_PX = 0.7  # blur up to which the sizes of the common errors were measured; they grow with it
+_NAMED_BLUR = 1.3  # times that, from which blur is told
+_LIGHT_OF_GROWTH = 2 / 3  # as in EXPECTED_COMMON_ERRORS
+
+CommonErrorName = Literal["shift_x_px", "shift_y_px", "growth_px", "focal_x", "focal_y"]
+
+
+@dataclass(frozen=True, slots=True)
+class CommonError:
+    """One error that all outlines share; focal lengths are relative, given over true, less one."""
+
+    name: CommonErrorName
+    value: float
+    sigma: float
+    expected: float  # standard deviation by which it may differ from zero
+
+    @property
+    def uncertainty(self) -> float:
+        """Standard deviation of the value as an error of the inputs, whose expected size it cannot be told from."""
+        return float(np.hypot(self.sigma, self.expected))
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is larger than its uncertainty allows."""
+        return abs(self.value) > _SIGMAS * self.uncertainty
+
+
+@dataclass(frozen=True, slots=True)
+class BeyondModel:
+    """What the free fit tells.
+
+    Attributes:
+        errors: the common errors as the outlines have them; empty if they do not determine them.
+        blur_px: median blur of the outlines.
+        component: (6, 6) covariance of T_world_scan for what the model does not explain; zero if it explains all.
+        findings: the causes, in words.
+    """
+
+    errors: tuple[CommonError, ...]
+    blur_px: float
+    component: Array
+    findings: tuple[Contradiction, ...]
+
+
+def beyond_model(
+    outlines: Sequence[Sequence[SphereOutline]],
+    assignments: Sequence[Assignment],
+    images: PosedImages,
+    spheres: ScanSpheres,
+    held: RegistrationResult,
+    settings: RegistrationSettings,
+    *,
+    lens_covariance: Array | None = None,
+) -> BeyondModel:
+    """Compare a registration with one that leaves the errors that all outlines share free.
+
+    Args:
+        outlines: as for the registration.
+        assignments: as for the registration.
+        images: as for the registration.
+        spheres: as for the registration.
+        held: the registration, with the common errors near zero and the camera as calibrated.
+        settings: of the registration.
+        lens_covariance: (8, 8) of the calibration; None if it is not stated.
+    """
+    camera = images.camera
+    blur_px = float(np.median([o.systematic_px for o in held.solution.problem.outlines])) / SYSTEMATIC_PER_BLUR
+    lens = np.diag([(_FREE_FOCAL * camera.fx) ** 2, (_FREE_FOCAL * camera.fy) ** 2, *[1e-12] * 2, *[1e-18] * 4])
+    common = settings.common_errors
+    wide = replace(
+        settings,
+        intrinsics_covariance=lens,
+        common_errors=CommonErrors(_FREE_PX, _FREE_PX, common.light_px),
+    )
+    try:
+        free = register(outlines, assignments, images, spheres, wide)
+    except ComputeError:  # the outlines do not determine so much
+        free = None
+    errors = () if free is None else _errors(free, images, common, lens_covariance)
+    significant: dict[CommonErrorName, CommonError] = {e.name: e for e in errors if e.significant}
+    component = np.zeros((6, 6))
+    if free is not None and significant:
+        moved = _moved(held, free)
+        component += np.outer(moved, moved)
+    light_px = _light_px(significant.get("growth_px"), blur_px, common)
+    light_m = held.solution.problem.light_unit_m * float(np.sqrt(max(0.0, light_px**2 - common.light_px**2)))
+    component += block_diag(light_m**2 * np.eye(3), np.zeros((3, 3)))
+    return BeyondModel(errors, blur_px, component, _findings(significant, blur_px, held, camera.fx))
+
+
+def added_covariance(exact: Array, uncertain: Array) -> Array:
+    """(6, 6) What uncertain inputs add to a covariance with the poses held fixed; positive semidefinite."""
+    unit = np.sqrt(np.diag(exact))  # so that metres and radians are comparable
+    more = (uncertain - exact) / np.outer(unit, unit)
+    values, vectors = np.linalg.eigh((more + more.T) / 2)
+    kept = (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(unit, unit)
+    return np.asarray(kept, dtype=np.float64)
+
+
+def held_lens_covariance(uncertain: RegistrationResult, lens_covariance: Array) -> Array:
+    """(6, 6) covariance that a calibration's errors cause in T_world_scan if the camera is held as calibrated.
+
+    Whole, not what the outlines leave of it, since the camera is not corrected: an error e of the lens moves the scan
+    by V e, V the regression of the scan's errors on those of the lens.
+
+    Args:
+        uncertain: the registration with this covariance as a prior.
+        lens_covariance: (8, 8) of the calibration.
+    """
+    problem, joint = uncertain.solution.problem, uncertain.solution.covariance
+    lens = slice(problem.lens_column, problem.size)
+    V = np.linalg.solve(joint[lens, lens], joint[lens, :6]).T
+    return np.asarray(V @ lens_covariance @ V.T, dtype=np.float64)
+
+
+def _errors(
+    free: RegistrationResult, images: PosedImages, common: CommonErrors, lens_covariance: Array | None
+) -> tuple[CommonError, ...]:
+    solution, problem = free.solution, free.solution.problem
+    values = solution.state.common[3:8]
+    first = problem.common_column + 3
+    sigma = np.sqrt(np.maximum(np.diag(solution.covariance)[first : first + 5], 0.0))
+    f = np.array([images.camera.fx, images.camera.fy])
+    stated = np.zeros(4) if lens_covariance is None else np.sqrt(np.maximum(np.diag(lens_covariance)[:4], 0.0))
+    focal = np.hypot(stated[:2] / f, _EXPECTED_FOCAL)
+    shift = np.hypot(stated[2:], common.shift_px)
+    expected = (*shift.tolist(), common.growth_px, *focal.tolist())
+    unit = (1.0, 1.0, 1.0, *f.tolist())
+    names: tuple[CommonErrorName, ...] = ("shift_x_px", "shift_y_px", "growth_px", "focal_x", "focal_y")
+    return tuple(
+        CommonError(name, float(v) / u, float(s) / u, e)
+        for name, v, s, u, e in zip(names, values, sigma, unit, expected, strict=True)
+    )
+
+
+def _moved(held: RegistrationResult, free: RegistrationResult) -> Array:
+    """(6,) perturbation of T_world_scan, against the cameras, from the one registration to the other."""
+    placed = np.isfinite(held.T_scan_camera).all(axis=(1, 2)) & np.isfinite(free.T_scan_camera).all(axis=(1, 2))
+    T, _ = align_points(held.T_scan_camera[placed, :3, 3], free.T_scan_camera[placed, :3, 3])
+    R = held.T_world_scan[:3, :3]
+    if held.solution.problem.with_scale:
+        return np.concatenate([R @ T[:3, 3], Rotation.from_matrix(R @ T[:3, :3] @ R.T).as_rotvec()])
+    # Given metric poses, the scan moves in their frame.
+    turn = Rotation.from_matrix(free.T_world_scan[:3, :3] @ R.T).as_rotvec()
+    return np.concatenate([free.T_world_scan[:3, 3] - held.T_world_scan[:3, 3], turn])
+
+
+def _light_px(growth: CommonError | None, blur_px: float, common: CommonErrors) -> float:
+    """The bias by light from one side that outlines of this blur and growth may have."""
+    if blur_px <= _SHARP_PX:
+        return common.light_px
+    by_growth = 0.0 if growth is None else _LIGHT_OF_GROWTH * abs(growth.value)
+    return max(common.light_px * blur_px / _SHARP_PX, by_growth)
+
+
+def _findings(
+    significant: dict[CommonErrorName, CommonError], blur_px: float, held: RegistrationResult, f: float
+) -> tuple[Contradiction, ...]:
+    out: list[Contradiction] = []
+    focal = [significant[name] for name in ("focal_x", "focal_y") if name in significant]
+    if focal:
+        sizes = " and ".join(
+            f"{'fx' if e.name == 'focal_x' else 'fy'} by {100 * abs(e.value):.3f} ± {100 * e.uncertainty:.3f} % too "
+            f"{'large' if e.value > 0 else 'small'}"
+            for e in focal
+        )
+        out.append(
+            Contradiction(
+                "focal length",
+                f"The outlines contradict the focal length: {sizes}, if the camera positions are right",
+                "Calibrate the camera at this focus and zoom. If it is right, the cameras are nearer or farther "
+                "than their poses say: check the hand-eye along the optical axis, and the positions' scale. The "
+                "images cannot tell these apart",
+            )
+        )
+    shift = [significant[name] for name in ("shift_x_px", "shift_y_px") if name in significant]
+    if shift:
+        sizes = " and ".join(
+            f"{'cx' if e.name == 'shift_x_px' else 'cy'} by {abs(e.value):.2f} px ± {e.uncertainty:.2f} too "
+            f"{'large' if e.value < 0 else 'small'}"
+            for e in shift
+        )
+        out.append(
+            Contradiction(
+                "principal point",
+                f"The outlines are shifted as by a wrong principal point: {sizes}",
+                "Calibrate the camera, and check that the images are neither cropped nor shifted by a stabiliser. "
+                "If the camera is right, all poses are turned alike: check the hand-eye. The images cannot tell "
+                "these apart",
+            )
+        )
+    growth = significant.get("growth_px")
+    if growth is not None:
+        out.append(_size_finding(growth, blur_px, held, f))
+    elif blur_px > _NAMED_BLUR * _SHARP_PX:
+        out.append(
+            Contradiction(
+                "blur",
+                f"The outlines are blurred over {blur_px:.1f} px; the stated sigma is larger for it",
+                "Focus, and expose for less time or with the camera at rest",
+            )
+        )
+    return tuple(out)
+
+
+def _size_finding(growth: CommonError, blur_px: float, held: RegistrationResult, f: float) -> Contradiction:
+    problem = held.solution.problem
+    radius_px = f * float(np.median(problem.cones.half_angles))
+    given_mm = mm(problem.radius_m)
+    true_mm, sigma_mm = given_mm * (1 + growth.value / radius_px), given_mm * growth.uncertainty / radius_px
+    larger = "larger" if growth.value > 0 else "smaller"
+    blurred = f" (they are blurred over {blur_px:.1f} px)" if blur_px > _SHARP_PX else ""
+    return Contradiction(
+        "size of outlines",
+        f"All outlines are {abs(growth.value):.2f} px ± {growth.uncertainty:.2f} {larger} than spheres of radius "
+        f"{given_mm:.2f} mm appear{blurred}: by the images the radius is {true_mm:.2f} mm ± {sigma_mm:.2f}",
+        "Measure the spheres, coat included, and correct the radius. If it is right, the edges are biased: by blur "
+        "of focus or motion, or by the images' processing. The images cannot tell these apart",
+    )
