@@ -80,6 +80,7 @@ def test_squares_that_are_not_as_stated_are_refused_with_their_true_side(
     assert json.loads(out.read_text())["board_size"]["tolerance"] == pytest.approx(2e-4)
 
 
+@pytest.mark.slow
 def test_a_universal_robots_rows_without_header_are_read(photographs: BoardFolder, tmp_path: Path) -> None:
     poses, out = tmp_path / "poses.txt", tmp_path / "hand_eye.json"
     rows = [[*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_rotvec()] for T in photographs.T_base_flange.values()]

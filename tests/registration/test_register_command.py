@@ -229,6 +229,7 @@ def test_scale_of_poses_that_are_not_metric(capture: Capture, few: Path, tmp_pat
     refused(register(capture, tmp_path / "none.json", **options), tmp_path / "none.json", "poses contradict", "unit")
 
 
+@pytest.mark.slow
 def test_a_displaced_control_sphere_is_measured_told_and_not_passed(
     capture: Capture, few: Path, tmp_path: Path
 ) -> None:
