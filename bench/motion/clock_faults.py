@@ -59,7 +59,6 @@ PLACES = {
     "service/core/run/tries.py": _STAMP,
     "service/core/text/clock_time.py": _STAMP,
     "service/core/results/arrival.py": "by how much a result is late; that it is late follows from the run's state",
-    "service/core/run/state_transitions.py": _FIGURE,
     "service/monitor/alarm.py": _STAMP,
     "service/monitor/figures.py": _FIGURE,
     "service/monitor/health.py": "time in which a runner's main loop hangs",
