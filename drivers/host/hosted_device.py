@@ -36,7 +36,8 @@ _READING = frozenset({"report", "settings"})  # calls that only read what the de
 
 _LOG = logging.getLogger("drivers.host")
 _LEVELS = logging.getLevelNamesMapping()
-_OURS = frozenset({"drivers", "service", "root"})  # what libraries log in a child is for the log file, not for people
+# What other libraries than the driver's own package log in a child is for the log file, not for people.
+_OURS = frozenset({"drivers", "service", "root"})
 
 
 def hosted(
@@ -257,7 +258,8 @@ class HostedDevice:
             errors="replace",
         )
         theirs.close()
-        reader = threading.Thread(target=_log_output, args=(process, self._name), daemon=True)
+        package = self._spec_path.partition(".")[0].partition(":")[0]
+        reader = threading.Thread(target=_log_output, args=(process, self._name, package), daemon=True)
         reader.start()
         self._child = _Child(process, Line(Connection(ours.detach())), reader)
         self._suspect = False
@@ -308,13 +310,13 @@ class HostedDevice:
                 self._lock.release()
 
 
-def _log_output(process: Popen[str], name: str) -> None:
+def _log_output(process: Popen[str], name: str, package: str) -> None:
     log = logging.getLogger(f"{_LOG.name}.{name}")
     assert process.stdout is not None
     for line in process.stdout:
         level, separator, message = line.rstrip().partition("|")
         if separator and level in _LEVELS:
-            ours = message.partition(":")[0].partition(".")[0] in _OURS
+            ours = message.partition(":")[0].partition(".")[0] in _OURS | {package}
             log.log(_LEVELS[level] if ours else min(_LEVELS[level], logging.INFO), "%s", message)
         elif line.strip():
             log.info("%s", line.rstrip())

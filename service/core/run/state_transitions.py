@@ -26,11 +26,8 @@ UNMEASURED: Mapping[str, Any] = {
     "signed_by": "",
     "failure": None,
 }
-
-
-def work_begins(event: Event) -> dict[str, Any]:
-    """What a step remembers of when the work of an attempt began."""
-    return {"work_began_utc": event.at_utc, "waits_since_utc": "", "waited_s": 0.0}
+# What a step knows of waits for a person when the work of an attempt begins.
+NOT_WAITING: Mapping[str, Any] = {"waits_since_utc": "", "waited_s": 0.0}
 
 
 def wait(protocol: Protocol, state: RunState, event: Event) -> RunState:

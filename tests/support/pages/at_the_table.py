@@ -41,7 +41,7 @@ def record(server: Served, run_id: str, *payloads: Payload) -> None:
         store.record(run_id, list(payloads), actor="grace")
 
 
-class _LeftError(Exception):
+class _LeftError(BaseException):
     """The person has gone."""
 
 

@@ -63,7 +63,7 @@ def shown_site(folder: Path) -> ShownSite:
     )
 
 
-class _LeftError(Exception):
+class _LeftError(BaseException):
     """The person has gone."""
 
 

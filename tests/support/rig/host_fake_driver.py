@@ -113,7 +113,8 @@ class FakeDriver:
 
     def talk(self) -> None:
         os.write(1, b"vendor chatter on stdout\n")
-        logging.getLogger("fake").warning("the driver warns")
+        logging.getLogger(__name__).warning("the driver warns")
+        logging.getLogger("pydicom").warning("words of a library")
 
     def stdin_target(self) -> str:
         return os.readlink("/proc/self/fd/0")

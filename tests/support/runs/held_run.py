@@ -128,7 +128,7 @@ def held_run(
     return bench, person
 
 
-class _LeftError(Exception):
+class _LeftError(BaseException):
     """The runner's process ended in the middle."""
 
 

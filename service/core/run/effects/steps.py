@@ -20,7 +20,7 @@ from service.core.records.events import (
 from service.core.run.actions import unmet_requirements
 from service.core.run.effects.place import impossible, is_void, is_void_now, triggered, without_effect
 from service.core.run.state import FailedTries, Failure, Note, RunState
-from service.core.run.state_transitions import UNMEASURED, change, pass_on, work_begins
+from service.core.run.state_transitions import NOT_WAITING, UNMEASURED, change, pass_on
 
 
 def worked_s(state: RunState, event: Event) -> float | None:
@@ -38,7 +38,7 @@ def step_started(protocol: Protocol, state: RunState, event: Event, p: StepStart
     if unmet_requirements(step, state) or (step.irreversible and not now.signed):
         raise impossible(event, "what it requires has not passed, or nobody has signed")
     state = replace(state, last_view=("", ""))
-    began = {"started_utc": event.at_utc, **work_begins(event)}
+    began = {"started_utc": event.at_utc, "work_began_utc": event.at_utc, **NOT_WAITING}
     return triggered(protocol, state, event, "begin", failures=0, **began)
 
 
@@ -91,7 +91,8 @@ def step_retried(protocol: Protocol, state: RunState, event: Event, p: StepRetri
     if not (now.retry_granted or (now.failure is not None and now.failure.recovery == "retry")):
         raise impossible(event, "neither the policy nor the operator allowed a retry")
     state = replace(state, last_view=("", ""))
-    changes: dict[str, Any] = {**UNMEASURED, "attempt": p.attempt, "retry_granted": False, **work_begins(event)}
+    changes: dict[str, Any] = {**UNMEASURED, "attempt": p.attempt, "retry_granted": False}
+    changes |= {"work_began_utc": event.at_utc, **NOT_WAITING}
     if protocol.step(p.step).irreversible:  # its signature let it begin and remains valid
         changes |= {"signed": now.signed, "signed_by": now.signed_by}
     if now.retry_granted:  # viewpoints that were given up are tried again
