@@ -7,7 +7,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -48,6 +48,7 @@ class Difference:
     relative: float | None  # relative to the largest number of the field
     unit: str
     values: int = 1  # number of values that differ
+    added: bool = False  # what was recorded has no such field
 
     @property
     def wording(self) -> bool:
@@ -78,6 +79,10 @@ class Comparison:
         """Whether nothing but rounding differs."""
         return all(d.within_tolerance for d in self.differences)
 
+    def of_recorded(self) -> Comparison:
+        """The comparison of the fields that were recorded, without those that only the recomputed data have."""
+        return replace(self, differences=tuple(d for d in self.differences if not d.added))
+
 
 @dataclass
 class _Collector:
@@ -99,6 +104,7 @@ class _Collector:
             worst.relative,
             worst.unit,
             before.values + difference.values,
+            worst.added,
         )
 
 
@@ -136,7 +142,7 @@ def _walk(out: _Collector, a: Any, b: Any, path: str, group: str) -> None:
             if key not in here or key not in there:
                 missing = "nothing"
                 old, new = _brief(here.get(key, missing)), _brief(there.get(key, missing))
-                out.add(shown, Difference(below, old, new, None, None, ""))
+                out.add(shown, Difference(below, old, new, None, None, "", added=key not in here))
             else:
                 _walk(out, here[key], there[key], below, shown)
         return

@@ -188,7 +188,9 @@ def _compare(
     listed = compare_data(*names, path="files")
     measures = compare_data(recorded.measures, now.measures, path="measures")
     result = compare_data(recorded.result, now.result, path="result", renamed=renamed)
-    parts = (measures, result, listed, *(artefact.content for artefact in artefacts))
+    parts = [measures, result, listed, *(artefact.content for artefact in artefacts)]
+    if about.computed_by:  # an earlier version did not tell what this one tells besides
+        parts = [part.of_recorded() for part in parts]
     same_files = all(artefact.recorded_sha256 == artefact.recomputed_sha256 for artefact in artefacts)
     result = replace(result, differences=(*listed.differences, *result.differences))
     verdict = _verdict(parts, same_files=same_files)
