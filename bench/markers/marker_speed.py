@@ -93,7 +93,8 @@ def measure(folder: Path, most: int) -> dict[str, object]:
         ):
             expected = PredictedSpheres(inverse(T_scan_world @ T_world_camera), centres, known.radius_m, margin, tone)
             row[f"{label}_s"], found = cpu(partial(locate_predicted, image, camera, expected))
-            row[f"{label}_found"], row[f"{label}_expected"] = len(found.outlines), found.expected
+            row[f"{label}_found"] = len(found.outlines)
+            row[f"{label}_expected"] = len(found.outlines) + len(found.missing)
         rows.append(row)
     middle = {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
     return {

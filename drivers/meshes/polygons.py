@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from drivers.interfaces import Array
 
 IntArray = NDArray[np.int64]
+_ALIKE = 1e-6  # of a length: diagonals that differ by less are equally long
 _FLAT = 1e-12  # of a polygon's area: what is smaller is no area, but the rounding of coordinates
 
 
@@ -85,7 +86,7 @@ def _quadrangles(p: Array) -> tuple[IntArray, int]:
     lines = [(x[j] - x[i], y[j] - y[i], z[j] - z[i]) for i, j in ((0, 2), (1, 3))]
     diagonal = np.stack([_dot(line, line) for line in lines], axis=1)
     shorter = np.argmin(diagonal, axis=1)
-    alike = np.flatnonzero(np.abs(diagonal[:, 0] - diagonal[:, 1]) <= 1e-6 * diagonal.max(axis=1))
+    alike = np.flatnonzero(np.abs(diagonal[:, 0] - diagonal[:, 1]) <= _ALIKE * diagonal.max(axis=1))
     shorter[alike] = _lowest(p[alike]) % 2
     chosen = np.where(inside[:, 0] == inside[:, 1], shorter, np.argmax(inside, axis=1))
     # A corner given twice, or one between collinear edges, leaves a triangle without an area, and no doubt.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import combinations, permutations
 from pathlib import Path
 
@@ -184,6 +185,24 @@ def test_an_outline_of_a_known_sphere_is_not_read_as_one_more() -> None:
     assert outcome.good
     assert outcome.passed
     assert outcome.photographs == 2
+
+
+@pytest.mark.parametrize("sphere", range(0, 13, 4))
+def test_an_outline_whose_size_errs_is_that_of_its_known_sphere(sphere: int) -> None:
+    """By its size the sphere is 3 cm from its place: a whole run on a new scene ended with two at the same place."""
+    scene = Scene.generate(47)
+    first, second = _photographed(scene, 2)
+    cone = second.cones[sphere]
+    larger = replace(cone, half_angle_rad=1.05 * cone.half_angle_rad)
+    covariances = second.covariances.copy()
+    covariances[sphere, 2, 2] = (0.05 * cone.half_angle_rad) ** 2
+    cones = (*second.cones[:sphere], larger, *second.cones[sphere + 1 :])
+    found = layout_from_photographs(
+        [first, replace(second, cones=cones, covariances=covariances)], scene.radius_m, LensPrior()
+    )
+    assert (len(found.centres_m), found.used) == (13, 2)
+    assert sorted(found.spheres[1]) == list(range(13))
+    check_layout(found.centres_m, found.covariance, radius_m=scene.radius_m)
 
 
 def test_bounds_hold_the_truth_as_often_as_they_say() -> None:

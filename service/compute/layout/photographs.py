@@ -23,6 +23,10 @@ _TRIANGLES = 10  # largest triangles of the leading photograph, with which poses
 _PROPOSALS = 4000
 _READINGS = 3  # assignments of one photograph that are tried in the joint adjustment
 _APART = 1.5  # radii, least distance of two centres: 2 for spheres that touch, less their uncertainty
+_ASIDE, _BEHIND = (
+    0.5,
+    4.0,
+)  # radii: of an outline's ray from a sphere that is not seen, and of its depth by size from it
 _WORST_CHI2 = 20.0  # per degree of freedom: above it, the photograph shows something else
 
 
@@ -136,14 +140,49 @@ def _joined(
         )
         try:
             adjusted = _adjusted(photographs, joined, centres, radius_m, prior)
+            single = _without_doubles(joined, adjusted, len(found.centres_m), radius_m)
+            if len(single[1]) < len(adjusted.centres_m):
+                joined, adjusted = single[0], _adjusted(photographs, *single, radius_m, prior)
         except ComputeError:
             continue  # this assignment does not fit
-        # Spheres are solid. If two overlap, either an outline of a known sphere was taken for a new one, or one
-        # sphere was outlined twice. Such an assignment counts only if there is no other.
+        # Spheres are solid: an assignment by which two still overlap counts only if there is no other.
         rank = (_nearest_m(adjusted.centres_m) < _APART * radius_m, adjusted.chi2)
         if adjusted.chi2 < _WORST_CHI2 and (best is None or rank < best_rank):
             best, best_rank = (joined, adjusted), rank
     return (group, found) if best is None else best
+
+
+def _without_doubles(joined: _Group, adjusted: AdjustedLayout, known: int, radius_m: float) -> tuple[_Group, Array]:
+    """The group and its centres without spheres of the newest photograph that are known ones.
+
+    Spheres are solid: one that lies in a known one is that sphere, or outlined twice, and then none. In the direction
+    of a known sphere that the photograph shows nowhere else, the outline is that sphere's, though by its size it is
+    nearer or farther.
+
+    Args:
+        joined: with the newest photograph last.
+        adjusted: the group's layout.
+        known: number of spheres before that photograph; its own come behind.
+        radius_m: of the spheres.
+    """
+    ids = joined.spheres[-1].copy()
+    kept = np.ones(len(adjusted.centres_m), dtype=bool)
+    seen = apply(adjusted.T_photo_first[-1], adjusted.centres_m)
+    ray = seen[known:] / np.linalg.norm(seen[known:], axis=1, keepdims=True)
+    along = np.abs(ray @ seen[:known].T - np.linalg.norm(seen[known:], axis=1, keepdims=True))
+    gap = distances(adjusted.centres_m)[known:, :known]
+    aside = np.sqrt(np.maximum(gap**2 - along**2, 0.0))
+    inside, behind = gap < _APART * radius_m, (aside < _ASIDE * radius_m) & (along < _BEHIND * radius_m)
+    for row in np.argsort(gap.min(axis=1), kind="stable"):
+        unseen = ~np.isin(np.arange(known), ids)
+        same = np.flatnonzero(inside[row] | (behind[row] & unseen))
+        if len(same):
+            sphere = int(same[np.argmin(aside[row, same])])
+            ids[ids == known + row] = sphere if unseen[sphere] else -1
+            kept[known + row] = False
+    number = np.append(np.cumsum(kept) - 1, -1)  # the last for outlines of no sphere
+    spheres = [number[one] for one in (*joined.spheres[:-1], ids)]
+    return _Group(joined.photographs, spheres, list(adjusted.T_photo_first)), adjusted.centres_m[kept]
 
 
 def _nearest_m(centres: Array) -> float:

@@ -64,5 +64,6 @@ KIND = JobKind(
     answer=Answer,
     compute="service.worker.surfaces.layout:layout",
     words="layout of the spheres",
+    version=3,  # takes no outline of a known sphere for a sphere of its own
     order=22,
 )
