@@ -11,29 +11,13 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from service.core.protocol.models import parse_protocol
 from service.dataset.posed.exporter import exporter, write_data_set
 from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.summary import summarise
-from service.steps import params_models
 from tests.support.ct.fused_scene import CENTRES_M, scan_mesh, with_spheres
 from tests.support.runs.bench_run import bench_store
-from tests.support.runs.computing_run import OneScanner, begin_computing_run
+from tests.support.runs.computing_run import TEXTURED, OneScanner, begin_computing_run
 from tests.support.scenes.posed import posed_data_set
-
-PROTOCOL = """\
-id: textured
-version: "1"
-title: A textured scan
-spheres: {radius_mm: 6, registration: 5, control: 0}
-camera: {aperture_f: 22, exposure_s: 1/50, iso: 100}
-steps:
-  - id: scan
-    kind: scan_import
-    title: Scan
-    confirm: false
-    params: {spheres: 5, wait_s: 20}
-"""
 
 
 def write_textured(folder: Path) -> None:
@@ -60,12 +44,11 @@ def test_a_textured_scan_leaves_as_it_came(tmp_path: Path) -> None:
     rig = OneScanner()
     rig.folder = tmp_path / "scans"
     with bench_store(tmp_path / "data") as store:
-        bench = begin_computing_run(store, PROTOCOL, tmp_path, rig)
+        bench = begin_computing_run(store, TEXTURED, tmp_path, rig)
         state = bench.run()
         assert state.status == "completed", state
         assert state.steps["scan"].measures["scan_textures"] == 1
-        protocol = parse_protocol(PROTOCOL.encode(), params_models(), name="textured.yaml").protocol
-        files = scan_files(summarise(store, bench.run_id, protocol))
+        files = scan_files(summarise(store, bench.run_id, bench.protocol))
         assert {file.name for file in files} == {"scan.obj", "scan.mtl", "tex/Skin.png"}
         (tmp_path / "photographs").mkdir()
         data = dataclasses.replace(posed_data_set(tmp_path / "photographs", 2), scan_files=files)

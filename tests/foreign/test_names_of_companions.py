@@ -12,14 +12,12 @@ import pytest
 from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.meshes.companions import companion_names, companions
 from drivers.meshes.mesh_file import read_mesh_file
-from service.core.protocol.models import parse_protocol
 from service.core.records.events import FilesKept
 from service.dataset.posed.of_run.scan_files import scan_files
 from service.dataset.summary import summarise
-from service.steps import params_models
 from tests.support.ct.fused_scene import CENTRES_M, scan_mesh, with_spheres
 from tests.support.runs.bench_run import bench_store
-from tests.support.runs.computing_run import OneScanner, begin_computing_run
+from tests.support.runs.computing_run import TEXTURED, OneScanner, begin_computing_run
 
 TRIANGLE = b"v 0 0 0\nv 300 0 0\nv 0 200 0\nf 1 2 3\n"
 
@@ -93,21 +91,6 @@ def test_what_is_not_there_is_named(tmp_path: Path, name: bytes, error: type[Exc
         companions(tmp_path / "a.obj")
 
 
-PROTOCOL = """\
-id: textured
-version: "1"
-title: A textured scan
-spheres: {radius_mm: 6, registration: 5, control: 0}
-camera: {aperture_f: 22, exposure_s: 1/50, iso: 100}
-steps:
-  - id: scan
-    kind: scan_import
-    title: Scan
-    confirm: false
-    params: {spheres: 5, wait_s: 20}
-"""
-
-
 def ply_of_scene(texture: bytes) -> bytes:
     """The scene with five spheres, as MeshLab writes them with a texture: wedges at the faces."""
     scene = with_spheres(scan_mesh(), CENTRES_M)
@@ -133,13 +116,12 @@ def test_a_ply_and_its_texture_go_through_a_run_together(tmp_path: Path, as_on_d
     rig = OneScanner()
     rig.folder = tmp_path / "scans"
     with bench_store(tmp_path / "data") as store:
-        bench = begin_computing_run(store, PROTOCOL, tmp_path, rig)
+        bench = begin_computing_run(store, TEXTURED, tmp_path, rig)
         state = bench.run()
         assert state.status == "completed", bench.operator.told
         assert state.steps["scan"].measures["scan_textures"] == 1
         assert state.steps["scan"].measures["scan_normals_computed"] == 1
-        protocol = parse_protocol(PROTOCOL.encode(), params_models(), name="textured.yaml").protocol
-        files = scan_files(summarise(store, bench.run_id, protocol))
+        files = scan_files(summarise(store, bench.run_id, bench.protocol))
         assert {file.name for file in files} == {"Rücken.ply", "Häute.png"}
         assert any("Rücken.ply" in kept.note for kept in bench.payloads(FilesKept))
         bench.must_verify()

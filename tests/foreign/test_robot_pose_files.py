@@ -103,3 +103,12 @@ def test_tables_that_are_wrong_are_refused(tmp_path: Path, text: str, what: str)
     (tmp_path / "p.csv").write_text(text)
     with pytest.raises(DataError, match=what):
         read_robot_poses(tmp_path / "p.csv")
+
+
+def test_names_are_matched_as_those_of_camera_poses_are(tmp_path: Path) -> None:
+    path = tmp_path / "p.csv"
+    rows = [f"{name},{row.replace(' ', ',')}\n" for name, row in zip(("C:\\scans\\B0", "B1.JPG"), ROWS, strict=False)]
+    path.write_text("".join(("image,x,y,z,rx,ry,rz\n", *rows)))
+    assert matched_rows(read_robot_poses(path), ["b1.jpg", "b0.jpg"], path) == {"b0.jpg": 0, "b1.jpg": 1}
+    with pytest.raises(DataError, match="it is not clear whose pose it is"):
+        matched_rows(read_robot_poses(path), ["b0.jpg", "b0.png"], path)

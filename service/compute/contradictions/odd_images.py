@@ -8,7 +8,7 @@ import numpy as np
 
 from service.compute.contradictions.findings import Contradiction
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.predicted import visible_cones
+from service.compute.markers.search.predicted import CLEARLY_VISIBLE, visible_cones
 from service.compute.registration.identification.hypotheses import image_hypotheses, rivals
 from service.compute.registration.result import RegistrationResult
 from service.compute.scene import PosedImages, ScanSpheres
@@ -18,7 +18,6 @@ from service.core.units import mm
 MOST_LEFT_OUT = 0.25  # share of the images: if more contradict one another, nothing tells which are wrong
 _TIMES_TYPICAL, _LEAST_PX = 5.0, 1.0  # of the other images' distance from the prediction
 _LEAST_SEEN, _SEEN_SHARE = 4, 0.3  # spheres that must be expected, and share of them that must be used
-_VISIBLE = 0.8  # share of an outline that must be in the image and not behind another sphere
 _SAME_PLACE_M, _SAME_TURN_RAD = 5e-3, np.radians(1.0)  # of poses that are taken as one
 _NAMED = 6  # images in one sentence
 
@@ -80,7 +79,7 @@ def _misses_most(i: int, images: PosedImages, spheres: ScanSpheres, registration
     T = registration.T_scan_camera[i]
     if not np.isfinite(T).all():
         return False
-    shown = visible_cones(inverse(T), spheres.centres_m, spheres.radius_m, images.camera, least=_VISIBLE)
+    shown = visible_cones(inverse(T), spheres.centres_m, spheres.radius_m, images.camera, least=CLEARLY_VISIBLE)
     used = sum(r.image == i and not r.excluded for r in registration.residuals)
     return len(shown) >= _LEAST_SEEN and used < _SEEN_SHARE * len(shown)
 

@@ -11,7 +11,7 @@ from service.compute.contradictions.findings import Contradiction
 from service.compute.evaluation.control_spheres import SearchNearby, evaluate_controls
 from service.compute.evaluation.seen_places import WINDOW_M
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.predicted import visible_cones
+from service.compute.markers.search.predicted import CLEARLY_VISIBLE, visible_cones
 from service.compute.registration.identification.hypotheses import image_hypotheses
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.result import RegistrationResult
@@ -21,7 +21,6 @@ from service.core.geometry import inverse
 from service.core.text.counts import counted
 from service.core.units import mm
 
-_VISIBLE = 0.8  # share of an outline that must be in the image and not behind another sphere
 _LEAST_IMAGES, _USED_SHARE = 2, 0.3  # that should show a sphere, and share of them whose outline must be used
 _MOST_LACKING = 0.3  # share of the spheres: if more are not found, the list is doubtful
 _MIRRORED_GAIN = 1.3  # outlines that the mirrored list explains, over those that the list does
@@ -44,7 +43,7 @@ def odd_spheres(
     registered = replace(images, poses=registration.T_scan_camera)
     shown = {
         i: visible_cones(
-            inverse(registered.poses[i]), spheres.centres_m, spheres.radius_m, images.camera, least=_VISIBLE
+            inverse(registered.poses[i]), spheres.centres_m, spheres.radius_m, images.camera, least=CLEARLY_VISIBLE
         )
         for i in posed
     }

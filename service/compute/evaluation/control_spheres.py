@@ -17,7 +17,7 @@ from service.compute.evaluation.closure import TriangulatedSphere, locate_in_ima
 from service.compute.evaluation.seen_places import WINDOW_M, SeenPlace, SeenSpheres
 from service.compute.markers.cones import Cone
 from service.compute.markers.records import SphereOutline
-from service.compute.markers.search.predicted import visible_cones
+from service.compute.markers.search.predicted import CLEARLY_VISIBLE, visible_cones
 from service.compute.registration.identification.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array, inverse
@@ -26,7 +26,6 @@ from service.core.units import mm
 
 MOST_WORST_MM = 0.5  # radial error of one control sphere, where the paper's mean over all is 0.35
 LEAST_SHARE = 0.5  # of the outlines of one control sphere that should be seen
-_VISIBLE = 0.8  # share of an outline in the image and not behind another sphere that is expected to be measured
 _NEAR_RADII = 1.0  # around a place that the images agree on, where the outlines that lack are searched
 _FOUND_SHARE = 0.3  # of a capture's images: in a capture that shows no control sphere in so many, none was placed
 _SIGMAS, _LEAST_DISPLACEMENT_M = 5.0, 0.3e-3  # from which a displacement is told
@@ -142,7 +141,7 @@ def evaluate_controls(
     first = len(spheres.centres_m)
     cones = {int(i): visible_cones(inverse(images.poses[i]), every, spheres.radius_m, images.camera) for i in posed}
     clear = {
-        i: visible_cones(inverse(images.poses[i]), every, spheres.radius_m, images.camera, least=_VISIBLE)
+        i: visible_cones(inverse(images.poses[i]), every, spheres.radius_m, images.camera, least=CLEARLY_VISIBLE)
         for i in cones
     }
     expected = {s: [i for i, shown in clear.items() if first + s in shown] for s in range(len(spheres.control_m))}

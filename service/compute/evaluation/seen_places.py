@@ -11,6 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from service.compute.evaluation.closure import locate_in_images
 from service.compute.markers.records import SphereOutline
+from service.compute.markers.search.nearby import is_another
 from service.compute.registration.identification.identity import Assignment
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.geometry import Array
@@ -65,8 +66,7 @@ class SeenSpheres:
     def add(self, image: int, found: Sequence[SphereOutline]) -> None:
         """Add outlines of an image that are not those of spheres that it already has."""
         for outline in found:
-            half = outline.cone.half_angle_rad
-            if all(float(np.linalg.norm(outline.cone.axis - o.cone.axis)) > 0.6 * half for o in self.outlines[image]):
+            if is_another(outline, self.outlines[image]):
                 self.outlines[image].append(outline)
 
     def places(self, expected: dict[int, list[int]]) -> dict[int, SeenPlace]:

@@ -316,11 +316,7 @@ def _with_contradictions(
         "left_out": {images.names[i]: why for i, why in images.left_out.items()},
     }
     if beyond is not None:
-        errors = ((e.name, e.value, e.sigma, e.expected) for e in beyond.errors)
-        found["common_errors"] = tuple(
-            job.CommonError(name=name, value=value, sigma=sigma, expected=expected)
-            for name, value, sigma, expected in errors
-        )
+        found["common_errors"] = tuple(job.CommonError(**asdict(one)) for one in beyond.errors)
         found["blur_px"] = beyond.blur_px
     return record.model_copy(update=found)
 

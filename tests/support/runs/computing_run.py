@@ -13,6 +13,21 @@ from service.worker.loop import work
 from tests.support.rig.bench_rig import BenchRig
 from tests.support.runs.bench_run import Bench, begin_run
 
+# A run of one step, whose scan has a texture.
+TEXTURED = """\
+id: textured
+version: "1"
+title: A textured scan
+spheres: {radius_mm: 6, registration: 5, control: 0}
+camera: {aperture_f: 22, exposure_s: 1/50, iso: 100}
+steps:
+  - id: scan
+    kind: scan_import
+    title: Scan
+    confirm: false
+    params: {spheres: 5, wait_s: 20}
+"""
+
 
 class OneScanner(BenchRig):
     """The bench with a scanner that writes its meshes, in millimetres, into a folder."""

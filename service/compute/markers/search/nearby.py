@@ -14,6 +14,7 @@ from service.compute.markers.detect import confirmed_outlines, find_rough
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 
 _SIZES = (0.75, 1.3)  # of the expected radius, which is wrong by the displacement along the view
+_SAME = 0.6  # of an outline's half angle: one whose axis is nearer is of the same sphere
 _CANDIDATES = 24  # circles examined around one place
 
 
@@ -34,10 +35,15 @@ def find_nearby(
     found: list[SphereOutline] = []
     for cone, window_rad in expected:
         for outline in _around(image_bgr, camera, cone, window_rad, options):
-            apart = (float(np.linalg.norm(outline.cone.axis - other.cone.axis)) for other in found)
-            if all(gap > 0.6 * outline.cone.half_angle_rad for gap in apart):
+            if is_another(outline, found):
                 found.append(outline)
     return tuple(found)
+
+
+def is_another(outline: SphereOutline, known: Sequence[SphereOutline]) -> bool:
+    """Whether an outline is of another sphere than each of those that are known in the same image."""
+    apart = (float(np.linalg.norm(outline.cone.axis - other.cone.axis)) for other in known)
+    return all(gap > _SAME * outline.cone.half_angle_rad for gap in apart)
 
 
 def _around(

@@ -27,6 +27,7 @@ WIDE = 0.42  # largest search range, for a robot that is off by millimetres
 _GATE = MatchGate(0.05, 0.04)  # of a whole outline from the image's other spheres; scaled for partial ones
 _ROUGH_GATE = 0.12
 _APPROACH_GATE = 0.02  # of approached outlines, on whose agreement the others are predicted
+CLEARLY_VISIBLE = 0.8  # the share from which on a sphere that is not found counts as lacking
 _LEAST_PART = 0.45  # share of an outline that must be inside the image and not behind another sphere
 _REGION_RADIUS_PX = 24.0  # of a sphere in the reduced region that is searched
 _REGION_RAYS = 64

@@ -16,6 +16,7 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from service.compute.poses.files.image_names import matched_names
 from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.text.counts import counted
@@ -128,7 +129,6 @@ def read_robot_poses(
         DataError: there is no pose, or a row has another form; the message names file:line.
     """
     lines = [(line, _cells(row)) for line, row in csv_rows(path)]
-    lines = [(line, cells) for line, cells in lines if any(cells) and not cells[0].startswith("#")]
     if not lines:
         raise DataError("the file holds no pose", where=str(path), remedy="Write one line per image")
     columns = _columns(lines[0][1], path, lines[0][0])
@@ -174,7 +174,7 @@ def matched_rows(table: RobotPoseTable, images: Sequence[str], path: Path) -> di
     """The row of each image that has one: by name, or, without names, by the order of the numbers in the names.
 
     Raises:
-        DataError: without names, there are more or fewer rows than images.
+        DataError: without names, there are more or fewer rows than images; with names, as `matched_names`.
     """
     if table.names is None:
         if len(table.position) != len(images):
@@ -185,15 +185,7 @@ def matched_rows(table: RobotPoseTable, images: Sequence[str], path: Path) -> di
             )
         return {name: row for row, name in enumerate(sorted(images, key=natural))}
     rows = {name: row for row, name in enumerate(table.names)}
-    alike: dict[str, list[int]] = {}
-    for name, row in rows.items():
-        alike.setdefault(_file_name(name), []).append(row)
-    found: dict[str, int] = {}
-    for image in images:
-        same = [rows[image]] if image in rows else alike.get(_file_name(image), [])
-        if len(same) == 1:
-            found[image] = same[0]
-    return found
+    return {image: rows[name] for image, name in matched_names(images, rows, str(path)).items()}
 
 
 def other_orders(rows: Mapping[str, int]) -> Iterator[tuple[dict[str, int], str]]:
@@ -213,10 +205,6 @@ def natural(name: str) -> list[tuple[int, int, str]]:
     ]
 
 
-def _file_name(name: str) -> str:
-    return re.split(r"[\\/]", name)[-1]
-
-
 @dataclass(frozen=True, slots=True)
 class _Columns:
     """Where a table has its numbers, and what they are."""
@@ -230,9 +218,8 @@ class _Columns:
 
 
 def _cells(row: Sequence[str]) -> list[str]:
-    """The cells of a row; separated by blanks where there is no other separator, without p[ … ] as URScript has."""
-    cells = row[0].split() if len(row) == 1 else row
-    return [re.sub(r"^\s*(p?\[)|\]\s*$", "", cell).strip() for cell in cells]
+    """The cells of a row without p[ … ], as URScript writes a pose."""
+    return [re.sub(r"^\s*(p?\[)|\]\s*$", "", cell).strip() for cell in row]
 
 
 def _columns(first: Sequence[str], path: Path, line: int) -> _Columns:
