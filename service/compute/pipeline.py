@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -113,15 +113,9 @@ class PipelineResult:
             },
             "common_errors": []
             if self.beyond is None
-            else [
-                {"name": e.name, "value": e.value, "sigma": e.sigma, "expected": e.expected, "named": e.significant}
-                for e in self.beyond.errors
-            ],
+            else [{**asdict(error), "named": error.significant} for error in self.beyond.errors],
             "blur_px": None if self.beyond is None else self.beyond.blur_px,
-            "findings": [
-                {"kind": one.kind, "what": one.what, "remedy": one.remedy, "refuses": one.refuses}
-                for one in self.findings
-            ],
+            "findings": [asdict(one) for one in self.findings],
             "markers": [
                 {
                     "index": m,

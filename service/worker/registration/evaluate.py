@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from service.compute.camera_model import CameraModel
+from service.compute.contradictions.common_errors import UNEXPLAINED
 from service.compute.evaluation.closure import Alignment, compare_shapes, locate_in_images
 from service.compute.evaluation.control_spheres import ControlEvaluation, ExpectedNearby, evaluate_controls
 from service.compute.evaluation.error_budget import (
@@ -30,7 +31,7 @@ from service.compute.markers.detectors import options_for
 from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.image_files import search_nearby
 from service.compute.overlay import draw_overlay
-from service.compute.pipeline import Detection
+from service.compute.pipeline import INTRINSICS, Detection
 from service.compute.registration.identification.identity import Assignment
 from service.compute.registration.identification.pairing import CONTROL_GATE, paired
 from service.compute.scene import PosedImages, ScanSpheres
@@ -48,7 +49,7 @@ from service.worker.job import JobAnswer, JobContext
 from service.worker.poses.photographs import photographs_at
 from service.worker.registration.outlines import read_outlines
 
-_COMMON = ("common", "intrinsics", "unexplained")  # components that move all spheres equally
+_COMMON = ("common", INTRINSICS, UNEXPLAINED)  # components that move all spheres equally
 
 
 @dataclass(frozen=True, slots=True)
