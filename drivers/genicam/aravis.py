@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import ctypes.util
+from contextlib import ExitStack
 from typing import Any
 
 from drivers.genicam.link import Frame, LibraryMissingError, LinkError, NoImageError, NotInControlError
@@ -19,6 +20,7 @@ _SUCCESS = 0  # of ArvBufferStatus
 # one that sees all traffic of the machine until its filter is set; a foreign packet ends the wait for the image.
 _NOTHING_IN_IT = (1, 8)
 _TRIES = 5  # exposures
+_SINGLE_FRAME = 1  # of ArvAcquisitionMode
 _DENIED = "access-denied"  # GigE Vision's answer to who is not in control; what it lacks it calls otherwise
 _NO_CONTROL = "the camera takes no settings from here: another program controls it, or the connection was lost"
 _POINTER, _TEXT, _REAL = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_double
@@ -52,13 +54,18 @@ class AravisCamera:
 
     def _controls(self) -> bool:
         """Whether the camera takes settings from here. By GigE Vision one program controls, and others may read."""
-        is_network, device, is_controller = (
-            getattr(self._aravis, f"arv_{name}")
-            for name in ("camera_is_gv_device", "camera_get_device", "gv_device_is_controller")
+        device, is_controller = (
+            getattr(self._aravis, f"arv_{name}") for name in ("camera_get_device", "gv_device_is_controller")
         )
-        for function, gives in ((is_network, ctypes.c_int), (device, _POINTER), (is_controller, ctypes.c_int)):
+        for function, gives in ((device, _POINTER), (is_controller, ctypes.c_int)):
             function.restype, function.argtypes = gives, (_POINTER,)
-        return not is_network(self._camera) or bool(is_controller(device(self._camera)))
+        return not self._is_network() or bool(is_controller(device(self._camera)))
+
+    def _is_network(self) -> bool:
+        """Whether it is a camera of GigE Vision, whose images come in packets."""
+        is_network = self._aravis.arv_camera_is_gv_device
+        is_network.restype, is_network.argtypes = ctypes.c_int, (_POINTER,)
+        return bool(is_network(self._camera))
 
     @property
     def software(self) -> str:
@@ -120,19 +127,46 @@ class AravisCamera:
 
     def _acquired(self, timeout_s: float) -> Frame | None:
         """One image; None if there is nothing of an image in the buffer."""
-        timeout_us = ctypes.c_uint64(round(us(timeout_s)))
-        buffer = self._of_camera("arv_camera_acquisition", _POINTER, timeout_us, of=(ctypes.c_uint64,))
-        if not buffer:
-            raise NoImageError("no image came")
-        try:
+        with ExitStack() as until_the_end:
+            stream = self._of_camera("arv_camera_create_stream", _POINTER, None, None, of=(_POINTER, _POINTER))
+            until_the_end.callback(self._unref, stream)
+            if self._is_network():
+                self._wait_for_packets(stream, timeout_s / 2)
+            self._give_buffer(stream)
+            self._of_camera("arv_camera_set_acquisition_mode", None, _SINGLE_FRAME, of=(ctypes.c_int,))
+            self._of_camera("arv_camera_start_acquisition", None)
+            pop = self._aravis.arv_stream_timeout_pop_buffer
+            pop.restype, pop.argtypes = _POINTER, (_POINTER, ctypes.c_uint64)
+            buffer = pop(stream, round(us(timeout_s)))
+            if buffer:
+                until_the_end.callback(self._unref, buffer)
+            self._of_camera("arv_camera_stop_acquisition", None)
+            if not buffer:
+                raise NoImageError("no image came")
             status = self._of_buffer(buffer, "status", ctypes.c_int)
             if status in _NOTHING_IN_IT:
                 return None
             if status != _SUCCESS:
                 raise NoImageError(f"an image is incomplete (Aravis' status {status})")
             return self._frame(buffer)
-        finally:
-            self._unref(buffer)
+
+    def _wait_for_packets(self, stream: int, longest_s: float) -> None:
+        """Let an image be whole that much later than its last packet, after which it counts as incomplete.
+
+        By itself Aravis gives up after 0.1 s, measured when its own thread is run: on a busy machine an image was
+        called incomplete whose packets lay in the socket.
+        """
+        set_property = self._gobject.g_object_set
+        set_property.restype, set_property.argtypes = None, (_POINTER, _TEXT)  # and what a property takes, and NULL
+        set_property(stream, b"frame-retention", ctypes.c_uint(round(us(longest_s))), ctypes.c_void_p(None))
+
+    def _give_buffer(self, stream: int) -> None:
+        """Give the stream, which then owns it, a buffer for one image."""
+        size = int(self._of_camera("arv_camera_get_payload", ctypes.c_uint))
+        allocate, push = self._aravis.arv_buffer_new_allocate, self._aravis.arv_stream_push_buffer
+        allocate.restype, allocate.argtypes = _POINTER, (ctypes.c_size_t,)
+        push.restype, push.argtypes = None, (_POINTER, _POINTER)
+        push(stream, allocate(size))
 
     def _text(self, what: str) -> str:
         """The text that `arv_camera_get_…` gives."""

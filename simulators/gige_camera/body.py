@@ -97,7 +97,10 @@ class IndustrialBody:
         self._write_log(moment, settings)
         lost = 3 if kind in ("lost_packets", "truncate") else 0
         block = (counter - 1) % _LAST_BLOCK + 1
-        self._stream.send(block, code, pixels, nanoseconds(began_s), lost, for_good=kind == "truncate")
+        stall_s = float(fault.value or 0.5) if fault is not None and kind == "stall" else 0.0
+        self._stream.send(
+            block, code, pixels, nanoseconds(began_s), lost, for_good=kind == "truncate", stall_s=stall_s
+        )
 
     def _settings(self) -> ExposureSettings:
         exposure_us = self._registers.real(EXPOSURE_US)

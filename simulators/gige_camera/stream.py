@@ -42,9 +42,13 @@ class Stream:
         self._lost_for_good: frozenset[int] = frozenset()
 
     def send(
-        self, block: int, code: int, pixels: bytes, exposed_ns: int, lost: int = 0, *, for_good: bool = False
-    ) -> None:
-        """Send an image with this pixel format; `lost` packets in its middle are lost, perhaps for good."""
+        self, block: int, code: int, pixels: bytes, exposed_ns: int, lost: int = 0, *, for_good: bool = False,
+        stall_s: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Send an image with this pixel format.
+
+        `lost` packets in its middle are lost, perhaps for good; `stall_s` is a pause in its middle.
+        """
         packets = self._packed(block, code, pixels, exposed_ns)
         middle = len(packets) // 2
         missing = frozenset(range(middle, middle + lost))
@@ -61,6 +65,8 @@ class Stream:
                 self._sent = number + 1
             if number % _AT_ONCE == 0:
                 time.sleep(pause_s)
+            if number == middle:
+                time.sleep(stall_s)
 
     def resend(self, block: int, first: int, last: int) -> None:
         """Send packets of the last image again; what is lost for good is said to be unavailable.
