@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 
 from service.compute.camera_model import CameraModel
-from service.compute.contradictions.common_errors import UNEXPLAINED
+from service.compute.contradictions.common_errors import UNEXPLAINED, held_lens_covariance
 from service.compute.contradictions.odd_spheres import require_handedness
 from service.compute.markers.cones import Cone
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import INTRINSICS, PipelineResult, register_images
 from service.compute.registration.identification.identity import Assignment
+from service.compute.registration.settings import RegistrationSettings
+from service.compute.registration.solve import register
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
-from service.core.geometry import Array, apply, inverse
+from service.core.geometry import Array, apply, inverse, skew
 from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, exact_outlines, scene
 
 N = 10
@@ -236,6 +238,29 @@ def test_the_covariance_of_the_calibration_is_a_component() -> None:
     assert with_it.registration.sigma_at_m(CENTRE_M) > without.registration.sigma_at_m(CENTRE_M)
     both = np.sum(list(with_it.registration.components.values()), axis=0)
     assert np.allclose(both, with_it.registration.covariance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("refined", [False, True], ids=["cameras as given", "cameras refined"])
+def test_an_error_of_the_lens_moves_the_scan_as_its_component_says(refined: bool) -> None:
+    """The camera is held as calibrated: what the outlines would tell of it is not taken off."""
+    off = np.array([0.8, 0.8, 0.5, -0.4, 0.0, 0.0, 0.0, 0.0])
+    wrong = replace(MADE.camera, fx=MADE.camera.fx + 0.8, fy=MADE.camera.fy + 0.8, cx=MADE.camera.cx + 0.5)
+    wrong = replace(wrong, cy=wrong.cy - 0.4)
+    exact = changed([exact_outlines(MADE, i, REGISTRATION_M, 0.001, seed=8)[0] for i in range(N)], through(wrong))
+    poses = PosedImages(MADE.T_world_camera, wrong)
+    held = register(exact, NAMED, poses, ScanSpheres(REGISTRATION_M, RADIUS_M))
+    lens = np.outer(off, off) + np.diag([1e-6] * 4 + [1e-14] * 4)
+    unsure = register(
+        exact, NAMED, poses, ScanSpheres(REGISTRATION_M, RADIUS_M), RegistrationSettings(intrinsics_covariance=lens)
+    )
+    component = held_lens_covariance(unsure, lens, refined=refined)
+    placed = held.T_scan_camera_refined if refined else held.T_scan_camera
+    # Seen from the cameras, where they are in truth.
+    seen_m = [apply(T @ inverse(there), CENTRE_M) for T, there in zip(MADE.T_world_camera, placed, strict=True)]
+    error_m = np.mean(seen_m, axis=0) - apply(MADE.T_world_scan, CENTRE_M)
+    lever = np.hstack([np.eye(3), -skew(held.T_world_scan[:3, :3] @ CENTRE_M)])
+    stated_m = np.sqrt(np.trace(lever @ component @ lever.T))
+    assert np.linalg.norm(error_m) == pytest.approx(stated_m, rel=0.15)
 
 
 def test_control_spheres_are_judged_without_the_images_that_were_left_out() -> None:

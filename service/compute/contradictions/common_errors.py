@@ -124,29 +124,22 @@ def beyond_model(
     return BeyondModel(errors, blur_px, component, _findings(significant, blur_px, held, camera.fx))
 
 
-def added_covariance(exact: Array, uncertain: Array) -> Array:
-    """(6, 6) What uncertain inputs add to a covariance with the poses held fixed; positive semidefinite."""
-    unit = np.sqrt(np.diag(exact))  # so that metres and radians are comparable
-    more = (uncertain - exact) / np.outer(unit, unit)
-    values, vectors = np.linalg.eigh((more + more.T) / 2)
-    kept = (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(unit, unit)
-    return np.asarray(kept, dtype=np.float64)
-
-
-def held_lens_covariance(uncertain: RegistrationResult, lens_covariance: Array) -> Array:
+def held_lens_covariance(uncertain: RegistrationResult, lens_covariance: Array, *, refined: bool = False) -> Array:
     """(6, 6) covariance that a calibration's errors cause in T_world_scan if the camera is held as calibrated.
 
-    Whole, not what the outlines leave of it, since the camera is not corrected: an error e of the lens moves the scan
-    by V e, V the regression of the scan's errors on those of the lens.
+    Whole, not what the outlines leave of it, since the camera is not corrected: an error e of the lens moves the
+    unknowns by V e, V the regression of their errors on those of the lens.
 
     Args:
         uncertain: the registration with this covariance as a prior.
         lens_covariance: (8, 8) of the calibration.
+        refined: whether the scan is meant relative to the cameras that the outlines refined.
     """
     problem, joint = uncertain.solution.problem, uncertain.solution.covariance
     lens = slice(problem.lens_column, problem.size)
-    V = np.linalg.solve(joint[lens, lens], joint[lens, :6]).T
-    return np.asarray(V @ lens_covariance @ V.T, dtype=np.float64)
+    V = np.linalg.solve(joint[lens, lens], joint[lens]).T
+    moved = uncertain.refined_gain()[0] @ V if refined else V[:6]
+    return np.asarray(moved @ lens_covariance @ moved.T, dtype=np.float64)
 
 
 def _errors(

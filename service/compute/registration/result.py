@@ -89,6 +89,23 @@ class RegistrationResult:
     def refined_components(self) -> dict[str, Array]:
         """Parts of `refined_covariance`; the noise of outlines and poses is inseparable and one part."""
         s = self.solution
+        problem = s.problem
+        by_common, own = self.refined_gain()
+        prior, inside = problem.prior(), slice(problem.sphere_column, problem.common_column)
+        through = by_common @ s.covariance
+        spheres = through[:, inside] @ prior[inside, inside] @ through[:, inside].T
+        common = through[:, problem.common_column :]
+        common = common @ prior[problem.common_column :, problem.common_column :] @ common.T
+        noise = through @ by_common.T + own - spheres - common
+        return {"outlines and poses": noise, "common": common, "spheres": spheres}
+
+    def refined_gain(self) -> tuple[Array, Array]:
+        """How errors move the scan relative to `T_scan_camera_refined`, averaged over all images with outlines.
+
+        Returns:
+            (6, n) by errors of the n common unknowns, and the (6, 6) covariance by the images' own errors.
+        """
+        s = self.solution
         problem, gain = s.problem, s.pose_gain()
         seen = np.unique(problem.image)
         T_base_camera = s.state.cameras(problem, refined=True)
@@ -104,13 +121,7 @@ class RegistrationResult:
             by_common -= to_world @ by_pose @ gain[i]
             part = to_world @ by_pose
             own += part @ s.marginal.Q[i] @ part.T
-        prior, inside = problem.prior(), slice(problem.sphere_column, problem.common_column)
-        through = by_common @ s.covariance
-        spheres = through[:, inside] @ prior[inside, inside] @ through[:, inside].T
-        common = through[:, problem.common_column :]
-        common = common @ prior[problem.common_column :, problem.common_column :] @ common.T
-        noise = through @ by_common.T + own - spheres - common
-        return {"outlines and poses": noise, "common": common, "spheres": spheres}
+        return by_common, own
 
     def sigma_map_m(self, points_scan_m: Array) -> Array:
         """Target registration error: predicted standard deviation (N,) in m, 3D, at points (N, 3) of the scan."""
@@ -131,11 +142,6 @@ class RegistrationResult:
     def _at_m2(self, covariance: Array, point_scan_m: Array) -> Array:
         J = np.hstack([np.eye(3), -skew(self.T_world_scan[:3, :3] @ point_scan_m)])
         return np.asarray(J @ covariance[:6, :6] @ J.T, dtype=np.float64)
-
-    @property
-    def solution_covariance(self) -> Array:
-        """(6, 6) covariance of T_world_scan by the solution alone, without components added to it."""
-        return self.solution.covariance[:6, :6]
 
 
 def _variance_m2(turned: Array, covariance: Array) -> Array:

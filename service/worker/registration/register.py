@@ -12,7 +12,7 @@ import numpy as np
 
 from service.compute.camera_model import CameraModel
 from service.compute.capture.located import poses_by_spheres
-from service.compute.contradictions.common_errors import UNEXPLAINED, added_covariance
+from service.compute.contradictions.common_errors import UNEXPLAINED, held_lens_covariance
 from service.compute.evaluation.accuracy import leave_one_out
 from service.compute.evaluation.closure import Alignment
 from service.compute.markers.records import SphereOutline
@@ -65,8 +65,7 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
         components = components | {UNEXPLAINED: answer.components[UNEXPLAINED][:6, :6]}
     if lens is not None:
         judged = again(replace(settings, intrinsics_covariance=lens)).registration
-        both = [r.refined_covariance if refined else r.solution_covariance for r in (placing, judged)]
-        components = components | {INTRINSICS: added_covariance(*both)}
+        components = components | {INTRINSICS: held_lens_covariance(judged, lens, refined=refined)}
     covariance = np.sum(list(components.values()), axis=0)
     # Unless they are free, the poses of located images know every sphere: none is left out of them.
     left_out = None if images.located and not free else _leave_one_out(placing, refined=refined)
