@@ -154,6 +154,11 @@ class SphereMeasures(LayoutMeasures):
     radius_residual_max_mm: Annotated[
         float | None, Measure("mm", 1e-3, 5), "largest difference between a fitted radius and the nominal one"
     ] = None
+    sphere_radius_mm: Annotated[
+        float | None,
+        Measure("mm", 1e-3, 5),
+        "radius of the spheres by the mesh, in the mean: another than theirs means a wrong scale or a coat",
+    ] = None
     sphere_rms_max_mm: Annotated[
         float | None, Measure("mm", 1e-3, 5), "largest rms distance of the mesh's vertices from their sphere"
     ] = None
@@ -171,6 +176,14 @@ class SphereMeasures(LayoutMeasures):
     loop_closure_chi2: Annotated[
         Ratio,
         "chi-squared per degree of freedom of the spheres that did not move: near 1 if the covariances are right",
+    ] = None
+    sphere_scale_percent: Annotated[
+        float | None,
+        Measure("%", -15, 15),
+        "by how much distances between spheres are larger here than in the earlier mesh: one of two scanners may err",
+    ] = None
+    sphere_scale_sigma_percent: Annotated[
+        float | None, Measure("%", 1e-4, 5), "standard deviation of `sphere_scale_percent`"
     ] = None
 
 

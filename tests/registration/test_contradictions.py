@@ -52,7 +52,7 @@ def registered(
     """The registration; `named` says that the outlines are known to be those of the list, which takes less time."""
     return register_images(
         outlines,
-        PosedImages(poses, camera, names=[f"view_{i}.jpg" for i in range(N)]),
+        PosedImages(poses, camera, names=[f"view_{i}.jpg" for i in range(len(poses))]),
         ScanSpheres(listed_m, radius_m),
         assignments=NAMED if named else None,
         lens_covariance=lens_covariance,
@@ -122,6 +122,43 @@ def test_a_wrong_focal_length_is_measured_and_named_and_its_effect_is_counted() 
     unsure = registered(outlines, camera=wrong, lens_covariance=lens)
     assert unsure.findings == ()
     assert in_sigma(unsure) < 3
+
+
+@pytest.mark.parametrize(
+    ("of_list", "of_positions", "wrong"),
+    [(1.01, 1.0, "so that the list is wrong"), (1.0, 1.01, "so that the positions are wrong"), (0.9985, 1.0, "")],
+)
+def test_a_list_in_another_scale_than_the_positions_is_told_from_a_wrong_lens(
+    of_list: float, of_positions: float, wrong: str
+) -> None:
+    poses = MADE.T_world_camera.copy()
+    poses[:, :3, 3] *= of_positions
+    result = registered(seen(), poses=poses, listed_m=of_list * REGISTRATION_M)
+    assert [finding.kind for finding in result.findings if finding.refuses] == ["scale"]
+    finding = next(finding for finding in result.findings if finding.kind == "scale")
+    assert wrong in finding.what
+    assert ("larger" if of_list > of_positions else "smaller") in finding.what
+    assert result.beyond is not None
+    (scale,) = (e for e in result.beyond.errors if e.name == "scale")
+    assert scale.value == pytest.approx(of_list / of_positions - 1, abs=3 * scale.uncertainty)
+    assert in_sigma(result) < 3
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(0.93, "multiplied by about 1.0"), (1 / 25.4, "inches taken as milli")]
+)
+def test_a_list_so_far_off_that_nothing_fits_is_told_with_its_scale(factor: float, words: str) -> None:
+    with pytest.raises(ComputeError, match=words):
+        registered(seen()[:3], poses=MADE.T_world_camera[:3], listed_m=factor * REGISTRATION_M, named=False)
+
+
+def test_positions_in_another_unit_than_list_and_radius_are_told_with_their_scale() -> None:
+    poses = MADE.T_world_camera.copy()
+    poses[:, :3, 3] /= 25.4
+    with pytest.raises(
+        ComputeError, match=r"multiplied by 25\.\d+ \(inches taken as millimetres\), \d+ images agree"
+    ):
+        registered(seen(), poses=poses, named=False)
 
 
 def test_a_principal_point_that_is_off_is_named_with_its_sign() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 
 import numpy as np
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
 from service.compute.surfaces.constellations import match_constellations
+from service.compute.surfaces.loop_closure import close_loop
 from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, apply, inverse, transform
@@ -169,6 +171,26 @@ def test_constellations_match_in_any_order(
 def test_mirrored_constellation_is_refused() -> None:
     with pytest.raises(ComputeError, match=r"mirror images \(10 spheres agree only when mirrored\)"):
         match_constellations(CONSTELLATION, CONSTELLATION * [1, -1, 1])
+
+
+@pytest.mark.parametrize("scale", [1.02, 0.93, 1.1])
+def test_a_constellation_in_another_scale_is_refused_with_it(scale: float) -> None:
+    rng = np.random.default_rng(5)
+    other = scale * CONSTELLATION + rng.normal(0, 5e-5, CONSTELLATION.shape)
+    with pytest.raises(ComputeError, match=r"with the second multiplied by (\d\.\d{4}), 10 do") as told:
+        match_constellations(CONSTELLATION, other)
+    words = re.search(r"multiplied by (\d\.\d{4})", str(told.value))
+    assert words is not None
+    assert float(words[1]) == pytest.approx(1 / scale, abs=5e-4)
+
+
+def test_a_small_difference_of_scale_is_measured_with_its_sigma() -> None:
+    rng = np.random.default_rng(6)
+    covariance = np.broadcast_to(np.eye(3) * 2e-5**2, (len(CONSTELLATION), 3, 3))
+    other = 1.003 * CONSTELLATION + rng.normal(0, 2e-5, CONSTELLATION.shape)
+    loop = close_loop(CONSTELLATION, covariance, other, covariance, match_constellations(CONSTELLATION, other))
+    assert loop.scale == pytest.approx(1.003, abs=3 * loop.scale_sigma)
+    assert 1e-5 < loop.scale_sigma < 2e-4
 
 
 def test_flat_and_symmetric_constellations_are_refused() -> None:

@@ -4,6 +4,9 @@ A registration holds the camera as calibrated, and common shifts and growths of 
 outlines say otherwise, its residuals may look harmless while the scan is misplaced by more than the stated sigma. A
 second fit with these errors free tells how large they are, and how far the scan moves with them: that much is
 uncertain, since the outlines alone do not tell which of several inputs is wrong.
+
+A list of spheres in another scale than the camera positions looks like a wrong focal length, and the other way round.
+Where there is a sign of either, a third fit leaves both free: they differ in how perspective changes with depth.
 """
 
 from __future__ import annotations
@@ -37,13 +40,22 @@ _EXPECTED_FOCAL = 0.5e-4
 _SHARP_PX = 0.7  # blur up to which the sizes of the common errors were measured; they grow with it
 _NAMED_BLUR = 1.3  # times that, from which blur is told
 _LIGHT_OF_GROWTH = 2 / 3  # as in EXPECTED_COMMON_ERRORS
+# Clean rendered scenes gave at most 1.1e-4 with focal length and scale free.
+_EXPECTED_SCALE = 1e-4
+_SIGN_OF_SCALE = 2e-4  # from which the positions that the outlines prefer are a sign of another scale
+_AGREES = 3.0  # standard deviations
+_LEAST_POSITIONS = 4  # that tell a scale
 
-CommonErrorName = Literal["shift_x_px", "shift_y_px", "growth_px", "focal_x", "focal_y"]
+CommonErrorName = Literal["shift_x_px", "shift_y_px", "growth_px", "focal_x", "focal_y", "scale"]
 
 
 @dataclass(frozen=True, slots=True)
 class CommonError:
-    """One error that all outlines share; focal lengths are relative, given over true, less one."""
+    """One error that all outlines share.
+
+    Focal lengths are relative, given over true, less one; the scale is that of the list of spheres, in camera
+    positions, less one.
+    """
 
     name: CommonErrorName
     value: float
@@ -108,20 +120,58 @@ def beyond_model(
         intrinsics_covariance=lens,
         common_errors=CommonErrors(_FREE_PX, _FREE_PX, common.light_px),
     )
-    try:
-        free = register(outlines, assignments, images, spheres, wide)
-    except ComputeError:  # the outlines do not determine so much
-        free = None
+    free = _fitted(outlines, assignments, images, spheres, wide)
     errors = () if free is None else _errors(free, images, common, lens_covariance)
+    if images.metric and (
+        _focal_length_is_off(errors) or abs(_scale_of_positions(held, images) - 1) > _SIGN_OF_SCALE
+    ):
+        scaled = _fitted(outlines, assignments, replace(images, metric=False), spheres, wide)
+        told = () if scaled is None else _errors(scaled, images, common, lens_covariance)
+        if any(e.significant for e in told if e.name == "scale") or _focal_length_is_off(told):
+            free, errors = scaled, told  # else the images cannot tell the two apart
     significant: dict[CommonErrorName, CommonError] = {e.name: e for e in errors if e.significant}
     component = np.zeros((6, 6))
     if free is not None and significant:
-        moved = _moved(held, free)
-        component += np.outer(moved, moved)
+        ways = _moved(held, free)
+        component += sum(np.outer(moved, moved) for moved in ways) / len(ways)
     light_px = _light_px(significant.get("growth_px"), blur_px, common)
     light_m = held.solution.problem.light_unit_m * float(np.sqrt(max(0.0, light_px**2 - common.light_px**2)))
     component += block_diag(light_m**2 * np.eye(3), np.zeros((3, 3)))
-    return BeyondModel(errors, blur_px, component, _findings(significant, blur_px, held, camera.fx))
+    growth = next((e for e in errors if e.name == "growth_px"), None)
+    return BeyondModel(errors, blur_px, component, _findings(significant, growth, blur_px, held, camera.fx))
+
+
+def _fitted(
+    outlines: Sequence[Sequence[SphereOutline]],
+    assignments: Sequence[Assignment],
+    images: PosedImages,
+    spheres: ScanSpheres,
+    settings: RegistrationSettings,
+) -> RegistrationResult | None:
+    """The registration; None if the outlines do not determine so much."""
+    try:
+        return register(outlines, assignments, images, spheres, settings)
+    except ComputeError:
+        return None
+
+
+def _focal_length_is_off(errors: Sequence[CommonError]) -> bool:
+    return any(e.significant for e in errors if e.name in ("focal_x", "focal_y"))
+
+
+def _scale_of_positions(held: RegistrationResult, images: PosedImages) -> float:
+    """By how much the outlines have the camera positions larger than given, at the station that differs most.
+
+    An estimate that takes no time: poses that are trusted too much move less.
+    """
+    stations = images.stations
+    more: list[float] = []
+    for g in sorted(set(stations.tolist())):
+        placed = (stations == g) & np.isfinite(held.T_scan_camera_refined).all(axis=(1, 2))
+        if np.count_nonzero(placed) >= _LEAST_POSITIONS:
+            refined_m = held.T_scan_camera_refined[placed, :3, 3]
+            more.append(align_points(refined_m, images.poses[placed, :3, 3], with_scale=True)[1])
+    return max(more, key=lambda s: abs(s - 1), default=1.0)
 
 
 def held_lens_covariance(uncertain: RegistrationResult, lens_covariance: Array, *, refined: bool = False) -> Array:
@@ -156,22 +206,32 @@ def _errors(
     expected = (*shift.tolist(), common.growth_px, *focal.tolist())
     unit = (1.0, 1.0, 1.0, *f.tolist())
     names: tuple[CommonErrorName, ...] = ("shift_x_px", "shift_y_px", "growth_px", "focal_x", "focal_y")
-    return tuple(
+    out = tuple(
         CommonError(name, float(v) / u, float(s) / u, e)
         for name, v, s, u, e in zip(names, values, sigma, unit, expected, strict=True)
     )
+    if not images.metric or not problem.with_scale:
+        return out
+    of_scale = float(np.sqrt(max(solution.covariance[problem.scale_column, problem.scale_column], 0.0)))
+    return (*out, CommonError("scale", free.scale - 1, free.scale * of_scale, _EXPECTED_SCALE))
 
 
-def _moved(held: RegistrationResult, free: RegistrationResult) -> Array:
-    """(6,) perturbation of T_world_scan, against the cameras, from the one registration to the other."""
+def _moved(held: RegistrationResult, free: RegistrationResult) -> tuple[Array, ...]:
+    """(6,) perturbations of T_world_scan, against the cameras, from the one registration to the other.
+
+    Two, if their scales differ: the one holds if the positions are wrong, the other if the list is.
+    """
     placed = np.isfinite(held.T_scan_camera).all(axis=(1, 2)) & np.isfinite(free.T_scan_camera).all(axis=(1, 2))
     T, _ = align_points(held.T_scan_camera[placed, :3, 3], free.T_scan_camera[placed, :3, 3])
     R = held.T_world_scan[:3, :3]
     if held.solution.problem.with_scale:
-        return np.concatenate([R @ T[:3, 3], Rotation.from_matrix(R @ T[:3, :3] @ R.T).as_rotvec()])
+        return (np.concatenate([R @ T[:3, 3], Rotation.from_matrix(R @ T[:3, :3] @ R.T).as_rotvec()]),)
     # Given metric poses, the scan moves in their frame.
     turn = Rotation.from_matrix(free.T_world_scan[:3, :3] @ R.T).as_rotvec()
-    return np.concatenate([free.T_world_scan[:3, 3] - held.T_world_scan[:3, 3], turn])
+    scales = (1.0, free.scale) if free.solution.problem.with_scale else (1.0,)
+    return tuple(
+        np.concatenate([free.T_world_scan[:3, 3] / scale - held.T_world_scan[:3, 3], turn]) for scale in scales
+    )
 
 
 def _light_px(growth: CommonError | None, blur_px: float, common: CommonErrors) -> float:
@@ -183,7 +243,11 @@ def _light_px(growth: CommonError | None, blur_px: float, common: CommonErrors) 
 
 
 def _findings(
-    significant: dict[CommonErrorName, CommonError], blur_px: float, held: RegistrationResult, f: float
+    significant: dict[CommonErrorName, CommonError],
+    growth: CommonError | None,
+    blur_px: float,
+    held: RegistrationResult,
+    f: float,
 ) -> tuple[Contradiction, ...]:
     out: list[Contradiction] = []
     focal = [significant[name] for name in ("focal_x", "focal_y") if name in significant]
@@ -218,8 +282,11 @@ def _findings(
                 "these apart",
             )
         )
-    growth = significant.get("growth_px")
-    if growth is not None:
+    scale = significant.get("scale")
+    by_size = None if scale is None or growth is None else _contradicts_radius(scale, growth, _radius_px(held, f))
+    if scale is not None:
+        out.append(_scale_finding(scale, by_size))
+    if growth is not None and growth.significant and by_size != "list":
         out.append(_size_finding(growth, blur_px, held, f))
     elif blur_px > _NAMED_BLUR * _SHARP_PX:
         out.append(
@@ -232,9 +299,48 @@ def _findings(
     return tuple(out)
 
 
+def _radius_px(held: RegistrationResult, f: float) -> float:
+    return f * float(np.median(held.solution.problem.cones.half_angles))
+
+
+def _contradicts_radius(
+    scale: CommonError, growth: CommonError, radius_px: float
+) -> Literal["list", "positions"] | None:
+    """Which of the two does not go with the spheres' radius, by the size of the outlines; None if that is open."""
+    grown, uncertainty = growth.value / radius_px, growth.uncertainty / radius_px
+    with_list = abs(grown) <= _AGREES * uncertainty  # outlines as large as the list has them
+    with_positions = abs(grown - scale.value) <= _AGREES * uncertainty
+    if with_list == with_positions:
+        return None
+    return "positions" if with_list else "list"
+
+
+def _scale_finding(scale: CommonError, by_size: Literal["list", "positions"] | None) -> Contradiction:
+    larger = "larger" if scale.value > 0 else "smaller"
+    agrees = {
+        "list": "; the outlines are as large as the positions say, so that the list is wrong",
+        "positions": "; the outlines are as large as the list says, so that the positions are wrong, or the list "
+        "with its radius",
+        None: "",
+    }[by_size]
+    of_list = "Check the unit of the list, and how scanner and mesh's program were calibrated and set"
+    of_positions = (
+        "Check the unit of the positions, and the robot's calibration; with --estimate-scale, only the list's scale "
+        "counts"
+    )
+    remedy = of_list if by_size == "list" else f"{of_positions}. {of_list}"
+    return Contradiction(
+        "scale",
+        f"The list of spheres is {100 * abs(scale.value):.2f} % ± {100 * scale.uncertainty:.2f} {larger} than the "
+        f"camera positions say{agrees}",
+        remedy,
+        refuses=True,
+    )
+
+
 def _size_finding(growth: CommonError, blur_px: float, held: RegistrationResult, f: float) -> Contradiction:
     problem = held.solution.problem
-    radius_px = f * float(np.median(problem.cones.half_angles))
+    radius_px = _radius_px(held, f)
     given_mm = mm(problem.radius_m)
     true_mm, sigma_mm = given_mm * (1 + growth.value / radius_px), given_mm * growth.uncertainty / radius_px
     larger = "larger" if growth.value > 0 else "smaller"

@@ -7,7 +7,7 @@ from typing import Literal
 
 ContradictionKind = Literal[
     "image left out", "images contradict", "sphere not found", "spheres not found", "focal length",
-    "principal point", "size of outlines", "blur",
+    "principal point", "scale", "size of outlines", "blur",
 ]  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from scipy.special import chdtrc
 from service.compute.descent import gauss_newton
 from service.compute.surfaces.constellations import ConstellationMatch
 from service.core.errors import ComputeError
-from service.core.geometry import Array, Transform, apply, place_jacobian, transform
+from service.core.geometry import Array, Transform, align_points, apply, place_jacobian, transform
 
 SYSTEMATIC_SIGMA_M = 2.0e-5  # per coordinate: difference of two instruments beyond their noise (scale, temperature)
 MOVED_PROBABILITY = 1.0e-3  # of a false alarm: some sphere is reported as moved though none did
@@ -48,6 +48,8 @@ class LoopClosure:
         chi2_per_dof: of the spheres that did not move; near 1 if the stated uncertainties are right.
         rms_m: of the differences of the spheres that did not move.
         sigma_rms_m: predicted rms from the stated uncertainties.
+        scale: lengths in b over lengths in a, by all spheres: one of two instruments may be calibrated wrongly.
+        scale_sigma: its standard deviation.
     """
 
     T_a_b: Transform
@@ -55,6 +57,8 @@ class LoopClosure:
     chi2_per_dof: float
     rms_m: float
     sigma_rms_m: float
+    scale: float
+    scale_sigma: float
 
     @property
     def moved(self) -> tuple[SphereDifference, ...]:
@@ -115,6 +119,8 @@ def close_loop(
         chi2_per_dof=statistic / dof,
         rms_m=float(np.sqrt(np.mean(np.sum(d**2, axis=1)))),
         sigma_rms_m=float(np.sqrt(expected / staying.sum())),
+        scale=align_points(pb, pa, with_scale=True)[1],
+        scale_sigma=float(np.sqrt(np.trace(C, axis1=1, axis2=2).mean() / 3 / np.sum((pa - pa.mean(axis=0)) ** 2))),
     )
 
 

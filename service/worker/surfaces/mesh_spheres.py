@@ -123,8 +123,11 @@ def search_spheres(
     centres = np.array([s.centre_m for s in spheres])
     covariances = np.array([s.covariance for s in spheres])
     layout = check_layout(centres, covariances, radius_m=radius_m) if len(spheres) >= LAYOUT_SUBSET else None
+    weights = np.array([s.radius_sigma_m for s in spheres]) ** -2.0
+    residual_m = float(np.average([s.radius_residual_m for s in spheres], weights=weights))
     measures = {
         "spheres_found": float(len(spheres)),
+        "sphere_radius_mm": mm(radius_m + residual_m),
         "radius_residual_max_mm": mm(max(abs(s.radius_residual_m) for s in spheres)),
         "sphere_rms_max_mm": mm(max(s.rms_m for s in spheres)),
         "sphere_sigma_max_mm": mm(max(float(np.sqrt(np.trace(s.covariance))) for s in spheres)),
@@ -144,6 +147,8 @@ def search_spheres(
             closure = close_loop(reference, np.array(arguments.reference_covariances_m2), centres, covariances, match)
             measures["spheres_moved"] = float(len(closure.moved))
             measures["loop_closure_chi2"] = closure.chi2_per_dof
+            measures["sphere_scale_percent"] = 100 * (closure.scale - 1)
+            measures["sphere_scale_sigma_percent"] = 100 * closure.scale_sigma
             details = details.model_copy(update={"loop_closure": _closure_record(closure)})
     return measures, SpheresFound(spheres_m=centres.tolist(), details=details)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.identification.hypotheses import Hypothesis, image_hypotheses, rivals
+from service.compute.registration.identification.other_scale import words_of_other_scale, words_of_unit
 from service.compute.registration.identification.pairing import ROBOT_GATE, Sightings, match, sightings
 from service.compute.scene import PosedImages, ScanSpheres
 from service.core.errors import ComputeError
@@ -19,6 +20,7 @@ from service.core.geometry import Array, Transform, apply, inverse, rotation_ang
 
 _HYPOTHESES_PER_IMAGE = 6
 _MOST_TRIED = 80
+_LEAST_AGREEING = 3  # images from which a scale is believed
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +76,7 @@ def identify(
     centres = np.asarray(spheres.centres_m, dtype=np.float64)
     seen = [sightings(o, spheres.radius_m, images.camera) for o in outlines]
     readings = [image_hypotheses(o, centres, spheres.radius_m, images.camera) for o in outlines]
-    _require_any(readings, outlines, names, len(centres))
+    _require_any(readings, outlines, names, spheres, images.camera)
     out: list[Assignment] = [Assignment()] * len(outlines)
     for g in sorted(set(stations.tolist())):
         members = np.nonzero(stations == g)[0]
@@ -109,7 +111,7 @@ def identify_each(
     labels = [f"image {i}" for i in range(len(outlines))]
     centres = np.asarray(spheres.centres_m, dtype=np.float64)
     readings = [image_hypotheses(o, centres, spheres.radius_m, camera) for o in outlines]
-    _require_any(readings, outlines, labels, len(centres))
+    _require_any(readings, outlines, labels, spheres, camera)
     unclear = [k for k, r in enumerate(readings) if rivals(r)]
     if unclear and len(unclear) == sum(bool(r) for r in readings):
         k = unclear[0]
@@ -127,7 +129,11 @@ def identify_each(
 
 
 def _require_any(
-    readings: Sequence[list[Hypothesis]], outlines: Sequence[Sequence[SphereOutline]], names: Sequence[str], M: int
+    readings: Sequence[list[Hypothesis]],
+    outlines: Sequence[Sequence[SphereOutline]],
+    names: Sequence[str],
+    spheres: ScanSpheres,
+    camera: CameraModel,
 ) -> None:
     if any(readings):
         return
@@ -138,8 +144,11 @@ def _require_any(
             f"too few spheres are visible: one image must show four, at most {most} were found ({counts})",
             remedy="Capture images that show more of the registration spheres, or check the detector's options",
         )
+    centres_m = np.asarray(spheres.centres_m, dtype=np.float64)
+    other = words_of_other_scale(outlines, names, centres_m, spheres.radius_m, camera)
     raise ComputeError(
-        f"no image shows four of the {M} spheres in the arrangement of the sphere list (spheres found: {counts})",
+        f"no image shows four of the {len(centres_m)} spheres in the arrangement of the sphere list (spheres found: "
+        f"{counts}){other}",
         remedy="Check the sphere list, its unit, the radius and the camera calibration",
     )
 
@@ -161,17 +170,39 @@ def _solve_station(station: _Station) -> _Reading:
     n_hypotheses = sum(bool(r) for r in readings)
     if not station.metric and n_hypotheses < 2:
         raise _scale_unknown(station)
-    best = _clear_best(_solutions(station), station.where)
+    try:
+        best = _clear_best(_solutions(station), station.where)
+    except ComputeError as error:
+        raise _in_another_scale(station, error) from error
     if not station.metric and n_images > 1 and sum(len(m) > 0 for m in best.markers) < 2:
         raise _scale_unknown(station)
     agreeing = _agreeing(best, readings)
     if n_hypotheses >= 3 and agreeing < 0.34 * n_hypotheses:
-        raise ComputeError(
+        contradicted = ComputeError(
             f"the poses contradict the images: {agreeing} of {n_hypotheses} images agree with one registration",
             where=station.where,
             remedy="Check that the poses belong to these images, their convention and their unit",
         )
+        raise _in_another_scale(station, contradicted)
     return best
+
+
+def _in_another_scale(station: _Station, error: ComputeError) -> ComputeError:
+    """The error, or what is wrong with the scale if the poses fit the spheres in another one."""
+    if not station.metric:
+        return error
+    solved = _solutions(replace(station, metric=False))
+    agreeing = _agreeing(solved[0], station.readings) if solved else 0
+    if agreeing < max(_LEAST_AGREEING, 0.5 * sum(bool(r) for r in station.readings)):
+        return error
+    scale = solved[0].scale
+    return ComputeError(
+        f"the camera positions and the spheres are in different units or scales: with the positions multiplied by "
+        f"{scale:.4g}{words_of_unit(scale)}, {agreeing} images agree",
+        where=station.where,
+        remedy="Correct the unit of the positions, or that of the spheres and their radius; with --estimate-scale, "
+        "only the scale of the spheres counts",
+    )
 
 
 def _solutions(station: _Station) -> list[_Reading]:
