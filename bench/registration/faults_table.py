@@ -103,6 +103,23 @@ def _radius(factor: float) -> Callable[[Inputs], None]:
     return change
 
 
+def _scaled_list(factor: float, *, with_radius: bool = False) -> Callable[[Inputs], None]:
+    def change(inputs: Inputs) -> None:
+        for key in ("registration_mm", "control_mm"):
+            inputs.spheres[key] = (factor * np.array(inputs.spheres[key])).tolist()
+        inputs.spheres["radius_mm"] *= factor if with_radius else 1.0
+
+    return change
+
+
+def _scaled_positions(factor: float) -> Callable[[Inputs], None]:
+    def change(inputs: Inputs) -> None:
+        for pose in inputs.poses.values():
+            pose[:3] = [factor * value for value in pose[:3]]
+
+    return change
+
+
 def _focal(fx: float, fy: float) -> Callable[[Inputs], None]:
     def change(inputs: Inputs) -> None:
         inputs.camera["fx"] *= fx
@@ -199,6 +216,13 @@ CASES = (
     Case("focal length 0.1 % wrong", _focal(1.001, 1.001), ("focal length",)),
     Case("fx alone 0.1 % wrong", _focal(1.001, 1.0), ("focal length",)),
     Case("principal point 2 px off", _principal_point, ("principal point",)),
+    Case("sphere list 0.1 % too large", _scaled_list(1.001), ("% larger than the camera positions",)),
+    Case("sphere list 1 % too large", _scaled_list(1.01), ("list is wrong",)),
+    Case("sphere list 5 % too small", _scaled_list(0.95), ("multiplied by about 1.05", "multiplied by about 1.06")),
+    Case("sphere list in inches", _scaled_list(1 / 25.4), ("inches taken as millimetres",)),
+    Case("sphere list and radius in inches", _scaled_list(1 / 25.4, with_radius=True), ("different units",)),
+    Case("camera positions 1 % too large", _scaled_positions(1.01), ("positions are wrong",)),
+    Case("camera positions in millimetres", _scaled_positions(1000.0), ("different units",)),
     Case("motion blur of 5 px", _pictures(_motion_blur), ("blur",)),
     Case("motion blur of 5 px of the coded values", _pictures(_motion_blur_of_codes), ("blur",)),
     Case("out of focus by 2.5 px", _pictures(_defocus), ("blur",)),
