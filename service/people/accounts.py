@@ -10,17 +10,14 @@ from sqlalchemy import Connection, Row, func, insert, select, update
 from service.core.records.events import AccountChanged
 from service.people.credentials.passwords import Passwords, new_token, require_password, require_pin, token_sha256
 from service.people.errors import AccountError, LinkError
+from service.people.names import require_account_name, require_full_name, require_unlike_others
 from service.people.person import Account, Invitation, Person
 from service.people.roles import ROLES, Role
 from service.people.rows import (
     SERVICE,
     end_sessions,
-    find_account,
     get_account,
-    plain_name,
     record_change,
-    require_full_name,
-    require_name,
     require_reason,
     to_account,
 )
@@ -68,8 +65,7 @@ class Accounts:
 
     def set_up(self, token: str, account: str, full_name: str, password: str, pin: str) -> str:
         """Use the first link to make the administrator; returns its account. Raises LinkError, AccountError."""
-        name = plain_name(account)
-        require_name(name)
+        name = require_account_name(account)
         plain = require_full_name(full_name)
         require_password(password, name)
         require_pin(pin)
@@ -77,8 +73,7 @@ class Accounts:
         with self._store.database.writing() as connection:
             if self._invitation(connection, token).account or self._administrators(connection):
                 raise _no_link()
-            if find_account(connection, name) is not None:
-                raise AccountError(f"there is an account {name} already", where="account", remedy="Choose another")
+            require_unlike_others(connection, name, plain)
             self._use(connection, token)
             self._create(connection, name, name, plain, "administrator", "active", secrets)
         return name
@@ -105,15 +100,11 @@ class Accounts:
 
     def invite(self, by: Person, account: str, full_name: str, role: Role) -> str:
         """Make an account. Returns the token of its link, which is shown only once. Raises AccountError."""
-        name = plain_name(account)
-        require_name(name)
+        name = require_account_name(account)
         plain = require_full_name(full_name)
         _require_role(role)
         with self._store.database.writing() as connection:
-            if find_account(connection, name) is not None:
-                raise AccountError(
-                    f"there is an account {name} already", where="account", remedy="Choose another, or reset that one"
-                )
+            require_unlike_others(connection, name, plain)
             nothing = {"password_hash": "", "pin_hash": ""}
             self._create(connection, by.account, name, plain, role, "invited", nothing)
             return self._new_link(connection, name, INVITATION_S, actor=by.account)

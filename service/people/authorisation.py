@@ -9,8 +9,9 @@ from typing import Literal
 from service.core.gates.acceptance import demanded_role
 from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
+from service.core.text.person_names import cleaned_name, person_name
 from service.people.errors import NotAllowedError
-from service.people.rows import plain_name
+from service.people.names import plain_name
 from service.people.sessions import KnownBy, People
 
 
@@ -43,16 +44,34 @@ def identity_for(
 
 
 def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identity:
-    """The person who acts on the command line: by claim, or by password if the name is that of an account.
+    """The person who acts on the command line: by password where there are accounts, else by claim.
 
-    Raises SignInRefusedError if name and password do not belong together or the account is not in use.
+    Raises:
+        NotAllowedError: there are accounts, and none has this name.
+        SignInRefusedError: name and password do not belong together, or the account is not in use.
+        ConfigurationError: there are no accounts, and this is not a person's name.
     """
+    accounts = {account.account: account.role for account in people.accounts.all()}
+    if not accounts:
+        return Identity(person_name(typed), "", "claimed")
     name = plain_name(typed)
-    account = next((account for account in people.accounts.all() if account.account == name), None)
-    if account is None:
-        return Identity(typed.strip(), "", "claimed")
+    if name not in accounts:
+        raise NotAllowedError(
+            f"only accounts act here, and {typed!r} is none",
+            where="name",
+            remedy="Give the name of your account with --operator; an administrator makes one on the page Accounts",
+        )
     people.check_password(name, password())
-    return Identity(name, account.role, "password")
+    return Identity(name, accounts[name], "password")
+
+
+def who_pauses(people: People, typed: str) -> Identity:
+    """Whoever pauses a run, without a password and whatever the name: pausing is always safe.
+
+    Where there are accounts, the record says that the name was only claimed.
+    """
+    name = cleaned_name(typed)
+    return Identity(f"claimed:{name}" if people.accounts.all() else name, "", "claimed")
 
 
 def identify(
@@ -70,11 +89,12 @@ def identify(
     Raises:
         SignInRefusedError: name and secret do not belong together.
         NotAllowedError: no name was given, or the account has another role.
+        ConfigurationError: there are no accounts, and this is not a person's name.
     """
     if not typed.strip():
         raise NotAllowedError("a name is needed", where="name", remedy=f"Give the name of the {role}")
-    if not any(account.state == "active" for account in people.accounts.all()):
-        return Identity(typed.strip(), role, "claimed")
+    if not people.accounts.all():
+        return Identity(person_name(typed), role, "claimed")
     name = plain_name(typed)
     people.check_secret(name, known_by, secret())
     account = people.accounts.get(name)

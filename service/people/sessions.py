@@ -23,13 +23,13 @@ from service.people.errors import (
     PinRefusedError,
     SignInRefusedError,
 )
+from service.people.names import plain_name
 from service.people.person import Person, Screen
 from service.people.rows import (
     SERVICE,
     SESSION_S,
     find_account,
     get_account,
-    plain_name,
     record_change,
     record_sign_in,
     to_account,

@@ -72,7 +72,7 @@ def test_weak_secrets_are_refused_and_the_link_stays_good(office: Office, passwo
         office.people.accounts.accept(link, "another password", PIN)
 
 
-@pytest.mark.parametrize("name", ["", "x", "runner", "web", "9lives", "a b", "é" * 4, "a/../b", "x" * 40, "a\u0000b"])
+@pytest.mark.parametrize("name", ["", "x", "runner", "web", "9lives", "a b", "a/../b", "x" * 40, "a\u0000b"])
 def test_names_that_cannot_be_accounts(office: Office, name: str) -> None:
     _, administrator = office.enter("ada")
     with pytest.raises(AccountError):

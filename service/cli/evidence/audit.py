@@ -31,6 +31,7 @@ from service.cli.evidence.audit_figures import figures_command
 from service.cli.evidence.audit_report import report_command
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.text.counts import counted
+from service.core.text.person_names import cleaned_name
 from service.core.units import megabytes
 from service.store.durable_effects import utc_text
 from service.store.records import Artefact
@@ -111,7 +112,7 @@ def verify_command(
 
 def _tell_the_pages(data: Path, report: AuditReport, took_s: float) -> None:
     """Save the result for the audit's pages, if the folder is writable."""
-    by, at_utc = f"{getpass.getuser()} (command line)", utc_text(datetime.now(UTC))
+    by, at_utc = f"{cleaned_name(getpass.getuser())} (command line)", utc_text(datetime.now(UTC))
     for run_id in report.runs:
         with suppress(OSError):
             found = verification_of(report, run_id, by=by, at_utc=at_utc, duration_s=took_s)
