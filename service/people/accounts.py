@@ -8,7 +8,14 @@ from typing import Any
 from sqlalchemy import Connection, Row, func, insert, select, update
 
 from service.core.records.events import AccountChanged
-from service.people.credentials.passwords import Passwords, new_token, require_password, require_pin, token_sha256
+from service.people.credentials.passwords import (
+    Passwords,
+    ShortSecrets,
+    new_token,
+    require_password,
+    require_pin,
+    token_sha256,
+)
 from service.people.errors import AccountError, LinkError
 from service.people.names import require_account_name, require_full_name, require_unlike_others
 from service.people.person import Account, Invitation, Person
@@ -31,9 +38,10 @@ INVITATION_S = 72 * 3600.0
 class Accounts:
     """Changes that administrators make to accounts, and people to their own; each is recorded in its transaction."""
 
-    def __init__(self, store: Store, passwords: Passwords) -> None:
+    def __init__(self, store: Store, passwords: Passwords, pins: ShortSecrets) -> None:
         self._store = store
         self._passwords = passwords
+        self._pins = pins
 
     def all(self) -> list[Account]:
         """Every account, sorted by name."""
@@ -69,7 +77,7 @@ class Accounts:
         plain = require_full_name(full_name)
         require_password(password, name)
         require_pin(pin)
-        secrets = {"password_hash": self._passwords.hash(password), "pin_hash": self._passwords.hash(pin)}
+        secrets = {"password_hash": self._passwords.hash(password), "pin_hash": self._pins.hash(pin)}
         with self._store.database.writing() as connection:
             if self._invitation(connection, token).account or self._administrators(connection):
                 raise _no_link()
@@ -83,7 +91,7 @@ class Accounts:
         name = self.invitation(token).account
         require_password(password, name)
         require_pin(pin)
-        secrets = {"password_hash": self._passwords.hash(password), "pin_hash": self._passwords.hash(pin)}
+        secrets = {"password_hash": self._passwords.hash(password), "pin_hash": self._pins.hash(pin)}
         with self._store.database.writing() as connection:
             unused = name and self._invitation(connection, token).account == name
             if not unused or get_account(connection, name).state != "invited":
@@ -197,7 +205,7 @@ class Accounts:
     def change_pin(self, person: Person, pin: str) -> None:
         """Set a new PIN; the caller has checked the password. Raises AccountError if it is not acceptable."""
         require_pin(pin)
-        self._change_secret(person, "pin", self._passwords.hash(pin))
+        self._change_secret(person, "pin", self._pins.hash(pin))
 
     def _change_secret(self, person: Person, which: str, stored: str) -> None:
         with self._store.database.writing() as connection:

@@ -15,7 +15,8 @@ from service.core.records.events import AccountChanged, SignInRecorded
 from service.core.records.moments import age_s
 from service.people.accounts import Accounts
 from service.people.credentials.badges import Badges
-from service.people.credentials.passwords import Passwords, new_token, token_sha256
+from service.people.credentials.passwords import Passwords, ShortSecrets, new_token, token_sha256
+from service.people.credentials.pepper import Pepper
 from service.people.errors import (
     AccountError,
     AccountJustChangedError,
@@ -62,8 +63,9 @@ class People:
         self._passwords = Passwords(hasher)
         # One check at a time, so that every guess is counted before the next and argon2's memory stays bounded.
         self._one_guess = Lock()
-        self.accounts = Accounts(store, self._passwords)
-        self.badges = Badges(store, self._passwords, self.check_password)
+        self._short = ShortSecrets(self._passwords, Pepper(store))
+        self.accounts = Accounts(store, self._passwords, self._short)
+        self.badges = Badges(store, self._short, self.check_password)
 
     def first_link(self) -> str | None:
         """A new one-time token for the page /set-up/TOKEN, voiding earlier ones; None if an administrator exists."""
@@ -118,7 +120,23 @@ class People:
             self.check_password(account, secret)
             return
         with self._one_guess:
-            self._checked(account, secret.strip().upper(), "", known_by)
+            plain = secret.strip().upper()
+            row = self._checked(account, plain, "", known_by)
+            self._renew(row.account, known_by, row.pin_hash if known_by == "pin" else row.badge_hash, plain)
+
+    def _renew(self, account: str, which: KnownBy, stored: str, secret: str) -> None:
+        """Hash a right PIN or badge again if its hash is of an earlier version."""
+        if not self._short.is_outdated(stored):
+            return
+        column = f"{which}_hash"
+        values = {column: self._short.hash(secret)}
+        with self._store.database.writing() as connection:
+            row = find_account(connection, account)
+            if row is None or getattr(row, column) != stored:
+                return  # it was changed meanwhile
+            connection.execute(update(accounts).where(accounts.c.account == account).values(**values))
+            change = AccountChanged(account=account, field=which, old="set", new="hashed anew")
+            record_change(self._store, connection, account, change, values)
 
     def refuse_address(self, address: str) -> None:
         """Record that an address has failed too often and must wait."""
@@ -133,7 +151,8 @@ class People:
         usable = row is not None and row.state == "active" and not waits
         hashes = {} if row is None else {"password": row.password_hash, "pin": row.pin_hash, "badge": row.badge_hash}
         stored = str(hashes[known_by]) if usable else ""
-        matches = self._passwords.matches(stored, secret)
+        hashes_of = self._passwords if known_by == "password" else self._short
+        matches = hashes_of.matches(stored, secret)
         if row is not None and matches:
             return row
         with self._store.database.writing() as connection:
@@ -244,7 +263,15 @@ class People:
                 ).one_or_none()
             if row is None:
                 raise NotSignedInError("this sign-in has ended", remedy="Sign in again")
-            matches = self._passwords.matches(row.pin_hash, pin)
+            if self._short.is_lost(row.pin_hash):
+                raise PinRefusedError(
+                    "no PIN can be checked: the key to which PINs are bound was replaced",
+                    where="pin",
+                    remedy="Sign out, sign in with the password, and set a new PIN on the page of your account",
+                )
+            matches = self._short.matches(row.pin_hash, pin)
+            if matches:
+                self._renew(person.account, "pin", row.pin_hash, pin)
             failures = 0 if matches else row.pin_failures + 1
             ended = failures >= FREE_FAILURES
             with self._store.database.writing() as connection:

@@ -54,6 +54,7 @@ from service.run_start import (
 from service.runner.loop import Runner
 from service.station import Station, devices_of, layout_of
 from service.steps import params_models
+from service.store.access import kept_to
 from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.timestamps import stamp_end
 from service.store.store import Store
@@ -176,7 +177,7 @@ def drive(
             who.name, protocol, display, hands, preview=preview, people=People(store), who=who
         )
     beside = worker_beside(data, error_console.print) if worker else nullcontext()
-    with sigterm_like_ctrl_c(), file_log(data, "runner", run=run_id), beside:
+    with sigterm_like_ctrl_c(), kept_to(data), file_log(data, "runner", run=run_id), beside:
         authority, copy = time_stamp_authority(rig), signature_copy(rig)
         reporter.begin()
         try:

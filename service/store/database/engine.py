@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sqlite3
 import time
 from collections.abc import Generator, Mapping
@@ -18,6 +19,7 @@ from sqlalchemy.pool import ConnectionPoolEntry
 from sqlalchemy.util import LRUCache
 
 from service.core.errors import StoreError
+from service.store.access import file_mode, open_new, require_access
 from service.store.database import new_schema
 from service.store.durable_effects import Files
 from service.store.errors import StoreVersionError
@@ -141,6 +143,8 @@ def open_database(data_dir: Path, files: Files, patience_s: float = PATIENCE_S) 
     A write waits up to about `patience_s` for other processes that write.
     """
     path = database_path(data_dir)
+    with _store_errors(path):
+        os.close(open_new(path, os.O_RDONLY, file_mode(data_dir)))  # SQLite gives its other files the same mode
     engine = _engine(f"file:{quote(str(path.absolute()))}?uri=true", writable=True)
     database = Database(engine, path, files, patience_s)
     try:
@@ -163,6 +167,7 @@ def open_read_only(data_dir: Path, files: Files) -> Database:
     Raises StoreError if there is none, StoreVersionError if it is of another version.
     """
     path = database_path(data_dir)
+    require_access(data_dir)
     if not path.is_file():
         raise StoreError(
             "there is no run data here",
