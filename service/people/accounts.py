@@ -16,6 +16,7 @@ from service.people.credentials.passwords import (
     require_pin,
     token_sha256,
 )
+from service.people.credentials.tries import KnownTries
 from service.people.errors import AccountError, LinkError
 from service.people.names import require_account_name, require_full_name, require_unlike_others
 from service.people.person import Account, Invitation, Person
@@ -38,10 +39,11 @@ INVITATION_S = 72 * 3600.0
 class Accounts:
     """Changes that administrators make to accounts, and people to their own; each is recorded in its transaction."""
 
-    def __init__(self, store: Store, passwords: Passwords, pins: ShortSecrets) -> None:
+    def __init__(self, store: Store, passwords: Passwords, pins: ShortSecrets, known: KnownTries) -> None:
         self._store = store
         self._passwords = passwords
         self._pins = pins
+        self._known = known
 
     def all(self) -> list[Account]:
         """Every account, sorted by name."""
@@ -53,9 +55,15 @@ class Accounts:
         with self._store.database.reading() as connection:
             return to_account(get_account(connection, account))
 
-    def has_to_wait(self, account: Account) -> bool:
-        """Whether wrong passwords have closed the account for now; both clocks must say that the wait is over."""
+    def strangers_wait(self, account: Account) -> bool:
+        """Whether wrong passwords have closed the account to strangers; both clocks must say that it is over."""
         return self._store.ages.at_least_s(account.locked_until_utc_s) < 0
+
+    def waits_until_utc_s(self, account: Account) -> float:
+        """Until when somebody has to wait after wrong passwords of the account; 0 if nobody has to."""
+        known_s = self._known.longest_wait_s(account.account)
+        strangers_s = account.locked_until_utc_s if self.strangers_wait(account) else 0.0
+        return max(strangers_s, self._store.clock.utc_s() + known_s if known_s else 0.0)
 
     # --- one-time links ---
 
@@ -181,8 +189,8 @@ class Accounts:
             change = AccountChanged(account=account, field="state", old="disabled", new="active", reason=why)
             record_change(self._store, connection, by.account, change)
 
-    def end_wait(self, by: Person, account: str) -> None:
-        """End an account's wait after wrong passwords. Raises AccountError."""
+    def end_wait(self, by: str, account: str) -> None:
+        """End all waits after wrong passwords of an account. Raises AccountError."""
         with self._store.database.writing() as connection:
             row = get_account(connection, account)
             values = {"failures": 0, "locked_until_utc_s": 0.0}
@@ -190,7 +198,7 @@ class Accounts:
             change = AccountChanged(
                 account=account, field="lock_out", old=f"{row.failures} wrong passwords", new="ended"
             )
-            record_change(self._store, connection, by.account, change)
+            record_change(self._store, connection, by, change)
 
     # --- one's own ---
 

@@ -10,6 +10,7 @@ from service.core.gates.acceptance import demanded_role
 from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
 from service.core.text.person_names import cleaned_name, person_name
+from service.people.credentials.tries import TERMINAL, Origin
 from service.people.errors import NotAllowedError
 from service.people.names import plain_name
 from service.people.sessions import KnownBy, People
@@ -32,6 +33,7 @@ def identity_for(
     typed: str,
     secret: Callable[[], str],
     known_by: KnownBy = "password",
+    origin: Origin = TERMINAL,
 ) -> Identity | None:
     """The person who acts, if the verb now needs a role; else None.
 
@@ -40,7 +42,7 @@ def identity_for(
         NotAllowedError: no name was given, or the account has another role.
     """
     role = demanded_role(protocol, state) if verb == "accept" else ""
-    return identify(people, typed, role, secret, known_by) if role else None
+    return identify(people, typed, role, secret, known_by, origin) if role else None
 
 
 def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identity:
@@ -75,7 +77,12 @@ def who_pauses(people: People, typed: str) -> Identity:
 
 
 def identify(
-    people: People, typed: str, role: str, secret: Callable[[], str], known_by: KnownBy = "password"
+    people: People,
+    typed: str,
+    role: str,
+    secret: Callable[[], str],
+    known_by: KnownBy = "password",
+    origin: Origin = TERMINAL,
 ) -> Identity:
     """Identify the person of this name in this role.
 
@@ -85,6 +92,7 @@ def identify(
         role: the role that the action needs.
         secret: asks for the secret; not called on a site without accounts, where the name is a claim.
         known_by: the kind of secret: the account's password, PIN or badge.
+        origin: where it is typed.
 
     Raises:
         SignInRefusedError: name and secret do not belong together.
@@ -96,7 +104,7 @@ def identify(
     if not people.accounts.all():
         return Identity(person_name(typed), role, "claimed")
     name = plain_name(typed)
-    people.check_secret(name, known_by, secret())
+    people.check_secret(name, known_by, secret(), origin)
     account = people.accounts.get(name)
     if account.role != role:
         raise NotAllowedError(f"{name} is {account.role}; this needs a {role}", where="role", remedy=f"Call a {role}")

@@ -172,7 +172,7 @@ def test_an_administrator_ends_a_wait(office: Office) -> None:
     _, administrator = office.enter("ada")
     for _ in range(5):
         refused(lambda: office.people.sign_in("grace", "wrong"))
-    office.people.accounts.end_wait(administrator, "grace")
+    office.people.accounts.end_wait(administrator.account, "grace")
     office.enter("grace")
 
 
@@ -245,7 +245,7 @@ def test_what_cannot_be_recorded_does_not_happen(office: Office, monkeypatch: py
         lambda: office.people.accounts.reset(administrator, "grace", "a reason"),
         lambda: office.people.accounts.change_password(person, "quite another one"),
         lambda: office.people.accounts.change_pin(person, "1122334"),
-        lambda: office.people.accounts.end_wait(administrator, "grace"),
+        lambda: office.people.accounts.end_wait(administrator.account, "grace"),
     ):
         with pytest.raises(NoRecordError):
             act()

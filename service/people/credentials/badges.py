@@ -8,6 +8,7 @@ from sqlalchemy import select, update
 
 from service.core.records.events import AccountChanged
 from service.people.credentials.passwords import ShortSecrets, plain_badge
+from service.people.credentials.tries import Origin, on_screen_of
 from service.people.errors import AccountError
 from service.people.person import Person
 from service.people.rows import get_account, record_change, require_reason
@@ -18,7 +19,7 @@ from service.store.store import Store
 class Badges:
     """Enrolling and revoking badges, by supervisors and administrators."""
 
-    def __init__(self, store: Store, codes: ShortSecrets, check_password: Callable[[str, str], None]) -> None:
+    def __init__(self, store: Store, codes: ShortSecrets, check_password: Callable[[str, str, Origin], None]) -> None:
         self._store = store
         self._codes = codes
         self._check_password = check_password
@@ -33,7 +34,7 @@ class Badges:
             SignInRefusedError: the password is wrong.
         """
         plain = plain_badge(badge)
-        self._check_password(account, password)
+        self._check_password(account, password, on_screen_of(by))
         if any(self._codes.matches(stored, plain) for stored in self._others(account)):
             raise AccountError(
                 "this badge belongs to somebody else", where="badge", remedy="Revoke it there first, or use another"
