@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from service.core.errors import ConfigurationError
 from service.core.gates.acceptance import demanded_role
 from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
@@ -49,13 +50,12 @@ def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identit
     """The person who acts on the command line: by password where there are accounts, else by claim.
 
     Raises:
-        NotAllowedError: there are accounts, and none has this name.
+        NotAllowedError: there are accounts, and none has this name; or there are none, and this is no person's name.
         SignInRefusedError: name and password do not belong together, or the account is not in use.
-        ConfigurationError: there are no accounts, and this is not a person's name.
     """
     accounts = {account.account: account.role for account in people.accounts.all()}
     if not accounts:
-        return Identity(person_name(typed), "", "claimed")
+        return Identity(_claimed(typed), "", "claimed")
     name = plain_name(typed)
     if name not in accounts:
         raise NotAllowedError(
@@ -96,16 +96,23 @@ def identify(
 
     Raises:
         SignInRefusedError: name and secret do not belong together.
-        NotAllowedError: no name was given, or the account has another role.
-        ConfigurationError: there are no accounts, and this is not a person's name.
+        NotAllowedError: no name was given, or none that a person can have, or the account has another role.
     """
     if not typed.strip():
         raise NotAllowedError("a name is needed", where="name", remedy=f"Give the name of the {role}")
     if not people.accounts.all():
-        return Identity(person_name(typed), role, "claimed")
+        return Identity(_claimed(typed), role, "claimed")
     name = plain_name(typed)
     people.check_secret(name, known_by, secret(), origin)
     account = people.accounts.get(name)
     if account.role != role:
         raise NotAllowedError(f"{name} is {account.role}; this needs a {role}", where="role", remedy=f"Call a {role}")
     return Identity(name, account.role, known_by)
+
+
+def _claimed(typed: str) -> str:
+    """A name on a site without accounts. Raises NotAllowedError if it is no person's name."""
+    try:
+        return person_name(typed)
+    except ConfigurationError as error:
+        raise NotAllowedError(error.what, where=error.where, remedy=error.remedy) from error

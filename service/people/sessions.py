@@ -170,7 +170,7 @@ class People:
         if row is not None and matches:
             return row
         with self._store.database.writing() as connection:
-            if usable and known:
+            if known and not waits:
                 self._known.failed(name, origin)
             elif usable:
                 waits = self._count_strangers_failure(connection, name)

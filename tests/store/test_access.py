@@ -8,17 +8,20 @@ import stat
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.errors import StoreError
+from service.core.records.events import LeftoversRemoved
 from service.people.sessions import People
 from service.store.backup.backup import BackupOptions, back_up
 from service.store.backup.restore import restore
 from service.store.database.engine import database_path, open_read_only
 from service.store.durable_effects import DurableFiles
+from service.store.errors import SigningKeyError
 from service.store.records import SITE
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
@@ -57,6 +60,22 @@ def another_account(folder: Path) -> Generator[None]:
         yield
     finally:
         folder.chmod(0o700)
+
+
+@contextmanager
+def another_account_of_the_group() -> Generator[None]:
+    """As another account that belongs to GROUP; as oneself for whoever cannot become another."""
+    if os.geteuid() != 0:
+        yield
+        return
+    before = os.getegid()
+    os.setegid(GROUP)
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+        os.setegid(before)
 
 
 def test_whatever_is_made_is_its_owners_alone(tmp_path: Path) -> None:
@@ -143,6 +162,28 @@ def test_a_folder_shared_with_a_group_stays_shared_but_for_the_keys(
     data.chmod(0o2775)
     with Store.open(data):
         assert data.stat().st_mode & 0o7777 == 0o2770
+
+
+def test_an_account_of_the_group_records_and_does_not_sign() -> None:
+    with TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        data = Path(folder) / "data"
+        with Store.open(data) as store:
+            store.record_site([], actor="ada")
+            checkpoint(store, SITE)
+        os.chown(data, -1, GROUP)
+        data.chmod(0o2770)
+        Store.open(data).close()
+        with another_account_of_the_group(), Store.open(data) as store:
+            store.put_bytes(b"computed", kind="image", media_type="image/jpeg", original_name="x")
+            store.record_site([LeftoversRemoved(files={"x": 1})], actor="ada")
+            if os.geteuid() != 0 and os.getuid() == 0:
+                with pytest.raises(SigningKeyError, match="another account's"):
+                    checkpoint(store, SITE)
+        with Store.open(data) as store:
+            checkpoint(store, SITE)
+            assert store.put_bytes(b"computed", kind="image", media_type="image/jpeg", original_name="x")
+        assert verify(data).ok
 
 
 def test_another_account_is_told_whose_the_folder_is(tmp_path: Path) -> None:
