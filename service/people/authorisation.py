@@ -11,7 +11,7 @@ from service.core.gates.acceptance import demanded_role
 from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
 from service.core.text.person_names import cleaned_name, person_name
-from service.people.credentials.tries import TERMINAL, Origin
+from service.people.credentials.tries import TERMINAL, SecretOrigin
 from service.people.errors import NotAllowedError
 from service.people.names import plain_name
 from service.people.sessions import KnownBy, People
@@ -34,7 +34,7 @@ def identity_for(
     typed: str,
     secret: Callable[[], str],
     known_by: KnownBy = "password",
-    origin: Origin = TERMINAL,
+    origin: SecretOrigin = TERMINAL,
 ) -> Identity | None:
     """The person who acts, if the verb now needs a role; else None.
 
@@ -82,7 +82,7 @@ def identify(
     role: str,
     secret: Callable[[], str],
     known_by: KnownBy = "password",
-    origin: Origin = TERMINAL,
+    origin: SecretOrigin = TERMINAL,
 ) -> Identity:
     """Identify the person of this name in this role.
 

@@ -23,7 +23,7 @@ from service.people.credentials.tries import (
     LONGEST_WAIT_S,
     TERMINAL,
     KnownTries,
-    Origin,
+    SecretOrigin,
     wait_after_s,
 )
 from service.people.errors import (
@@ -80,7 +80,7 @@ class People:
         Raises SignInRefusedError, with the same words and after the same time whatever the cause.
         """
         with self._one_guess:
-            origin = Origin(address=address)
+            origin = SecretOrigin(address=address)
             row = self._checked(account, password, origin)
             token = new_token()
             now = self._store.clock.utc_s()
@@ -108,11 +108,11 @@ class People:
 
         So may whoever has signed in from there before, and need not wait for wrong passwords of that account.
         """
-        name, origin = plain_name(account), Origin(address=address)
+        name, origin = plain_name(account), SecretOrigin(address=address)
         with self._one_guess:
             return self._known.knows(name, origin) and not self._known.wait_s(name, origin)
 
-    def check_password(self, account: str, password: str, origin: Origin = TERMINAL) -> None:
+    def check_password(self, account: str, password: str, origin: SecretOrigin = TERMINAL) -> None:
         """Check a password again for a signature. A wrong one counts as a failed try: SignInRefusedError."""
         with self._one_guess:
             row = self._checked(account, password, origin)
@@ -123,7 +123,7 @@ class People:
             else:
                 self._known.succeeded(row.account, origin)
 
-    def check_secret(self, account: str, known_by: KnownBy, secret: str, origin: Origin = TERMINAL) -> None:
+    def check_secret(self, account: str, known_by: KnownBy, secret: str, origin: SecretOrigin = TERMINAL) -> None:
         """Check a password, PIN or badge again for a signature.
 
         A wrong one counts as a failed try and raises SignInRefusedError. Only the right password resets the count, so
@@ -156,7 +156,7 @@ class People:
         with self._store.database.writing() as connection:
             record_sign_in(self._store, connection, SignInRecorded(account="", outcome="locked_out", address=address))
 
-    def _checked(self, typed: str, secret: str, origin: Origin, known_by: KnownBy = "password") -> Row[Any]:
+    def _checked(self, typed: str, secret: str, origin: SecretOrigin, known_by: KnownBy = "password") -> Row[Any]:
         name = plain_name(typed)
         with self._store.database.reading() as connection:
             row = find_account(connection, name)
@@ -219,7 +219,7 @@ class People:
                 "the account has just been changed", where="password", remedy="Sign in again"
             )
 
-    def _reset_failures(self, connection: Connection, row: Row[Any], password: str, origin: Origin) -> None:
+    def _reset_failures(self, connection: Connection, row: Row[Any], password: str, origin: SecretOrigin) -> None:
         """Begin to count anew, where the right password was given."""
         values: dict[str, object] = {}
         if not self._known.knows(row.account, origin):

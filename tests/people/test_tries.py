@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.records.events import AccountChanged, SignInRecorded
-from service.people.credentials.tries import FREE_FAILURES, Origin, on_screen_of
+from service.people.credentials.tries import FREE_FAILURES, SecretOrigin, on_screen_of
 from service.people.errors import SignInRefusedError
 from service.people.person import Person
 from service.people.sessions import KnownBy, People
@@ -54,11 +54,11 @@ def test_strangers_shut_nobody_out_whom_the_account_knows(office: Office) -> Non
         guess(office, 2, address=f"10.1.0.{address}")
     right = password_of("emmy")
     assert slowed(office, lambda: office.people.sign_in("emmy", right, address=ELSEWHERE))
-    ways: list[tuple[KnownBy, str, Origin]] = [
+    ways: list[tuple[KnownBy, str, SecretOrigin]] = [
         ("password", right, on_screen_of(emmy)),
         ("pin", PIN, on_screen_of(emmy)),
         ("password", right, on_screen_of(grace)),  # at the technician's screen
-        ("password", right, Origin(address="terminal")),
+        ("password", right, SecretOrigin(address="terminal")),
     ]
     for known_by, secret, origin in ways:
         office.people.check_secret("emmy", known_by, secret, origin)

@@ -8,7 +8,7 @@ from sqlalchemy import select, update
 
 from service.core.records.events import AccountChanged
 from service.people.credentials.passwords import ShortSecrets, plain_badge
-from service.people.credentials.tries import Origin, on_screen_of
+from service.people.credentials.tries import SecretOrigin, on_screen_of
 from service.people.errors import AccountError
 from service.people.person import Person
 from service.people.rows import get_account, record_change, require_reason
@@ -19,7 +19,9 @@ from service.store.store import Store
 class Badges:
     """Enrolling and revoking badges, by supervisors and administrators."""
 
-    def __init__(self, store: Store, codes: ShortSecrets, check_password: Callable[[str, str, Origin], None]) -> None:
+    def __init__(
+        self, store: Store, codes: ShortSecrets, check_password: Callable[[str, str, SecretOrigin], None]
+    ) -> None:
         self._store = store
         self._codes = codes
         self._check_password = check_password

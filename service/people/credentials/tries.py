@@ -41,7 +41,7 @@ def wait_after_s(failures: int) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Origin:
+class SecretOrigin:
     """Where a secret is typed: at a browser's address, on a screen that is signed in, or at a terminal."""
 
     address: str = ""  # of the browser that signs in
@@ -49,15 +49,15 @@ class Origin:
     by: str = ""  # the account that is signed in on the screen
 
 
-TERMINAL = Origin(address="terminal")
+TERMINAL = SecretOrigin(address="terminal")
 
 
-def on_screen_of(person: Person) -> Origin:
+def on_screen_of(person: Person) -> SecretOrigin:
     """The screen on which a person is signed in."""
-    return Origin(screen=person.screen, by=person.account)
+    return SecretOrigin(screen=person.screen, by=person.account)
 
 
-def _counted_at(account: str, origin: Origin) -> tuple[str, str, str]:
+def _counted_at(account: str, origin: SecretOrigin) -> tuple[str, str, str]:
     """Which tries are counted together. For another's secret that is who typed it: a new sign-in is no new count."""
     if not origin.by:
         return account, "address", origin.address
@@ -70,11 +70,11 @@ class KnownTries:
     def __init__(self, store: Store) -> None:
         self._store = store
 
-    def knows(self, account: str, origin: Origin) -> bool:
+    def knows(self, account: str, origin: SecretOrigin) -> bool:
         """Whether the origin is a screen, a terminal, or an address from which the account has signed in."""
         return bool(origin.by) or origin == TERMINAL or (account, origin.address) in self._addresses
 
-    def wait_s(self, account: str, origin: Origin) -> float:
+    def wait_s(self, account: str, origin: SecretOrigin) -> float:
         """Seconds to wait before the next try; 0 for none."""
         return self._wait_s(_counted_at(account, origin))
 
@@ -82,12 +82,12 @@ class KnownTries:
         """The longest wait at any of the account's known origins."""
         return max((self._wait_s(counted) for counted in tuple(self._failed) if counted[0] == account), default=0.0)
 
-    def failed(self, account: str, origin: Origin) -> None:
+    def failed(self, account: str, origin: SecretOrigin) -> None:
         """Count a wrong secret."""
         at_s = self._store.clock.monotonic_s()
         self._failed.setdefault(_counted_at(account, origin), _new_count()).append(at_s)
 
-    def succeeded(self, account: str, origin: Origin) -> None:
+    def succeeded(self, account: str, origin: SecretOrigin) -> None:
         """Begin to count anew after the right password; a sign-in makes its address known."""
         self._failed.pop(_counted_at(account, origin), None)
         if origin.address and not origin.by:
@@ -139,7 +139,7 @@ class KnownTries:
         counted: dict[tuple[str, str, str], deque[float]] = {}
         for row, tried, age_s in reversed(list(_recent(self._store, REMEMBERED_S))):
             by = "" if row.actor == SERVICE or not tried.screen else str(row.actor)
-            origin = Origin(tried.address, tried.screen if by else "", by)
+            origin = SecretOrigin(tried.address, tried.screen if by else "", by)
             if tried.outcome == "signed_in":
                 counted.pop((tried.account, "address", tried.address), None)
             elif _is_wrong(tried) and (by or tried.address) and self.knows(tried.account, origin):
