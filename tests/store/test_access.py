@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import stat
+import subprocess
+import sys
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -125,6 +127,17 @@ def test_a_folder_of_an_earlier_version_is_closed_and_the_log_says_so(
     caplog.clear()
     with Store.open(data):
         assert not caplog.records
+
+
+def test_opening_again_in_one_process_keeps_the_locks_that_keep_the_log_from_others(tmp_path: Path) -> None:
+    """POSIX releases a process's locks when it closes any descriptor of the file, and the log would be removed."""
+    data = tmp_path / "data"
+    with Store.open(data) as store:
+        store.record_site([], actor="ada")
+        Store.open(data).close()
+        listed = [sys.executable, "-m", "service.cli.main", "runs", "--data", str(data)]
+        assert subprocess.run(listed, check=False, capture_output=True).returncode == 0
+        store.record_site([], actor="ada")
 
 
 def test_a_folder_that_was_made_by_hand_is_closed_when_it_becomes_a_data_folder(tmp_path: Path) -> None:

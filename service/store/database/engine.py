@@ -7,7 +7,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Generator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -143,8 +143,10 @@ def open_database(data_dir: Path, files: Files, patience_s: float = PATIENCE_S) 
     A write waits up to about `patience_s` for other processes that write.
     """
     path = database_path(data_dir)
-    with _store_errors(path):
-        os.close(open_new(path, os.O_RDONLY, file_mode(data_dir)))  # SQLite gives its other files the same mode
+    with _store_errors(path), suppress(FileExistsError):
+        # SQLite gives its other files the same mode. A database that exists must not even be opened here: closing it
+        # would release the locks that SQLite holds on it in this process (POSIX).
+        os.close(open_new(path, os.O_EXCL | os.O_RDONLY, file_mode(data_dir)))
     engine = _engine(f"file:{quote(str(path.absolute()))}?uri=true", writable=True)
     database = Database(engine, path, files, patience_s)
     try:
