@@ -110,10 +110,10 @@ def close_to_others(folder: Path, database: str) -> None:
         stat.S_IMODE(before.st_mode) == wanted and not _differs(folder / database, kept, before.st_gid)
     ):
         return
-    try:
+    with suppress(OSError):
         folder.chmod(wanted)  # first of all: nobody else reaches what lies within any more
-    except OSError as error:
-        _LOG.warning("%s cannot be closed to other accounts of this machine: %s", folder, error.strerror)
+    if stat.S_IMODE(folder.stat().st_mode) != wanted:
+        _LOG.warning("%s cannot be closed to other accounts of this machine: its file system keeps no rights", folder)
         return
     changed = sum(_close(path, kept, before.st_gid) for path in _within(folder))
     if changed:
