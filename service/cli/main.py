@@ -130,6 +130,7 @@ _COMMANDS = {
         "service.cli.evidence.export:export_command",
         "Write the data set of a completed run in a format that others read: images, poses, depth, masks, mesh.",
     ),
+    "accounts": _Command("service.cli.site.accounts:accounts_app", "Maintain the accounts of a site."),
     "protocol": _Command("service.cli.site.protocol:protocol_app", "Check a protocol file before it is used."),
     "plan": _Command("service.cli.site.plan:plan_app", "Plan viewpoints, before and during a capture."),
 }

@@ -8,19 +8,24 @@ from typing import Any
 from sqlalchemy import Connection, Row, func, insert, select, update
 
 from service.core.records.events import AccountChanged
-from service.people.credentials.passwords import Passwords, new_token, require_password, require_pin, token_sha256
+from service.people.credentials.passwords import (
+    Passwords,
+    ShortSecrets,
+    new_token,
+    require_password,
+    require_pin,
+    token_sha256,
+)
+from service.people.credentials.tries import KnownTries
 from service.people.errors import AccountError, LinkError
+from service.people.names import require_account_name, require_full_name, require_unlike_others
 from service.people.person import Account, Invitation, Person
 from service.people.roles import ROLES, Role
 from service.people.rows import (
     SERVICE,
     end_sessions,
-    find_account,
     get_account,
-    plain_name,
     record_change,
-    require_full_name,
-    require_name,
     require_reason,
     to_account,
 )
@@ -34,9 +39,11 @@ INVITATION_S = 72 * 3600.0
 class Accounts:
     """Changes that administrators make to accounts, and people to their own; each is recorded in its transaction."""
 
-    def __init__(self, store: Store, passwords: Passwords) -> None:
+    def __init__(self, store: Store, passwords: Passwords, pins: ShortSecrets, known: KnownTries) -> None:
         self._store = store
         self._passwords = passwords
+        self._pins = pins
+        self._known = known
 
     def all(self) -> list[Account]:
         """Every account, sorted by name."""
@@ -48,9 +55,15 @@ class Accounts:
         with self._store.database.reading() as connection:
             return to_account(get_account(connection, account))
 
-    def has_to_wait(self, account: Account) -> bool:
-        """Whether wrong passwords have closed the account for now; both clocks must say that the wait is over."""
+    def strangers_wait(self, account: Account) -> bool:
+        """Whether wrong passwords have closed the account to strangers; both clocks must say that it is over."""
         return self._store.ages.at_least_s(account.locked_until_utc_s) < 0
+
+    def waits_until_utc_s(self, account: Account) -> float:
+        """Until when somebody has to wait after wrong passwords of the account; 0 if nobody has to."""
+        known_s = self._known.longest_wait_s(account.account)
+        strangers_s = account.locked_until_utc_s if self.strangers_wait(account) else 0.0
+        return max(strangers_s, self._store.clock.utc_s() + known_s if known_s else 0.0)
 
     # --- one-time links ---
 
@@ -68,17 +81,15 @@ class Accounts:
 
     def set_up(self, token: str, account: str, full_name: str, password: str, pin: str) -> str:
         """Use the first link to make the administrator; returns its account. Raises LinkError, AccountError."""
-        name = plain_name(account)
-        require_name(name)
+        name = require_account_name(account)
         plain = require_full_name(full_name)
         require_password(password, name)
         require_pin(pin)
-        secrets = {"password_hash": self._passwords.hash(password), "pin_hash": self._passwords.hash(pin)}
+        secrets = {"password_hash": self._passwords.hash(password), "pin_hash": self._pins.hash(pin)}
         with self._store.database.writing() as connection:
             if self._invitation(connection, token).account or self._administrators(connection):
                 raise _no_link()
-            if find_account(connection, name) is not None:
-                raise AccountError(f"there is an account {name} already", where="account", remedy="Choose another")
+            require_unlike_others(connection, name, plain)
             self._use(connection, token)
             self._create(connection, name, name, plain, "administrator", "active", secrets)
         return name
@@ -88,7 +99,7 @@ class Accounts:
         name = self.invitation(token).account
         require_password(password, name)
         require_pin(pin)
-        secrets = {"password_hash": self._passwords.hash(password), "pin_hash": self._passwords.hash(pin)}
+        secrets = {"password_hash": self._passwords.hash(password), "pin_hash": self._pins.hash(pin)}
         with self._store.database.writing() as connection:
             unused = name and self._invitation(connection, token).account == name
             if not unused or get_account(connection, name).state != "invited":
@@ -105,15 +116,11 @@ class Accounts:
 
     def invite(self, by: Person, account: str, full_name: str, role: Role) -> str:
         """Make an account. Returns the token of its link, which is shown only once. Raises AccountError."""
-        name = plain_name(account)
-        require_name(name)
+        name = require_account_name(account)
         plain = require_full_name(full_name)
         _require_role(role)
         with self._store.database.writing() as connection:
-            if find_account(connection, name) is not None:
-                raise AccountError(
-                    f"there is an account {name} already", where="account", remedy="Choose another, or reset that one"
-                )
+            require_unlike_others(connection, name, plain)
             nothing = {"password_hash": "", "pin_hash": ""}
             self._create(connection, by.account, name, plain, role, "invited", nothing)
             return self._new_link(connection, name, INVITATION_S, actor=by.account)
@@ -182,8 +189,8 @@ class Accounts:
             change = AccountChanged(account=account, field="state", old="disabled", new="active", reason=why)
             record_change(self._store, connection, by.account, change)
 
-    def end_wait(self, by: Person, account: str) -> None:
-        """End an account's wait after wrong passwords. Raises AccountError."""
+    def end_wait(self, by: str, account: str) -> None:
+        """End all waits after wrong passwords of an account. Raises AccountError."""
         with self._store.database.writing() as connection:
             row = get_account(connection, account)
             values = {"failures": 0, "locked_until_utc_s": 0.0}
@@ -191,7 +198,7 @@ class Accounts:
             change = AccountChanged(
                 account=account, field="lock_out", old=f"{row.failures} wrong passwords", new="ended"
             )
-            record_change(self._store, connection, by.account, change)
+            record_change(self._store, connection, by, change)
 
     # --- one's own ---
 
@@ -206,7 +213,7 @@ class Accounts:
     def change_pin(self, person: Person, pin: str) -> None:
         """Set a new PIN; the caller has checked the password. Raises AccountError if it is not acceptable."""
         require_pin(pin)
-        self._change_secret(person, "pin", self._passwords.hash(pin))
+        self._change_secret(person, "pin", self._pins.hash(pin))
 
     def _change_secret(self, person: Person, which: str, stored: str) -> None:
         with self._store.database.writing() as connection:

@@ -6,11 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from service.core.errors import ConfigurationError
 from service.core.gates.acceptance import demanded_role
 from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
+from service.core.text.person_names import cleaned_name, person_name
+from service.people.credentials.tries import TERMINAL, SecretOrigin
 from service.people.errors import NotAllowedError
-from service.people.rows import plain_name
+from service.people.names import plain_name
 from service.people.sessions import KnownBy, People
 
 
@@ -31,6 +34,7 @@ def identity_for(
     typed: str,
     secret: Callable[[], str],
     known_by: KnownBy = "password",
+    origin: SecretOrigin = TERMINAL,
 ) -> Identity | None:
     """The person who acts, if the verb now needs a role; else None.
 
@@ -39,24 +43,46 @@ def identity_for(
         NotAllowedError: no name was given, or the account has another role.
     """
     role = demanded_role(protocol, state) if verb == "accept" else ""
-    return identify(people, typed, role, secret, known_by) if role else None
+    return identify(people, typed, role, secret, known_by, origin) if role else None
 
 
 def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identity:
-    """The person who acts on the command line: by claim, or by password if the name is that of an account.
+    """The person who acts on the command line: by password where there are accounts, else by claim.
 
-    Raises SignInRefusedError if name and password do not belong together or the account is not in use.
+    Raises:
+        NotAllowedError: there are accounts, and none has this name; or there are none, and this is no person's name.
+        SignInRefusedError: name and password do not belong together, or the account is not in use.
     """
+    accounts = {account.account: account.role for account in people.accounts.all()}
+    if not accounts:
+        return Identity(_claimed(typed), "", "claimed")
     name = plain_name(typed)
-    account = next((account for account in people.accounts.all() if account.account == name), None)
-    if account is None:
-        return Identity(typed.strip(), "", "claimed")
+    if name not in accounts:
+        raise NotAllowedError(
+            f"only accounts act here, and {typed!r} is none",
+            where="name",
+            remedy="Give the name of your account with --operator; an administrator makes one on the page Accounts",
+        )
     people.check_password(name, password())
-    return Identity(name, account.role, "password")
+    return Identity(name, accounts[name], "password")
+
+
+def who_pauses(people: People, typed: str) -> Identity:
+    """Whoever pauses a run, without a password and whatever the name: pausing is always safe.
+
+    Where there are accounts, the record says that the name was only claimed.
+    """
+    name = cleaned_name(typed)
+    return Identity(f"claimed:{name}" if people.accounts.all() else name, "", "claimed")
 
 
 def identify(
-    people: People, typed: str, role: str, secret: Callable[[], str], known_by: KnownBy = "password"
+    people: People,
+    typed: str,
+    role: str,
+    secret: Callable[[], str],
+    known_by: KnownBy = "password",
+    origin: SecretOrigin = TERMINAL,
 ) -> Identity:
     """Identify the person of this name in this role.
 
@@ -66,18 +92,27 @@ def identify(
         role: the role that the action needs.
         secret: asks for the secret; not called on a site without accounts, where the name is a claim.
         known_by: the kind of secret: the account's password, PIN or badge.
+        origin: where it is typed.
 
     Raises:
         SignInRefusedError: name and secret do not belong together.
-        NotAllowedError: no name was given, or the account has another role.
+        NotAllowedError: no name was given, or none that a person can have, or the account has another role.
     """
     if not typed.strip():
         raise NotAllowedError("a name is needed", where="name", remedy=f"Give the name of the {role}")
-    if not any(account.state == "active" for account in people.accounts.all()):
-        return Identity(typed.strip(), role, "claimed")
+    if not people.accounts.all():
+        return Identity(_claimed(typed), role, "claimed")
     name = plain_name(typed)
-    people.check_secret(name, known_by, secret())
+    people.check_secret(name, known_by, secret(), origin)
     account = people.accounts.get(name)
     if account.role != role:
         raise NotAllowedError(f"{name} is {account.role}; this needs a {role}", where="role", remedy=f"Call a {role}")
     return Identity(name, account.role, known_by)
+
+
+def _claimed(typed: str) -> str:
+    """A name on a site without accounts. Raises NotAllowedError if it is no person's name."""
+    try:
+        return person_name(typed)
+    except ConfigurationError as error:
+        raise NotAllowedError(error.what, where=error.where, remedy=error.remedy) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -19,37 +18,6 @@ from service.store.verification.people_checks import session_sha256
 
 SERVICE = "web"  # actor of events that no signed-in person caused
 SESSION_S = 12 * 3600.0
-_NAME = re.compile(r"[a-z][a-z0-9._-]{1,31}")
-_RESERVED = frozenset({"web", "runner", "worker", "site", "service", "camera", "robot", "orthocapture", "nobody"})
-
-
-def plain_name(typed: str) -> str:
-    """The account name for a typed name: lower case, without outer blanks."""
-    return typed.strip().lower()
-
-
-def require_name(name: str) -> None:
-    """Raise AccountError unless the name is valid for an account."""
-    if not _NAME.fullmatch(name):
-        raise AccountError(
-            "this cannot be the name of an account",
-            where="account",
-            remedy="Use 2 to 32 letters a-z, digits, dots, dashes or underscores, a letter first",
-        )
-    if name in _RESERVED:
-        raise AccountError(f"{name} is a name of the system itself", where="account", remedy="Choose another one")
-
-
-def require_full_name(name: str) -> str:
-    """The name with single blanks. Raises AccountError if it is not a printable name of 2 to 80 characters."""
-    plain = " ".join(name.split())
-    if not 2 <= len(plain) <= 80 or not plain.isprintable():
-        raise AccountError(
-            "this cannot be a person's name",
-            where="full_name",
-            remedy="Give first and last name, up to 80 characters",
-        )
-    return plain
 
 
 def require_reason(reason: str) -> str:

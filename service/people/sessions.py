@@ -15,7 +15,17 @@ from service.core.records.events import AccountChanged, SignInRecorded
 from service.core.records.moments import age_s
 from service.people.accounts import Accounts
 from service.people.credentials.badges import Badges
-from service.people.credentials.passwords import Passwords, new_token, token_sha256
+from service.people.credentials.passwords import Passwords, ShortSecrets, new_token, token_sha256
+from service.people.credentials.pepper import Pepper
+from service.people.credentials.tries import (
+    FIRST_WAIT_S,
+    FREE_FAILURES,
+    LONGEST_WAIT_S,
+    TERMINAL,
+    KnownTries,
+    SecretOrigin,
+    wait_after_s,
+)
 from service.people.errors import (
     AccountError,
     AccountJustChangedError,
@@ -23,13 +33,13 @@ from service.people.errors import (
     PinRefusedError,
     SignInRefusedError,
 )
+from service.people.names import plain_name
 from service.people.person import Person, Screen
 from service.people.rows import (
     SERVICE,
     SESSION_S,
     find_account,
     get_account,
-    plain_name,
     record_change,
     record_sign_in,
     to_account,
@@ -38,20 +48,11 @@ from service.people.rows import (
 from service.store.database.tables import accounts, sessions
 from service.store.store import Store
 
-FREE_FAILURES = 5  # wrong passwords in a row before an account waits; wrong PINs before a sign-in ends
-FIRST_WAIT_S = 30.0
-LONGEST_WAIT_S = 900.0
 _SCREEN_LETTERS = "23456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 
 KnownBy = Literal["password", "pin", "badge"]  # the secret with which a person signs
 NAMES: Mapping[KnownBy, str] = {"password": "password", "pin": "PIN", "badge": "badge"}
-
-
-def wait_after_s(failures: int) -> float:
-    """Seconds that an account must wait after this many wrong passwords in a row."""
-    over = failures - FREE_FAILURES
-    return 0.0 if over < 0 else min(FIRST_WAIT_S * 2.0 ** min(over, 10), LONGEST_WAIT_S)
 
 
 class People:
@@ -62,8 +63,10 @@ class People:
         self._passwords = Passwords(hasher)
         # One check at a time, so that every guess is counted before the next and argon2's memory stays bounded.
         self._one_guess = Lock()
-        self.accounts = Accounts(store, self._passwords)
-        self.badges = Badges(store, self._passwords, self.check_password)
+        self._short = ShortSecrets(self._passwords, Pepper(store))
+        self._known = KnownTries(store)
+        self.accounts = Accounts(store, self._passwords, self._short, self._known)
+        self.badges = Badges(store, self._short, self.check_password)
 
     def first_link(self) -> str | None:
         """A new one-time token for the page /set-up/TOKEN, voiding earlier ones; None if an administrator exists."""
@@ -77,7 +80,8 @@ class People:
         Raises SignInRefusedError, with the same words and after the same time whatever the cause.
         """
         with self._one_guess:
-            row = self._checked(account, password, address)
+            origin = SecretOrigin(address=address)
+            row = self._checked(account, password, origin)
             token = new_token()
             now = self._store.clock.utc_s()
             with self._store.database.writing() as connection:
@@ -94,73 +98,109 @@ class People:
                 }
                 self._store.ages.begin(now)
                 connection.execute(insert(sessions).values(**session, seen_utc_s=now, locked=0, pin_failures=0))
-                self._reset_failures(connection, row, password)
+                self._reset_failures(connection, row, password, origin)
                 outcome = SignInRecorded(account=row.account, outcome="signed_in", screen=screen, address=address)
                 record_sign_in(self._store, connection, outcome, actor=row.account, session=session)
             return token
 
-    def check_password(self, account: str, password: str) -> None:
+    def may_try(self, account: str, address: str) -> bool:
+        """Whether a person may sign in from an address however many others failed there.
+
+        So may whoever has signed in from there before, and need not wait for wrong passwords of that account.
+        """
+        name, origin = plain_name(account), SecretOrigin(address=address)
+        with self._one_guess:
+            return self._known.knows(name, origin) and not self._known.wait_s(name, origin)
+
+    def check_password(self, account: str, password: str, origin: SecretOrigin = TERMINAL) -> None:
         """Check a password again for a signature. A wrong one counts as a failed try: SignInRefusedError."""
         with self._one_guess:
-            row = self._checked(account, password, "")
-            if row.failures or self._passwords.is_outdated(row.password_hash):
+            row = self._checked(account, password, origin)
+            if self._passwords.is_outdated(row.password_hash) or not self._known.knows(row.account, origin):
                 with self._store.database.writing() as connection:
                     self._require_unchanged(connection, row)
-                    self._reset_failures(connection, row, password)
+                    self._reset_failures(connection, row, password, origin)
+            else:
+                self._known.succeeded(row.account, origin)
 
-    def check_secret(self, account: str, known_by: KnownBy, secret: str) -> None:
+    def check_secret(self, account: str, known_by: KnownBy, secret: str, origin: SecretOrigin = TERMINAL) -> None:
         """Check a password, PIN or badge again for a signature.
 
         A wrong one counts as a failed try and raises SignInRefusedError. Only the right password resets the count, so
         that knowing a PIN gives no further guesses at the password.
         """
         if known_by == "password":
-            self.check_password(account, secret)
+            self.check_password(account, secret, origin)
             return
         with self._one_guess:
-            self._checked(account, secret.strip().upper(), "", known_by)
+            plain = secret.strip().upper()
+            row = self._checked(account, plain, origin, known_by)
+            self._renew(row.account, known_by, row.pin_hash if known_by == "pin" else row.badge_hash, plain)
+
+    def _renew(self, account: str, which: KnownBy, stored: str, secret: str) -> None:
+        """Hash a right PIN or badge again if its hash is of an earlier version."""
+        if not self._short.is_outdated(stored):
+            return
+        column = f"{which}_hash"
+        values = {column: self._short.hash(secret)}
+        with self._store.database.writing() as connection:
+            row = find_account(connection, account)
+            if row is None or getattr(row, column) != stored:
+                return  # it was changed meanwhile
+            connection.execute(update(accounts).where(accounts.c.account == account).values(**values))
+            change = AccountChanged(account=account, field=which, old="set", new="hashed anew")
+            record_change(self._store, connection, account, change, values)
 
     def refuse_address(self, address: str) -> None:
         """Record that an address has failed too often and must wait."""
         with self._store.database.writing() as connection:
             record_sign_in(self._store, connection, SignInRecorded(account="", outcome="locked_out", address=address))
 
-    def _checked(self, typed: str, secret: str, address: str, known_by: KnownBy = "password") -> Row[Any]:
+    def _checked(self, typed: str, secret: str, origin: SecretOrigin, known_by: KnownBy = "password") -> Row[Any]:
         name = plain_name(typed)
         with self._store.database.reading() as connection:
             row = find_account(connection, name)
-        waits = row is not None and self._has_to_wait(row)
+        known = row is not None and self._known.knows(name, origin)
+        waits = row is not None and (self._known.wait_s(name, origin) > 0 if known else self._has_to_wait(row))
         usable = row is not None and row.state == "active" and not waits
         hashes = {} if row is None else {"password": row.password_hash, "pin": row.pin_hash, "badge": row.badge_hash}
         stored = str(hashes[known_by]) if usable else ""
-        matches = self._passwords.matches(stored, secret)
+        hashes_of = self._passwords if known_by == "password" else self._short
+        matches = hashes_of.matches(stored, secret)
         if row is not None and matches:
             return row
         with self._store.database.writing() as connection:
-            if row is not None and usable:
-                failures = get_account(connection, name).failures + 1  # another process may count too
-                wait_s = wait_after_s(failures)
-                until_s = self._store.clock.utc_s() + wait_s if wait_s else 0.0
-                self._store.ages.begin(until_s)
-                counted = {"failures": failures, "locked_until_utc_s": until_s}
-                connection.execute(update(accounts).where(accounts.c.account == name).values(**counted))
-                waits = wait_s > 0
+            if known and not waits:
+                self._known.failed(name, origin)
+            elif usable:
+                waits = self._count_strangers_failure(connection, name)
             # An unknown name is not recorded, because it may be a password typed into the wrong field.
             outcome = SignInRecorded(
                 account=row.account if row is not None else "",
                 outcome="locked_out" if waits else "refused",
-                address=address,
+                address=origin.address,
+                screen=origin.screen,
             )
-            record_sign_in(self._store, connection, outcome)
+            record_sign_in(self._store, connection, outcome, actor=origin.by or SERVICE)
         raise SignInRefusedError(
             f"name and {NAMES[known_by]} do not belong together, or the account has to wait",
             where="password",
-            remedy=f"Check both. After {FREE_FAILURES} wrong {NAMES[known_by]}s in a row an account waits "
+            remedy=f"Check both. After {FREE_FAILURES} wrong {NAMES[known_by]}s in a row one waits "
             f"{FIRST_WAIT_S:.0f} s, then longer; an administrator can end the wait",
         )
 
+    def _count_strangers_failure(self, connection: Connection, name: str) -> bool:
+        """Count a wrong secret of somebody whom the account does not know; returns whether strangers wait now."""
+        failures = get_account(connection, name).failures + 1  # another process may count too
+        wait_s = wait_after_s(failures)
+        until_s = self._store.clock.utc_s() + wait_s if wait_s else 0.0
+        self._store.ages.begin(until_s)
+        counted = {"failures": failures, "locked_until_utc_s": until_s}
+        connection.execute(update(accounts).where(accounts.c.account == name).values(**counted))
+        return wait_s > 0
+
     def _has_to_wait(self, row: Row[Any]) -> bool:
-        """Whether wrong passwords have closed the account for now.
+        """Whether wrong passwords of strangers have closed the account to them for now.
 
         A wait longer than the longest comes from a clock that was set back since; it is cut to the longest.
         """
@@ -169,7 +209,7 @@ class People:
             with self._store.database.writing() as connection:
                 cut = {"locked_until_utc_s": now + LONGEST_WAIT_S}
                 connection.execute(update(accounts).where(accounts.c.account == row.account).values(**cut))
-        return self.accounts.has_to_wait(to_account(row))
+        return self.accounts.strangers_wait(to_account(row))
 
     def _require_unchanged(self, connection: Connection, row: Row[Any]) -> None:
         """Raise AccountJustChangedError if the account has changed since its password was checked."""
@@ -179,15 +219,20 @@ class People:
                 "the account has just been changed", where="password", remedy="Sign in again"
             )
 
-    def _reset_failures(self, connection: Connection, row: Row[Any], password: str) -> None:
-        values: dict[str, object] = {"failures": 0, "locked_until_utc_s": 0.0}
+    def _reset_failures(self, connection: Connection, row: Row[Any], password: str, origin: SecretOrigin) -> None:
+        """Begin to count anew, where the right password was given."""
+        values: dict[str, object] = {}
+        if not self._known.knows(row.account, origin):
+            values = {"failures": 0, "locked_until_utc_s": 0.0}
+        self._known.succeeded(row.account, origin)
         if self._passwords.is_outdated(row.password_hash):
             stored = {"password_hash": self._passwords.hash(password)}
             values |= stored
             name = row.account
             change = AccountChanged(account=name, field="password", old="set", new="hashed anew")
             record_change(self._store, connection, name, change, stored)
-        connection.execute(update(accounts).where(accounts.c.account == row.account).values(**values))
+        if values:
+            connection.execute(update(accounts).where(accounts.c.account == row.account).values(**values))
 
     # --- sign-ins ---
 
@@ -244,7 +289,15 @@ class People:
                 ).one_or_none()
             if row is None:
                 raise NotSignedInError("this sign-in has ended", remedy="Sign in again")
-            matches = self._passwords.matches(row.pin_hash, pin)
+            if self._short.is_lost(row.pin_hash):
+                raise PinRefusedError(
+                    "no PIN can be checked: the key to which PINs are bound was replaced",
+                    where="pin",
+                    remedy="Sign out, sign in with the password, and set a new PIN on the page of your account",
+                )
+            matches = self._short.matches(row.pin_hash, pin)
+            if matches:
+                self._renew(person.account, "pin", row.pin_hash, pin)
             failures = 0 if matches else row.pin_failures + 1
             ended = failures >= FREE_FAILURES
             with self._store.database.writing() as connection:

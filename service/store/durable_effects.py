@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Protocol
 
 from service.core.records.moments import Moment
+from service.store.access import file_mode, folder_mode, make_folder, open_new
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
@@ -23,13 +24,16 @@ class Files(Protocol):
     """
 
     def make_directory(self, path: Path, *, private: bool = False) -> None:
-        """Create one directory, unless it exists. Durable only after `sync_directory(path.parent)`."""
+        """Create one directory, unless it exists. Durable only after `sync_directory(path.parent)`.
+
+        It is for whom the folder is in which it lies; a `private` one is for its owner alone.
+        """
         ...
 
     def write(self, path: Path, chunks: Iterable[bytes], *, private: bool = False) -> None:
         """Create `path`, which must not exist, and write the chunks. Durable only after `sync_file`.
 
-        A `private` file is never readable by others, not even for a moment.
+        It is for whom its folder is; a `private` one is never readable by others, not even for a moment.
         """
         ...
 
@@ -38,7 +42,7 @@ class Files(Protocol):
         ...
 
     def make_read_only(self, path: Path) -> None:
-        """Remove write permission (mode 0o444)."""
+        """Remove write permission."""
         ...
 
     def sync_file(self, path: Path) -> None:
@@ -66,26 +70,26 @@ class DurableFiles:
     """`Files` on a POSIX file system."""
 
     def make_directory(self, path: Path, *, private: bool = False) -> None:
-        """Create one directory, unless it exists; a private one with mode 0o700. Raises OSError."""
-        path.mkdir(mode=0o700 if private else 0o777, exist_ok=True)
+        """Create one directory, unless it exists: for whom its folder is, a private one for its owner alone."""
+        make_folder(path, 0o700 if private else folder_mode(path.parent))
 
     def write(self, path: Path, chunks: Iterable[bytes], *, private: bool = False) -> None:
-        """Create a new file and write the chunks; a private one with mode 0o600. Raises OSError."""
-        flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW
-        with open(os.open(path, flags, 0o600 if private else 0o666), "wb") as handle:
+        """Create a new file, for whom its folder is or private, and write the chunks. Raises OSError."""
+        mode = 0o600 if private else file_mode(path.parent)
+        with open(open_new(path, os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW, mode), "wb") as handle:
             for chunk in chunks:
                 handle.write(chunk)
 
     def append(self, path: Path, offset: int, data: bytes) -> None:
         """Truncate a file (created if missing) to `offset` bytes and append the data. Raises OSError."""
-        with open(os.open(path, os.O_CREAT | os.O_WRONLY | os.O_CLOEXEC, 0o666), "wb") as handle:
+        with open(open_new(path, os.O_WRONLY, file_mode(path.parent)), "wb") as handle:
             handle.truncate(offset)
             handle.seek(offset)
             handle.write(data)
 
     def make_read_only(self, path: Path) -> None:
-        """Remove write permission (mode 0o444). Raises OSError."""
-        path.chmod(0o444)
+        """Remove write permission. Raises OSError."""
+        path.chmod(path.stat().st_mode & 0o444)
 
     def sync_file(self, path: Path) -> None:
         """Flush the file's data and metadata to disk with fsync. Raises OSError."""

@@ -14,8 +14,17 @@ from sqlalchemy import Connection, bindparam, select
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.jobs.priorities import Lane
 from service.core.records.events import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
+from service.store.access import close_to_others, require_access
 from service.store.ages import Ages
-from service.store.database.engine import LOOK, PATIENCE_S, RESTORE, Database, database_path, open_database
+from service.store.database.engine import (
+    DATABASE_NAME,
+    LOOK,
+    PATIENCE_S,
+    RESTORE,
+    Database,
+    database_path,
+    open_database,
+)
 from service.store.database.tables import artefacts, events, heads, runs
 from service.store.durable_effects import Clock, DurableFiles, Files, IdSource, RandomIds, SystemClock
 from service.store.errors import UnknownRunError
@@ -69,6 +78,7 @@ class Store:
         """
         files = files or DurableFiles()
         ids = ids or RandomIds()
+        require_access(data_dir)
         if not create and not database_path(data_dir).is_file():
             raise StoreError(
                 "there is no run data here",
@@ -76,6 +86,7 @@ class Store:
                 remedy="Name the data folder with --data DIR, or with the environment variable ORTHOCAPTURE_DATA",
             )
         folder = open_folder(data_dir, files, ids)
+        close_to_others(data_dir, DATABASE_NAME)
         database = open_database(data_dir, files, patience_s)
         return cls(database, folder, files, clock or SystemClock(), ids, database_path(data_dir))
 

@@ -28,7 +28,7 @@ COMMAND = Path(sys.executable).with_name("orthocapture")
 COMMANDS = (
     "demo", "serve", "run", "resume", "import", "act", "note", "status", "runs", "compare", "history", "worker",
     "doctor", "dicom-listen", "calibrate", "import-ros", "develop", "sfm", "register", "spheres", "layout", "fuse",
-    "evaluate", "benchmark", "simulate", "audit", "store", "replay", "export", "protocol", "plan",
+    "evaluate", "benchmark", "simulate", "audit", "store", "replay", "export", "accounts", "protocol", "plan",
 )  # fmt: skip
 
 

@@ -72,7 +72,7 @@ def test_weak_secrets_are_refused_and_the_link_stays_good(office: Office, passwo
         office.people.accounts.accept(link, "another password", PIN)
 
 
-@pytest.mark.parametrize("name", ["", "x", "runner", "web", "9lives", "a b", "é" * 4, "a/../b", "x" * 40, "a\u0000b"])
+@pytest.mark.parametrize("name", ["", "x", "runner", "web", "9lives", "a b", "a/../b", "x" * 40, "a\u0000b"])
 def test_names_that_cannot_be_accounts(office: Office, name: str) -> None:
     _, administrator = office.enter("ada")
     with pytest.raises(AccountError):
@@ -172,7 +172,7 @@ def test_an_administrator_ends_a_wait(office: Office) -> None:
     _, administrator = office.enter("ada")
     for _ in range(5):
         refused(lambda: office.people.sign_in("grace", "wrong"))
-    office.people.accounts.end_wait(administrator, "grace")
+    office.people.accounts.end_wait(administrator.account, "grace")
     office.enter("grace")
 
 
@@ -245,7 +245,7 @@ def test_what_cannot_be_recorded_does_not_happen(office: Office, monkeypatch: py
         lambda: office.people.accounts.reset(administrator, "grace", "a reason"),
         lambda: office.people.accounts.change_password(person, "quite another one"),
         lambda: office.people.accounts.change_pin(person, "1122334"),
-        lambda: office.people.accounts.end_wait(administrator, "grace"),
+        lambda: office.people.accounts.end_wait(administrator.account, "grace"),
     ):
         with pytest.raises(NoRecordError):
             act()

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from sqlalchemy import Connection
 
 from service.core.records.events import ServiceStarted, SignInRecorded
-from service.people.credentials.tries import failed_tries
+from service.people.credentials.tries import failed_tries, wait_after_s
 from service.people.errors import NotSignedInError, PinRefusedError
-from service.people.sessions import People, wait_after_s
+from service.people.sessions import People
 from service.store.database.engine import Database, database_path
 from tests.support.pages.web import PIN, password_of
 from tests.support.record.office import IDLE_S, Office, refused
@@ -257,7 +257,7 @@ def test_a_clock_that_is_set_forward_ends_no_wait(office: Office) -> None:
         refused(lambda: office.people.sign_in("grace", "wrong"))
     office.clock.set_utc(3600.0)
     refused(lambda: office.people.sign_in("grace", password_of("grace")))
-    assert office.people.accounts.has_to_wait(office.people.accounts.get("grace"))
+    assert office.people.accounts.strangers_wait(office.people.accounts.get("grace"))
     office.clock.passed_s += 31
     office.enter("grace")
 

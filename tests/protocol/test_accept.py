@@ -307,11 +307,13 @@ def test_whoever_acts_in_the_name_of_an_account_gives_its_password(web: WebSite)
     assert not bench.state().step.retry_granted
     assert plainly(web.folder, bench.run_id, "pause", "emmy").exit_code == 0, "nobody is kept from pausing"
     assert plainly(web.folder, bench.run_id, "resume", "Emmy", password_of("emmy") + "\n").exit_code == 0
-    assert plainly(web.folder, bench.run_id, "confirm", "A Stranger").exit_code == 0
+    assert plainly(web.folder, bench.run_id, "confirm", "A Stranger").exit_code == 1
+    assert not bench.state().step.retry_granted
+    assert plainly(web.folder, bench.run_id, "confirm", "emmy", password_of("emmy") + "\n").exit_code == 0
     with Store.open(web.folder / "data") as store:
         events = [event for event in store.events(bench.run_id) if isinstance(event.payload, OperatorAction)]
     known = [(event.actor, event.payload.model_dump()["identified"]) for event in events[-3:]]
-    assert known == [("emmy", "claimed"), ("emmy", "password"), ("A Stranger", "claimed")]
+    assert known == [("claimed:emmy", "claimed"), ("emmy", "password"), ("emmy", "password")]
 
 
 def test_without_accounts_a_name_is_a_claim_and_the_record_says_so(tmp_path: Path) -> None:
@@ -393,3 +395,21 @@ def test_at_the_terminal_a_supervisor_types_name_and_hidden_password(web: WebSit
         assert typed.echoes
     finally:
         typed.close()
+
+
+def test_at_the_terminal_a_name_that_nobody_has_ends_no_run(tmp_path: Path) -> None:
+    with Store.open(tmp_path / "data") as store:
+        typed = Typed(tmp_path, People(store))
+        try:
+            for name in ("runner", "\u0435mmy", "em\u200bmy"):
+                for text in ("accept one view less", name):
+                    assert typed.line(text) is None
+                assert typed.line("") is None
+                assert "cannot be a person's name" in typed.told
+            for text in ("accept one view less", "李明"):
+                assert typed.line(text) is None
+            spoken = typed.line("")
+            assert isinstance(spoken, AnswerBy)
+            assert (spoken.actor, spoken.action.identified) == ("李明", "claimed")
+        finally:
+            typed.close()

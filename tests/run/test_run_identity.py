@@ -27,7 +27,7 @@ from service.core.records.events import PAYLOAD, RunAborted, RunStarted
 from service.store.signatures.signing import checkpoint
 from service.store.verification.verify import verify
 from tests.support.pages.browsed_run import words
-from tests.support.pages.web import Browser, WebSite, web_site
+from tests.support.pages.web import Browser, WebSite, password_of, web_site
 from tests.support.rig.rig import REPOSITORY
 from tests.support.runs.bench_run import PROTOCOL
 
@@ -46,9 +46,9 @@ def web(tmp_path: Path) -> Generator[WebSite]:
         yield site
 
 
-def typed(*arguments: str) -> Result:
+def typed(*arguments: str, said: str = "") -> Result:
     """Run a command line to its end."""
-    return CliRunner().invoke(app, list(arguments))
+    return CliRunner().invoke(app, list(arguments), input=said)
 
 
 def jpeg(width: int = 640, height: int = 480) -> bytes:
@@ -348,17 +348,17 @@ def test_the_command_line_enters_notes_and_finds_the_same(tmp_path: Path) -> Non
 def test_a_note_from_the_command_line(web: WebSite, tmp_path: Path) -> None:
     run_id = web.begin_run().run_id
     (tmp_path / "seen.jpg").write_bytes(jpeg())
-    data = ("--data", str(web.site.data))
-    done = typed(
-        "note", "a scratch", "--photo", str(tmp_path / "seen.jpg"), "--step", "capture", "--operator", "Lou", *data
-    )
+    said = password_of("grace")
+    grace = ("--operator", "grace", "--password-stdin", "--data", str(web.site.data))
+    photograph = ("--photo", str(tmp_path / "seen.jpg"))
+    done = typed("note", "a scratch", *photograph, "--step", "capture", *grace, said=said)
     assert done.exit_code == 0, done.stderr
     (taken,) = notes(web, run_id)
     assert (taken.text, taken.step, taken.via) == ("a scratch", "capture", "cli")
     assert taken.photograph is not None
     assert taken.photograph.original_name == "seen.jpg"
     (tmp_path / "seen.jpg").write_bytes(b"text")
-    refused = typed("note", "--photo", str(tmp_path / "seen.jpg"), "--operator", "Lou", *data)
+    refused = typed("note", *photograph, *grace, said=said)
     assert refused.exit_code == 1
     assert "neither a JPEG nor a PNG" in refused.stderr
     assert verify(web.site.data, run_id).ok

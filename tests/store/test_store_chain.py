@@ -318,7 +318,7 @@ def test_putting_twice_keeps_one_read_only_file(store: Store, tmp_path: Path) ->
     before = path.stat().st_ino
     assert store.put_file(source, kind="image", media_type="image/jpeg", sha256=first.sha256) == first
     assert path.stat().st_ino == before
-    assert path.stat().st_mode & 0o777 == 0o444
+    assert path.stat().st_mode & 0o777 == 0o400
     assert path.read_bytes() == source.read_bytes()
     with pytest.raises(StoreError, match="changed in transfer"):
         store.put_file(source, kind="image", media_type="image/jpeg", sha256="0" * 64)

@@ -211,23 +211,24 @@ def test_a_process_that_holds_the_database_for_long_is_waited_for(
     assert verify(data).faults == ()
 
 
-def test_only_what_is_private_is_kept_from_other_users(tmp_path: Path) -> None:
-    """Keys are for the service's own user; for everything else the rights are those that the host gives new files."""
+@pytest.mark.parametrize(("folder", "file"), [(0o700, 0o600), (0o755, 0o644), (0o2770, 0o660), (0o777, 0o644)])
+def test_what_is_made_is_for_whom_its_folder_is_and_keys_for_their_owner(
+    tmp_path: Path, folder: int, file: int
+) -> None:
     files = DurableFiles()
-    (tmp_path / "like_this").touch()
-    (tmp_path / "as_this").mkdir()
+    tmp_path.chmod(folder)
     files.make_directory(tmp_path / "keys", private=True)
     files.make_directory(tmp_path / "runs")
     files.write(tmp_path / "key", [b"a", b"b"], private=True)
     files.write(tmp_path / "image", [b"a", b"b"])
     files.append(tmp_path / "log", 0, b"whole")
     files.append(tmp_path / "log", 2, b"o")
-    rights = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
+    rights = {path.name: path.stat().st_mode & 0o7777 for path in tmp_path.iterdir()}
     assert (rights["keys"], rights["key"]) == (0o700, 0o600)
-    assert rights["runs"] == rights["as_this"]
-    assert rights["image"] == rights["log"] == rights["like_this"]
+    assert rights["runs"] == folder & ~0o022 | (0o2070 & folder if folder & 0o2000 else 0)
+    assert rights["image"] == rights["log"] == file
     assert ((tmp_path / "image").read_bytes(), (tmp_path / "log").read_bytes()) == (b"ab", b"who")
     with pytest.raises(FileExistsError):  # nothing recorded is ever written over
         files.write(tmp_path / "image", [b"c"])
     files.make_read_only(tmp_path / "image")
-    assert (tmp_path / "image").stat().st_mode & 0o777 == 0o444
+    assert (tmp_path / "image").stat().st_mode & 0o777 == file & 0o444

@@ -99,6 +99,9 @@ RUN_ELSEWHERE = {
     "orthocapture compare RUN OTHER --data runs": (
         "tests/audit/test_runs_beside_runs.py::test_two_runs_side_by_side_in_the_terminal"
     ),
+    "orthocapture accounts end-wait emmy --operator ada --data runs": (
+        "tests/people/test_tries.py::test_an_administrator_clears_it_on_the_command_line"
+    ),
     "orthocapture replay latest --data runs": "tests/audit/test_replay.py::test_command_says_equal_with_status_0",
     "orthocapture calibrate intrinsics --images DIR --board 16x23 --square-mm 15 --out camera.json": (
         "tests/calibration/test_intrinsics_command.py::test_a_folder_of_photographs_becomes_a_camera_that_every_command_reads"

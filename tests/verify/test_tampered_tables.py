@@ -280,7 +280,7 @@ def test_whatever_people_do_verifies(tmp_path: Path) -> None:
         for _ in range(6):
             with suppress(SignInRefusedError):
                 people.sign_in("marie", "wrong")
-        accounts.end_wait(ada, "marie")
+        accounts.end_wait(ada.account, "marie")
         marie = person("marie", "radium and polonium")
         people.lock(marie)
         for _ in range(5):

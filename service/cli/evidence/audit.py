@@ -31,7 +31,9 @@ from service.cli.evidence.audit_figures import figures_command
 from service.cli.evidence.audit_report import report_command
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.text.counts import counted
+from service.core.text.person_names import cleaned_name
 from service.core.units import megabytes
+from service.store.access import kept_to
 from service.store.durable_effects import utc_text
 from service.store.records import Artefact
 from service.store.run_rows import resolve_run
@@ -111,9 +113,9 @@ def verify_command(
 
 def _tell_the_pages(data: Path, report: AuditReport, took_s: float) -> None:
     """Save the result for the audit's pages, if the folder is writable."""
-    by, at_utc = f"{getpass.getuser()} (command line)", utc_text(datetime.now(UTC))
+    by, at_utc = f"{cleaned_name(getpass.getuser())} (command line)", utc_text(datetime.now(UTC))
     for run_id in report.runs:
-        with suppress(OSError):
+        with suppress(OSError), kept_to(data):
             found = verification_of(report, run_id, by=by, at_utc=at_utc, duration_s=took_s)
             keep_verification(data, run_id, found)
 

@@ -20,7 +20,7 @@ from service.core.run.actions import VERBS, capture_refusal, record_to_sign, ref
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.notes import NotePhotograph, require_size, take_note
-from service.people.authorisation import Identity, identity_for, who_acts
+from service.people.authorisation import Identity, identity_for, who_acts, who_pauses
 from service.people.sessions import People
 from service.run_record import read_log
 from service.run_start import record_refusal, recorded_run
@@ -90,7 +90,7 @@ def _identity(
     """Who acts. Pausing is always safe, so anybody may pause without a password."""
     identity = identity_for(People(store), protocol, state, verb, name, password)
     if identity is None and verb == "pause":
-        return Identity(name, "", "claimed")
+        return who_pauses(People(store), name)
     return identity or who_acts(People(store), name, password)
 
 

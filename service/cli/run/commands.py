@@ -22,7 +22,7 @@ from service.cli.common import (
 from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption, described
 from service.cli.run.beside import worker_beside
 from service.cli.run.ending import sigterm_like_ctrl_c
-from service.cli.run.person import OperatorOption, PasswordOption, acting_person, typed_password
+from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.cli.run.status import status_record
 from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.import_operator import ImportOperator
@@ -38,7 +38,7 @@ from service.monitor.alarm import alarm_of
 from service.monitor.devices import OpenDevices
 from service.monitor.reporter import Reporter
 from service.people.approvals import approve
-from service.people.authorisation import Identity, who_acts
+from service.people.authorisation import Identity
 from service.people.sessions import People
 from service.rig import Rig, load_rig
 from service.run_start import (
@@ -54,6 +54,7 @@ from service.run_start import (
 from service.runner.loop import Runner
 from service.station import Station, devices_of, layout_of
 from service.steps import params_models
+from service.store.access import kept_to
 from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.timestamps import stamp_end
 from service.store.store import Store
@@ -113,6 +114,8 @@ def resume_command(
     screens: Annotated[
         bool, typer.Option("--screens", help="Questions are answered in the browser (`orthocapture serve`).")
     ] = False,
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
     json: JsonOption = False,
 ) -> None:
     """Continue a run after a crash, a power failure or a pause; nothing captured is lost or taken twice."""
@@ -120,7 +123,12 @@ def resume_command(
         run_id = store.find_run(run)
         _, root = recorded_run(store, run_id)
         rig = recorded_rig(store, root)
-        state = drive(store, run_id, rig, data=data, auto_confirm=auto_confirm, worker=worker, screens=screens)
+        who = None
+        if not (auto_confirm or screens):
+            who = acting_person(store, operator or root.operator, password_stdin=password_stdin)
+        state = drive(
+            store, run_id, rig, data=data, auto_confirm=auto_confirm, worker=worker, screens=screens, who=who
+        )
         _report_end(run_id, state, json=json)
 
 
@@ -145,7 +153,7 @@ def drive(
         auto_confirm: a simulated technician answers every question.
         worker: start a worker process beside the run.
         screens: people answer in the browser.
-        who: the person at this terminal; None for the run's operator, who is asked for a password.
+        who: the person at this terminal; None if nobody answers there.
     """
     protocol, root = recorded_run(store, run_id)
     require_rig_free(store, rig.path, run_id=run_id)
@@ -158,17 +166,18 @@ def drive(
     if auto_confirm:
         require_simulated(rig)
         operator = AutomaticOperator(root.operator, protocol, display, hands)
-    elif screens:
+    elif screens or who is None:
         operator = ScreenOperator(root.operator, protocol, display, hands)
     elif rig.section.imported is not None:
-        operator = ImportOperator(root.operator, protocol, display, hands, listing=rig.section.imported)
+        listing = rig.section.imported
+        operator = ImportOperator(who.name, protocol, display, hands, people=People(store), who=who, listing=listing)
     else:
         preview = partial(_preview, protocol, rig)
-        people = People(store)
-        who = who or who_acts(people, root.operator, partial(typed_password, root.operator, from_stdin=False))
-        operator = TerminalOperator(who.name, protocol, display, hands, preview=preview, people=people, who=who)
+        operator = TerminalOperator(
+            who.name, protocol, display, hands, preview=preview, people=People(store), who=who
+        )
     beside = worker_beside(data, error_console.print) if worker else nullcontext()
-    with sigterm_like_ctrl_c(), file_log(data, "runner", run=run_id), beside:
+    with sigterm_like_ctrl_c(), kept_to(data), file_log(data, "runner", run=run_id), beside:
         authority, copy = time_stamp_authority(rig), signature_copy(rig)
         reporter.begin()
         try:

@@ -139,7 +139,7 @@ def import_command(
         with Store.open(data) as store:
             who = acting_person(store, operator, password_stdin=password_stdin)
             run_id = _run_of(store, loaded, rig, operator=who.name, again=again, about=about)
-            state = drive(store, run_id, rig, data=data, auto_confirm=False, worker=worker)
+            state = drive(store, run_id, rig, data=data, auto_confirm=False, worker=worker, who=who)
             summary = summarise(store, run_id, loaded.protocol)
             table, note = summary.table(), shared_adjustment_note(loaded.protocol, summary.state)
         if json:

@@ -30,6 +30,7 @@ from service.rig import Rig, load_rig
 from service.run_start import signature_copy
 from service.station import devices_of
 from service.steps import params_models
+from service.store.access import kept_to
 from service.store.database.engine import BUSY_TIMEOUT_S
 from service.store.records import SITE
 from service.store.signatures.log_copy import keep_elsewhere
@@ -104,6 +105,7 @@ def serve_command(
         with (
             listening(host, port, limits, proxies) as listener,
             Store.open(data, patience_s=BUSY_TIMEOUT_S) as store,  # a page does not wait for minutes
+            kept_to(data),
             sparing_log(store.clock) as log,
             file_log(data, "web", admits=told),
         ):

@@ -19,6 +19,7 @@ from service.cli.common import (
 )
 from service.core.text.counts import counted
 from service.logs.file_log import file_log
+from service.store.access import kept_to
 from service.worker.pool import work_side_by_side
 
 
@@ -41,7 +42,7 @@ def worker_command(
         stopped = True
 
     signal.signal(signal.SIGTERM, on_terminate)
-    with reporting_errors(json), file_log(data, "worker"), progress_bar(quiet=json) as progress:
+    with reporting_errors(json), kept_to(data), file_log(data, "worker"), progress_bar(quiet=json) as progress:
         done = work_side_by_side(
             data,
             at_once=jobs or os.cpu_count() or 1,

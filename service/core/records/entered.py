@@ -10,6 +10,7 @@ from pydantic import Field
 
 from service.core.errors import ConfigurationError
 from service.core.records.base import ArtefactRef, Record
+from service.core.text.person_names import person_name
 
 LINE_CHARACTERS = 200
 TEXT_CHARACTERS = 4000
@@ -55,12 +56,15 @@ ABOUT: Mapping[str, str] = {
 def about_run(
     *, specimen: str = "", purpose: str = "", site: str = "", operator: str = "", text: str = ""
 ) -> RunAbout:
-    """Clean up what was entered. Raises ConfigurationError, naming the field, if a text is too long."""
+    """Clean up what was entered.
+
+    Raises ConfigurationError, naming the field, if a text is too long, or the operator's name is no person's name.
+    """
     return RunAbout(
         specimen=line(specimen, "the specimen"),
         purpose=line(purpose, "the purpose"),
         site=line(site, "the site"),
-        operator=line(operator, "the operator"),
+        operator=person_name(operator) if operator.strip() else "",
         text=paragraphs(text, "the remarks"),
     )
 

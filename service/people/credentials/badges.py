@@ -7,7 +7,8 @@ from collections.abc import Callable
 from sqlalchemy import select, update
 
 from service.core.records.events import AccountChanged
-from service.people.credentials.passwords import Passwords, plain_badge
+from service.people.credentials.passwords import ShortSecrets, plain_badge
+from service.people.credentials.tries import SecretOrigin, on_screen_of
 from service.people.errors import AccountError
 from service.people.person import Person
 from service.people.rows import get_account, record_change, require_reason
@@ -18,9 +19,11 @@ from service.store.store import Store
 class Badges:
     """Enrolling and revoking badges, by supervisors and administrators."""
 
-    def __init__(self, store: Store, passwords: Passwords, check_password: Callable[[str, str], None]) -> None:
+    def __init__(
+        self, store: Store, codes: ShortSecrets, check_password: Callable[[str, str, SecretOrigin], None]
+    ) -> None:
         self._store = store
-        self._passwords = passwords
+        self._codes = codes
         self._check_password = check_password
 
     def enrol(self, by: Person, account: str, password: str, badge: str) -> None:
@@ -33,12 +36,12 @@ class Badges:
             SignInRefusedError: the password is wrong.
         """
         plain = plain_badge(badge)
-        self._check_password(account, password)
-        if any(self._passwords.matches(stored, plain) for stored in self._others(account)):
+        self._check_password(account, password, on_screen_of(by))
+        if any(self._codes.matches(stored, plain) for stored in self._others(account)):
             raise AccountError(
                 "this badge belongs to somebody else", where="badge", remedy="Revoke it there first, or use another"
             )
-        self._set(by, account, self._passwords.hash(plain), "enrolled")
+        self._set(by, account, self._codes.hash(plain), "enrolled")
 
     def revoke(self, by: Person, account: str, reason: str) -> None:
         """Revoke an account's badge, so that it can no longer sign. Raises AccountError."""

@@ -11,11 +11,13 @@ from functools import cached_property
 from argon2 import PasswordHasher
 from argon2.exceptions import VerifyMismatchError
 
+from service.people.credentials.pepper import Pepper
 from service.people.errors import AccountError
 
 PASSWORD_MIN = 10
 PASSWORD_MAX = 256
 _PIN = re.compile(r"[0-9]{4,8}")
+_BOUND = "hmac-sha256:"  # before the name of the key, a colon, and the argon2id hash of the keyed hash
 _BADGE = re.compile(r"[0-9A-F]{6,32}")
 
 
@@ -45,6 +47,40 @@ class Passwords:
     @cached_property
     def _decoy(self) -> str:
         return self._hasher.hash(secrets.token_urlsafe(16))
+
+
+class ShortSecrets:
+    """Hashes of PINs and badges, which whoever has a hash could guess: bound to a key outside the database.
+
+    A copy of the database alone, such as a backup without keys, tells nobody a PIN. Hashes of earlier versions are
+    accepted until they are renewed.
+    """
+
+    def __init__(self, passwords: Passwords, pepper: Pepper) -> None:
+        self._passwords = passwords
+        self._pepper = pepper
+
+    def hash(self, secret: str) -> str:
+        """The hash to store, with the name of the key to which it is bound. Raises StoreError without that key."""
+        return f"{self._bound()}{self._passwords.hash(self._pepper.bind(_same_form(secret)))}"
+
+    def matches(self, stored: str, secret: str) -> bool:
+        """Whether a secret belongs to a stored hash; takes the same time if it cannot. Raises StoreError."""
+        if not stored.startswith(_BOUND):
+            return self._passwords.matches(stored, secret)
+        mine = "" if self.is_lost(stored) else stored.removeprefix(self._bound())
+        return self._passwords.matches(mine, self._pepper.bind(_same_form(secret)))
+
+    def is_outdated(self, stored: str) -> bool:
+        """Whether a stored hash is not bound to the key, or was made with parameters other than the present ones."""
+        return not stored.startswith(_BOUND) or self._passwords.is_outdated(stored.rpartition(":")[2])
+
+    def is_lost(self, stored: str) -> bool:
+        """Whether a hash is bound to a key that is not here any more, so that nothing matches it."""
+        return stored.startswith(_BOUND) and not stored.startswith(self._bound())
+
+    def _bound(self) -> str:
+        return f"{_BOUND}{self._pepper.name()}:"
 
 
 def _same_form(secret: str) -> str:

@@ -18,13 +18,13 @@ from sqlalchemy import Connection, select
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.units import gigabytes
+from service.store.access import KEYS, PEPPER
 from service.store.backup.folder import PART, STATE_FILE, BackupFolder, BackupState, folder_errors
 from service.store.database.engine import DATABASE_NAME, LOOK, open_read_only
 from service.store.database.tables import artefacts, event_index, heads, runs
 from service.store.durable_effects import Clock, DurableFiles, Files, RandomIds, SystemClock, utc_text
 from service.store.files.artefacts import chunks_of, hash_file, relative_path
 from service.store.signatures.checkpoints import read_every_checkpoint
-from service.store.signatures.keys import FOLDER as KEYS
 from service.store.signatures.keys import KeyFolder
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import read_log
@@ -182,6 +182,7 @@ class _Backup:
         """Copy in one step of SQLite's backup, which gives one consistent state. Returns the copy's SHA-256."""
         self.progress("copying the database", 0, 0)
         target = part / DATABASE_NAME
+        self.folder.files.write(target, [])  # for whom the folder is; SQLite fills it
         source = open_read_only(self.data_dir, DurableFiles())
         try:
             with source.reading() as connection:
@@ -285,12 +286,12 @@ class _Backup:
         return ""
 
     def _copy_keys(self, part: Path) -> None:
-        keys = part / KEYS
-        keys.mkdir(mode=0o700)
-        for key_id in KeyFolder(self.data_dir, self.folder.files).present():
-            copy = keys / f"{key_id}.pem"
-            self.folder.files.write(copy, [(self.data_dir / KEYS / copy.name).read_bytes()], private=True)
-            self.folder.files.sync_file(copy)
+        source, keys = self.data_dir / KEYS, part / KEYS
+        names = [f"{key_id}.pem" for key_id in KeyFolder(self.data_dir, self.folder.files).present()]
+        self.folder.files.make_directory(keys, private=True)
+        for name in (*names, *(path.name for path in source.glob(PEPPER))):
+            self.folder.files.write(keys / name, [(source / name).read_bytes()], private=True)
+            self.folder.files.sync_file(keys / name)
         self.folder.files.sync_directory(keys)
 
     def _write(self, path: Path, content: bytes) -> None:

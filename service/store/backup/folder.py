@@ -22,6 +22,7 @@ from pydantic import ValidationError
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import Record
+from service.store.access import close_to_others
 from service.store.durable_effects import Files, IdSource
 from service.store.files.artefacts import TEMPORARY, ArtefactFiles
 
@@ -75,8 +76,9 @@ class BackupFolder:
         with folder_errors("the folder for backups cannot be made"):
             for directory in (*reversed(self.folder.absolute().parents), self.folder.absolute()):
                 if not directory.exists():
-                    self.files.make_directory(directory)
+                    self.files.make_directory(directory, private=directory == self.folder.absolute())
                     self.files.sync_directory(directory.parent)
+            close_to_others(self.folder, MARKER)
             if not (self.folder / MARKER).exists():
                 self._mark()
             self.require()

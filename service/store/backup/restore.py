@@ -11,12 +11,12 @@ from sqlalchemy import delete, select
 
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.records.events import DataRestored
+from service.store.access import KEYS
 from service.store.backup.folder import BackupFolder, BackupState, folder_errors
 from service.store.database.engine import DATABASE_NAME, open_read_only
 from service.store.database.tables import artefacts, control, leases, sessions
 from service.store.durable_effects import DurableFiles, Files, RandomIds
 from service.store.files.artefacts import ArtefactFiles, chunks_of, hash_file, relative_path
-from service.store.signatures.keys import FOLDER as KEYS
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.store import Store
 from service.store.verification import verify as audit
@@ -78,9 +78,10 @@ def restore(
     with folder_errors("the data folder could not be restored"):
         _require_empty(destination)
         for directory in (*reversed(destination.absolute().parents), destination.absolute()):
-            files.make_directory(directory) if not directory.exists() else None
+            if not directory.exists():
+                files.make_directory(directory, private=directory == destination.absolute())
         work = destination / _UNDER_WAY
-        files.make_directory(work)
+        files.make_directory(work, private=True)
         _copy_state(source.path(name), work, state, files)
         try:
             name_of_actor = actor(work)
@@ -122,9 +123,9 @@ def _copy_state(state_dir: Path, work: Path, state: BackupState, files: Files) -
                 remedy="Restore an older state with --state; nothing was restored",
             )
     if state.with_keys:
-        (work / KEYS).mkdir(mode=0o700)
-        for key in sorted((state_dir / KEYS).glob("*.pem")):
-            shutil.copy2(key, work / KEYS / key.name)
+        files.make_directory(work / KEYS, private=True)
+        for key in sorted(path for path in (state_dir / KEYS).iterdir() if path.is_file()):
+            files.write(work / KEYS / key.name, [key.read_bytes()], private=True)
             files.sync_file(work / KEYS / key.name)
         files.sync_directory(work / KEYS)
 

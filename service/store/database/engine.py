@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
 import sqlite3
 import time
 from collections.abc import Generator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from sqlalchemy.pool import ConnectionPoolEntry
 from sqlalchemy.util import LRUCache
 
 from service.core.errors import StoreError
+from service.store.access import file_mode, open_new, require_access
 from service.store.database import new_schema
 from service.store.durable_effects import Files
 from service.store.errors import StoreVersionError
@@ -141,6 +143,10 @@ def open_database(data_dir: Path, files: Files, patience_s: float = PATIENCE_S) 
     A write waits up to about `patience_s` for other processes that write.
     """
     path = database_path(data_dir)
+    with _store_errors(path), suppress(FileExistsError):
+        # SQLite gives its other files the same mode. A database that exists must not even be opened here: closing it
+        # would release the locks that SQLite holds on it in this process (POSIX).
+        os.close(open_new(path, os.O_EXCL | os.O_RDONLY, file_mode(data_dir)))
     engine = _engine(f"file:{quote(str(path.absolute()))}?uri=true", writable=True)
     database = Database(engine, path, files, patience_s)
     try:
@@ -163,6 +169,7 @@ def open_read_only(data_dir: Path, files: Files) -> Database:
     Raises StoreError if there is none, StoreVersionError if it is of another version.
     """
     path = database_path(data_dir)
+    require_access(data_dir)
     if not path.is_file():
         raise StoreError(
             "there is no run data here",

@@ -311,7 +311,7 @@ def open_folder(data_dir: Path, files: Files, ids: IdSource) -> ArtefactFiles:
     try:
         for directory in (*reversed(data_dir.absolute().parents), data_dir.absolute()):
             if not directory.exists():
-                files.make_directory(directory)
+                files.make_directory(directory, private=directory == data_dir.absolute())
                 files.sync_directory(directory.parent)
         folder.prepare()
     except OSError as error:

@@ -14,11 +14,11 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
+from service.store.access import KEYS
 from service.store.durable_effects import Files
 from service.store.errors import SigningKeyError
 from service.store.signatures.checkpoints import key_fingerprint
 
-FOLDER = "keys"
 _SUFFIX, _PART = ".pem", ".part"
 _REMEDY = "Restore the folder keys/ from a copy, or make a new key with `orthocapture audit rotate-key --lost`"
 
@@ -32,7 +32,7 @@ class KeyFolder:
     """The private keys of one data folder. Callers hold the database's write lock, so no two processes interfere."""
 
     def __init__(self, data_dir: Path, files: Files) -> None:
-        self._folder = data_dir / FOLDER
+        self._folder = data_dir / KEYS
         self._files = files
 
     def make(self) -> Ed25519PrivateKey:
@@ -76,6 +76,12 @@ class KeyFolder:
             key = load_pem_private_key(path.read_bytes(), password=None)
         except FileNotFoundError as error:
             raise SigningKeyError("the signing key is missing", where=str(path), remedy=_REMEDY) from error
+        except PermissionError as error:
+            raise SigningKeyError(
+                "the signing key is another account's, which alone signs in this data folder",
+                where=str(path),
+                remedy="Run this as the account that owns the data folder; a worker may be another's",
+            ) from error
         except (OSError, ValueError, TypeError, UnsupportedAlgorithm) as error:
             raise SigningKeyError(
                 f"the signing key cannot be read: {error}", where=str(path), remedy=_REMEDY

@@ -18,6 +18,7 @@ from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.gates.release import refuse_data_set, refuse_export, refuse_release, release_meaning
 from service.core.records.data_set import FIRST_VERSION, LONGEST_NAME, VERSION, DataSetStatement
 from service.core.records.events import RunReleased
+from service.people.credentials.tries import on_screen_of
 from service.people.errors import NotAllowedError
 from service.people.person import Person
 from service.store.signatures.signing import checkpoint
@@ -125,7 +126,7 @@ def release(
             remedy="Read the run again and sign it as it is now",
         )
     _require_verified(audit_frame(audit, run_id, ""))
-    site.people.check_password(person.account, password)
+    site.people.check_password(person.account, password, on_screen_of(person))
     site.store.record(run_id, [RunReleased(meaning=meaning, signed_sha256=signed_sha256)], actor=person.account)
     checkpoint(site.store, run_id)
     return _back(run_id)

@@ -9,6 +9,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import BaseModel, Field
 
 from service.core.errors import OrthocaptureError
+from service.people.credentials.tries import on_screen_of
 from service.people.errors import AccountError, AccountJustChangedError, SignInRefusedError
 from service.web.page.errors import status_of, wants_json
 from service.web.page.rendering import render
@@ -78,7 +79,8 @@ def sign_in(
 ) -> Response:
     """Sign in. The browser always gets a new token."""
     limiter, address = _limiter(request), _address(request)
-    limiter.require(address)
+    if not site.people.may_try(account, address):
+        limiter.require(address)
     try:
         token = site.people.sign_in(account, password, address=address, replaces=token_of(request, site))
     except SignInRefusedError as error:
@@ -253,7 +255,7 @@ def change_password(
     """Set a new password; the person's other screens are signed out."""
     try:
         _require_same(new_password, repeated)
-        site.people.check_password(person.account, password)
+        site.people.check_password(person.account, password, on_screen_of(person))
         site.people.accounts.change_password(person, new_password)
     except (AccountError, SignInRefusedError) as error:
         if wants_json(request):
@@ -272,7 +274,7 @@ def change_password(
 def change_pin(request: Request, site: CurrentSite, person: SignedInPerson, password: Secret, pin: Pin) -> Response:
     """Set a new PIN."""
     try:
-        site.people.check_password(person.account, password)
+        site.people.check_password(person.account, password, on_screen_of(person))
         site.people.accounts.change_pin(person, pin)
     except (AccountError, SignInRefusedError) as error:
         if wants_json(request):

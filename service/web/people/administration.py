@@ -126,7 +126,7 @@ def enable(
 )
 def end_wait(site: CurrentSite, person: SignedInPerson, account: AccountName) -> Response:
     """End an account's wait after wrong passwords."""
-    site.people.accounts.end_wait(person, account)
+    site.people.accounts.end_wait(person.account, account)
     return _back(account)
 
 
@@ -185,7 +185,7 @@ def _list(
         "people/accounts.html.j2",
         status=status_of(problem) if problem else 200,
         accounts=accounts,
-        waits={one.account for one in accounts if site.people.accounts.has_to_wait(one)},
+        waits={one.account for one in accounts if site.people.accounts.waits_until_utc_s(one)},
         roles=ROLES,
         problem=problem,
         typed=typed or {"account": "", "full_name": "", "role": "technician"},
@@ -194,13 +194,13 @@ def _list(
 
 def _one(request: Request, site: Site, account: str, *, problem: OrthocaptureError | None = None) -> HTMLResponse:
     shown = site.people.accounts.get(account)
-    waits = site.people.accounts.has_to_wait(shown)
+    waits_until_utc_s = site.people.accounts.waits_until_utc_s(shown)
     return render(
         request,
         "people/account_administration.html.j2",
         status=status_of(problem) if problem else 200,
         shown=shown,
-        waits_until=utc_of(shown.locked_until_utc_s) if waits else "",
+        waits_until=utc_of(waits_until_utc_s) if waits_until_utc_s else "",
         screens=len(site.people.screens(account)),
         roles=ROLES,
         problem=problem,

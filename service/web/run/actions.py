@@ -32,6 +32,7 @@ from service.core.run.state import RunState
 from service.people.approvals import approve, standing_of
 from service.people.authorisation import Identity, identity_for
 from service.people.control import Control
+from service.people.credentials.tries import on_screen_of
 from service.people.errors import NotAllowedError
 from service.people.sessions import NAMES, KnownBy
 from service.rig import load_rig
@@ -96,7 +97,7 @@ def start(
         if not person.may("sign"):
             raise NotAllowedError(f"the role {person.role} may not approve a changed protocol", where=form.protocol)
         if form.reason.strip():
-            site.people.check_password(person.account, form.password)
+            site.people.check_password(person.account, form.password, on_screen_of(person))
     approve(site.store, loaded, person.account, reason=form.reason, identified="password" if changed else "")
     run_id = start_run(site.store, loaded, rig, operator=person.account, auto_confirm=False, about=about)
     Control(site.store).take(run_id, person)
@@ -185,12 +186,21 @@ def act(
         if not person.may("sign"):
             raise NotAllowedError(f"the role {person.role} may not sign", where=run_id)
         _require_signing_with(site, form.known_by)
-        site.people.check_secret(person.account, form.known_by, form.password)
+        site.people.check_secret(person.account, form.known_by, form.password, on_screen_of(person))
     if form.verb == "accept":
         _require_signing_with(site, form.known_by)
     # A supervisor may accept on the technician's screen, by name and password.
     account = form.account or person.account
-    who = identity_for(site.people, log.protocol, log.state, form.verb, account, lambda: form.password, form.known_by)
+    who = identity_for(
+        site.people,
+        log.protocol,
+        log.state,
+        form.verb,
+        account,
+        lambda: form.password,
+        form.known_by,
+        on_screen_of(person),
+    )
     _append(site, log, _action(form, log.state, who), who.name if who else person.account)
     return back_to(run_id, form.back)
 
