@@ -208,7 +208,7 @@ def export_command(
         return
     console.print(f"{escape(str(made.path))}: {megabytes(made.size_bytes):.1f} MB, SHA-256 {made.sha256}")
     console.print(f"  signed with key {made.key_id}")
-    console.print(f"  To verify it anywhere: python verify.py {escape(made.path.name)} --key {made.key_id}")
+    console.print(f"  To verify it anywhere: python -I verify.py {escape(made.path.name)} --key {made.key_id}")
 
 
 def _key_json(key: PublicKey) -> dict[str, Any]:
