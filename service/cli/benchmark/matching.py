@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from service.cli.common import (
@@ -57,6 +56,6 @@ def matching_command(
     for row in rows(results):
         table.add_row(*row)
     print_table(table)
-    console.print(f"Written to {escape(str(out))}: {how.name}.json, table.md, curves.png")
+    console.print(f"Written to {out!s}: {how.name}.json, table.md, curves.png")
     if any(result.simulated for result in results):
         console.print("  The data set is simulated.")

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from service.cli.benchmark.run import DEFAULT_OUT
-from service.cli.common import JsonOption, print_json, reporting_errors, require_writable
+from service.cli.common import JsonOption, print_document, print_json, reporting_errors, require_writable
 
 
 def table_command(
@@ -41,4 +41,4 @@ def table_command(
         if json:
             print_json(table_record(results, known))
         else:
-            typer.echo(text)
+            print_document(f"{text}\n")

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 
 from drivers.errors import UnreadableFileError
 from drivers.photos.photo_file import read_exif
@@ -213,6 +212,6 @@ def _tell(
         f"({uncertainty.worst_mm:.4f} mm) at worst"
     )
     for view in record.excluded:
-        console.print(f"[yellow]left out[/] {escape(view.image)}: {escape(view.reason)}")
+        console.tell(("left out", "yellow"), f" {view.image}: {view.reason}")
     for warning in record.warnings:
-        console.print(f"[yellow]warning[/] {escape(warning)}")
+        console.tell(("warning", "yellow"), f" {warning}")

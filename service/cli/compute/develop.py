@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 
 from service.cli.common import JsonOption, console, print_json, reporting_errors
 from service.compute.images.develop import Developed, develop, encode_tiff
@@ -88,4 +87,4 @@ def _tell(record: dict[str, Any], jpeg: Path | None) -> None:
     place = "no JPEG beside it: its place is not checked"
     if jpeg is not None:
         place = f"at most {shift_px:.2f} px from {jpeg.name}"
-    console.print(escape(f"{record['tiff']['name']}: {crop['width']} × {crop['height']} px, {place}"))
+    console.print(f"{record['tiff']['name']}: {crop['width']} × {crop['height']} px, {place}")

@@ -142,7 +142,8 @@ def _show(score: ChamferScore, files: tuple[SurfaceFile, SurfaceFile], settings:
     scores = ", ".join(
         f"{value:.3f} at {mm(limit):g} mm" for value, limit in zip(score.f_scores, score.thresholds_m, strict=True)
     )
-    console.print(
-        f"[bold]Chamfer distance {mm(score.chamfer_m):.3f} mm[/]; equal surfaces would give "
-        f"{mm(score.floor_m):.3f} mm at a spacing of {mm(settings.spacing_m):g} mm. F-score {scores}."
+    console.tell(
+        (f"Chamfer distance {mm(score.chamfer_m):.3f} mm", "bold"),
+        "; equal surfaces would give "
+        f"{mm(score.floor_m):.3f} mm at a spacing of {mm(settings.spacing_m):g} mm. F-score {scores}.",
     )

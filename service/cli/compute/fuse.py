@@ -158,9 +158,10 @@ def _show(record: dict[str, Any]) -> None:
         f"largest change of a distance {record['distance_change_mm']:.3f} mm "
         f"(limit {record['distance_change_limit_mm']:g} mm)"
     )
-    console.print(
-        f"[bold]Chamfer distance CT to scan {record['chamfer_ct_scan_mm']:.3f} mm[/] (equal surfaces would give "
-        f"{record['chamfer_floor_mm']:.3f} mm); the CT is {record['ct_above_scan_mm']:+.3f} mm above the scan"
+    console.tell(
+        (f"Chamfer distance CT to scan {record['chamfer_ct_scan_mm']:.3f} mm", "bold"),
+        f" (equal surfaces would give "
+        f"{record['chamfer_floor_mm']:.3f} mm); the CT is {record['ct_above_scan_mm']:+.3f} mm above the scan",
     )
     shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in record["share"].items())
     console.print(f"{record['vertices']} vertices: {shares}; {record['folded_faces']} folded faces")

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from service.cli.common import JsonOption, console, print_json, reporting_errors, tell_left_out
 from service.compute.poses.files.camera_files import write_camera_json
@@ -109,8 +108,8 @@ def import_ros_command(
             print_json(record)
             return
         tell_left_out(left_out)
-        console.print(escape(_words(poses)))
-        console.print(f"written: {', '.join(written)} in {escape(str(out))}")
+        console.print(_words(poses))
+        console.print(f"written: {', '.join(written)} in {out!s}")
 
 
 def _require_one_source(flange: str, pose_topic: str, camera_frame: str) -> None:

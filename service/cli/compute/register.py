@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
-from rich.markup import escape
 
 from drivers.meshes.mesh_file import MeshUnit
 from service.cli.common import (
@@ -218,13 +217,13 @@ def _tell(result: PipelineResult, record: dict[str, Any], verdicts: Sequence[Gat
             f"{controls.worst_mm or 0.0:.3f} mm; {controls.measured} of {len(controls.spheres)} measured"
         )
     for one in result.findings:
-        console.print(f"[bold]{escape(one.what)}.[/] {escape(one.remedy)}.")
+        console.tell((f"{one.what}.", "bold"), f" {one.remedy}.")
     for text in () if controls is None else controls.findings:
-        console.print(f"[bold]{escape(text[0].upper() + text[1:])}.[/]")
+        console.tell((f"{text[0].upper() + text[1:]}.", "bold"))
     outside = [verdict for verdict in verdicts if not verdict.passed]
     for verdict in outside:
-        console.print(f"outside its limit: {escape(describe_judged(verdict))}")
-    console.print("[bold red]not passed[/]" if outside else "[bold green]passed[/]")
+        console.print(f"outside its limit: {describe_judged(verdict)}")
+    console.tell(("not passed", "bold red") if outside else ("passed", "bold green"))
 
 
 def _file_detector(

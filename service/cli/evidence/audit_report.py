@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from service.cli.common import (
     DEFAULT_DATA,
@@ -84,13 +83,13 @@ def report_command(
             }
         )
     else:
-        console.print(f"Report of run {run_id}: {escape(', '.join(written))}")
+        console.print(f"Report of run {run_id}: {', '.join(written)}")
         if not recorded:
             why = "its evidence does not verify" if not verified.ok else "the data folder is read-only"
             console.print(f"  The report is not recorded in the run, because {why}.")
     if not verified.ok:
         if not json:
-            error_console.print(f"[bold red]The evidence does NOT verify:[/] {escape(str(verified.first_fault))}")
+            error_console.tell(("The evidence does NOT verify:", "bold red"), f" {verified.first_fault}")
         raise typer.Exit(1)
 
 

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import typer
 from pydantic import ValidationError
-from rich.markup import escape
 
 from service.audit.export.wanted import WantedExport
 from service.cli.common import (
@@ -122,7 +121,7 @@ def export_command(
             }
         )
     else:
-        console.print(f"{counted(len(dataset.views), 'image')} of run {run_id} as {form}: {escape(str(target))}")
+        console.print(f"{counted(len(dataset.views), 'image')} of run {run_id} as {form}: {target!s}")
         if dataset.simulated:
             console.print("  The run is simulated, and its files say so.")
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person, typed_password
@@ -110,7 +109,7 @@ def _report_recorded(run_id: str, verb: str, step: str | None, name: str, *, jso
     if json:
         print_json({"run": run_id, "recorded": verb, "step": step} | ({"event": seq} if seq else {}))
     else:
-        console.print(f"Recorded: {verb} of {step} by {escape(name)}")
+        console.print(f"Recorded: {verb} of {step} by {name}")
 
 
 def signed_by_verb(verb: str, protocol: Protocol, state: RunState) -> str:

@@ -18,7 +18,6 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import ArrayLike
-from rich.markup import escape
 from rich.table import Table
 
 from service.audit.export.posed import export_data_set
@@ -294,7 +293,7 @@ def _print(result: _Result, rows: Sequence[Row], true_error_mm: Mapping[str, flo
         )
     print_table(table)
     if result.table_note:
-        console.print(escape(result.table_note))
+        console.print(result.table_note)
     made = {
         "run": result.run,
         "database": result.database,

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from drivers.dicom_receiver import Receiver, ReceiverConfig
 from service.cli.common import JsonOption, console, print_json, reporting_errors, require_writable_folder
@@ -59,7 +58,7 @@ def dicom_listen_command(
                 if json:
                     print_json({"told": text})
                 else:
-                    console.print(escape(text))
+                    console.print(text)
 
         with Receiver(config, tell) as receiver:
             if json:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from service.cli.common import (
@@ -66,7 +65,7 @@ def show_command(
         return
     for name, plans in answers.items():
         for plan in plans:
-            console.print(f"{name}, {plan['station']}: {escape(plan['text'])}")
+            console.print(f"{name}, {plan['station']}: {plan['text']}")
             if "prediction" in plan:
                 console.print(_coverage_text(plan["prediction"]["coverage_map"]), highlight=False)
 
