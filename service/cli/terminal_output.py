@@ -27,11 +27,13 @@ class Terminal(Console):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(**{"highlight": False, "soft_wrap": True, **options, "markup": False, "emoji": False})
+        given: dict[str, Any] = {"highlight": False, "soft_wrap": True, **options, "markup": False, "emoji": False}
+        super().__init__(**given)
 
     def render_str(self, text: str, **options: Any) -> Text:
         """A string as it is printed; Rich calls this for everything that is not a Text."""
-        return super().render_str(shown_continued(text), **{**options, "markup": False, "emoji": False})
+        given: dict[str, Any] = {**options, "markup": False, "emoji": False}
+        return super().render_str(shown_continued(text), **given)
 
     def tell(self, *pieces: Piece) -> None:
         """Print one line of pieces, each with its style."""

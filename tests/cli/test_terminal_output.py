@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import typer
 from rich.table import Table
 from typer.testing import CliRunner
 
@@ -102,7 +103,7 @@ def test_a_document_keeps_its_lines(text: str, capsys: pytest.CaptureFixture[str
 @texts
 @pytest.mark.parametrize("as_json", [False, True])
 def test_an_error_is_told(text: str, as_json: bool, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(Exception) as ended, reporting_errors(as_json):  # noqa: PT011 - typer.Exit
+    with pytest.raises(typer.Exit) as ended, reporting_errors(as_json):
         raise ConfigurationError(text, where=text, remedy=text)
     assert ended.value.exit_code == 1
     printed = capsys.readouterr()
@@ -116,7 +117,7 @@ def test_an_error_is_told(text: str, as_json: bool, capsys: pytest.CaptureFixtur
 
 @texts
 def test_a_fault_of_the_program_ends_with_json_too(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(Exception) as ended, reporting_errors(json=True):  # noqa: PT011 - typer.Exit
+    with pytest.raises(typer.Exit) as ended, reporting_errors(json=True):
         raise ZeroDivisionError(text)
     assert ended.value.exit_code == 1
     told = json.loads(capsys.readouterr().out)["error"]

@@ -78,7 +78,7 @@ def shifted(content: bytes, before: bytes) -> bytes:
     """The content behind other bytes, with every place in it corrected, as a self-extracting archive has it."""
     made = bytearray(lengthened_directory(content, start=len(before)))
     at = struct.unpack_from("<L", content, len(content) - 6)[0]
-    while made[at : at + 4] == b"PK\x01\x02":
+    while bytes(made[at : at + 4]) == b"PK\x01\x02":
         (offset,) = struct.unpack_from("<L", made, at + 42)
         struct.pack_into("<L", made, at + 42, offset + len(before))
         at += 46 + sum(struct.unpack_from("<3H", made, at + 28))
@@ -169,7 +169,7 @@ def test_bytes_hidden_behind_the_compressed_content_are_found(unpacked: Path, tm
     struct.pack_into("<L", made, info.header_offset + 18, info.compress_size + len(hidden))
     made = bytearray(lengthened_directory(bytes(made), start=len(hidden)))
     at = struct.unpack_from("<L", made, len(made) - 6)[0]
-    while made[at : at + 4] == b"PK\x01\x02":
+    while bytes(made[at : at + 4]) == b"PK\x01\x02":
         compressed, offset = struct.unpack_from("<L", made, at + 20)[0], struct.unpack_from("<L", made, at + 42)[0]
         if offset == info.header_offset:
             struct.pack_into("<L", made, at + 20, compressed + len(hidden))
