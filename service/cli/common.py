@@ -21,7 +21,7 @@ from typer.models import OptionInfo
 
 from service.cli.terminal_output import Terminal, bar_of_shares
 from service.core.errors import ConfigurationError, OrthocaptureError
-from service.core.text.shown_text import shown, shown_json, shown_lines
+from service.core.shown_text import shown, shown_json, shown_lines
 
 PROGRESS_AFTER_S = 2.0
 _NUMBER = re.compile(r"[-+−±]?\d[\d.,:+−± e%-]*|more|–|-|")

@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from service.core.loading import begin_loading, end_loading
-from service.core.text.shown_text import shown, shown_lines
+from service.core.shown_text import shown, shown_lines
 from service.logs.terminal import show_own_words_only
 
 
@@ -54,6 +54,10 @@ _COMMANDS = {
     "act": _Command(
         "service.cli.run.act:act_command",
         "Answer or stop a run that another terminal drives. A confirmation ticks the whole checklist.",
+    ),
+    "draw-region": _Command(
+        "service.cli.run.act:draw_region_command",
+        "Draw a region in which the CT or the scan counts; the next fusion uses it, as one drawn on the 3D view.",
     ),
     "note": _Command(
         "service.cli.run.act:note_command",

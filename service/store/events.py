@@ -15,7 +15,7 @@ from sqlalchemy import Connection, Row, bindparam, insert, select, update
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import PAYLOAD, ArtefactRef, Event, Payload
-from service.core.text.shown_text import storable, storable_data
+from service.core.shown_text import storable, storable_data
 from service.store.database.tables import events, heads
 from service.store.durable_effects import Clock, utc_text
 

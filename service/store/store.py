@@ -14,7 +14,7 @@ from sqlalchemy import Connection, bindparam, select
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.jobs.priorities import Lane
 from service.core.records.events import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
-from service.core.text.shown_text import storable
+from service.core.shown_text import storable
 from service.store.ages import Ages
 from service.store.database.engine import LOOK, PATIENCE_S, RESTORE, Database, database_path, open_database
 from service.store.database.tables import artefacts, events, heads, runs

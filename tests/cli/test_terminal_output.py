@@ -21,7 +21,7 @@ from service.cli.main import app
 from service.cli.run.terminal.operators import Display
 from service.cli.terminal_output import Terminal, bar_of_counts, bar_of_shares, listed, styled
 from service.core.errors import ConfigurationError
-from service.core.text.shown_text import shown, shown_json, shown_lines
+from service.core.shown_text import shown, shown_json, shown_lines
 from service.logs.terminal import EscapingFormatter
 from tests.support.hostile_text import HOSTILE, obeyed
 

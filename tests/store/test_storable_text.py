@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from service.audit.bundle.export import export_bundle
 from service.cli.main import app
 from service.core.records.events import JobFailed, StepNote
-from service.core.text.shown_text import storable, storable_data
+from service.core.shown_text import storable, storable_data
 from service.store import events as event_module
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store

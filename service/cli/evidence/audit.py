@@ -26,6 +26,7 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
 )
+from service.cli.evidence.audit_acts import correct_command, release_command
 from service.cli.evidence.audit_figures import figures_command
 from service.cli.evidence.audit_report import report_command
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
@@ -290,5 +291,7 @@ def _print_report(report: AuditReport) -> None:
     console.print("  Keep this folder as it is, and compare it with a copy made earlier.")
 
 
+audit_app.command("release")(release_command)
+audit_app.command("correct")(correct_command)
 audit_app.command("report")(report_command)
 audit_app.command("figures")(figures_command)

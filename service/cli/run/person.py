@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from service.core.errors import ConfigurationError
-from service.core.text.shown_text import shown
+from service.core.shown_text import shown
 from service.people.authorisation import Identity, who_acts
 from service.people.sessions import People
 from service.store.store import Store

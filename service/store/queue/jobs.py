@@ -10,7 +10,7 @@ from sqlalchemy import ColumnElement, Connection, Row, and_, func, insert, selec
 
 from service.core.jobs.priorities import EARLY, Lane
 from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished, StepNote
-from service.core.text.shown_text import storable
+from service.core.shown_text import storable
 from service.store.database.tables import jobs
 from service.store.durable_effects import Clock, IdSource, utc_text
 from service.store.errors import LeaseLostError

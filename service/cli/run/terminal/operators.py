@@ -19,7 +19,7 @@ from service.core.recovery.ways_on import takes_words
 from service.core.run.decide import AskOperator
 from service.core.run.noted import HandWork
 from service.core.run.state import RunState
-from service.core.text.shown_text import shown
+from service.core.shown_text import shown
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Asks, Doing
 from service.people.authorisation import Identity, identity_for
