@@ -156,7 +156,7 @@ def require_writable(file: Path) -> None:
             where=str(file),
             remedy="Create the folder, or name another one",
         )
-    there = file.exists()
+    there = file.exists() or file.is_symlink()
     try:
         with file.open("ab"):
             pass
@@ -167,10 +167,21 @@ def require_writable(file: Path) -> None:
 
 
 def require_writable_folder(folder: Path) -> None:
-    """Create the folder if need be, and raise ConfigurationError unless files can be written into it."""
+    """Raise ConfigurationError unless files can be written into the folder, or it can be made where it is named.
+
+    Nothing is made. A folder around it that does not exist is rather a slip of the keyboard than meant.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ConfigurationError("this is a file, not a folder", where=str(folder), remedy="Name a folder")
+    around = folder.absolute().parent
+    if not folder.exists() and not around.is_dir():
+        raise ConfigurationError(
+            "the folder around the one to write does not exist",
+            where=str(folder),
+            remedy="Create it, or name another one",
+        )
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
+        with tempfile.TemporaryFile(dir=folder if folder.exists() else around):
             pass
     except OSError as error:
         raise _unwritable(folder, error) from error

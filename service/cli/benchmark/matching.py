@@ -47,6 +47,7 @@ def matching_command(
 
         how = matcher(method)
         require_writable_folder(out)
+        out.mkdir(exist_ok=True)
         results = run_matching(MatchingTask(dataset, how, weights, pairs_per_class, out), progress)
         if json:
             own = next(result for result in results if result.method == how.name)

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.cli.common import JsonOption, console, print_json, reporting_errors
+from service.cli.common import JsonOption, console, print_json, reporting_errors, require_writable_folder
 from service.compute.images.develop import Developed, develop, encode_tiff
 from service.compute.images.develop_parameters import PARAMETERS
 from service.compute.images.files import read_image
@@ -47,7 +47,7 @@ def develop_command(
 
 def _require_new(files: list[Path], out: Path) -> None:
     """Nothing is overwritten, and every raw file has a name of its own."""
-    out.mkdir(parents=True, exist_ok=True)
+    require_writable_folder(out)
     stems = [file.stem for file in files]
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice is not None:
@@ -67,6 +67,7 @@ def _jpeg_of(raw: Path) -> Path | None:
 
 def _write(made: Developed, raw: Path, jpeg: Path | None, out: Path) -> dict[str, Any]:
     data = encode_tiff(made.image_bgr)
+    out.mkdir(exist_ok=True)
     (out / f"{raw.stem}.tif").write_bytes(data)
     record: dict[str, Any] = {
         "raw": _named(raw.name, raw.read_bytes()),

@@ -101,7 +101,8 @@ def sfm_command(
         refine: Refine = "nothing"
         if refine_principal_point or refine_intrinsics:
             refine = "principal_point" if refine_principal_point else "intrinsics"
-        require_writable_folder(out)
+        for folder in filter(None, (out, workspace)):
+            require_writable_folder(folder)
         model = read_camera_json(camera)
         found = image_folder(images, size=(model.width, model.height), strict=strict)
         tell_left_out(found.left_out)

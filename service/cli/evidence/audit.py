@@ -25,6 +25,7 @@ from service.cli.common import (
     print_table,
     progress_bar,
     reporting_errors,
+    require_writable,
 )
 from service.cli.evidence.audit_acts import correct_command, release_command
 from service.cli.evidence.audit_figures import figures_command
@@ -193,6 +194,7 @@ def export_command(
 
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
+        require_writable(bundle)
         who = acting_person(store, operator, password_stdin=password_stdin)
         with progress_bar(quiet=json) as report_progress:
             made = export_bundle(

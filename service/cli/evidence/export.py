@@ -17,6 +17,7 @@ from service.cli.common import (
     print_json,
     progress_bar,
     reporting_errors,
+    require_writable_folder,
 )
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.errors import ConfigurationError
@@ -95,6 +96,7 @@ def export_command(
         from service.audit.export.posed import export_data_set  # noqa: PLC0415 - loads the numerics
 
         target = out.resolve()
+        require_writable_folder(target)
         run_id = store.find_run(run)
         stated = _stated(
             title=title,

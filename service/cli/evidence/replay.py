@@ -24,6 +24,7 @@ from service.cli.common import (
     print_json,
     print_table,
     progress_bar,
+    require_writable_folder,
 )
 from service.cli.terminal_output import styled
 from service.core.errors import OrthocaptureError
@@ -73,6 +74,8 @@ def replay_command(
     """
     try:
         kinds = list(HANDLERS) if jobs == "all" else [kind.strip() for kind in jobs.split(",") if kind.strip()]
+        if out is not None:
+            require_writable_folder(out)
         recorded = read_run(data, run)
         with progress_bar(quiet=json) as progress:
             report = replay(recorded, kinds=kinds, step=step, end_to_end=end_to_end, out=out, progress=progress)

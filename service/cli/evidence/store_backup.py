@@ -15,6 +15,7 @@ from service.cli.common import (
     print_json,
     progress_bar,
     reporting_errors,
+    require_writable_folder,
 )
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.text.counts import counted
@@ -44,6 +45,7 @@ def backup_command(
     the copied data does not verify.
     """
     with reporting_errors(json), progress_bar(quiet=json) as progress:
+        require_writable_folder(destination)
         made = back_up(data, destination, BackupOptions(with_keys, read_all, keep), progress=progress)
     if json:
         print_json(_backup_json(made))
@@ -72,6 +74,7 @@ def restore_command(
             return acting_person(store, operator, password_stdin=password_stdin).name
 
     with reporting_errors(json), progress_bar(quiet=json) as progress:
+        require_writable_folder(destination)
         made = restore(backup, destination, name=state, actor=actor, progress=progress)
     if json:
         print_json(_restore_json(made))

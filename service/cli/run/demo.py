@@ -33,6 +33,7 @@ from service.cli.common import (
     print_table,
     progress_bar,
     reporting_errors,
+    require_writable_folder,
 )
 from service.cli.run.commands import drive
 from service.cli.run.ending import end_with_children, sigterm_like_ctrl_c
@@ -71,6 +72,7 @@ def demo_command(
     """Run the demonstration protocol on a simulated rig and show the results. Takes a few minutes."""
     started_s = time.monotonic()
     with reporting_errors(json), sigterm_like_ctrl_c():
+        require_writable_folder(out)
         folder = out.resolve() / time.strftime("%Y%m%d-%H%M%S")
         with _simulated_rig(folder / "rig", scene, image_width, host or free_address()) as ready:
             run_id = _run_to_its_end(folder / "data", ready.rig)

@@ -26,7 +26,7 @@ from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOpti
 from service.cli.run.commands import WorkerOption, drive
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.cli.run.terminal.import_operator import part_of
-from service.cli.shipped_protocols import shipped_protocols
+from service.cli.shipped_protocols import protocol_file, shipped_protocols
 from service.core.errors import ConfigurationError
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
 from service.core.records.entered import RunAbout
@@ -112,7 +112,7 @@ def import_command(
     }
     with reporting_errors(json):
         about = RunAbout() if dry_run else described(specimen, purpose=purpose, site=site, remarks=remarks)
-        loaded = load_protocol(protocol, params_models())
+        loaded = load_protocol(protocol_file(protocol), params_models())
         require_plausible(loaded, str(protocol))
         with progress_bar(quiet=json) as progress:
             places = find_places(folder, given, _parts_of(loaded.protocol))

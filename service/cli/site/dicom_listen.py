@@ -47,6 +47,7 @@ def dicom_listen_command(
                 "port to the CT suite in the firewall",
             )
         require_writable_folder(folder)
+        folder.mkdir(exist_ok=True)
         stopped = threading.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: stopped.set())

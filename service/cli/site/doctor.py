@@ -23,6 +23,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.run.commands import RigOption
+from service.cli.shipped_protocols import protocol_file
 from service.core.equipment.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, clock_offset_words
 from service.core.equipment.disk_space import Forecast, Usage, forecast
 from service.core.errors import ConfigurationError, OrthocaptureError
@@ -57,7 +58,7 @@ def doctor_command(
     """Open every device of a rig; report versions, clock offsets, free space and problems."""
     with reporting_errors(json):
         rig_file = load_rig(rig)
-        loaded = None if protocol is None else load_protocol(protocol, params_models()).protocol
+        loaded = None if protocol is None else load_protocol(protocol_file(protocol), params_models()).protocol
         station = Station(rig_file)
         found = _reports(station, quiet=json)
         existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from service.cli.common import JsonOption, console, print_document, print_json, reporting_errors
+from service.cli.shipped_protocols import protocol_file
 from service.core.documents.protocol_docs import lifecycle_text, schema_text
 from service.core.documents.ways_docs import ways_text
 from service.core.protocol.models import load_protocol
@@ -30,6 +31,7 @@ def check_command(
 ) -> None:
     """Check a protocol and report every problem with file, line and field."""
     with reporting_errors(json):
+        file = protocol_file(file)
         loaded = load_protocol(file, params_models())
         protocol = loaded.protocol
         site = None if rig is None else load_rig(rig)
@@ -59,11 +61,11 @@ def schema_command() -> None:
 def diagram_command(file: Annotated[Path, typer.Argument(help="The protocol file.")]) -> None:
     """Print the state machine of a protocol as a page with Mermaid diagrams."""
     with reporting_errors():
-        print_document(lifecycle_text(load_protocol(file, params_models()).protocol))
+        print_document(lifecycle_text(load_protocol(protocol_file(file), params_models()).protocol))
 
 
 @protocol_app.command("ways")
 def ways_command(file: Annotated[Path, typer.Argument(help="The protocol file.")]) -> None:
     """Print the ways on after every failure of a protocol's steps, with time and loss, as a page of tables."""
     with reporting_errors():
-        print_document(ways_text(load_protocol(file, params_models()).protocol))
+        print_document(ways_text(load_protocol(protocol_file(file), params_models()).protocol))
