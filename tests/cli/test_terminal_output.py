@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import ast
 import io
 import json
 import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
+from rich.markup import escape  # noqa: TID251 - what Typer would take for markup
 from rich.table import Table
+from typer.core import TyperGroup
 from typer.testing import CliRunner
 
 from service.audit.verify import bundle_verifier
@@ -24,6 +28,7 @@ from service.core.errors import ConfigurationError
 from service.core.shown_text import shown, shown_json, shown_lines
 from service.logs.terminal import EscapingFormatter
 from tests.support.hostile_text import HOSTILE, obeyed
+from tests.support.rig.rig import REPOSITORY
 
 texts = pytest.mark.parametrize("text", HOSTILE.values(), ids=list(HOSTILE))
 
@@ -189,3 +194,29 @@ def test_what_was_typed_is_repeated_with_escapes(
     assert obeyed(done.output) == []
     assert not any(line.startswith("Verified") for line in done.output.splitlines())
     assert sorted(tmp_path.iterdir()) == []
+
+
+def of_all(command: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """A command and all below it, with their names."""
+    yield name, command
+    if isinstance(command, TyperGroup):
+        context = typer.Context(command)
+        for each in command.list_commands(context):
+            yield from of_all(command.resolve_command(context, [each])[1], f"{name} {each}")
+
+
+def test_no_help_has_what_typer_takes_for_markup() -> None:
+    seen: list[str] = []
+    for name, command in of_all(typer.main.get_command(app), "orthocapture"):
+        for text in (command.help, *(getattr(one, "help", None) for one in command.params)):
+            assert escape(text or "") == (text or ""), f"{name}: square brackets vanish from its help"
+        seen.append(name)
+    assert len(seen) > 50
+
+
+def test_no_help_of_a_simulator_has_it_either() -> None:
+    for path in sorted((REPOSITORY / "simulators").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.keyword) and node.arg == "help" and isinstance(node.value, ast.Constant):
+                text = str(node.value.value)
+                assert escape(text) == text, f"{path.name}:{node.lineno}: square brackets vanish from this help"

@@ -193,10 +193,14 @@ def _photograph(path: Path) -> NotePhotograph:
 def draw_region_command(
     corners: Annotated[
         str,
-        typer.Argument(help="Corners as JSON, three at least, in the frame of the scan, metres: [[x, y, z], …]."),
+        typer.Argument(
+            help="At least three corners as a JSON list of lists: x, y, z in metres, in the frame of the scan."
+        ),
     ],
     source: Annotated[Literal["ct", "scan"], typer.Option("--source", help="What counts within the polygon.")],
-    along: Annotated[str, typer.Option("--along", help="The direction from the surface to the viewer: [x, y, z].")],
+    along: Annotated[
+        str, typer.Option("--along", help="The direction from the surface to the viewer, as a JSON list of x, y, z.")
+    ],
     run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
     operator: OperatorOption = "",
     password_stdin: PasswordOption = False,
