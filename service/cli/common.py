@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
+import os
 import re
 import sys
 import tempfile
@@ -185,6 +186,24 @@ def require_writable_folder(folder: Path) -> None:
             pass
     except OSError as error:
         raise _unwritable(folder, error) from error
+
+
+def write_whole(file: Path, content: str | bytes) -> None:
+    """Write a file as a whole or not at all; what was there before stays until then. Raises ConfigurationError."""
+    data = content.encode() if isinstance(content, str) else content
+    target = file.resolve()
+    try:
+        if target.exists() and not target.is_file():  # such as /dev/stdout, which has no other name to write to first
+            target.write_bytes(data)
+            return
+        part = target.with_name(f".{target.name}.{os.getpid()}.part")
+        try:
+            part.write_bytes(data)
+            part.replace(target)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise _unwritable(file, error) from error
 
 
 def _unwritable(path: Path, error: OSError) -> ConfigurationError:

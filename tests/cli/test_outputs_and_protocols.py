@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.cli.common import require_writable, require_writable_folder
+from service.cli.common import require_writable, require_writable_folder, write_whole
 from service.cli.main import app
 from service.cli.shipped_protocols import protocol_file, shipped_protocols
 from service.core.errors import ConfigurationError, ProtocolError
@@ -51,23 +51,22 @@ def heads(data: Path, run: str) -> tuple[int, int]:
         return store.head(run), store.head(SITE)
 
 
-@pytest.mark.parametrize("place", ["in no folder", "in a file"])
 @pytest.mark.parametrize("command", OUTPUTS)
 def test_an_output_with_no_place_is_refused_and_nothing_is_made_or_recorded(
-    recorded: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, place: str
+    recorded: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     data, run = recorded
     file, folder = tmp_path / "file", tmp_path / "folder"
     file.write_text("a file")
     folder.mkdir()
-    target = tmp_path / ("no" if place == "in no folder" else "file") / "such" / "output.zip"
+    target = tmp_path / "no" / "such" / "output.zip"
     filled = {"{}": str(target), "{data}": str(data), "{run}": run, "{file}": str(file), "{folder}": str(folder)}
     before = heads(data, run)
     words = [filled.get(word, word) for word in OUTPUTS[command]]
     as_json = [] if command == "history" else ["--json"]  # what it prints is CSV
     done = CliRunner().invoke(app, [*words, *as_json], env={"COLUMNS": "200"})
-    assert done.exit_code == 1, done.output
+    assert done.exit_code == (2 if command == "replay" else 1), done.output
     if as_json:
         told = json.loads(done.stdout)["error"]
         assert (told["kind"], told["where"]) == ("ConfigurationError", str(target))
@@ -89,6 +88,11 @@ def test_the_check_itself_leaves_nothing(tmp_path: Path) -> None:
     for check, path in ((require_writable, tmp_path), (require_writable_folder, tmp_path / "file")):
         with pytest.raises(ConfigurationError, match="this is a f"):
             check(path)
+    for check in (require_writable, require_writable_folder):
+        for within in ("file", "no"):
+            with pytest.raises(ConfigurationError, match="does not exist"):
+                check(tmp_path / within / "output")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 # --- protocols -----------------------------------------------------------------------------------------------
@@ -142,3 +146,27 @@ def test_the_check_outside_a_checkout_names_the_file_that_it_read(
     assert done.output.startswith(f"{shipped_protocols() / 'exvivo_spine.yaml'} is valid: ")
     with pytest.raises(ProtocolError):
         protocol_file(Path("other.yaml"))
+
+
+def test_a_file_is_written_as_a_whole_or_what_was_there_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, link = tmp_path / "out.json", tmp_path / "link.json"
+    write_whole(out, "first")
+    link.symlink_to(out)
+    write_whole(link, b"second")  # through the link, which stays one
+    assert (out.read_text(), link.is_symlink()) == ("second", True)
+
+    def full(self: Path, data: bytes) -> int:
+        with self.open("wb") as file:
+            file.write(data[:3])
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "write_bytes", full)
+        with pytest.raises(ConfigurationError, match="No space left on device"):
+            write_whole(out, "third, which is longer")
+    assert out.read_text() == "second"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link.json", "out.json"]
+    write_whole(Path("/dev/null"), "nothing to be replaced")
+    assert Path("/dev/null").is_char_device()

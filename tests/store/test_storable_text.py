@@ -23,12 +23,12 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from service.worker.job import JobAnswer, JobContext
 from service.worker.loop import HANDLERS, work
-from tests.support.hostile_text import HOSTILE, obeyed
+from tests.support.hostile_text import UNSTORABLE, obeyed
 from tests.support.record.bundled_site import check
 from tests.support.record.store import CountedIds, start_run
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
-texts = pytest.mark.parametrize("text", HOSTILE.values(), ids=list(HOSTILE))
+texts = pytest.mark.parametrize("text", UNSTORABLE.values(), ids=list(UNSTORABLE))
 
 
 @pytest.fixture
@@ -107,7 +107,7 @@ PLACES: dict[str, Callable[[Store, str, str], None]] = {
     [
         pytest.param(place, text, id=f"{place}-{name}")
         for place in PLACES
-        for name, text in HOSTILE.items()
+        for name, text in UNSTORABLE.items()
         if place != "file's own name" or can_name_a_file(text)
     ],
 )

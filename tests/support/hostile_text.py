@@ -27,6 +27,12 @@ HOSTILE = {
     "deleted": "a\x7fb",
 }
 
+# All of them that a shell can give to a command, in one line; and those that a database may refuse.
+TYPED = " ".join(text for text in HOSTILE.values() if "\x00" not in text)
+UNSTORABLE = {name: HOSTILE[name] for name in ("NUL", "surrogate", "pair of surrogates")} | {
+    "all of them": " ".join(HOSTILE.values())
+}
+
 _OBEYED = re.compile(
     r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u200b\u200e\u200f\u2028-\u202e\u2066-\u2069]|[\ud800-\udfff\U000e0000-\U000e007f]"
 )

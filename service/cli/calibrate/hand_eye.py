@@ -31,6 +31,7 @@ from service.cli.common import (
     print_json,
     reporting_errors,
     require_writable,
+    write_whole,
 )
 from service.compute.arm.joint_file import read_joints_csv
 from service.compute.arm.kinematics import active_tool, matching_arm, solve_joints
@@ -165,9 +166,9 @@ def hand_eye_command(
             suggested_poses=tuple(_as_recorded(pose) for pose in suggested),
             suggestions_reachable=kinematics is not None,
         )
-        out.write_text(record.text(), encoding="utf-8")
+        write_whole(out, record.text())
         if preview is not None:
-            preview.write_bytes(_drawn(result, session, suggested))
+            write_whole(preview, _drawn(result, session, suggested))
         if json:
             print_json(record.printed())
             return

@@ -32,6 +32,7 @@ from service.cli.common import (
     reporting_errors,
     require_writable,
     require_writable_folder,
+    write_whole,
 )
 from service.compute.calibration.board.images import UsableViews
 from service.compute.calibration.intrinsics.adjustment import LensModel
@@ -110,7 +111,7 @@ def intrinsics_command(
         left_out = folder.left_out | {files[k].name: excluded[k] for k in sorted(excluded)}
         stated = intrinsics_record(result, validation, uncertainty, warnings, names, left_out)
         record: dict[str, Any] = {**result.camera.record(), **stated.plain(), "optics": optics}
-        _write(out, json_module.dumps(record, indent=1, allow_nan=False) + "\n")
+        write_whole(out, json_module.dumps(record, indent=1, allow_nan=False) + "\n")
         if report is not None:
             _write_plots(report, result, uncertainty)
         if json:
@@ -176,13 +177,6 @@ def optics_of(file: Path) -> Optics:
         body=f"{exif.make} {exif.model}".strip(),
         body_serial=exif.body_serial,
     )
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise DataError(f"the file cannot be written: {error.strerror}", where=str(path)) from error
 
 
 def _write_plots(folder: Path, result: IntrinsicsResult, uncertainty: ProjectionUncertainty) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.cli.common import JsonOption, console, print_json, reporting_errors, require_writable_folder
+from service.cli.common import JsonOption, console, print_json, reporting_errors, require_writable_folder, write_whole
 from service.compute.images.develop import Developed, develop, encode_tiff
 from service.compute.images.develop_parameters import PARAMETERS
 from service.compute.images.files import read_image
@@ -68,14 +68,14 @@ def _jpeg_of(raw: Path) -> Path | None:
 def _write(made: Developed, raw: Path, jpeg: Path | None, out: Path) -> dict[str, Any]:
     data = encode_tiff(made.image_bgr)
     out.mkdir(exist_ok=True)
-    (out / f"{raw.stem}.tif").write_bytes(data)
+    write_whole(out / f"{raw.stem}.tif", data)
     record: dict[str, Any] = {
         "raw": _named(raw.name, raw.read_bytes()),
         "jpeg": None if jpeg is None else _named(jpeg.name, jpeg.read_bytes()),
         "tiff": _named(f"{raw.stem}.tif", data),
         **asdict(made.how),
     }
-    (out / f"{raw.stem}.json").write_text(json_module.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_whole(out / f"{raw.stem}.json", json_module.dumps(record, indent=1) + "\n")
     return record
 
 

@@ -18,6 +18,7 @@ from service.cli.common import (
     reporting_errors,
     require_writable,
     tell_doubt,
+    write_whole,
 )
 from service.compute.ground_truth.align import TRANSPORT_GATE_M, Aligned, align
 from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, chamfer
@@ -95,7 +96,7 @@ def fuse_command(
             distance_m = PointIndex(score.gt.samples.points_m).nearest(common.ct.vertices_m, scale.outlier_m)[0]
             write_heat_mesh(heat_map, common.ct, distance_m, scale, unit_m)
         if picture is not None:
-            picture.write_bytes(fusion_picture(common.ct, scanned, score, scale, fused))
+            write_whole(picture, fusion_picture(common.ct, scanned, score, scale, fused))
         record = fusion_record(aligned, score, fused)
         if json:
             print_json(record)

@@ -22,6 +22,7 @@ from service.cli.common import (
     reporting_errors,
     require_writable,
     tell_left_out,
+    write_whole,
 )
 from service.cli.compute.spheres import SeedsOption, spheres_of
 from service.compute.camera_covariance import read_camera_covariance
@@ -178,7 +179,7 @@ def register_command(
         record["left_out"] = folder.left_out | {names[i]: why for i, why in result.left_out.items()}
         record["search"] = _search(located, names)
         record["detector"] = {"name": detector, "weights_sha256": found_by}
-        out.write_text(json_module.dumps(record, indent=1), encoding="utf-8")
+        write_whole(out, json_module.dumps(record, indent=1))
         if json:
             print_json(record)
         else:

@@ -25,6 +25,7 @@ from service.cli.common import (
     print_table,
     progress_bar,
     require_writable_folder,
+    write_whole,
 )
 from service.cli.terminal_output import styled
 from service.core.errors import OrthocaptureError
@@ -82,7 +83,7 @@ def replay_command(
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
             text = json_module.dumps(report_json(report), indent=1, ensure_ascii=False, allow_nan=False)
-            (out / "replay.json").write_text(text + "\n", encoding="utf-8")
+            write_whole(out / "replay.json", text + "\n")
     except OrthocaptureError as error:
         fail(error, json=json)  # only prints; its exit status 1 would mean a difference
         raise typer.Exit(_COULD_NOT) from error

@@ -23,6 +23,7 @@ from service.cli.common import (
     print_table,
     reporting_errors,
     require_writable,
+    write_whole,
 )
 from service.core.text.counts import counted
 from service.run_record import read_log
@@ -171,5 +172,6 @@ def history_command(
     if out is None:
         print_document(content)
         return
-    out.write_text(content, encoding="utf-8", newline="")
+    with reporting_errors():
+        write_whole(out, content)
     console.print(f"{counted(len(rows), 'run')} with figures: {out!s}")
