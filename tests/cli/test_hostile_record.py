@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from pathlib import Path
@@ -11,8 +12,11 @@ from typer.testing import CliRunner
 
 from service.audit.verify import bundle_verifier
 from service.cli.main import app
+from service.cli.terminal_output import Terminal
 from service.core.records.events import DeviceTrouble, OperatorAction, StepNote
+from service.core.shown_text import shown
 from service.store.records import NewArtefact
+from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.signing import checkpoint, rotate_key
 from tests.support.hostile_text import HOSTILE, obeyed
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
@@ -96,3 +100,13 @@ def test_it_is_reported_exported_and_verified_elsewhere(recorded: tuple[Path, st
     assert obeyed(bundle_verifier.report(check)) == []
     with zipfile.ZipFile(tmp_path / "b-SIMULATED.zip") as archive:
         assert b"\\u0000" not in archive.read("events.jsonl").replace(b"\\\\u0000", b"")
+
+
+@pytest.mark.parametrize("folder", ["[/gone]", "[bold red]share[/]", "\x1b[2Jshare"])
+def test_a_second_place_of_signatures_that_is_away_is_told_as_it_is_named(
+    recorded: tuple[Path, str, str], tmp_path: Path, folder: str
+) -> None:
+    stream = io.StringIO()
+    keep_elsewhere(recorded[0], tmp_path / folder / "signatures.jsonl", Terminal(file=stream, width=300).print)
+    assert shown(folder) in stream.getvalue()
+    assert obeyed(stream.getvalue()) == []
