@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json as json_module
+import os
 import re
+import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,20 +16,20 @@ from typing import Annotated, Any
 
 import typer
 from rich.cells import cell_len
-from rich.console import Console
-from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 from typer.models import OptionInfo
 
+from service.cli.terminal_output import Terminal, bar_of_shares
 from service.core.errors import ConfigurationError, OrthocaptureError
+from service.core.shown_text import shown, shown_json, shown_lines
 
 PROGRESS_AFTER_S = 2.0
 _NUMBER = re.compile(r"[-+−±]?\d[\d.,:+−± e%-]*|more|–|-|")
 
 # Results go to stdout, everything else to stderr. The streams are looked up at each print, so redirection works.
-console = Console(highlight=False, soft_wrap=True)
-error_console = Console(stderr=True, highlight=False, soft_wrap=True)
+console = Terminal()
+error_console = Terminal(stderr=True)
 
 data_option: OptionInfo = typer.Option(
     "--data",
@@ -47,7 +50,7 @@ StrictOption = Annotated[bool, strict_option]
 DEFAULT_DATA = Path("runs")
 
 
-def print_table(table: Table, to: Console | None = None) -> None:
+def print_table(table: Table, to: Terminal | None = None) -> None:
     """Print a table. Words wrap at the terminal's edge; numbers are never cut or broken.
 
     If the numbers alone are wider than the terminal, so is the table.
@@ -60,17 +63,25 @@ def print_table(table: Table, to: Console | None = None) -> None:
         column.no_wrap, column.overflow = numeric, "fold"
         column.min_width = width if numeric else min(8, max((cell_len(cell) for cell in cells), default=1))
         least += width + 3
-    shown = to or console
+    shown_on = to or console
     # Output to a file or another program is not wrapped, so that `grep` finds the text of a cell.
-    whole = 0 if shown.is_terminal else Measurement.get(shown, shown.options.update(max_width=10_000), table).maximum
-    if max(least, whole) > shown.width:
+    options = shown_on.options.update(max_width=10_000)
+    whole = 0 if shown_on.is_terminal else Measurement.get(shown_on, options, table).maximum
+    if max(least, whole) > shown_on.width:
         table.width = max(least, whole)
-    shown.print(table, soft_wrap=False, crop=False)
+    shown_on.print(table, soft_wrap=False, crop=False)
 
 
 def print_json(value: Any) -> None:
     """Write one line of JSON to standard output, undecorated."""
-    typer.echo(json_module.dumps(value, ensure_ascii=False, allow_nan=False))
+    sys.stdout.write(shown_json(json_module.dumps(value, ensure_ascii=False, allow_nan=False)) + "\n")
+    sys.stdout.flush()
+
+
+def print_document(text: str) -> None:
+    """Write a document of lines to standard output, undecorated."""
+    sys.stdout.write(shown_lines(text))
+    sys.stdout.flush()
 
 
 def error_record(error: OrthocaptureError) -> dict[str, str]:
@@ -83,27 +94,49 @@ def fail(error: OrthocaptureError, *, json: bool = False) -> typer.Exit:
     if json:
         print_json({"error": error_record(error)})
     else:
-        error_console.print(f"[bold red]Error:[/] {escape(error.what)}")
+        error_console.tell(("Error:", "bold red"), f" {error.what}")
         if error.where:
-            error_console.print(f"  where: {escape(error.where)}")
+            error_console.print(f"  where: {error.where}")
         if error.remedy:
-            error_console.print(f"  what to do: {escape(error.remedy)}")
+            error_console.print(f"  what to do: {error.remedy}")
     return typer.Exit(1)
 
 
 @contextmanager
 def reporting_errors(json: bool = False) -> Generator[None]:
-    """Wrap a command's body: an OrthocaptureError is printed and ends it with status 1; others are bugs and pass."""
+    """Wrap a command's body: an OrthocaptureError is printed and ends it with status 1; others are bugs and pass.
+
+    With `json` a bug is printed as JSON too, so that the program that reads it is told.
+    """
     try:
         yield
     except OrthocaptureError as error:
         raise fail(error, json=json) from error
+    except (typer.Exit, typer.Abort, typer.BadParameter):
+        raise
+    except Exception as error:
+        if not json:
+            raise
+        print_json({"error": _bug_record(error)})
+        raise typer.Exit(1) from error
+
+
+def _bug_record(error: Exception) -> dict[str, str | list[str]]:
+    """A fault of this program as plain data, with what a developer needs to find it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return {
+        "kind": type(error).__name__,
+        "what": str(error) or "no message",
+        "where": f"{Path(frames[-1].filename).name}:{frames[-1].lineno}",
+        "remedy": "This is a fault of the program; report it with `trace`",
+        "trace": [f"{Path(frame.filename).name}:{frame.lineno} {frame.name}" for frame in frames],
+    }
 
 
 def tell_left_out(left_out: Mapping[str, str]) -> None:
     """Print the files that were left out, each with the reason."""
     for name, reason in left_out.items():
-        error_console.print(f"[yellow]left out[/] {escape(name)}: {escape(reason)}")
+        error_console.tell(("left out", "yellow"), f" {name}: {reason}")
 
 
 def tell_doubt(file: Path, doubtful: float) -> None:
@@ -111,7 +144,7 @@ def tell_doubt(file: Path, doubtful: float) -> None:
     from drivers.meshes.polygons import in_doubt  # noqa: PLC0415 - NumPy, for those who read a mesh
 
     if words := in_doubt(int(doubtful)):
-        error_console.print(f"[yellow]{escape(file.name)}[/]: {words}")
+        error_console.tell((file.name, "yellow"), f": {words}")
 
 
 def require_writable(file: Path) -> None:
@@ -124,7 +157,7 @@ def require_writable(file: Path) -> None:
             where=str(file),
             remedy="Create the folder, or name another one",
         )
-    there = file.exists()
+    there = file.exists() or file.is_symlink()
     try:
         with file.open("ab"):
             pass
@@ -135,13 +168,42 @@ def require_writable(file: Path) -> None:
 
 
 def require_writable_folder(folder: Path) -> None:
-    """Create the folder if need be, and raise ConfigurationError unless files can be written into it."""
+    """Raise ConfigurationError unless files can be written into the folder, or it can be made where it is named.
+
+    Nothing is made. A folder around it that does not exist is rather a slip of the keyboard than meant.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ConfigurationError("this is a file, not a folder", where=str(folder), remedy="Name a folder")
+    around = folder.absolute().parent
+    if not folder.exists() and not around.is_dir():
+        raise ConfigurationError(
+            "the folder around the one to write does not exist",
+            where=str(folder),
+            remedy="Create it, or name another one",
+        )
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
+        with tempfile.TemporaryFile(dir=folder if folder.exists() else around):
             pass
     except OSError as error:
         raise _unwritable(folder, error) from error
+
+
+def write_whole(file: Path, content: str | bytes) -> None:
+    """Write a file as a whole or not at all; what was there before stays until then. Raises ConfigurationError."""
+    data = content.encode() if isinstance(content, str) else content
+    target = file.resolve()
+    try:
+        if target.exists() and not target.is_file():  # such as /dev/stdout, which has no other name to write to first
+            target.write_bytes(data)
+            return
+        part = target.with_name(f".{target.name}.{os.getpid()}.part")
+        try:
+            part.write_bytes(data)
+            part.replace(target)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise _unwritable(file, error) from error
 
 
 def _unwritable(path: Path, error: OSError) -> ConfigurationError:
@@ -153,35 +215,20 @@ def _unwritable(path: Path, error: OSError) -> ConfigurationError:
 @contextmanager
 def progress_bar(*, quiet: bool = False) -> Generator[Callable[[str, int, int], None]]:
     """A progress bar on stderr, shown after PROGRESS_AFTER_S seconds. Yields report(what, done, total)."""
-    from rich.progress import (  # noqa: PLC0415 - most commands have none
-        BarColumn,
-        Progress,
-        TaskProgressColumn,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
     started = time.monotonic()
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        console=error_console,
-        transient=True,
-    )
+    bar = bar_of_shares(error_console)
     task = bar.add_task("", total=None)
-    shown = False
+    on_screen = False
 
     def report(what: str, done: int, total: int) -> None:
-        nonlocal shown
-        bar.update(task, description=what, completed=done, total=total)
-        if not quiet and not shown and time.monotonic() - started > PROGRESS_AFTER_S:
+        nonlocal on_screen
+        bar.update(task, description=shown(what), completed=done, total=total)
+        if not quiet and not on_screen and time.monotonic() - started > PROGRESS_AFTER_S:
             bar.start()
-            shown = True
+            on_screen = True
 
     try:
         yield report
     finally:
-        if shown:
+        if on_screen:
             bar.stop()

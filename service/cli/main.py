@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
+import traceback
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib.metadata import version
@@ -13,6 +17,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from service.core.loading import begin_loading, end_loading
+from service.core.shown_text import shown, shown_lines
 from service.logs.terminal import show_own_words_only
 
 
@@ -49,6 +54,10 @@ _COMMANDS = {
     "act": _Command(
         "service.cli.run.act:act_command",
         "Answer or stop a run that another terminal drives. A confirmation ticks the whole checklist.",
+    ),
+    "draw-region": _Command(
+        "service.cli.run.act:draw_region_command",
+        "Draw a region in which the CT or the scan counts; the next fusion uses it, as one drawn on the 3D view.",
     ),
     "note": _Command(
         "service.cli.run.act:note_command",
@@ -139,8 +148,29 @@ _SETTINGS: dict[str, dict[str, Any]] = {
 }
 
 
+@contextmanager
+def _usage_escaped() -> Generator[None]:
+    """Escape what was typed wrongly before Typer repeats it on the terminal."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(message := getattr(error, "message", None), str):
+            vars(error)["message"] = shown(message)
+        raise
+
+
 class _Commands(TyperGroup):
     """The group of all commands, each imported on first use."""
+
+    def make_context(self, *words: Any, **options: Any) -> Any:
+        """The options before the command."""
+        with _usage_escaped():
+            return super().make_context(*words, **options)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Read the options of the command and run it."""
+        with _usage_escaped():
+            return super().invoke(ctx)
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Names in the order of the help text."""
@@ -182,7 +212,7 @@ app = typer.Typer(name="orthocapture", cls=_Commands, no_args_is_help=True, pret
 
 def _tell_version(asked: bool) -> None:
     if asked:
-        typer.echo(f"orthocapture {version('orthocapture')}")
+        sys.stdout.write(f"orthocapture {version('orthocapture')}\n")
         raise typer.Exit
 
 
@@ -203,7 +233,11 @@ def main() -> None:
     # slower on a busy machine. The library reads this when it is loaded, here and in every child process.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     show_own_words_only()
-    app()
+    try:
+        app()
+    except Exception:  # noqa: BLE001 - a fault of this program; its text may come from a device or a file
+        sys.stderr.write(shown_lines(traceback.format_exc()))
+        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
-# Control characters, which a terminal or page would act on, and lone surrogates. Quoted files may hold them.
-_UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+from service.core.shown_text import shown_lines
+
 _LONGEST, _LONGEST_LINE = 20_000, 4_000  # characters: a quoted file may hold a megabyte without a space
 
 
@@ -41,9 +40,8 @@ def what_of(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    """A text that can be printed and recorded: without control characters and lone surrogates, and not too long."""
-    plain = _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
-    return _cut("\n".join(_cut(line, _LONGEST_LINE) for line in plain.split("\n")), _LONGEST)
+    """A text that can be printed and recorded: with escapes for what a terminal would obey, and not too long."""
+    return _cut("\n".join(_cut(line, _LONGEST_LINE) for line in shown_lines(text).split("\n")), _LONGEST)
 
 
 def _cut(text: str, longest: int) -> str:

@@ -11,6 +11,8 @@ import logging
 import os
 import platform
 
+from service.core.shown_text import shown_continued
+
 ASKED = "ORTHOCAPTURE_LIBRARY_WORDS"
 _OURS = frozenset({"service", "drivers", "simulators", "orthocapture", "root"})
 _QUIET = {  # what native libraries read when they are loaded, here and in every child process
@@ -27,7 +29,7 @@ def show_own_words_only() -> None:
     pydicom's does. What is written to the error stream by Python stays: tracebacks, and the words of child processes.
     """
     handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s %(levelname)s %(message)s"))
+    handler.setFormatter(EscapingFormatter("%(asctime)s %(name)s %(levelname)s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
     logging.captureWarnings(capture=True)
     if os.environ.get(ASKED):
@@ -36,6 +38,14 @@ def show_own_words_only() -> None:
     for name, value in _QUIET.items():
         os.environ.setdefault(name, value)
     _divert_stdio()
+
+
+class EscapingFormatter(logging.Formatter):
+    """Lines in which nothing is left that a terminal would obey: messages may quote a device or a file."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One record as lines."""
+        return shown_continued(super().format(record))
 
 
 def is_own(record: logging.LogRecord) -> bool:

@@ -15,6 +15,7 @@ from sqlalchemy import Connection, Row, bindparam, insert, select, update
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import PAYLOAD, ArtefactRef, Event, Payload
+from service.core.shown_text import storable, storable_data
 from service.store.database.tables import events, heads
 from service.store.durable_effects import Clock, utc_text
 
@@ -110,7 +111,7 @@ def event_text(fields: Mapping[str, Any], payload: str) -> str:
 
 
 def payload_text(payload: Payload) -> str:
-    """Canonical JSON of a payload. Raises StoreError naming the field that has no canonical form."""
+    """Canonical JSON of a payload, its texts storable. Raises StoreError naming a field without a canonical form."""
     # In JSON mode pydantic writes NaN in untyped fields as null, which would silently change the evidence.
     for path, number in _numbers(payload.model_dump(mode="python"), payload.kind):
         if not math.isfinite(number):
@@ -120,11 +121,18 @@ def payload_text(payload: Payload) -> str:
                 remedy="Leave the value out, or say in words why it is missing",
             )
     try:
-        return canonical(payload.model_dump(mode="json"))
+        return canonical(_plain(payload))
     except PydanticSerializationError as error:
         raise StoreError(
             f"this is not plain data: {error}", where=payload.kind, remedy="Convert arrays to lists"
         ) from error
+
+
+def _plain(payload: Payload) -> object:
+    try:
+        return storable_data(payload.model_dump(mode="json"))
+    except UnicodeEncodeError:  # pydantic writes surrogates in texts, but not in names of fields
+        return PAYLOAD.validate_python(storable_data(payload.model_dump(mode="python"))).model_dump(mode="json")
 
 
 def _numbers(value: object, path: str) -> Iterator[tuple[str, float]]:
@@ -166,6 +174,8 @@ def _reference(fields: Mapping[str, object]) -> ArtefactRef:
 def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence[Payload], actor: str) -> list[Event]:
     """Append to a run's chain within the caller's IMMEDIATE transaction, so that no other writer interferes.
 
+    NUL and surrogates in texts become escapes, so the events that are returned may differ from the payloads.
+
     Raises:
         IntegrityError: the chain does not end where the last append left it.
         StoreError: a payload has no canonical form.
@@ -180,7 +190,7 @@ def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence
             "run_id": run_id,
             "at_utc": utc_text(clock.utc_now()),
             "monotonic_s": clock.monotonic_s(),
-            "actor": actor,
+            "actor": storable(actor),
             "payload": parse_canonical(text),
             "previous_sha256": previous,
         }

@@ -14,6 +14,7 @@ from sqlalchemy import Connection, bindparam, select
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.jobs.priorities import Lane
 from service.core.records.events import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
+from service.core.shown_text import storable
 from service.store.access import close_to_others, require_access
 from service.store.ages import Ages
 from service.store.database.engine import (
@@ -146,14 +147,14 @@ class Store:
             sha256: the hash that the driver took on arrival; a copy that differs is refused.
         """
         digest, size = self._folder.put(chunks_of(path), expected_sha256=sha256)
-        name = original_name or path.name
+        name = storable(original_name or path.name)
         return ArtefactRef(sha256=digest, kind=kind, media_type=media_type, size_bytes=size, original_name=name)
 
     def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
         """Write bytes into the store durably. Nothing refers to them until `record`."""
         digest, size = self._folder.put([data])
         return ArtefactRef(
-            sha256=digest, kind=kind, media_type=media_type, size_bytes=size, original_name=original_name
+            sha256=digest, kind=kind, media_type=media_type, size_bytes=size, original_name=storable(original_name)
         )
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:

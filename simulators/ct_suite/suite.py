@@ -30,7 +30,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--scene", type=int, required=True, metavar="SEED", help="seed of the scene")
     parser.add_argument(
-        "--moved", type=parse_moved, default=(), metavar="JSON", help="registration spheres moved: [[index, x, y, z]]"
+        "--moved",
+        type=parse_moved,
+        default=(),
+        metavar="JSON",
+        help="registration spheres moved, as a JSON list of lists: index, x, y, z",
     )
     parser.add_argument("--folder", type=Path, required=True, help="where the series is delivered")
     parser.add_argument("--once", action="store_true", help="end after one series")

@@ -261,7 +261,7 @@ def test_the_same_evidence_gives_the_same_bytes(folder: Path, report: Report) ->
 
 
 def test_command_writes_both(folder: Path, tmp_path: Path) -> None:
-    pdf, html = tmp_path / "new" / "r.pdf", tmp_path / "new" / "r.html"
+    pdf, html = tmp_path / "r.pdf", tmp_path / "r.html"
     words = ["audit", "report", "latest", "--data", str(folder / "data"), "--pdf", str(pdf), "--html", str(html)]
     before = sorted((p, p.stat().st_mtime_ns) for p in (folder / "data" / "artefacts").rglob("*"))
     answer = CliRunner().invoke(app, words)

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
-from rich.console import Console
 from rich.table import Table
 from typer.testing import CliRunner
 
@@ -24,6 +23,7 @@ from service.cli.main import app
 from service.cli.run.demo import free_address
 from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.operators import Display, TerminalOperator
+from service.cli.terminal_output import Terminal
 from service.compute.matching.methods.method import matchers
 from service.core.protocol.models import load_protocol
 from service.core.run.decide import AskOperator
@@ -65,7 +65,7 @@ def _plain(shown: str) -> str:
 def test_no_word_of_an_instruction_is_lost(columns: int) -> None:
     protocol = load_protocol(ROOT / "protocols" / "exvivo_spine.yaml", params_models()).protocol
     shown = io.StringIO()
-    console = Console(file=shown, width=columns, soft_wrap=True, highlight=False)
+    console = Terminal(file=shown, width=columns)
     nobody_types, _ = os.pipe()
     reporter = cast(Any, None)
     operator = TerminalOperator("A. Tester", protocol, Display(console, reporter), SimulatedHands(None), nobody_types)
@@ -87,7 +87,7 @@ def _shown_table(*, terminal: bool) -> str:
     shown = io.StringIO()
     table = Table("", "x mm", "y mm", "z mm", "sigma mm", "what")
     table.add_row("0", "-5895.842", "-12345.678", "99999.123", "0.0001", "a long word on where this lies in the hall")
-    print_table(table, Console(file=shown, width=40, soft_wrap=True, highlight=False, force_terminal=terminal))
+    print_table(table, Terminal(file=shown, width=40, force_terminal=terminal))
     return shown.getvalue()
 
 

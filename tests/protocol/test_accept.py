@@ -12,12 +12,12 @@ import termios
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
 from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.operators import Display, TerminalOperator
+from service.cli.terminal_output import Terminal
 from service.core.errors import ProtocolError
 from service.core.gates.dependence import dependent_steps, depends_on
 from service.core.protocol.models import load_protocol
@@ -345,7 +345,7 @@ class Typed:
         self.master, self.slave = pty.openpty()
         self.screen = io.StringIO()
         reporter = Reporter(folder, "run", OpenDevices, BenchRig().camera_named)
-        display = Display(Console(file=self.screen, width=500), reporter)
+        display = Display(Terminal(file=self.screen, width=500), reporter)
         self.operator = TerminalOperator(
             "Ada", self.log.protocol, display, SimulatedHands(None), descriptor=self.slave, people=people
         )

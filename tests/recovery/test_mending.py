@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.operators import AutomaticOperator, Display
+from service.cli.terminal_output import Terminal
 from service.core.errors import OrthocaptureError
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import OperatorAction, StepNote
@@ -87,7 +87,7 @@ def automatic_run(bench: Bench, world: _World) -> RunState:
     reporter = Reporter(bench.data, bench.run_id, OpenDevices, bench.rig.camera_named)
     host, port = world.server_address[:2]
     operator = AutomaticOperator(
-        "Ada", protocol, Display(Console(file=io.StringIO()), reporter), SimulatedHands(f"{host!s}:{port}")
+        "Ada", protocol, Display(Terminal(file=io.StringIO()), reporter), SimulatedHands(f"{host!s}:{port}")
     )
     return Runner(bench.store, bench.run_id, protocol, bench.rig, operator).run()
 

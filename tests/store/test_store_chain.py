@@ -134,7 +134,7 @@ def test_events_link_and_read_back_equal(store: Store) -> None:
 
 @pytest.mark.parametrize(
     ("value", "said"),
-    [(float("nan"), "nan"), (float("inf"), "inf"), (2**60, "safe integer"), ("\ud800", "UTF-8"), (object(), "plain")],
+    [(float("nan"), "nan"), (float("inf"), "inf"), (2**60, "safe integer"), (object(), "plain")],
 )
 def test_what_has_no_canonical_form_is_refused_and_nothing_is_written(store: Store, value: object, said: str) -> None:
     run = start_run(store)

@@ -83,6 +83,7 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture audit report latest --pdf report.pdf --html report.html --data runs": succeeds,
     "orthocapture audit figures latest --out figures --data runs": succeeds,
     "orthocapture audit export latest bundle.zip --data runs": succeeds,
+    "orthocapture audit release latest --data runs": succeeds,
     "orthocapture register --images DIR --camera camera.json --poses poses.csv --mesh scan.ply --radius-mm 15 "
     "--out result.json": registers,
     "orthocapture audit show latest --data runs": succeeds,

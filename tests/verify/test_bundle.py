@@ -232,7 +232,7 @@ def test_the_command_exports_and_says_how_to_verify(site: Site, tmp_path: Path) 
     words = ["export", "latest", str(tmp_path / "b.zip"), "--data", str(data), "--hashes-only", "--operator", "ada"]
     done = CliRunner().invoke(audit_app, words, env={"COLUMNS": "200"})
     assert done.exit_code == 0, done.output
-    assert f"python verify.py b-SIMULATED.zip --key {site.key_id}" in done.stdout
+    assert f"python -I verify.py b-SIMULATED.zip --key {site.key_id}" in done.stdout
     done = CliRunner().invoke(audit_app, [*words, "--json"])
     assert done.exit_code == 1
     assert json.loads(done.stdout)["error"]["kind"] == "DataError"

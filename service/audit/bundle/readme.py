@@ -10,8 +10,9 @@ _TEXT = """Evidence of run {run_id}, exported by orthocapture
 
 {warnings}To verify this bundle, on any machine with Python 3.9 or newer and the package `cryptography`, offline:
 
-    python verify.py BUNDLE.zip --key FINGERPRINT
+    python -I verify.py BUNDLE.zip --key FINGERPRINT
 
+With -I, Python takes no module from beside verify.py in place of its own.
 FINGERPRINT is the fingerprint of the site's signing key. Ask the site for it; do not take it from this bundle. The
 site sees it with `orthocapture audit keys`. This bundle states that it is
 {key_id}

@@ -70,7 +70,7 @@ def _signature(connection: Connection, run_id: str, row: EventRow, digest: Diges
         if digest is None or digest.state is None
         else _stands(digest, row, action, signed) and not refused,
         refused=refused,
-        known_by=action.identified if action else "",
+        known_by=action.identified if action else release.identified if release else "",
     )
 
 

@@ -1,8 +1,9 @@
 """Tell whether an evidence bundle of orthocapture is whole and unaltered, on a machine without orthocapture.
 
-    python verify.py BUNDLE.zip [--key FINGERPRINT] [--certificates FILE] [--json]
-    python verify.py FOLDER        the same for an unpacked bundle; nothing is unpacked here
+    python -I verify.py BUNDLE.zip [--key FINGERPRINT] [--certificates FILE] [--json]
+    python -I verify.py FOLDER        the same for an unpacked bundle; nothing is unpacked here
 
+Without -I, Python would take a module from beside this file, such as a forged hashlib.py, in place of its own.
 Needs Python 3.9 or newer and the package `cryptography`, nothing else and no network. Nothing is written.
 Exit status: 0 whole and unaltered; 1 something differs, and every difference is named; 2 nothing can be said, because
 this is not a bundle or `cryptography` is missing.
@@ -21,6 +22,7 @@ import json
 import math
 import re
 import stat
+import struct
 import sys
 import zipfile
 import zlib
@@ -50,6 +52,12 @@ ROOT = "0" * 64
 CHUNK = 1 << 20
 LARGEST_MANIFEST = 64 << 20
 LARGEST_LINE = 64 << 20
+NOT_ISOLATED = (
+    "This verifier was not started as `python -I verify.py`: a file beside it, such as hashlib.py, may have taken "
+    "the place of a part of Python. Start it again with -I."
+)
+# What file managers leave in folders that they show, whatever the folder is.
+LEFT_BY_FILE_MANAGERS = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 LARGEST_EXPANSION = 200  # of a compressed file; records compress twentyfold at most
 MOST_DEEP = 100  # of JSON within JSON; records have a tenth of it
 SAFE_INTEGER = 2**53 - 1
@@ -83,7 +91,10 @@ class NotABundleError(Exception):
 # --- RFC 8785 canonical JSON ------------------------------------------------------------------------------------
 
 _ESCAPES = {"\b": "\\b", "\t": "\\t", "\n": "\\n", "\f": "\\f", "\r": "\\r", '"': '\\"', "\\": "\\\\"}
-_UNPRINTABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+_UNPRINTABLE = re.compile(
+    r"[\x00-\x1f\x7f-\x9f\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb]"
+    r"|[\ud800-\udfff\U000e0000-\U000e007f]"
+)
 _ESCAPED = re.compile(r'[\x00-\x1f"\\]')
 
 
@@ -201,9 +212,11 @@ def _constant(name: str) -> Any:
 
 
 class Bundle:
-    """The files of a bundle: names and sizes, and a stream of each."""
+    """The files of a bundle: names and sizes, and a stream of each; of an unpacked one, also its folders."""
 
     sizes: dict[str, int]
+    folders: Sequence[str] = ()
+    left_by_others: Sequence[str] = ()
 
     def open(self, name: str) -> IO[bytes]:
         """A stream of one file."""
@@ -227,17 +240,25 @@ class Bundle:
 
 
 class ZipBundle(Bundle):
-    """A zip file, read where it is."""
+    """A zip file, read where it is.
+
+    Readers disagree on what a zip file holds: some go by the directory at its end, others by the headers along the
+    way. Only a file that both read alike is accepted.
+    """
 
     def __init__(self, path: Path, fault: Callable[[str, str], None]) -> None:
         try:
             self._zip = zipfile.ZipFile(path)
+            infos = self._zip.infolist()
+            with path.open("rb") as stream:
+                for problem in ZipLayout(stream, path.stat().st_size).problems(infos):
+                    fault(path.name, f"{problem}: programs may read different contents from it")
         except UNREADABLE as error:
             raise NotABundleError(f"{path} cannot be read as a zip file: {error}") from error
         self._infos: dict[str, zipfile.ZipInfo] = {}
         self.sizes = {}
         compressed = 0
-        for info in self._zip.infolist():
+        for info in infos:
             compressed += info.compress_size
             problem = name_problem(info.orig_filename) or _entry_problem(info)
             if problem:
@@ -251,23 +272,147 @@ class ZipBundle(Bundle):
                 self.sizes[info.filename] = info.file_size
         if compressed > path.stat().st_size:
             raise NotABundleError("the entries of the zip file overlap: nothing in it was read")
+        with path.open("rb") as stream:
+            for name, info in self._infos.items():
+                problem = _stream_problem(stream, info)
+                if problem:
+                    fault(name, problem)
 
     def open(self, name: str) -> IO[bytes]:
         """Open a file of the zip archive for reading."""
         return self._zip.open(self._infos[name])
 
 
+def _offset(listed: tuple[zipfile.ZipInfo, bytes]) -> int:
+    return listed[0].header_offset
+
+
+class ZipLayout:
+    """Where the parts of a zip file lie. Entries and directory must cover it without a gap, as they were written."""
+
+    _END, _END_64, _LOCATOR_64 = b"PK\x05\x06", b"PK\x06\x06", b"PK\x06\x07"
+    _CENTRAL, _LOCAL = b"PK\x01\x02", b"PK\x03\x04"
+    # Extra fields that change nothing: sizes beyond 4 GB, times and owners. Others may give another name or content.
+    _HARMLESS = frozenset({0x0001, 0x000A, 0x5455, 0x5855, 0x7855, 0x7875})
+
+    def __init__(self, stream: IO[bytes], size: int) -> None:
+        self._stream = stream
+        self._size = size
+
+    def problems(self, infos: Sequence[zipfile.ZipInfo]) -> list[str]:
+        """What keeps this from being exactly one zip file."""
+        try:
+            start, end, count = self._directory()
+            names = self._directory_names(start, end)
+            if len(names) != len(infos) or count != len(infos):
+                return ["its directory lists another number of files than it says"]
+            return self._entry_problems(infos, names, start)
+        except (struct.error, ValueError) as error:
+            return [str(error) if isinstance(error, ValueError) else "it is cut off"]
+
+    def _at(self, offset: int, size: int) -> bytes:
+        self._stream.seek(offset)
+        return self._stream.read(size)
+
+    def _directory(self) -> tuple[int, int, int]:
+        """Where the directory begins and ends, and how many files it lists. Raises ValueError."""
+        end = self._size - 22
+        last = self._at(max(end, 0), 22)
+        if not last.startswith(self._END) or last[20:] != b"\0\0":
+            raise ValueError("something follows the end of the zip file")
+        disk, first_disk, here, count, size, start = struct.unpack("<4H2L", last[4:20])
+        if (disk, first_disk, here) != (0, 0, count):
+            raise ValueError("it says that it is one of several parts")
+        if end >= 20 and self._at(end - 20, 4) == self._LOCATOR_64:
+            disk, at, disks = struct.unpack("<LQL", self._at(end - 16, 16))
+            record = self._at(at, 56)
+            if at + 56 != end - 20 or not record.startswith(self._END_64) or record[4:12] != struct.pack("<Q", 44):
+                raise ValueError("something lies within the end of the zip file")
+            first_disk, other_disk, here, count, size, start = struct.unpack("<2L4Q", record[16:])
+            if (disk, disks, first_disk, other_disk, here) != (0, 1, 0, 0, count):
+                raise ValueError("it says that it is one of several parts")
+            end = at
+        if start + size != end:
+            raise ValueError("something lies before its first file, or between its directory and its end")
+        return start, end, count
+
+    def _directory_names(self, start: int, end: int) -> list[bytes]:
+        """The names in the directory, as bytes. Raises ValueError, struct.error."""
+        names: list[bytes] = []
+        while start < end:
+            head = self._at(start, 46)
+            if not head.startswith(self._CENTRAL):
+                raise ValueError("its directory has a gap")
+            name, extra, comment = struct.unpack("<3H", head[28:34])
+            if comment or head[34:36] != b"\0\0":
+                raise ValueError("its directory has comments or other parts")
+            names.append(self._at(start + 46, name))
+            self._check_extra(self._at(start + 46 + name, extra))
+            start += 46 + name + extra
+        if start != end:
+            raise ValueError("its directory is cut off")
+        return names
+
+    def _check_extra(self, extra: bytes) -> bytes:
+        """The sizes beyond 4 GB among the extra fields. Raises ValueError, struct.error."""
+        sizes = b""
+        while extra:
+            kind, size = struct.unpack("<2H", extra[:4])
+            if kind not in self._HARMLESS or len(extra) < 4 + size:
+                raise ValueError(f"its entries have additions of the kind {kind:#06x}, which no bundle has")
+            if kind == 1:
+                sizes = extra[4 : 4 + size]
+            extra = extra[4 + size :]
+        return sizes
+
+    def _entry_problems(self, infos: Sequence[zipfile.ZipInfo], names: Sequence[bytes], end: int) -> list[str]:
+        """Entries that do not follow each other, or whose own header differs from the directory."""
+        found: list[str] = []
+        position = 0
+        for info, name in sorted(zip(infos, names), key=_offset):  # noqa: B905 - not in 3.9
+            if info.header_offset != position:
+                return [*found, f"something lies before {name!r}, or it overlaps another file"]
+            head = self._at(position, 30)
+            if not head.startswith(self._LOCAL):
+                return [*found, f"{name!r} has no header where the directory places it"]
+            _, flags, method, _, _, crc, compressed, size, length, extra = struct.unpack("<5H3L2H", head[4:])
+            own = self._at(position + 30, length)
+            beyond = self._check_extra(self._at(position + 30 + length, extra))
+            if 0xFFFFFFFF in (compressed, size):
+                size, compressed = struct.unpack("<2Q", beyond[:16])
+            if flags & 8:
+                return [*found, f"the header of {name!r} leaves its size open (pack it again, or verify the folder)"]
+            if (own, flags, method, crc, compressed, size) != (
+                *(name, info.flag_bits, info.compress_type),
+                *(info.CRC, info.compress_size, info.file_size),
+            ):
+                found.append(f"the header of {name!r} differs from the directory")
+            position = info.header_offset + 30 + length + extra + info.compress_size
+        if position != end:
+            found.append("something lies between its last file and its directory")
+        return found
+
+
 class FolderBundle(Bundle):
     """An unpacked bundle."""
 
+    folders: list[str]
+    left_by_others: list[str]
+
     def __init__(self, folder: Path, fault: Callable[[str, str], None]) -> None:
         self._folder = folder
-        self.sizes = {}
+        self.sizes, self.folders, self.left_by_others = {}, [], []
         for path in sorted(folder.rglob("*")):
             name = path.relative_to(folder).as_posix()
             if path.is_symlink():
                 fault(name, "it is a link, not a file")
-            elif path.is_file():
+            elif path.is_dir():
+                self.folders.append(name)
+            elif not path.is_file():
+                fault(name, "it is a device or a pipe, not a file")
+            elif path.name in LEFT_BY_FILE_MANAGERS:
+                self.left_by_others.append(name)
+            else:
                 self.sizes[name] = path.stat().st_size
 
     def open(self, name: str) -> IO[bytes]:
@@ -292,6 +437,29 @@ def _entry_problem(info: zipfile.ZipInfo) -> str:
         return "it is encrypted"
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         return "it is compressed in a way that no bundle is"  # others may ask for gigabytes to unpack a kilobyte
+    return ""
+
+
+def _stream_problem(stream: IO[bytes], info: zipfile.ZipInfo) -> str:
+    """Why the bytes of an entry are not exactly its content, with nothing behind it; "" if they are."""
+    if info.compress_type == zipfile.ZIP_STORED:
+        return "" if info.compress_size == info.file_size else "it is stored with another size than it has"
+    stream.seek(info.header_offset + 26)
+    lengths = stream.read(4)
+    stream.seek(info.header_offset + 30 + sum(lengths[::2]) + 256 * sum(lengths[1::2]))
+    expand, left, size = zlib.decompressobj(-15), info.compress_size, 0
+    try:
+        while not expand.eof and size <= info.file_size:
+            chunk = expand.unconsumed_tail or stream.read(min(CHUNK, left))
+            left -= 0 if expand.unconsumed_tail else len(chunk)
+            content = expand.decompress(chunk, CHUNK)
+            size += len(content)
+            if not chunk and not content:
+                break
+    except zlib.error as error:
+        return f"it cannot be expanded ({error})"
+    if left or expand.unused_data or not expand.eof or size != info.file_size:
+        return "its compressed bytes are not exactly those of its content: something may be hidden behind it"
     return ""
 
 
@@ -384,6 +552,13 @@ class Check:
                 whole.append(name)  # altered records are read too, to say what was altered
         for name in sorted(set(bundle.sizes) - set(self.files) - {MANIFEST, SIGNATURE}):
             self.fault(name, "it is in the bundle, but not in the manifest")
+        holding = {name[:at] for name in self.files for at, letter in enumerate(name) if letter == "/"}
+        for name in bundle.folders:
+            if name not in holding:
+                self.fault(name, "it is a folder that is not in the manifest")
+        self.notes += [
+            f"{name}: a file manager left this here; it is no part of the bundle" for name in bundle.left_by_others
+        ]
         for name in ("events.jsonl", "site_events.jsonl", "artefacts.jsonl", "jobs.jsonl", "checkpoints.jsonl"):
             if name not in self.files:
                 self.fault(name, "a bundle must have it; the manifest does not list it")
@@ -957,12 +1132,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="write the result as JSON")
     options = parser.parse_args(arguments)
     check = Check()
+    if not sys.flags.isolated:
+        check.notes.append(NOT_ISOLATED)
     try:
         check.run(options.bundle, options.key, options.certificates)
     except NotABundleError as error:
-        sys.stderr.write(shown(f"{error}\n"))
+        sys.stderr.write(shown(str(error)) + "\n")
         for fault in check.faults:
-            sys.stderr.write(shown(f"  {fault['where']}: {fault['what']}\n"))
+            sys.stderr.write(shown(f"  {fault['where']}: {fault['what']}") + "\n")
         return 2
     if options.json:
         result = {
@@ -999,11 +1176,11 @@ def report(check: Check) -> str:
         lines += [f"  {fault['where']}: {fault['what']}" for fault in check.faults]
     else:
         lines.append("WHOLE AND UNALTERED: every file, record, link and signature is as it was recorded.")
-    return "".join(shown(f"{line}\n") for line in lines)
+    return "".join(f"{shown(line)}\n" for line in lines)
 
 
 def shown(text: str) -> str:
-    """Escape control characters, which a terminal would obey: names in a bundle may be chosen by an attacker."""
+    """One line, with every character escaped that a terminal would obey: an attacker may have chosen the names."""
     return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from service.cli.common import (
@@ -48,6 +47,7 @@ def matching_command(
 
         how = matcher(method)
         require_writable_folder(out)
+        out.mkdir(exist_ok=True)
         results = run_matching(MatchingTask(dataset, how, weights, pairs_per_class, out), progress)
         if json:
             own = next(result for result in results if result.method == how.name)
@@ -57,6 +57,6 @@ def matching_command(
     for row in rows(results):
         table.add_row(*row)
     print_table(table)
-    console.print(f"Written to {escape(str(out))}: {how.name}.json, table.md, curves.png")
+    console.print(f"Written to {out!s}: {how.name}.json, table.md, curves.png")
     if any(result.simulated for result in results):
         console.print("  The data set is simulated.")

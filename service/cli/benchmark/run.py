@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from service.cli.common import (
     JsonOption,
@@ -72,12 +71,13 @@ def run_command(
     if json:
         print_json(result.model_dump(mode="json"))
     elif result.score is None:
-        console.print(f"{how.words}, {scenario.value}: no mesh. {escape(result.failure)}")
+        console.print(f"{how.words}, {scenario.value}: no mesh. {result.failure}")
     else:
         score = result.score
-        console.print(
-            f"{how.words}, {scenario.value}, {result.views} images: "
-            f"[bold]Chamfer distance {score.chamfer_mm:.3f} mm[/] (accuracy {score.accuracy_mm:.3f} mm, "
-            f"completeness {score.completeness_mm:.3f} mm; equal surfaces would give {score.floor_mm:.3f} mm)"
+        console.tell(
+            f"{how.words}, {scenario.value}, {result.views} images: ",
+            (f"Chamfer distance {score.chamfer_mm:.3f} mm", "bold"),
+            f" (accuracy {score.accuracy_mm:.3f} mm, "
+            f"completeness {score.completeness_mm:.3f} mm; equal surfaces would give {score.floor_mm:.3f} mm)",
         )
-        console.print(f"  written: {escape(str(trial.folder))}")
+        console.print(f"  written: {trial.folder!s}")

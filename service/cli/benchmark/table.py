@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from service.cli.benchmark.run import DEFAULT_OUT
-from service.cli.common import JsonOption, print_json, reporting_errors, require_writable
+from service.cli.common import JsonOption, print_document, print_json, reporting_errors, require_writable, write_whole
 
 
 def table_command(
@@ -34,11 +34,11 @@ def table_command(
         text = table_markdown(results, known)
         if markdown is not None:
             require_writable(markdown)
-            markdown.write_text(text, encoding="utf-8")
+            write_whole(markdown, text)
         if figure is not None:
             require_writable(figure)
-            figure.write_bytes(figure_png(out, results, known))
+            write_whole(figure, figure_png(out, results, known))
         if json:
             print_json(table_record(results, known))
         else:
-            typer.echo(text)
+            print_document(f"{text}\n")

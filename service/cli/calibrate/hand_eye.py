@@ -9,7 +9,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.markup import escape
 
 from service.cli.calibrate.board_options import (
     DEFAULT_DICTIONARY,
@@ -32,6 +31,7 @@ from service.cli.common import (
     print_json,
     reporting_errors,
     require_writable,
+    write_whole,
 )
 from service.compute.arm.joint_file import read_joints_csv
 from service.compute.arm.kinematics import active_tool, matching_arm, solve_joints
@@ -166,14 +166,14 @@ def hand_eye_command(
             suggested_poses=tuple(_as_recorded(pose) for pose in suggested),
             suggestions_reachable=kinematics is not None,
         )
-        out.write_text(record.text(), encoding="utf-8")
+        write_whole(out, record.text())
         if preview is not None:
-            preview.write_bytes(_drawn(result, session, suggested))
+            write_whole(preview, _drawn(result, session, suggested))
         if json:
             print_json(record.printed())
             return
         if poses.table is not None and not poses.table.plain:
-            console.print(f"{escape(robot_poses.name)} was read with {poses.table.words}")
+            console.print(f"{robot_poses.name} was read with {poses.table.words}")
         _tell(result, record)
         console.print(f"written: {out}")
 
@@ -345,7 +345,7 @@ def _tell(result: HandEyeResult, record: HandEyeFile) -> None:
     if result.size.sigma > _VAGUE_SIZE:
         console.print("the images hardly tell the size of the squares: take more, from other distances and sides")
     for finding in result.findings:
-        console.print(f"[yellow]warning[/] {escape(finding)}")
+        console.tell(("warning", "yellow"), f" {finding}")
     camera_mm, camera_deg = record.sigma.camera_mm, record.sigma.camera_deg
     if camera_mm and camera_deg is not None:
         console.print(f"of that ± {camera_mm:.3f} mm, ± {camera_deg:.4f}° from the uncertainty of the camera")
@@ -361,7 +361,7 @@ def _tell(result: HandEyeResult, record: HandEyeFile) -> None:
     elif len(result.arm_held_out_mm) > 1:
         console.print("estimating the arm's own error does not improve held-out images: not used")
     for name, reason in record.not_used.items():
-        console.print(f"not used: {escape(name)}: {escape(reason)}")
+        console.print(f"not used: {name}: {reason}")
     if record.suggested_poses:
         checked = "" if record.suggestions_reachable else " (reach not checked: no joints)"
         console.print(

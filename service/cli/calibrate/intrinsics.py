@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 
 from drivers.errors import UnreadableFileError
 from drivers.photos.photo_file import read_exif
@@ -33,6 +32,7 @@ from service.cli.common import (
     reporting_errors,
     require_writable,
     require_writable_folder,
+    write_whole,
 )
 from service.compute.calibration.board.images import UsableViews
 from service.compute.calibration.intrinsics.adjustment import LensModel
@@ -111,7 +111,7 @@ def intrinsics_command(
         left_out = folder.left_out | {files[k].name: excluded[k] for k in sorted(excluded)}
         stated = intrinsics_record(result, validation, uncertainty, warnings, names, left_out)
         record: dict[str, Any] = {**result.camera.record(), **stated.plain(), "optics": optics}
-        _write(out, json_module.dumps(record, indent=1, allow_nan=False) + "\n")
+        write_whole(out, json_module.dumps(record, indent=1, allow_nan=False) + "\n")
         if report is not None:
             _write_plots(report, result, uncertainty)
         if json:
@@ -179,13 +179,6 @@ def optics_of(file: Path) -> Optics:
     )
 
 
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise DataError(f"the file cannot be written: {error.strerror}", where=str(path)) from error
-
-
 def _write_plots(folder: Path, result: IntrinsicsResult, uncertainty: ProjectionUncertainty) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -213,6 +206,6 @@ def _tell(
         f"({uncertainty.worst_mm:.4f} mm) at worst"
     )
     for view in record.excluded:
-        console.print(f"[yellow]left out[/] {escape(view.image)}: {escape(view.reason)}")
+        console.tell(("left out", "yellow"), f" {view.image}: {view.reason}")
     for warning in record.warnings:
-        console.print(f"[yellow]warning[/] {escape(warning)}")
+        console.tell(("warning", "yellow"), f" {warning}")

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 
-from service.cli.common import JsonOption, console, print_json, reporting_errors
+from service.cli.common import JsonOption, console, print_json, reporting_errors, require_writable_folder, write_whole
 from service.compute.images.develop import Developed, develop, encode_tiff
 from service.compute.images.develop_parameters import PARAMETERS
 from service.compute.images.files import read_image
@@ -48,7 +47,7 @@ def develop_command(
 
 def _require_new(files: list[Path], out: Path) -> None:
     """Nothing is overwritten, and every raw file has a name of its own."""
-    out.mkdir(parents=True, exist_ok=True)
+    require_writable_folder(out)
     stems = [file.stem for file in files]
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice is not None:
@@ -68,14 +67,15 @@ def _jpeg_of(raw: Path) -> Path | None:
 
 def _write(made: Developed, raw: Path, jpeg: Path | None, out: Path) -> dict[str, Any]:
     data = encode_tiff(made.image_bgr)
-    (out / f"{raw.stem}.tif").write_bytes(data)
+    out.mkdir(exist_ok=True)
+    write_whole(out / f"{raw.stem}.tif", data)
     record: dict[str, Any] = {
         "raw": _named(raw.name, raw.read_bytes()),
         "jpeg": None if jpeg is None else _named(jpeg.name, jpeg.read_bytes()),
         "tiff": _named(f"{raw.stem}.tif", data),
         **asdict(made.how),
     }
-    (out / f"{raw.stem}.json").write_text(json_module.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_whole(out / f"{raw.stem}.json", json_module.dumps(record, indent=1) + "\n")
     return record
 
 
@@ -88,4 +88,4 @@ def _tell(record: dict[str, Any], jpeg: Path | None) -> None:
     place = "no JPEG beside it: its place is not checked"
     if jpeg is not None:
         place = f"at most {shift_px:.2f} px from {jpeg.name}"
-    console.print(escape(f"{record['tiff']['name']}: {crop['width']} × {crop['height']} px, {place}"))
+    console.print(f"{record['tiff']['name']}: {crop['width']} × {crop['height']} px, {place}")

@@ -19,6 +19,7 @@ from service.cli.common import (
     reporting_errors,
     require_writable,
     tell_doubt,
+    write_whole,
 )
 from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, Direction, chamfer
 from service.compute.ground_truth.distances.heat_map import HeatScale, heat_picture
@@ -63,7 +64,7 @@ def chamfer_command(
             distance_m = PointIndex(score.gt.samples.points_m).nearest(judged.vertices_m, scale.outlier_m)[0]
             write_heat_mesh(heat_map, judged, distance_m, scale, METRES_PER_UNIT[files[0].unit])
         if picture is not None:
-            picture.write_bytes(cv2.imencode(".png", heat_picture(judged, truth, score, scale))[1].tobytes())
+            write_whole(picture, cv2.imencode(".png", heat_picture(judged, truth, score, scale))[1].tobytes())
         if json:
             print_json(score_record(score))
             return
@@ -142,7 +143,8 @@ def _show(score: ChamferScore, files: tuple[SurfaceFile, SurfaceFile], settings:
     scores = ", ".join(
         f"{value:.3f} at {mm(limit):g} mm" for value, limit in zip(score.f_scores, score.thresholds_m, strict=True)
     )
-    console.print(
-        f"[bold]Chamfer distance {mm(score.chamfer_m):.3f} mm[/]; equal surfaces would give "
-        f"{mm(score.floor_m):.3f} mm at a spacing of {mm(settings.spacing_m):g} mm. F-score {scores}."
+    console.tell(
+        (f"Chamfer distance {mm(score.chamfer_m):.3f} mm", "bold"),
+        "; equal surfaces would give "
+        f"{mm(score.floor_m):.3f} mm at a spacing of {mm(settings.spacing_m):g} mm. F-score {scores}.",
     )

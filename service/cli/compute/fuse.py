@@ -18,6 +18,7 @@ from service.cli.common import (
     reporting_errors,
     require_writable,
     tell_doubt,
+    write_whole,
 )
 from service.compute.ground_truth.align import TRANSPORT_GATE_M, Aligned, align
 from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, chamfer
@@ -95,7 +96,7 @@ def fuse_command(
             distance_m = PointIndex(score.gt.samples.points_m).nearest(common.ct.vertices_m, scale.outlier_m)[0]
             write_heat_mesh(heat_map, common.ct, distance_m, scale, unit_m)
         if picture is not None:
-            picture.write_bytes(fusion_picture(common.ct, scanned, score, scale, fused))
+            write_whole(picture, fusion_picture(common.ct, scanned, score, scale, fused))
         record = fusion_record(aligned, score, fused)
         if json:
             print_json(record)
@@ -158,9 +159,10 @@ def _show(record: dict[str, Any]) -> None:
         f"largest change of a distance {record['distance_change_mm']:.3f} mm "
         f"(limit {record['distance_change_limit_mm']:g} mm)"
     )
-    console.print(
-        f"[bold]Chamfer distance CT to scan {record['chamfer_ct_scan_mm']:.3f} mm[/] (equal surfaces would give "
-        f"{record['chamfer_floor_mm']:.3f} mm); the CT is {record['ct_above_scan_mm']:+.3f} mm above the scan"
+    console.tell(
+        (f"Chamfer distance CT to scan {record['chamfer_ct_scan_mm']:.3f} mm", "bold"),
+        f" (equal surfaces would give "
+        f"{record['chamfer_floor_mm']:.3f} mm); the CT is {record['ct_above_scan_mm']:+.3f} mm above the scan",
     )
     shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in record["share"].items())
     console.print(f"{record['vertices']} vertices: {shares}; {record['folded_faces']} folded faces")

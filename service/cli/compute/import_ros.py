@@ -12,9 +12,15 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
-from service.cli.common import JsonOption, console, print_json, reporting_errors, tell_left_out
+from service.cli.common import (
+    JsonOption,
+    console,
+    print_json,
+    reporting_errors,
+    require_writable_folder,
+    tell_left_out,
+)
 from service.compute.poses.files.camera_files import write_camera_json
 from service.compute.poses.files.pose_files import write_poses_csv
 from service.compute.poses.ros.frames import FoundPose, FrameTree, NoPoseError, Timing
@@ -109,8 +115,8 @@ def import_ros_command(
             print_json(record)
             return
         tell_left_out(left_out)
-        console.print(escape(_words(poses)))
-        console.print(f"written: {', '.join(written)} in {escape(str(out))}")
+        console.print(_words(poses))
+        console.print(f"written: {', '.join(written)} in {out!s}")
 
 
 def _require_one_source(flange: str, pose_topic: str, camera_frame: str) -> None:
@@ -134,6 +140,7 @@ def _new_folder(out: Path) -> Generator[Path]:
     """
     if out.exists():
         raise DataError("the folder exists already", where=str(out), remedy="Name a new one; nothing is overwritten")
+    require_writable_folder(out)
     part = out.with_name(f".{out.name}.part")
     try:
         shutil.rmtree(part, ignore_errors=True)

@@ -87,7 +87,7 @@ def _show(report: LayoutReport, centres: Array, radius_m: float) -> None:
     seen = ", ".join(f"{k}: {mm(v):.1f}" for k, v in report.margin_by_count_m.items() if np.isfinite(v))
     console.print(f"least misfit in mm of a wrong assignment, by spheres seen: {seen}")
     for problem in report.problems:
-        console.print(f"[bold red]to do:[/] {problem}")
+        console.tell(("to do:", "bold red"), f" {problem}")
     for move in _moves(centres, radius_m) if report.problems else ():
         x, y, z = mm(move.by_m)
         console.print(
@@ -95,7 +95,7 @@ def _show(report: LayoutReport, centres: Array, radius_m: float) -> None:
             f"the margin is then {mm(move.margin_m):.2f} mm"
         )
     if report.passed:
-        console.print("[bold green]The spheres can be told apart.[/]")
+        console.tell(("The spheres can be told apart.", "bold green"))
 
 
 def _moves(centres: Array, radius_m: float) -> tuple[Move, ...]:

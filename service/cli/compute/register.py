@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
-from rich.markup import escape
 
 from drivers.meshes.mesh_file import MeshUnit
 from service.cli.common import (
@@ -23,6 +22,7 @@ from service.cli.common import (
     reporting_errors,
     require_writable,
     tell_left_out,
+    write_whole,
 )
 from service.cli.compute.spheres import SeedsOption, spheres_of
 from service.compute.camera_covariance import read_camera_covariance
@@ -179,7 +179,7 @@ def register_command(
         record["left_out"] = folder.left_out | {names[i]: why for i, why in result.left_out.items()}
         record["search"] = _search(located, names)
         record["detector"] = {"name": detector, "weights_sha256": found_by}
-        out.write_text(json_module.dumps(record, indent=1), encoding="utf-8")
+        write_whole(out, json_module.dumps(record, indent=1))
         if json:
             print_json(record)
         else:
@@ -218,13 +218,13 @@ def _tell(result: PipelineResult, record: dict[str, Any], verdicts: Sequence[Gat
             f"{controls.worst_mm or 0.0:.3f} mm; {controls.measured} of {len(controls.spheres)} measured"
         )
     for one in result.findings:
-        console.print(f"[bold]{escape(one.what)}.[/] {escape(one.remedy)}.")
+        console.tell((f"{one.what}.", "bold"), f" {one.remedy}.")
     for text in () if controls is None else controls.findings:
-        console.print(f"[bold]{escape(text[0].upper() + text[1:])}.[/]")
+        console.tell((f"{text[0].upper() + text[1:]}.", "bold"))
     outside = [verdict for verdict in verdicts if not verdict.passed]
     for verdict in outside:
-        console.print(f"outside its limit: {escape(describe_judged(verdict))}")
-    console.print("[bold red]not passed[/]" if outside else "[bold green]passed[/]")
+        console.print(f"outside its limit: {describe_judged(verdict)}")
+    console.tell(("not passed", "bold red") if outside else ("passed", "bold green"))
 
 
 def _file_detector(

@@ -26,6 +26,7 @@ from service.cli.common import (
     require_writable_folder,
     tell_doubt,
     tell_left_out,
+    write_whole,
 )
 from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
 from service.compute.images.folder import image_folder
@@ -101,7 +102,8 @@ def sfm_command(
         refine: Refine = "nothing"
         if refine_principal_point or refine_intrinsics:
             refine = "principal_point" if refine_principal_point else "intrinsics"
-        require_writable_folder(out)
+        for folder in filter(None, (out, workspace)):
+            require_writable_folder(folder)
         model = read_camera_json(camera)
         found = image_folder(images, size=(model.width, model.height), strict=strict)
         tell_left_out(found.left_out)
@@ -125,7 +127,7 @@ def sfm_command(
                 write_pose_covariance(
                     out / "poses_covariance.json", list(solved.T_world_camera), metric.pose_covariance, "m"
                 )
-        (out / "sfm.json").write_text(json_module.dumps(record, indent=1) + "\n", encoding="utf-8")
+        write_whole(out / "sfm.json", json_module.dumps(record, indent=1) + "\n")
         if json:
             print_json(record)
             return

@@ -22,6 +22,7 @@ from service.cli.common import (
     reporting_errors,
     require_writable,
     tell_doubt,
+    write_whole,
 )
 from service.compute.surfaces.spheres.mesh_spheres import MeshSphere, SphereLimits, locate_spheres
 from service.compute.surfaces.spheres.other_radii import MeasuredRadius, seen_radius
@@ -85,7 +86,7 @@ def spheres_command(
             "control_mm": [],
             "details": [measured_sphere(sphere).plain() for sphere in found],
         }
-        out.write_text(json_module.dumps(document, indent=1), encoding="utf-8")
+        write_whole(out, json_module.dumps(document, indent=1))
         if json:
             print_json(document)
             return

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from service.audit.verify.verifications import keep_verification, verification_of
@@ -26,10 +25,13 @@ from service.cli.common import (
     print_table,
     progress_bar,
     reporting_errors,
+    require_writable,
 )
+from service.cli.evidence.audit_acts import correct_command, release_command
 from service.cli.evidence.audit_figures import figures_command
 from service.cli.evidence.audit_report import report_command
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
+from service.cli.terminal_output import listed, styled
 from service.core.text.counts import counted
 from service.core.text.person_names import cleaned_name
 from service.core.units import megabytes
@@ -145,8 +147,8 @@ def keys_command(data: DataOption = DEFAULT_DATA, json: JsonOption = False) -> N
         console.print("No key has signed anything in this folder yet.")
     for key in keys:
         state = "in use" if key.replaced_seq is None else "replaced"
-        gap = "" if key.introduced or key is keys[0] else ", [yellow]not vouched for by the key before it[/]"
-        console.print(f"{key.key_id}  {state}{gap}  ({escape(key.reason)})")
+        gap = "" if key.introduced or key is keys[0] else ", not vouched for by the key before it"
+        console.tell(f"{key.key_id}  {state}", (gap, "yellow"), f"  ({key.reason})")
 
 
 @audit_app.command("rotate-key")
@@ -194,6 +196,7 @@ def export_command(
 
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
+        require_writable(bundle)
         who = acting_person(store, operator, password_stdin=password_stdin)
         with progress_bar(quiet=json) as report_progress:
             made = export_bundle(
@@ -208,9 +211,9 @@ def export_command(
     if json:
         print_json({**asdict(made), "path": str(made.path)})
         return
-    console.print(f"{escape(str(made.path))}: {megabytes(made.size_bytes):.1f} MB, SHA-256 {made.sha256}")
+    console.print(f"{made.path!s}: {megabytes(made.size_bytes):.1f} MB, SHA-256 {made.sha256}")
     console.print(f"  signed with key {made.key_id}")
-    console.print(f"  To verify it anywhere: python verify.py {escape(made.path.name)} --key {made.key_id}")
+    console.print(f"  To verify it anywhere: python -I verify.py {made.path.name} --key {made.key_id}")
 
 
 def _key_json(key: PublicKey) -> dict[str, Any]:
@@ -251,25 +254,28 @@ def _print_records(run_id: str, records: Sequence[EvidenceRecord]) -> None:
     for heading in ("no.", "time (UTC)", "who", "what", "details"):
         table.add_column(heading, overflow="fold")
     for record in records:
-        lines = [escape(record.summary)]
+        lines = [styled(record.summary)]
         lines += [
-            f"[dim]file[/] {escape(artefact.ref.original_name)} ({artefact.ref.kind}, "
-            f"{artefact.ref.size_bytes} bytes, from {escape(artefact.device)}, SHA-256 {artefact.ref.sha256[:12]}…)"
+            styled(
+                ("file", "dim"),
+                f" {artefact.ref.original_name} ({artefact.ref.kind}, {artefact.ref.size_bytes} bytes, "
+                f"from {artefact.device}, SHA-256 {artefact.ref.sha256[:12]}…)",
+            )
             for artefact in record.artefacts
         ]
         table.add_row(
             str(record.seq),
             record.at_utc[:23].replace("T", " "),
-            escape(record.actor),
+            record.actor,
             record.kind.replace("_", " "),
-            "\n".join(line for line in lines if line),
+            listed(*lines),
         )
     print_table(table)
 
 
 def _print_report(report: AuditReport) -> None:
     console.print(
-        f"Checked {counted(len(report.runs), 'run')} in {escape(report.data_dir)}: "
+        f"Checked {counted(len(report.runs), 'run')} in {report.data_dir}: "
         f"{counted(report.events, 'event')}, {counted(report.artefacts, 'recorded file')} "
         f"({megabytes(report.bytes_hashed):.1f} MB read again), {counted(report.jobs, 'job')}, "
         f"{counted(report.checkpoints, 'signature')}."
@@ -279,15 +285,17 @@ def _print_report(report: AuditReport) -> None:
     for key_id in report.key_ids:
         console.print(f"  signed with key {key_id}")
     for note in report.notes:
-        console.print(f"  [yellow]note:[/] {escape(note)}")
+        console.tell(("  note:", "yellow"), f" {note}")
     if report.first_fault is None:
-        console.print("[bold green]Verified:[/] everything is as it was recorded.")
+        console.tell(("Verified:", "bold green"), " everything is as it was recorded.")
         return
-    console.print(f"[bold red]NOT verified.[/] First fault: {escape(str(report.first_fault))}")
+    console.tell(("NOT verified.", "bold red"), f" First fault: {report.first_fault}")
     if len(report.faults) > 1:
         console.print(f"  and {len(report.faults) - 1} more; all of them with --json")
     console.print("  Keep this folder as it is, and compare it with a copy made earlier.")
 
 
+audit_app.command("release")(release_command)
+audit_app.command("correct")(correct_command)
 audit_app.command("report")(report_command)
 audit_app.command("figures")(figures_command)

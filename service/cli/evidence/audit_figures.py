@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from service.cli.common import (
     DEFAULT_DATA,
@@ -44,7 +43,7 @@ def figures_command(
         with progress_bar(quiet=json) as progress:
             verified = audit.verify(data, run_id, progress)
             if not verified.ok:
-                error_console.print(f"[bold red]The evidence does NOT verify:[/] {escape(str(verified.first_fault))}")
+                error_console.tell(("The evidence does NOT verify:", "bold red"), f" {verified.first_fault}")
                 raise typer.Exit(1)
             # The numerics take a second to load, and `audit verify` does not need them.
             from service.audit.record.run import read_run  # noqa: PLC0415
@@ -67,6 +66,6 @@ def figures_command(
     if not files:
         console.print(f"Run {run_id} has no figure yet: nothing was calibrated, registered or evaluated.")
         return
-    console.print(f"{counted(len(files), 'file')} of run {run_id} in {escape(str(out))}:")
+    console.print(f"{counted(len(files), 'file')} of run {run_id} in {out!s}:")
     for file in files:
-        console.print(f"  {escape(file.name)}: {escape(file.shows)}")
+        console.print(f"  {file.name}: {file.shows}")

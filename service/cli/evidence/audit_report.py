@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from service.cli.common import (
     DEFAULT_DATA,
@@ -21,6 +20,7 @@ from service.cli.common import (
     print_json,
     progress_bar,
     reporting_errors,
+    require_writable,
 )
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.errors import ConfigurationError
@@ -55,6 +55,9 @@ def report_command(
     with reporting_errors(json):
         if pdf is None and html is None:
             raise ConfigurationError("no file to write", remedy="Give --pdf FILE, --html FILE, or both")
+        for path in (pdf, html):
+            if path is not None:
+                require_writable(path)
         run_id = resolve_run(audit.list_runs(data), run)
         actor = _actor(data, operator, password_stdin=password_stdin) if _writable(data) else ""
         with progress_bar(quiet=json) as progress:
@@ -84,13 +87,13 @@ def report_command(
             }
         )
     else:
-        console.print(f"Report of run {run_id}: {escape(', '.join(written))}")
+        console.print(f"Report of run {run_id}: {', '.join(written)}")
         if not recorded:
             why = "its evidence does not verify" if not verified.ok else "the data folder is read-only"
             console.print(f"  The report is not recorded in the run, because {why}.")
     if not verified.ok:
         if not json:
-            error_console.print(f"[bold red]The evidence does NOT verify:[/] {escape(str(verified.first_fault))}")
+            error_console.tell(("The evidence does NOT verify:", "bold red"), f" {verified.first_fault}")
         raise typer.Exit(1)
 
 
@@ -103,7 +106,6 @@ def _actor(data: Path, operator: str, *, password_stdin: bool) -> str:
 def _write(path: Path, write: Callable[[Path], None], leave: Callable[[Path, str], None] | None) -> None:
     """Write a file under a temporary name and rename it once recorded; if recording fails, no report appears."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".report-") as folder:
             part = Path(folder) / path.name
             write(part)

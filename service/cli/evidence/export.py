@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import typer
 from pydantic import ValidationError
-from rich.markup import escape
 
 from service.audit.export.wanted import WantedExport
 from service.cli.common import (
@@ -18,6 +17,7 @@ from service.cli.common import (
     print_json,
     progress_bar,
     reporting_errors,
+    require_writable_folder,
 )
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.errors import ConfigurationError
@@ -96,6 +96,7 @@ def export_command(
         from service.audit.export.posed import export_data_set  # noqa: PLC0415 - loads the numerics
 
         target = out.resolve()
+        require_writable_folder(target)
         run_id = store.find_run(run)
         stated = _stated(
             title=title,
@@ -122,7 +123,7 @@ def export_command(
             }
         )
     else:
-        console.print(f"{counted(len(dataset.views), 'image')} of run {run_id} as {form}: {escape(str(target))}")
+        console.print(f"{counted(len(dataset.views), 'image')} of run {run_id} as {form}: {target!s}")
         if dataset.simulated:
             console.print("  The run is simulated, and its files say so.")
 

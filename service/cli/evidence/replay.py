@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from service.audit.record.run import read_run
@@ -25,7 +24,10 @@ from service.cli.common import (
     print_json,
     print_table,
     progress_bar,
+    require_writable_folder,
+    write_whole,
 )
+from service.cli.terminal_output import styled
 from service.core.errors import OrthocaptureError
 from service.core.gates.verdict import describe
 from service.core.units import megabytes
@@ -36,10 +38,10 @@ _COULD_NOT = 2
 _STATUS = {"identical": 0, "within_tolerance": 0, "different": 1, "not_replayed": _COULD_NOT}
 _SHOWN = 8  # most differences shown per job
 _WORDS = {
-    "identical": "[bold green]equal, bit for bit[/]",
-    "within_tolerance": "[bold green]equal[/] within rounding (1e-9)",
-    "different": "[bold yellow]different[/]",
-    "not_replayed": "[bold red]could not be replayed[/]",
+    "identical": ("equal, bit for bit", "bold green"),
+    "within_tolerance": ("equal within rounding (1e-9)", "bold green"),
+    "different": ("different", "bold yellow"),
+    "not_replayed": ("could not be replayed", "bold red"),
 }
 
 
@@ -73,13 +75,15 @@ def replay_command(
     """
     try:
         kinds = list(HANDLERS) if jobs == "all" else [kind.strip() for kind in jobs.split(",") if kind.strip()]
+        if out is not None:
+            require_writable_folder(out)
         recorded = read_run(data, run)
         with progress_bar(quiet=json) as progress:
             report = replay(recorded, kinds=kinds, step=step, end_to_end=end_to_end, out=out, progress=progress)
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
             text = json_module.dumps(report_json(report), indent=1, ensure_ascii=False, allow_nan=False)
-            (out / "replay.json").write_text(text + "\n", encoding="utf-8")
+            write_whole(out / "replay.json", text + "\n")
     except OrthocaptureError as error:
         fail(error, json=json)  # only prints; its exit status 1 would mean a difference
         raise typer.Exit(_COULD_NOT) from error
@@ -134,14 +138,14 @@ def _print(report: ReplayReport) -> None:
             f"Drift of {drift.registration} at the scene's centre: {world}"
             f"{drift.against_cameras_mm:.6f} mm against the cameras"
         )
-    console.print(f"[bold]The run is[/] {_WORDS[report.verdict]}")
+    console.tell(("The run is", "bold"), " ", _WORDS[report.verdict])
 
 
 def _print_versions(report: ReplayReport) -> None:
     if report.versions:
         console.print(f"{len(report.versions)} installed distributions have other versions than recorded:")
         for change in report.versions:
-            console.print(f"  {escape(change.name)} {change.recorded or 'none'} → {change.now or 'none'}")
+            console.print(f"  {change.name} {change.recorded or 'none'} → {change.now or 'none'}")
     else:
         console.print("Every installed distribution has the version that was recorded.")
 
@@ -155,7 +159,7 @@ def _print_table(report: ReplayReport) -> None:
         table.add_row(
             job.step,
             " ".join(filter(None, (term(job.kind), job.label))),
-            _WORDS[job.verdict],
+            styled(_WORDS[job.verdict]),
             f"{same} of {len(job.artefacts)}" if job.artefacts else "",
             f"{job.duration_s:.1f} s",
         )
@@ -169,22 +173,23 @@ def _print_gates(report: ReplayReport) -> None:
         + (f"these differ ({len(changed)}):" if changed else "none differs.")
     )
     for step, old, new in changed:
-        console.print(f"  {step}: {escape(describe(old))} → {escape(describe(new))}")
+        console.print(f"  {step}: {describe(old)} → {describe(new)}")
 
 
 def _print_job(job: JobReplay) -> None:
-    console.print(f"\n[bold]{escape(f'{job.step}: {job.kind} {job.label}'.strip())}[/]")
+    console.print()
+    console.tell((f"{job.step}: {job.kind} {job.label}".strip(), "bold"))
     for text in filter(None, (job.computed_by, job.error)):
-        console.print(f"  {escape(text)}")
+        console.print(f"  {text}")
     shown: Sequence[Difference] = job.differences[:_SHOWN]
     for d in shown:
         off = [] if d.difference is None else [f"difference {d.difference:.3g} {d.unit}".strip()]
         off += [] if d.relative is None else [f"relative {d.relative:.1e}"]
         off += [f"{d.values} values differ"] if d.values > 1 else []
-        console.print(f"  {escape(d.path)}: {_value(d.recorded)} → {_value(d.recomputed)}  {', '.join(off)}")
+        console.print(f"  {d.path}: {_value(d.recorded)} → {_value(d.recomputed)}  {', '.join(off)}")
     if len(job.differences) > len(shown):
         console.print(f"  and {len(job.differences) - len(shown)} more fields; all of them with --json")
 
 
 def _value(value: Any) -> str:
-    return f"{value:.12g}" if isinstance(value, float) else escape(str(value))
+    return f"{value:.12g}" if isinstance(value, float) else str(value)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from service.audit.runs.comparison import ComparedRun, RunComparison, compare_runs
@@ -19,10 +18,12 @@ from service.cli.common import (
     DataOption,
     JsonOption,
     console,
+    print_document,
     print_json,
     print_table,
     reporting_errors,
     require_writable,
+    write_whole,
 )
 from service.core.text.counts import counted
 from service.run_record import read_log
@@ -58,7 +59,7 @@ def runs_command(
         table.add_column(heading)
     for run in found:
         cells = (run.about.specimen, run.about.purpose, f"{run.protocol} {run.version}", by(run), result_words(run))
-        table.add_row(run.run_id, run.created_utc[:16].replace("T", " "), *map(escape, cells))
+        table.add_row(run.run_id, run.created_utc[:16].replace("T", " "), *cells)
     print_table(table)
 
 
@@ -117,7 +118,7 @@ def compare_command(
     else:
         console.print(f"{len(comparison.protocol_changes)} lines of the protocol differ (− {one}, + {other}):")
         for line in comparison.protocol_changes:
-            console.print(f"  {escape(line)}")
+            console.print(f"  {line}")
     for part in _PARTS:
         rows = [row for row in getattr(comparison, part) if everything or row.differs]
         if not rows:
@@ -127,12 +128,12 @@ def compare_command(
             table.add_column(heading)
         for row in rows:
             name = " ".join(filter(None, (row.step, row.name))).replace("_", " ")
-            table.add_row(*map(escape, (name, row.first, row.second, row.change)))
+            table.add_row(name, row.first, row.second, row.change)
         print_table(table)
     for run_id, lines in zip((one, other), comparison.deviations, strict=True):
         console.print(f"Deviations of {run_id}: {len(lines) or 'none'}")
         for line in lines:
-            console.print(f"  {escape(line)}")
+            console.print(f"  {line}")
 
 
 _PARTS = ("about", "accuracy", "gates", "calibration", "durations", "measures")
@@ -169,7 +170,8 @@ def history_command(
         rows = history(store)
         content = history_csv(rows)
     if out is None:
-        typer.echo(content, nl=False)
+        print_document(content)
         return
-    out.write_text(content, encoding="utf-8", newline="")
-    console.print(f"{counted(len(rows), 'run')} with figures: {escape(str(out))}")
+    with reporting_errors():
+        write_whole(out, content)
+    console.print(f"{counted(len(rows), 'run')} with figures: {out!s}")

@@ -6,7 +6,6 @@ from dataclasses import asdict
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from service.cli.common import (
     DEFAULT_DATA,
@@ -63,10 +62,10 @@ def gc_command(
         print_json({"removed": [asdict(one) for one in gone], "left": [asdict(one) for one in left]})
         return
     for one in gone:
-        console.print(f"removed: {escape(one.path)} ({one.size_bytes} bytes, written {one.written_utc})")
+        console.print(f"removed: {one.path} ({one.size_bytes} bytes, written {one.written_utc})")
     for one in left:
         why = f"stays: {one.stays}" if one.stays else "may be removed"
-        console.print(f"{escape(one.path)} ({one.size_bytes} bytes, written {one.written_utc}): {escape(why)}")
+        console.print(f"{one.path} ({one.size_bytes} bytes, written {one.written_utc}): {why}")
     removable = sum(not one.stays for one in left)
     if not gone and not left:
         console.print("Nothing is left over: a record refers to every file.")

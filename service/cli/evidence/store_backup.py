@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 
 from service.cli.common import (
     DEFAULT_DATA,
@@ -16,6 +15,7 @@ from service.cli.common import (
     print_json,
     progress_bar,
     reporting_errors,
+    require_writable_folder,
 )
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.text.counts import counted
@@ -45,6 +45,7 @@ def backup_command(
     the copied data does not verify.
     """
     with reporting_errors(json), progress_bar(quiet=json) as progress:
+        require_writable_folder(destination)
         made = back_up(data, destination, BackupOptions(with_keys, read_all, keep), progress=progress)
     if json:
         print_json(_backup_json(made))
@@ -73,6 +74,7 @@ def restore_command(
             return acting_person(store, operator, password_stdin=password_stdin).name
 
     with reporting_errors(json), progress_bar(quiet=json) as progress:
+        require_writable_folder(destination)
         made = restore(backup, destination, name=state, actor=actor, progress=progress)
     if json:
         print_json(_restore_json(made))
@@ -108,7 +110,7 @@ def _restore_json(made: RestoreReport) -> dict[str, Any]:
 def _print_backup(made: BackupReport) -> None:
     state = made.state
     console.print(
-        f"Backup {made.name} is in {escape(str(made.folder))}: {counted(len(state.heads), 'chain')}, "
+        f"Backup {made.name} is in {made.folder!s}: {counted(len(state.heads), 'chain')}, "
         f"{counted(state.artefacts, 'file')}, {gigabytes(state.artefact_bytes):.2f} GB."
     )
     console.print(
@@ -120,23 +122,23 @@ def _print_backup(made: BackupReport) -> None:
             "  It does not hold the signing key: keep the folder keys/ elsewhere (see docs/howto/operating.md)."
         )
     if state.faults:
-        console.print(f"[bold red]What was copied does not verify.[/] First fault: {escape(state.faults[0])}")
+        console.tell(("What was copied does not verify.", "bold red"), f" First fault: {state.faults[0]}")
         console.print("  Older backups are kept. Run: orthocapture audit verify all")
 
 
 def _print_restore(made: RestoreReport) -> None:
     state = made.state
-    console.print(f"{escape(str(made.folder))} is as {escape(state.data_folder)} was at {state.at_utc}.")
+    console.print(f"{made.folder!s} is as {state.data_folder} was at {state.at_utc}.")
     if not state.with_keys:
         console.print(
             "  The signing key was not in the backup: restore the folder keys/, or declare the key lost with"
         )
         console.print("  orthocapture audit rotate-key --lost --reason ...")
     for line in made.lost:
-        console.print(f"  [red]{escape(line)}[/]")
+        console.tell("  ", (line, "red"))
     if made.ok:
-        console.print("[bold green]Verified:[/] everything is as it was recorded.")
+        console.tell(("Verified:", "bold green"), " everything is as it was recorded.")
     elif made.audit.first_fault is not None:
-        console.print(f"[bold red]NOT verified.[/] First fault: {escape(str(made.audit.first_fault))}")
+        console.tell(("NOT verified.", "bold red"), f" First fault: {made.audit.first_fault}")
         if state.faults:
-            console.print(f"  The data folder had a fault when it was copied: {escape(state.faults[0])}")
+            console.print(f"  The data folder had a fault when it was copied: {state.faults[0]}")

@@ -6,10 +6,9 @@ import getpass
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
-from rich.markup import escape
 
 from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person, typed_password
@@ -17,23 +16,28 @@ from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.protocol.models import Protocol
 from service.core.records.events import CaptureAsked, OperatorAction
 from service.core.run.actions import VERBS, capture_refusal, record_to_sign, refuse
+from service.core.run.connections import connected_arms, lost_arms
 from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.notes import NotePhotograph, require_size, take_note
 from service.people.authorisation import Identity, identity_for, who_acts, who_pauses
 from service.people.sessions import People
-from service.run_record import read_log
+from service.run_acts import read_region, see_robot, step_to_draw_for, tick_item
+from service.run_record import RunRecord, read_log
 from service.run_start import record_refusal, recorded_run
 from service.store.store import Store
 
 _OF_A_CAPTURE = ("release", "finish")
+_BESIDE_THE_QUESTION = ("tick", "untick", "seen")
+ACTS = (*VERBS, *_OF_A_CAPTURE, *_BESIDE_THE_QUESTION)
 
 
 def act_command(
     verb: Annotated[
         str,
         typer.Argument(
-            help="confirm, sign, redo, skip, accept, pause, resume or abort; for a manual capture: release or finish."
+            help="confirm, sign, redo, skip, accept, pause, resume or abort; for a manual capture: release or "
+            "finish; tick or untick one item of the checklist; seen: you have looked at an arm that was lost."
         ),
     ],
     run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
@@ -41,14 +45,16 @@ def act_command(
     viewpoint: Annotated[str | None, typer.Option("--viewpoint", help="Redo only this viewpoint.")] = None,
     reason: Annotated[str, typer.Option("--reason", help="Why; required for redo, skip, accept and abort.")] = "",
     meaning: Annotated[str, typer.Option("--meaning", help="What the signature means.")] = "",
+    item: Annotated[str, typer.Option("--item", help="The item to tick or untick, or how it begins.")] = "",
+    device: Annotated[str, typer.Option("--device", help="The arm that you have looked at.")] = "",
     operator: OperatorOption = "",
     password_stdin: PasswordOption = False,
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:
     """Answer or stop a run that another terminal drives. A confirmation ticks the whole checklist."""
-    if verb not in (*VERBS, *_OF_A_CAPTURE):
-        raise typer.BadParameter(f"{verb!r} is not one of {', '.join((*VERBS, *_OF_A_CAPTURE))}", param_hint="VERB")
+    if verb not in ACTS:
+        raise typer.BadParameter(f"{verb!r} is not one of {', '.join(ACTS)}", param_hint="VERB")
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         protocol, _ = recorded_run(store, run_id)
@@ -62,6 +68,12 @@ def act_command(
             )
             _ask_capture(store, run_id, protocol, state, asked, name)
             _report_recorded(run_id, verb, asked.step, name, json=json)
+            return
+        if verb in _BESIDE_THE_QUESTION:
+            name = who_acts(People(store), name, password).name
+            log = read_log(store, run_id, protocol)
+            about = _see(log, device, name) if verb == "seen" else _tick(log, item, name, ticked=verb == "tick")
+            _report_recorded(run_id, verb, about, name, json=json)
             return
         identity = _identity(store, protocol, state, verb, name, password)
         name = identity.name
@@ -106,11 +118,38 @@ def _ask_capture(
     store.record(run_id, [asked], actor=name)
 
 
+def _tick(log: RunRecord, item: str, actor: str, *, ticked: bool) -> str:
+    """Mark the item that begins so, or take the mark back. The item. Raises OrthocaptureError."""
+    state = log.state
+    found = [each for each in log.protocol.step(state.current).checklist if item and each.startswith(item)]
+    if len(found) != 1 and item not in found:
+        raise ConfigurationError(
+            f"{len(found) or 'no'} items of the checklist begin so",
+            where=f"{state.current}: {item!r}",
+            remedy="Give --item as it begins",
+        )
+    tick_item(log, state.current, state.step.attempt, found[0], ticked=ticked, actor=actor)
+    return found[0]
+
+
+def _see(log: RunRecord, device: str, actor: str) -> str:
+    """Record that the person has looked at an arm, which has to be named if there are several. Its name."""
+    lost = lost_arms(log.state)
+    known = tuple(lost) or connected_arms(log.state)
+    if not device and len(known) != 1:
+        said = f"these arms are: {', '.join(known)}" if known else "no arm is lost or left alone"
+        raise ConfigurationError(said, where="--device", remedy="Name the arm that you have looked at")
+    name = device or known[0]
+    seq = lost[name].seq if name in lost else 0
+    see_robot(log, name, seq, driven=log.store.driven(log.run_id), actor=actor)
+    return name
+
+
 def _report_recorded(run_id: str, verb: str, step: str | None, name: str, *, json: bool, seq: int = 0) -> None:
     if json:
         print_json({"run": run_id, "recorded": verb, "step": step} | ({"event": seq} if seq else {}))
     else:
-        console.print(f"Recorded: {verb} of {step} by {escape(name)}")
+        console.print(f"Recorded: {verb} of {step} by {name}")
 
 
 def signed_by_verb(verb: str, protocol: Protocol, state: RunState) -> str:
@@ -149,3 +188,30 @@ def _photograph(path: Path) -> NotePhotograph:
         raise ConfigurationError(
             f"the photograph cannot be read: {error.strerror}", where=str(path), remedy="Check --photo"
         ) from error
+
+
+def draw_region_command(
+    corners: Annotated[
+        str,
+        typer.Argument(
+            help="At least three corners as a JSON list of lists: x, y, z in metres, in the frame of the scan."
+        ),
+    ],
+    source: Annotated[Literal["ct", "scan"], typer.Option("--source", help="What counts within the polygon.")],
+    along: Annotated[
+        str, typer.Option("--along", help="The direction from the surface to the viewer, as a JSON list of x, y, z.")
+    ],
+    run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
+    data: DataOption = DEFAULT_DATA,
+    json: JsonOption = False,
+) -> None:
+    """Draw a region in which the CT or the scan counts; the next fusion uses it, as one drawn on the 3D view."""
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        run_id = store.find_run(run)
+        protocol, _ = recorded_run(store, run_id)
+        name = acting_person(store, operator, password_stdin=password_stdin).name
+        region = read_region(step_to_draw_for(read_log(store, run_id, protocol)), source, corners, along)
+        (event,) = store.record(run_id, [region], actor=name)
+        _report_recorded(run_id, "region", region.step, name, json=json, seq=event.seq)

@@ -28,6 +28,7 @@ from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.import_operator import ImportOperator
 from service.cli.run.terminal.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
 from service.cli.run.terminal.waiting import wait_for_results
+from service.cli.shipped_protocols import protocol_file
 from service.core.errors import ConfigurationError
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.entered import about_run
@@ -69,7 +70,9 @@ WorkerOption = Annotated[
 
 
 def run_command(
-    protocol: Annotated[Path, typer.Argument(help="The protocol file, such as protocols/exvivo_spine.yaml.")],
+    protocol: Annotated[
+        Path, typer.Argument(help="The protocol file, or the name of a shipped one, such as exvivo_spine.")
+    ],
     rig: RigOption,
     data: DataOption = DEFAULT_DATA,
     operator: OperatorOption = "",
@@ -88,7 +91,7 @@ def run_command(
 ) -> None:
     """Run a protocol step by step. Nothing moves before you have confirmed it."""
     with reporting_errors(json):
-        loaded = load_protocol(protocol, params_models())
+        loaded = load_protocol(protocol_file(protocol), params_models())
         rig_file = load_rig(rig)
         if auto_confirm:
             require_simulated(rig_file)

@@ -18,7 +18,6 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import ArrayLike
-from rich.markup import escape
 from rich.table import Table
 
 from service.audit.export.posed import export_data_set
@@ -34,6 +33,7 @@ from service.cli.common import (
     print_table,
     progress_bar,
     reporting_errors,
+    require_writable_folder,
 )
 from service.cli.run.commands import drive
 from service.cli.run.ending import end_with_children, sigterm_like_ctrl_c
@@ -72,6 +72,7 @@ def demo_command(
     """Run the demonstration protocol on a simulated rig and show the results. Takes a few minutes."""
     started_s = time.monotonic()
     with reporting_errors(json), sigterm_like_ctrl_c():
+        require_writable_folder(out)
         folder = out.resolve() / time.strftime("%Y%m%d-%H%M%S")
         with _simulated_rig(folder / "rig", scene, image_width, host or free_address()) as ready:
             run_id = _run_to_its_end(folder / "data", ready.rig)
@@ -294,7 +295,7 @@ def _print(result: _Result, rows: Sequence[Row], true_error_mm: Mapping[str, flo
         )
     print_table(table)
     if result.table_note:
-        console.print(escape(result.table_note))
+        console.print(result.table_note)
     made = {
         "run": result.run,
         "database": result.database,

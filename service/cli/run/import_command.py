@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from service.cli.common import (
@@ -27,7 +26,7 @@ from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOpti
 from service.cli.run.commands import WorkerOption, drive
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.cli.run.terminal.import_operator import part_of
-from service.cli.shipped_protocols import shipped_protocols
+from service.cli.shipped_protocols import protocol_file, shipped_protocols
 from service.core.errors import ConfigurationError
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
 from service.core.records.entered import RunAbout
@@ -113,7 +112,7 @@ def import_command(
     }
     with reporting_errors(json):
         about = RunAbout() if dry_run else described(specimen, purpose=purpose, site=site, remarks=remarks)
-        loaded = load_protocol(protocol, params_models())
+        loaded = load_protocol(protocol_file(protocol), params_models())
         require_plausible(loaded, str(protocol))
         with progress_bar(quiet=json) as progress:
             places = find_places(folder, given, _parts_of(loaded.protocol))
@@ -253,7 +252,7 @@ def _stated(views: Sequence[ImportedView], names: Sequence[str]) -> list[str]:
 
 
 def _show(listing: ImportList) -> None:
-    table = Table(title=f"Found in {escape(listing.folder)}", title_justify="left")
+    table = Table(title=f"Found in {listing.folder}", title_justify="left")
     for heading in ("what", "files", "camera and lens", "px", "taken, according to the files", "MB"):
         table.add_column(heading, justify="right" if heading in ("files", "MB") else "left")
     for role, words in _PARTS.items():
@@ -264,15 +263,15 @@ def _show(listing: ImportList) -> None:
         optics = "; ".join(dict.fromkeys([*found.cameras, *found.lenses]))
         dates = _dates(found.first, found.last)
         size = f"{megabytes(found.bytes):.1f}"
-        table.add_row(words, f"{found.count}{raws}", escape(optics), ", ".join(found.sizes), dates, size)
+        table.add_row(words, f"{found.count}{raws}", optics, ", ".join(found.sizes), dates, size)
     for role, files in listing.files.items():
         size = f"{megabytes(sum(file.size_bytes for file in files)):.1f}"
         name = "DICOM series" if role == "ct" else Path(files[0].path).name
         written = f"written {files[0].modified_utc[:16].replace('T', ' ')}"
-        table.add_row(role.replace("_", " "), str(len(files)), escape(name), "", written, size)
+        table.add_row(role.replace("_", " "), str(len(files)), name, "", written, size)
     print_table(table)
     for one in listing.left_out[:_SHOWN]:
-        console.print(f"left out: {escape(one.path)}: {escape(one.reason)}")
+        console.print(f"left out: {one.path}: {one.reason}")
     if len(listing.left_out) > _SHOWN:
         console.print(f"left out: {len(listing.left_out) - _SHOWN} more files; --json lists them all")
 
@@ -300,7 +299,7 @@ def _show_result(run_id: str, status: str, deviations: int, rows: Sequence[Row],
             )
         print_table(table)
         if note:
-            console.print(escape(note))
+            console.print(note)
     console.print(
         f"Run {run_id} is {status}; {deviations} deviations. Its photographs are imported: how they were captured is "
         "not in evidence."

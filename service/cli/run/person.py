@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from service.core.errors import ConfigurationError
+from service.core.shown_text import shown
 from service.people.authorisation import Identity, who_acts
 from service.people.sessions import People
 from service.store.store import Store
@@ -34,6 +35,6 @@ def typed_password(name: str, *, from_stdin: bool) -> str:
     if from_stdin:
         return sys.stdin.readline().rstrip("\n")
     try:
-        return getpass.getpass(f"Password of {name}: ")
+        return getpass.getpass(f"Password of {shown(name)}: ")
     except EOFError as error:
         raise ConfigurationError("no password was given", remedy="Type it, or give --password-stdin") from error

@@ -6,7 +6,6 @@ from dataclasses import asdict
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from service.cli.common import (
@@ -18,6 +17,7 @@ from service.cli.common import (
     print_table,
     reporting_errors,
 )
+from service.cli.terminal_output import listed
 from service.core.gates.verdict import Standing, describe, standing
 from service.core.records.entered import about_rows
 from service.core.records.events import GateVerdict
@@ -58,29 +58,29 @@ def status_command(
         table.add_column(heading)
     for step in protocol.steps:
         now = state.steps[step.id]
-        gates = "\n".join(f"{describe(v)}: {_STANDINGS[_standing(v, now)]}" for v in now.verdicts)
+        gates = listed(*(f"{describe(v)}: {_STANDINGS[_standing(v, now)]}" for v in now.verdicts))
         phase = "skipped" if now.skipped else now.phase.replace("_", " ")
-        table.add_row(step.id, phase, str(now.attempt), str(len(now.captured) or ""), escape(gates))
+        table.add_row(step.id, phase, str(now.attempt), str(len(now.captured) or ""), gates)
     print_table(table)
     for arm, loss in lost_arms(state).items():
         since = f"the connection to it was lost at {time_utc(loss.since_utc)}, {loss.how}"
-        console.print(f"{escape(arm)} counts as moving until a person has looked: {escape(since)}")
+        console.print(f"{arm} counts as moving until a person has looked: {since}")
     if words := tries_words(protocol, state):
-        console.print(f"trying again: {escape(words)}")
+        console.print(f"trying again: {words}")
     for name, entered in about_rows(root.about):
-        console.print(f"{name}: {escape(entered)}")
+        console.print(f"{name}: {entered}")
     for coat in aging:
-        console.print(escape(f"{coat.title} {coat.text}"))
+        console.print(f"{coat.title} {coat.text}")
     live = [job for job in state.step.jobs.values() if job.kind == live_view.KIND.name and job.status != "enqueued"]
     for job in live[-3:]:
-        console.print(escape(describe_view(job)))
+        console.print(describe_view(job))
     for line in missing:
-        console.print(f"result to come: {escape(line)}")
+        console.print(f"result to come: {line}")
     for way in ways_on(protocol, state):
         can = f"takes {takes_words(way.minutes)}, loses: {way.loses}" if way.available else f"no: {way.why_not}"
-        console.print(f"way on: {way.verb} {way.step}: {escape(way.words)}; {escape(can)}")
+        console.print(f"way on: {way.verb} {way.step}: {way.words}; {can}")
     for deviation in state.deviations:
-        console.print(f"deviation: {escape(deviation.text)}")
+        console.print(f"deviation: {deviation.text}")
 
 
 _STANDINGS: dict[Standing, str] = {

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from drivers.dicom_receiver import Receiver, ReceiverConfig
 from service.cli.common import JsonOption, console, print_json, reporting_errors, require_writable_folder
@@ -48,6 +47,7 @@ def dicom_listen_command(
                 "port to the CT suite in the firewall",
             )
         require_writable_folder(folder)
+        folder.mkdir(exist_ok=True)
         stopped = threading.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: stopped.set())
@@ -59,7 +59,7 @@ def dicom_listen_command(
                 if json:
                     print_json({"told": text})
                 else:
-                    console.print(escape(text))
+                    console.print(text)
 
         with Receiver(config, tell) as receiver:
             if json:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from rich.markup import escape
 
 from drivers.errors import DeviceError
 from drivers.interfaces import DeviceIdentity, DeviceReport
@@ -24,6 +23,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.run.commands import RigOption
+from service.cli.shipped_protocols import protocol_file
 from service.core.equipment.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, clock_offset_words
 from service.core.equipment.disk_space import Forecast, Usage, forecast
 from service.core.errors import ConfigurationError, OrthocaptureError
@@ -58,7 +58,7 @@ def doctor_command(
     """Open every device of a rig; report versions, clock offsets, free space and problems."""
     with reporting_errors(json):
         rig_file = load_rig(rig)
-        loaded = None if protocol is None else load_protocol(protocol, params_models()).protocol
+        loaded = None if protocol is None else load_protocol(protocol_file(protocol), params_models()).protocol
         station = Station(rig_file)
         found = _reports(station, quiet=json)
         existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
@@ -77,7 +77,7 @@ def doctor_command(
         print_json({"ok": healthy, "devices": devices, "data": folder, "host_clock": found_clock, "missing": missing})
     else:
         for what in missing:
-            console.print(f"[bold yellow]![/] not installed: {escape(what)} (see docs/howto/installation.md)")
+            console.tell(("!", "bold yellow"), f" not installed: {what} (see docs/howto/installation.md)")
         for name, report in found.items():
             _print(name, report)
         _print_machine(data, free_bytes, space, clock)
@@ -102,12 +102,12 @@ def _reports(station: Station, *, quiet: bool) -> dict[str, DeviceReport | Ortho
 
 
 def _print_machine(data: Path, free_bytes: int, space: Forecast | None, clock: HostClock) -> None:
-    note = "" if free_bytes > _LOW_DISK_BYTES else "  [yellow]little for a full capture[/]"
-    console.print(f"[bold]data folder[/] {escape(str(data))}: {gigabytes(free_bytes):.1f} GB free{note}")
-    console.print(f"[bold]this machine's clock[/] {escape(_clock_words(clock))}")
+    note = "" if free_bytes > _LOW_DISK_BYTES else "  little for a full capture"
+    console.tell(("data folder", "bold"), f" {data}: {gigabytes(free_bytes):.1f} GB free", (note, "yellow"))
+    console.tell(("this machine's clock", "bold"), f" {_clock_words(clock)}")
     if space is not None:
         colour = {"enough": "green", "short": "yellow", "stop": "red"}[space.verdict]
-        console.print(f"    [{colour}]{escape(space.words)}[/]")
+        console.tell("    ", (space.words, colour))
 
 
 def _clock_words(clock: HostClock) -> str:
@@ -130,8 +130,8 @@ def _offset_words(offset_s: float, clock: Literal["utc", "uptime"], *, late: boo
     if not late:
         return words
     return (
-        f"[yellow]{words}, more than {DEVICE_LIMIT_S:g} s: set it before a run, or the times in its files will be "
-        "wrong by as much[/]"
+        f"{words}, more than {DEVICE_LIMIT_S:g} s: set it before a run, or the times in its files will be "
+        "wrong by as much"
     )
 
 
@@ -155,20 +155,21 @@ def _identity_words(who: DeviceIdentity) -> str:
 
 def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:
     if isinstance(report, OrthocaptureError):
-        console.print(f"[bold red]✗ {escape(name)}[/] {escape(str(report))}")
+        console.tell((f"✗ {name}", "bold red"), f" {report}")
         return
     who = report.identity
     late = report.clock == "utc" and abs(report.clock_offset_s or 0.0) > DEVICE_LIMIT_S
-    mark = "[bold yellow]!" if report.problems or late else "[bold green]✓"
-    console.print(f"{mark} {escape(name)}[/] {escape(_identity_words(who))}")
-    console.print(f"    {escape(who.driver)} {escape(who.driver_version)} at {escape(who.address)}")
+    mark, style = ("!", "bold yellow") if report.problems or late else ("✓", "bold green")
+    console.tell((f"{mark} {name}", style), f" {_identity_words(who)}")
+    console.print(f"    {who.driver} {who.driver_version} at {who.address}")
     if report.clock_offset_s is not None:
-        console.print(f"    {_offset_words(report.clock_offset_s, report.clock, late=late)}")
+        words = _offset_words(report.clock_offset_s, report.clock, late=late)
+        console.tell("    ", (words, "yellow" if late else ""))
     if report.free_bytes is not None:
         console.print(f"    {gigabytes(report.free_bytes):.1f} GB free")
     if report.battery_fraction is not None:
         console.print(f"    battery {report.battery_fraction:.0%}")
     for key, value in report.details.items():
-        console.print(f"    {escape(key)}: {escape(value)}")
+        console.print(f"    {key}: {value}")
     for problem in report.problems:
-        console.print(f"    [yellow]{escape(problem)}[/]")
+        console.tell("    ", (problem, "yellow"))

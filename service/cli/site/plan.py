@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from service.cli.common import (
@@ -20,6 +19,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.run.status import next_best_views
+from service.cli.shipped_protocols import protocol_file
 from service.core.errors import ConfigurationError
 from service.core.protocol.models import Step, load_protocol
 from service.core.run.fold import fold
@@ -44,7 +44,7 @@ def show_command(
 ) -> None:
     """Show the viewpoints that the arm can reach, their order and time, and the use of board images. No device."""
     with reporting_errors(json):
-        loaded = load_protocol(protocol, params_models())
+        loaded = load_protocol(protocol_file(protocol), params_models())
         rig_file = load_rig(rig)
         steps = [loaded.protocol.step(step)] if step else list(loaded.protocol.steps)
         answers: dict[str, list[dict[str, Any]]] = {}
@@ -66,7 +66,7 @@ def show_command(
         return
     for name, plans in answers.items():
         for plan in plans:
-            console.print(f"{name}, {plan['station']}: {escape(plan['text'])}")
+            console.print(f"{name}, {plan['station']}: {plan['text']}")
             if "prediction" in plan:
                 console.print(_coverage_text(plan["prediction"]["coverage_map"]), highlight=False)
 

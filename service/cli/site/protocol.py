@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
-from service.cli.common import JsonOption, console, print_json, reporting_errors
+from service.cli.common import JsonOption, console, print_document, print_json, reporting_errors
+from service.cli.shipped_protocols import protocol_file
 from service.core.documents.protocol_docs import lifecycle_text, schema_text
 from service.core.documents.ways_docs import ways_text
 from service.core.protocol.models import load_protocol
@@ -31,6 +31,7 @@ def check_command(
 ) -> None:
     """Check a protocol and report every problem with file, line and field."""
     with reporting_errors(json):
+        file = protocol_file(file)
         loaded = load_protocol(file, params_models())
         protocol = loaded.protocol
         site = None if rig is None else load_rig(rig)
@@ -44,9 +45,7 @@ def check_command(
             steps = [{"id": s.id, "kind": s.kind, "irreversible": s.irreversible} for s in protocol.steps]
             print_json({"id": protocol.id, "version": protocol.version, "sha256": loaded.sha256, "steps": steps})
             return
-        console.print(
-            f"{escape(str(file))} is valid: {protocol.id} {protocol.version}, {counted(len(protocol.steps), 'step')}"
-        )
+        console.print(f"{file!s} is valid: {protocol.id} {protocol.version}, {counted(len(protocol.steps), 'step')}")
         for step in protocol.steps:
             marks = ", ".join(m for m, on in (("irreversible", step.irreversible), ("signed", step.sign)) if on)
             console.print(f"  {step.id:<26} {step.kind:<20} {marks}")
@@ -55,18 +54,18 @@ def check_command(
 @protocol_app.command("schema")
 def schema_command() -> None:
     """Print the JSON Schema of protocol files, for editors."""
-    typer.echo(schema_text(params_models()), nl=False)
+    print_document(schema_text(params_models()))
 
 
 @protocol_app.command("diagram")
 def diagram_command(file: Annotated[Path, typer.Argument(help="The protocol file.")]) -> None:
     """Print the state machine of a protocol as a page with Mermaid diagrams."""
     with reporting_errors():
-        typer.echo(lifecycle_text(load_protocol(file, params_models()).protocol), nl=False)
+        print_document(lifecycle_text(load_protocol(protocol_file(file), params_models()).protocol))
 
 
 @protocol_app.command("ways")
 def ways_command(file: Annotated[Path, typer.Argument(help="The protocol file.")]) -> None:
     """Print the ways on after every failure of a protocol's steps, with time and loss, as a page of tables."""
     with reporting_errors():
-        typer.echo(ways_text(load_protocol(file, params_models()).protocol), nl=False)
+        print_document(ways_text(load_protocol(protocol_file(file), params_models()).protocol))

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from service.audit.record.starts import record_start
 from service.cli.common import (
@@ -159,9 +158,9 @@ def _announce(address: str, set_up: str, *, json: bool) -> None:
     if json:
         print_json({"url": address, "set_up": set_up})
         return
-    console.print(f"orthocapture is ready at {escape(address)}")
+    console.print(f"orthocapture is ready at {address}")
     if set_up:
-        console.print(f"First set-up, once and within a day: {escape(set_up)}")
+        console.print(f"First set-up, once and within a day: {set_up}")
 
 
 def _tls(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None:

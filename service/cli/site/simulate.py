@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
+from service.cli.common import print_document
 from service.core.errors import OrthocaptureError
 
 _SIMULATORS = (sys.executable, "-m", "simulators")
@@ -37,7 +38,7 @@ def simulate_command(context: typer.Context) -> None:
     if not words or {"--help", "-h"} & set(words):
         name, parent = (chosen, context) if chosen else ("simulate", context.parent)
         with command.make_context(name, ["--help"], parent=parent, resilient_parsing=True) as shown:
-            typer.echo(command.get_help(shown), nl=False)
+            print_document(command.get_help(shown))
         return
     if options is None:
         context.fail(f"Which one? There are {', '.join(described['simulators'])}.")

@@ -55,7 +55,8 @@ def refuse_export(protocol: Protocol, state: RunState) -> IllegalTransitionError
         return IllegalTransitionError(
             "the protocol asks for a second person's release before anything is exported",
             where=state.run_id,
-            remedy="A supervisor who took no part in the run reads it and signs its release",
+            remedy="A supervisor who took no part in the run reads it and signs its release, on the page or with "
+            "`orthocapture audit release`",
         )
     return None
 

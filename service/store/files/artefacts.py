@@ -9,12 +9,13 @@ import re
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from sqlalchemy import Connection, Row, bindparam, insert, select
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.records.events import ArtefactRef, Event
+from service.core.shown_text import storable_data
 from service.store.database.engine import RESTORE
 from service.store.database.tables import artefacts
 from service.store.durable_effects import Files, IdSource
@@ -246,7 +247,7 @@ def _insert(
         raise IntegrityError(
             f"the file has {size} bytes instead of {artefact.ref.size_bytes}", where=str(path), remedy=RESTORE
         )
-    fields: dict[str, Any] = {
+    origin: dict[str, Any] = {
         "run_id": event.run_id,
         "seq": event.seq,
         "position": position,
@@ -259,6 +260,7 @@ def _insert(
         "at_utc": event.at_utc if artefact.at_utc is None else artefact.at_utc,
         "monotonic_s": float(event.monotonic_s if artefact.monotonic_s is None else artefact.monotonic_s),
     }
+    fields = cast("dict[str, Any]", storable_data(origin))
     digest = record_sha256(event.sha256, fields)
     connection.execute(_INSERT, fields | {"record_sha256": digest})
 

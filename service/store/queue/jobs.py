@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from sqlalchemy import ColumnElement, Connection, Row, and_, func, insert, select, true, update
 
 from service.core.jobs.priorities import EARLY, Lane
 from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished, StepNote
+from service.core.shown_text import storable
 from service.store.database.tables import jobs
 from service.store.durable_effects import Clock, IdSource, utc_text
 from service.store.errors import LeaseLostError
@@ -39,15 +40,16 @@ def enqueue(
             version=job.version,
         )
         (event,) = append(connection, clock, run_id, [payload], actor)
+        made = cast(JobEnqueued, event.payload)  # its texts are storable
         connection.execute(
             insert(jobs).values(
-                job_id=payload.job,
+                job_id=made.job,
                 run_id=run_id,
-                kind=job.kind,
-                step=job.step,
-                attempt=job.attempt,
-                idempotency_key=job.idempotency_key,
-                arguments=canonical(payload.model_dump(mode="json")["arguments"]),
+                kind=made.job_kind,
+                step=made.step,
+                attempt=made.attempt,
+                idempotency_key=made.idempotency_key,
+                arguments=canonical(made.model_dump(mode="json")["arguments"]),
                 state="queued",
                 tries=0,
                 try_limit=job.try_limit,
@@ -63,7 +65,7 @@ def enqueue(
 def find_by_key(connection: Connection, run_id: str, idempotency_key: str) -> Job | None:
     """The job of a run with this key, or None."""
     row = connection.execute(
-        select(jobs).where(jobs.c.run_id == run_id, jobs.c.idempotency_key == idempotency_key)
+        select(jobs).where(jobs.c.run_id == run_id, jobs.c.idempotency_key == storable(idempotency_key))
     ).one_or_none()
     return None if row is None else to_job(row)
 
@@ -202,7 +204,7 @@ def fail(
     connection.execute(
         update(jobs)
         .where(jobs.c.job_id == job.job_id)
-        .values(state="queued", token=None, until_utc_s=None, error=f"{error}: {message}")
+        .values(state="queued", token=None, until_utc_s=None, error=storable(f"{error}: {message}"))
     )
     return [event]
 
@@ -254,7 +256,7 @@ def _end_failed(
         traceback=traceback,
     )
     (event,) = append(connection, clock, row.run_id, [payload], actor)
-    _end(connection, row, event, state="failed", error=f"{error}: {message}")
+    _end(connection, row, event, state="failed", error=storable(f"{error}: {message}"))
     return event
 
 

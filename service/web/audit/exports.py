@@ -21,7 +21,7 @@ from service.core.records.events import RunReleased
 from service.people.credentials.tries import on_screen_of
 from service.people.errors import NotAllowedError
 from service.people.person import Person
-from service.store.signatures.signing import checkpoint
+from service.run_acts import release_run, require_releasable
 from service.web.audit.frame import AuditFrame, CurrentAudit, audit_frame
 from service.web.page.rendering import render
 from service.web.security.guards import SignedInPerson, requires
@@ -116,19 +116,10 @@ def release(
 ) -> RedirectResponse:
     """Sign, as a second person, that a completed run may be exported; its evidence has to be verified first."""
     log = site.run(run_id)
-    refusal = refuse_release(log.state, person.account, signed_sha256)
-    if refusal is not None:
-        raise refusal
-    if meaning != release_meaning(log.state):
-        raise IllegalTransitionError(
-            "the words of this release are not those for the run as it is now",
-            where="meaning",
-            remedy="Read the run again and sign it as it is now",
-        )
+    require_releasable(log.state, person.account, meaning, signed_sha256)
     _require_verified(audit_frame(audit, run_id, ""))
     site.people.check_password(person.account, password, on_screen_of(person))
-    site.store.record(run_id, [RunReleased(meaning=meaning, signed_sha256=signed_sha256)], actor=person.account)
-    checkpoint(site.store, run_id)
+    release_run(log, meaning, signed_sha256, actor=person.account, identified="password")
     return _back(run_id)
 
 

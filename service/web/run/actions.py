@@ -26,8 +26,8 @@ from service.core.records.events import (
     StepNote,
 )
 from service.core.recovery.reasons import full_reason
-from service.core.run.actions import needs_leave, redo_moves, refuse
-from service.core.run.connections import connected_arms, lost_arms
+from service.core.run.actions import redo_moves, refuse
+from service.core.run.connections import lost_arms
 from service.core.run.state import RunState
 from service.people.approvals import approve, standing_of
 from service.people.authorisation import Identity, identity_for
@@ -36,6 +36,7 @@ from service.people.credentials.tries import on_screen_of
 from service.people.errors import NotAllowedError
 from service.people.sessions import NAMES, KnownBy
 from service.rig import load_rig
+from service.run_acts import DECIDE_AGAIN, out_of_date, see_robot, tick_item
 from service.run_record import RunRecord
 from service.run_start import record_refusal, require_rig_free, require_runnable, start_run
 from service.steps import params_models
@@ -48,7 +49,6 @@ router = APIRouter(tags=["acting"])
 Short = Annotated[str, Form(max_length=200)]
 Words = Annotated[str, Form(max_length=2000)]
 Number = Annotated[int, Form(ge=0, le=2**31)]
-DECIDE_AGAIN = "Close the form, read what the page shows now, and decide again; nothing was done"
 _WITHOUT_CONTROL = ("pause", "sign", "accept")
 # Events that change nothing on the page on which the person decided.
 _HARMLESS = (
@@ -129,16 +129,7 @@ def tick(
     """Mark a checklist item; every screen shows the same."""
     log = site.run(run_id)
     Control(site.store).require(run_id, person)
-    now = log.state.step
-    asked = now.phase in ("ready", "recovering") or needs_leave(log.protocol, log.state)
-    if log.state.terminal or (step, attempt) != (now.step, now.attempt) or not asked:
-        raise _out_of_date(log.state)
-    if item not in log.protocol.step(step).checklist:
-        raise IllegalTransitionError("there is no such item in the checklist", where=step)
-    if (item in now.ticked) != ticked:
-        site.store.record(
-            run_id, [ItemTicked(step=step, attempt=attempt, item=item, ticked=ticked)], actor=person.account
-        )
+    tick_item(log, step, attempt, item, ticked=ticked, actor=person.account)
     return back_to(run_id)
 
 
@@ -151,15 +142,7 @@ def robot_seen(
     It needs no control of the run: whoever stands where the arm can be seen says it.
     """
     log = site.run(run_id)
-    loss = lost_arms(log.state).get(device)
-    left_alone = device in connected_arms(log.state) and not site.launcher.driven(run_id)
-    if (loss is None and not left_alone) or lost_seq != (0 if loss is None else loss.seq):
-        raise IllegalTransitionError(
-            f"the page was out of date: that is not how it stands with {device} any more",
-            where=device,
-            remedy="Read what the banner says now; nothing was recorded",
-        )
-    site.store.record(run_id, [RobotSeen(device=device, lost_seq=lost_seq)], actor=person.account)
+    see_robot(log, device, lost_seq, driven=site.launcher.driven(run_id), actor=person.account)
     return back_to(run_id)
 
 
@@ -252,14 +235,14 @@ def _require_current(log: RunRecord, step: str, attempt: int, seen_seq: int) -> 
     state = log.state
     since = (event.payload for event in log.events[seen_seq:])
     if (step, attempt) != (state.current, state.step.attempt) or not all(isinstance(p, _HARMLESS) for p in since):
-        raise _out_of_date(state)
+        raise out_of_date(state)
 
 
 def _require_same_redo(log: RunRecord, form: ActionForm) -> None:
     """A redo does what its form said: from where the run was, of that image, and with that motion or none."""
     state = log.state
     if (form.current, form.attempt) != (state.current, state.step.attempt):
-        raise _out_of_date(state)
+        raise out_of_date(state)
     if not form.viewpoint or form.step not in state.steps:
         return
     image = state.steps[form.step].captured.get(form.viewpoint, 0)
@@ -278,12 +261,4 @@ def _require_losses_seen(log: RunRecord, seen_seq: int) -> None:
     """Whoever lets the robot move says to have looked at an arm whose connection was lost, so the page said so."""
     moves = log.protocol.step(log.state.current).moves_robot
     if moves and any(loss.seq > seen_seq for loss in lost_arms(log.state).values()):
-        raise _out_of_date(log.state)
-
-
-def _out_of_date(state: RunState) -> IllegalTransitionError:
-    return IllegalTransitionError(
-        "the page was out of date: the run has gone on since it was shown",
-        where=state.current,
-        remedy=DECIDE_AGAIN,
-    )
+        raise out_of_date(log.state)

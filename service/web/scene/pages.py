@@ -9,9 +9,10 @@ from fastapi.responses import HTMLResponse
 
 from service.core.gates.dependence import accepted_gates
 from service.people.control import Control
+from service.run_acts import drawing_step
 from service.web.page.rendering import render
 from service.web.page.run_frame import run_frame
-from service.web.scene.region import drawing_step, drawn_rows
+from service.web.scene.region import drawn_rows
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite
 

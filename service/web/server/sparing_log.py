@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TextIO
 
+from service.logs.terminal import EscapingFormatter
 from service.store.durable_effects import Clock
 
 EVERY_S = 60.0
@@ -36,7 +37,7 @@ class SparingHandler(logging.StreamHandler[TextIO]):
 
     def __init__(self, stream: TextIO, clock: Clock, *, every_s: float = EVERY_S) -> None:
         super().__init__(stream)
-        words = logging.Formatter("%(asctime)s %(name)s %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%SZ")
+        words = EscapingFormatter("%(asctime)s %(name)s %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%SZ")
         words.converter = time.gmtime
         self.setFormatter(words)
         self._clock = clock

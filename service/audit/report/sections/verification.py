@@ -16,8 +16,8 @@ _HOW = (
     "named in an event by its SHA-256. With the data folder: orthocapture audit verify {run} reads every file again, "
     "and orthocapture replay {run} computes calibration, registration and evaluation again and compares. Without "
     "orthocapture: the bundle made by orthocapture audit export holds verify.py, one file that needs only Python and "
-    "the package cryptography. Compare the chain head and the key's fingerprint above with those written down "
-    "elsewhere."
+    "the package cryptography; start it with python -I. Compare the chain head and the key's fingerprint above with "
+    "those written down elsewhere."
 )
 _PART_11 = (
     "Part 11-style controls: append-only records with person, time and reason; signatures that ask for the password "

@@ -7,14 +7,10 @@ import select
 import termios
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
-
-from rich.console import Console
-from rich.panel import Panel
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.text import Text
+from typing import TYPE_CHECKING, Any
 
 from service.cli.run.terminal.hands import SimulatedHands
+from service.cli.terminal_output import Terminal, bar_of_counts, styled
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.gates.acceptance import demanded_role
 from service.core.protocol.models import Protocol
@@ -23,6 +19,7 @@ from service.core.recovery.ways_on import takes_words
 from service.core.run.decide import AskOperator
 from service.core.run.noted import HandWork
 from service.core.run.state import RunState
+from service.core.shown_text import shown
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Asks, Doing
 from service.people.authorisation import Identity, identity_for
@@ -30,13 +27,16 @@ from service.people.errors import PeopleError
 from service.people.sessions import People
 from service.runner.operator import AnswerBy
 
+if TYPE_CHECKING:
+    from service.cli.terminal_output import Progress
+
 _MOST_MENDS = 4  # how often a step's advice is followed automatically before a person must decide
 
 
 class Display:
     """A progress bar with the time left, and one line per event, on stderr; stdout is for results."""
 
-    def __init__(self, console: Console, reporter: Reporter) -> None:
+    def __init__(self, console: Terminal, reporter: Reporter) -> None:
         self.console = console
         self.reporter = reporter
         self._progress: Progress | None = None
@@ -49,16 +49,9 @@ class Display:
             return
         if self._progress is None or what != self._what:
             self.clear()
-            self._progress = Progress(
-                TextColumn("  {task.description}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeRemainingColumn(),
-                console=self.console,
-                transient=True,
-            )
+            self._progress = bar_of_counts(self.console)
             self._progress.start()
-            self._progress.add_task(what, total=total or None)
+            self._progress.add_task(shown(what), total=total or None)
             self._what = what
         self._progress.update(self._progress.task_ids[0], completed=done, total=total or None)
 
@@ -72,7 +65,7 @@ class Display:
         """Print one line."""
         self.reporter.tell(message)
         self.clear()
-        self.console.print(f"  {message}", highlight=False, markup=False)
+        self.console.print(f"  {message}")
 
 
 @dataclass
@@ -193,14 +186,9 @@ class TerminalOperator(_Operator):
         lines.append(f"\nType one of: {', '.join(question.options)} (with a reason where one is needed).")
         if "confirm" in question.options and question.checklist:
             lines.append("By `confirm` you say that every item of the list is done.")
-        # Text, so that brackets in an instruction are not taken for markup; wrapped at the terminal's edge.
-        title, why = Text(step.title), Text(step.why)
-        panel = Panel(Text("\n".join(lines), overflow="fold"), title=title if len(title) < 60 else None)
-        if len(title) >= 60:
-            self.display.console.print(title, soft_wrap=False)
-        self.display.console.print(panel, soft_wrap=False)
-        if why:
-            self.display.console.print(Text("Why: ") + why, soft_wrap=False)
+        self.display.console.boxed("\n".join(lines), title=step.title)
+        if step.why:
+            self.display.console.print(styled(f"Why: {step.why}"), soft_wrap=False)
 
     def _accept(self, accepting: _AcceptanceForm, line: str, state: RunState) -> AnswerBy | None:
         """Read first the name, then the password, each on its own line; the run is attended to in between."""

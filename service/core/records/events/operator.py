@@ -95,6 +95,7 @@ class RunReleased(Record):
     kind: Literal["run_released"] = "run_released"
     meaning: str
     signed_sha256: str  # of the run_completed event
+    identified: Literal["", "claimed", "password"] = ""  # how the person was identified; "" in older records
 
 
 class EvidenceExported(Record):

@@ -31,8 +31,8 @@ from service.dataset.posed.exporter import exporter, write_data_set
 from service.dataset.posed.folder import SUMS
 from service.dataset.posed.of_folder import data_set_of_folder
 from service.dataset.preview.records import CoveragePreview, Preview, ViewPreview, read_preview, write_preview
+from service.run_acts import read_region
 from service.store.events import canonical
-from service.web.scene.region import read_region
 from tests.support.scenes.posed import posed_data_set
 
 _VIEWS = 3
@@ -230,5 +230,5 @@ TARGETS: tuple[Target, ...] = (
     Target("own_ply", "service.compute.ground_truth.ply:read_ply", _ply, _plys),
     Target("preview", "service.dataset.preview.records:read_preview", _preview, _previews, JSON),
     Target("export_request", "service.audit.export.wanted:kept_request", _request, _requests, JSON),
-    Target("region", "service.web.scene.region:read_region", _region, _regions, JSON),
+    Target("region", "service.run_acts:read_region", _region, _regions, JSON),
 )  # fmt: skip
