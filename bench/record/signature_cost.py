@@ -127,7 +127,12 @@ def measure(folder: Path, repeat: int) -> dict[str, float]:
 
         def tick() -> None:
             ticked[0] = not ticked[0]
-            fields = {"step": step.step, "attempt": step.attempt, "item": item, "ticked": str(ticked[0]).lower()}
+            fields: dict[str, Any] = {
+                "step": step.step,
+                "attempt": step.attempt,
+                "item": item,
+                "ticked": str(ticked[0]).lower(),
+            }
             answer = technician.send_form(f"/runs/{run.run_id}/ticks", **fields)
             if answer.status_code != 303:
                 raise RuntimeError(answer.text)

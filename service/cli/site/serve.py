@@ -26,13 +26,12 @@ from service.cli.shipped_protocols import shipped_protocols
 from service.core.errors import ConfigurationError
 from service.logs.file_log import file_log
 from service.people.sessions import People
-from service.rig import Rig, load_rig
-from service.run_start import signature_copy
+from service.rig import load_rig
 from service.station import devices_of
 from service.steps import params_models
 from service.store.database.engine import BUSY_TIMEOUT_S
 from service.store.records import SITE
-from service.store.signatures.log_copy import keep_elsewhere
+from service.store.signatures.second_place import away_words
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.web.app import create_app
@@ -123,13 +122,16 @@ def serve_command(
             )
             record_start(store, rig_file, site.protocol_files(), address)
             link = people.first_link()
-            _seal(store, data, rig_file)
+            _seal(site)
             http = server(create_app(site), listener, proxies, tls, log)
             with http.capture_signals():
                 _announce(address, f"{address}/set-up/{link}" if link else "", json=json)
                 threading.Thread(target=_load_the_rest, daemon=True).start()
+                ended = store.clock.signal()
+                threading.Thread(target=site.second_place.look_after, args=(ended,), daemon=True).start()
                 http.run(sockets=[listener])
-            _seal(store, data, rig_file)
+                ended.set()
+            _seal(site)
 
 
 def _load_the_rest() -> None:
@@ -147,10 +149,12 @@ def _unprotected(host: str) -> ConfigurationError:
     )
 
 
-def _seal(store: Store, data: Path, rig: Rig) -> None:
+def _seal(site: Site) -> None:
     """Sign the end of the site's chain, and keep a copy of the signature where the rig says."""
-    checkpoint(store, SITE)
-    keep_elsewhere(data, signature_copy(rig), error_console.print)
+    checkpoint(site.store, SITE)
+    away = site.second_place.update()
+    if away is not None:
+        error_console.print(away_words(away), markup=False)
 
 
 def _announce(address: str, set_up: str, *, json: bool) -> None:
