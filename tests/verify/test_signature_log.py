@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import rfc8785
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from sqlalchemy import Connection
 from typer.testing import CliRunner
 
 from service.cli.main import app
@@ -20,10 +21,12 @@ from service.core.records.events import SignInRecorded, StepPassed, StepStarted
 from service.rig import load_rig
 from service.run_start import second_place, signature_copy
 from service.store.database.engine import database_path
+from service.store.durable_effects import DurableFiles
 from service.store.events import canonical
 from service.store.records import SITE, Checkpoint
 from service.store.signatures.log import NAME, LogEnd, SignatureLog, read_log
 from service.store.signatures.log_copy import bring_up_to_date
+from service.store.signatures.seen import SeenSignatures
 from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
 from service.store.verification.verify import verify
@@ -388,6 +391,28 @@ def test_whoever_signs_waits_for_the_one_who_signs(data: Path) -> None:
         pytest.raises(StoreError, match="another process has been signing for too long"),
     ):
         checkpoint(second, SITE)
+
+
+def test_the_first_look_of_a_process_which_reads_everything_keeps_nobody_waiting(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    really, free = SeenSignatures.look, list[bool]()
+
+    def look(seen: SeenSignatures, connection: Connection) -> None:
+        try:
+            with SignatureLog(data, DurableFiles(), patience_s=0.0).alone():
+                free.append(True)
+        except StoreError:
+            free.append(False)
+        really(seen, connection)
+
+    run = run_of(data)
+    monkeypatch.setattr(SeenSignatures, "look", look)
+    with Store.open(data) as store:
+        for viewpoint in ("v4", "v5"):
+            capture(store, run, viewpoint)
+            checkpoint(store, run)
+    assert free == [True, False, False], "first without the others waiting, then for what is new"
 
 
 def test_a_signature_costs_the_same_however_old_the_site_is(data: Path) -> None:

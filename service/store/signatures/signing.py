@@ -58,13 +58,10 @@ def checkpoint(store: Store, run_id: str) -> Checkpoint:
         StoreError: the log of signatures cannot be written.
     """
     log, seen = store.signature_log, store.seen_signatures
+    if run_id not in store.sound_until:
+        _look(store, run_id)  # the first time takes long, and keeps nobody waiting
     with log.alone():
-        with store.database.reading() as connection:  # whatever takes long is done before others have to wait
-            if run_id != SITE:
-                _require_run(connection, run_id, store)
-            seen.look(connection)
-            require_sound(store, connection, run_id)
-            signed = _signed_end(connection, run_id)
+        signed = _look(store, run_id)
         if seen.missing:
             _write_missing_lines(store)
         elif signed is not None:
@@ -153,6 +150,16 @@ def public_keys(store: Store) -> list[PublicKey]:
         raw = base64.b64decode(payload["public_key"])
         keys.append(PublicKey(payload["key_id"], raw, seq, after, payload["reason"], introduced))
     return keys
+
+
+def _look(store: Store, run_id: str) -> Checkpoint | None:
+    """Look at what is new and require that it is sound. Returns the signature of the chain's end, if it has one."""
+    with store.database.reading() as connection:
+        if run_id != SITE:
+            _require_run(connection, run_id, store)
+        store.seen_signatures.look(connection)
+        require_sound(store, connection, run_id)
+        return _signed_end(connection, run_id)
 
 
 def _write_missing_lines(store: Store) -> None:
