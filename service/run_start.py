@@ -18,6 +18,9 @@ from service.runner.software import software_versions
 from service.steps.protocol_check import require_devices, require_plausible
 from service.store.files.space_used import forecast_of, require_space
 from service.store.records import NewArtefact
+from service.store.signatures.log import NAME as LOG_NAME
+from service.store.signatures.log_copy import LogCopy
+from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store
 
 if TYPE_CHECKING:
@@ -147,6 +150,13 @@ def signature_copy(rig: Rig) -> Path | None:
     """The path of the copy of the log of signatures, or None."""
     named = rig.section.signature_copy
     return None if named is None else rig.folder / named
+
+
+def second_place(rig: Rig, store: Store) -> SecondPlace:
+    """The second place of the signatures of a data folder, as the rig names it."""
+    copy = signature_copy(rig)
+    log = store.database_path.parent / LOG_NAME
+    return SecondPlace([] if copy is None else [LogCopy(log, copy, store.files)], store.clock)
 
 
 def require_rig_free(store: Store, rig: Path, *, run_id: str = "") -> None:

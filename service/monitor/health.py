@@ -16,6 +16,7 @@ from service.core.units import gigabytes
 from service.monitor.snapshot import read_snapshot
 from service.monitor.worker_sign import living_workers
 from service.store.durable_effects import Clock
+from service.store.signatures.second_place import Away
 from service.store.store import Store
 
 _SILENT_S = 60.0  # a runner's longest call, fetching one photograph, is shorter
@@ -29,15 +30,19 @@ class Health:
     data_folder: str
     worker: str
     runners: str
+    second_place: str
 
     @property
     def ok(self) -> bool:
         """Whether nothing is wrong."""
-        return not (self.database or self.data_folder or self.worker or self.runners)
+        return not (self.database or self.data_folder or self.worker or self.runners or self.second_place)
 
 
-def read_health(store: Store, data: Path, driven: Sequence[str]) -> Health:
-    """Check every part. The words name no runs, people or paths, because anyone may ask."""
+def read_health(store: Store, data: Path, driven: Sequence[str], away: Away | None = None) -> Health:
+    """Check every part. The words name no runs, people or paths, because anyone may ask.
+
+    `away` is what is known of the second place of the signatures.
+    """
     try:
         with store.database.reading() as connection:
             connection.execute(text("SELECT 1 FROM heads LIMIT 1")).all()
@@ -50,6 +55,7 @@ def read_health(store: Store, data: Path, driven: Sequence[str]) -> Health:
         _data_folder(data),
         _worker(data, queued, store.clock),
         _runners(data, driven, store.clock.utc_s()),
+        "" if away is None else f"it has not been up to date since {away.since_utc}",
     )
 
 

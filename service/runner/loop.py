@@ -6,7 +6,6 @@ import dataclasses
 import socket
 from dataclasses import dataclass, field
 from os import getpid
-from pathlib import Path
 
 from drivers.interfaces import DeviceReport, PedalReading
 from service.core.gates.verdict import describe_judged
@@ -49,6 +48,7 @@ from service.runner.pedal import Pedal
 from service.runner.sealing import Seal
 from service.runner.software import software_versions
 from service.steps.context import Devices
+from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store
 
@@ -59,8 +59,7 @@ _POLL_S = 0.1
 class Runner:
     """Drives one run to its end, by the store's clock.
 
-    `authority`, if given, stamps the record when the run ends; `signature_copy` is the path of the copy of the log of
-    signatures.
+    `authority`, if given, stamps the record when the run ends; `second_place` gets copies of the signatures.
     """
 
     store: Store
@@ -69,7 +68,7 @@ class Runner:
     devices: Devices
     operator: Operator
     authority: Authority | None = None
-    signature_copy: Path | None = None
+    second_place: SecondPlace | None = None
     _run: HeldRun = field(init=False)
     _seal: Seal = field(init=False)
     _pedal: Pedal = field(init=False)
@@ -84,9 +83,8 @@ class Runner:
         """
         operator, clock = self.operator, self.store.clock
         with short_collections(), held_run(self.store, self.run_id, self.protocol) as self._run:
-            self._seal = Seal(
-                self.store, self.run_id, self.authority, self.signature_copy, operator.busy, operator.tell
-            )
+            place = self.second_place or SecondPlace([], clock)
+            self._seal = Seal(self.store, self.run_id, self.authority, place, operator.busy, operator.tell)
             if self._run.state.terminal:
                 self._seal.sign_if_missing()
                 return self._run.state

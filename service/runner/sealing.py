@@ -4,28 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 from service.core.errors import StoreError
-from service.store.signatures.log_copy import keep_elsewhere
+from service.core.records.events import DeviceTrouble
+from service.store.signatures.second_place import Away, SecondPlace, away_words
+from service.store.signatures.signing import checkpoint
 from service.store.signatures.timestamps import Authority, stamp_end
 from service.store.store import Store
 
+_DEVICE = "second place of signatures"
 
-@dataclass(frozen=True)
+
+@dataclass
 class Seal:
-    """Signs the chain of one run, and keeps the copy of the log of signatures up to date.
+    """Signs the chain of one run, and keeps the second place of the signatures up to date.
 
-    `authority`, if given, stamps the run's end; `signature_copy` is the path of the copy. `busy` and `tell` are the
-    operator's methods.
+    `authority`, if given, stamps the run's end. `busy` and `tell` are the operator's methods.
     """
 
     store: Store
     run_id: str
     authority: Authority | None
-    signature_copy: Path | None
+    second_place: SecondPlace
     busy: Callable[[str], None]
     tell: Callable[[str], None]
+    _away: Away | None = None  # as the record says it
 
     def sign(self, *, ended: bool) -> None:
         """Sign the chain's end and, if the run has `ended`, have the signature stamped.
@@ -38,7 +41,23 @@ class Seal:
         except StoreError as error:
             resume = f"`orthocapture resume {self.run_id}` signs it"
             self.tell(f"the record could not be signed: {error}. Once that is put right, {resume}")
-        keep_elsewhere(self.store.database_path.parent, self.signature_copy, self.tell, self.store.files)
+        away = self.second_place.update()
+        if (away is None) != (self._away is None):
+            self._tell_of_the_place(away)
+
+    def _tell_of_the_place(self, away: Away | None) -> None:
+        """Tell the operator, and record that the second place is away; a run goes on without it."""
+        self._away = away
+        if away is None:
+            self.tell("the second place of the signatures is up to date again")
+            return
+        self.tell(away_words(away))
+        trouble = DeviceTrouble(device=_DEVICE, error="Away", message=f"{away.place}: {away.why}")
+        try:
+            self.store.record(self.run_id, [trouble], actor="service")
+            checkpoint(self.store, self.run_id)
+        except StoreError as error:
+            self.tell(f"that could not be recorded: {error}")
 
     def sign_if_missing(self) -> None:
         """Sign and stamp an ended run whose runner died before it could, or whose authority did not answer."""

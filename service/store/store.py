@@ -37,6 +37,8 @@ from service.store.queue.leases import RunLease, acquire, check_lease, held_runs
 from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, NewJob, RunRow, Timestamp
 from service.store.run_rows import begin_chain, read_open_runs, read_runs, resolve_run
 from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
+from service.store.signatures.log import SignatureLog
+from service.store.signatures.seen import SeenSignatures
 
 _HEAD = select(heads.c.seq).where(heads.c.run_id == bindparam("run"))  # put together once, for they are asked often
 _RUN = select(runs.c.run_id).where(runs.c.run_id == bindparam("run"))
@@ -50,7 +52,14 @@ class Store:
     """
 
     def __init__(
-        self, database: Database, folder: ArtefactFiles, files: Files, clock: Clock, ids: IdSource, path: Path
+        self,
+        database: Database,
+        folder: ArtefactFiles,
+        files: Files,
+        clock: Clock,
+        ids: IdSource,
+        path: Path,
+        signature_log: SignatureLog,
     ) -> None:
         self._database = database
         self._folder = folder
@@ -60,6 +69,8 @@ class Store:
         self.ages = Ages(clock)
         self.database_path = path
         self.sound_until: dict[str, tuple[int, str]] = {}  # chain → number and hash of the last event verified
+        self.signature_log = signature_log
+        self.seen_signatures = SeenSignatures(signature_log)
 
     @classmethod
     def open(
@@ -89,7 +100,8 @@ class Store:
         folder = open_folder(data_dir, files, ids)
         close_to_others(data_dir, DATABASE_NAME)
         database = open_database(data_dir, files, patience_s)
-        return cls(database, folder, files, clock or SystemClock(), ids, database_path(data_dir))
+        log = SignatureLog(data_dir, files, patience_s)
+        return cls(database, folder, files, clock or SystemClock(), ids, database_path(data_dir), log)
 
     @property
     def database(self) -> Database:

@@ -15,7 +15,8 @@ from service.core.run.expected import EarlierTimes
 from service.people.sessions import People
 from service.rig import Rig, RigDevice
 from service.run_record import RunFollower, RunRecord
-from service.run_start import recorded_run
+from service.run_start import recorded_run, second_place
+from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store
 from service.web.launch import Launcher
 from service.web.server.open_streams import OpenStreams
@@ -60,6 +61,7 @@ class Site:
     secure: bool = True  # cookies are sent over TLS, or to this machine, only
     idle_lock_s: float = 600.0
     hosts: tuple[str, ...] = ("127.0.0.1", "localhost")  # names by which browsers may ask
+    second_place: SecondPlace = field(init=False)
     sealed_seq: int = 0  # last event of the site's chain that is known to be signed
     streams: OpenStreams = field(default_factory=OpenStreams)
     runs: OpenedRuns = field(init=False)
@@ -67,6 +69,7 @@ class Site:
 
     def __post_init__(self) -> None:
         self.runs = OpenedRuns(self._first_read)
+        self.second_place = second_place(self.rig, self.store)
 
     def run(self, run_id: str) -> RunRecord:
         """A run's record as of now. Raises UnknownRunError, IntegrityError."""

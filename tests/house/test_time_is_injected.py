@@ -41,6 +41,7 @@ SERVICE = {
     "service/cli/run/terminal/hands.py": "the time limit of a socket",
     "service/compute/poses/colmap/process.py": "the time limit of a child process's answer",
     "service/store/database/engine.py": "SQLite waits for another process, by the host's clock",
+    "service/store/signatures/log.py": "waits for another process that signs, by the host's clock",
     "service/worker/pool.py": "in a child: looks whether the worker lives",
     # leaves the processor to others; no time is waited for
     "service/audit/background/incremental.py": "rests, so that pages are answered first",

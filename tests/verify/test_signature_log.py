@@ -6,27 +6,31 @@ import base64
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 import rfc8785
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from sqlalchemy import Connection
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.errors import IntegrityError
-from service.core.records.events import StepPassed, StepStarted
+from service.core.errors import IntegrityError, StoreError
+from service.core.records.events import SignInRecorded, StepPassed, StepStarted
 from service.rig import load_rig
-from service.run_start import signature_copy
+from service.run_start import second_place, signature_copy
 from service.store.database.engine import database_path
+from service.store.durable_effects import DurableFiles
 from service.store.events import canonical
-from service.store.records import SITE
-from service.store.signatures.log import NAME, SignatureLog, read_log
-from service.store.signatures.log_copy import bring_up_to_date, keep_elsewhere
+from service.store.records import SITE, Checkpoint
+from service.store.signatures.log import NAME, LogEnd, SignatureLog, read_log
+from service.store.signatures.log_copy import bring_up_to_date
+from service.store.signatures.seen import SeenSignatures
 from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.record.counting import lines_of
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, capture, start_run, tamper
 from tests.support.record.tampering import WORDS_AGAIN, cut, rewrite_to_the_end, without_signatures_from
@@ -258,17 +262,11 @@ def test_a_log_that_was_cut_or_changed_shows_against_its_copy(data: Path, tmp_pa
     assert str(verify(data, signatures_copy=copy).faults[-1]).startswith(f"{NAME}, line 2: it is not the line that")
 
 
-def test_a_copy_that_cannot_be_written_is_told_and_caught_up_with(data: Path, tmp_path: Path) -> None:
-    told: list[str] = []
-    copy = tmp_path / "share" / "signatures.jsonl"
-    keep_elsewhere(data, copy, told.append)
-    assert "the copy of the log of signatures cannot be written: No such file or directory" in told[0]
-    copy.parent.mkdir()
-    copy.write_bytes((data / NAME).read_bytes()[:100])  # half a line, from a share that disappeared
-    keep_elsewhere(data, copy, told.append)
-    assert len(told) == 1
+def test_half_a_line_in_the_copy_is_written_over(data: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "elsewhere.jsonl"
+    copy.write_bytes((data / NAME).read_bytes()[:100])  # from a share that disappeared
+    bring_up_to_date(data, copy)
     assert copy.read_bytes() == (data / NAME).read_bytes()
-    keep_elsewhere(data, None, told.append)
 
 
 def test_half_a_line_of_a_power_cut_is_taken_away_by_the_next_signature(data: Path) -> None:
@@ -280,7 +278,7 @@ def test_half_a_line_of_a_power_cut_is_taken_away_by_the_next_signature(data: Pa
     assert (data / NAME).read_bytes().startswith(whole)
 
 
-def test_a_signature_whose_line_a_crash_prevented_is_written_down_with_the_next(
+def test_a_signature_whose_line_a_crash_prevented_is_written_down_with_the_next_which_says_so(
     data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
@@ -289,19 +287,150 @@ def test_a_signature_whose_line_a_crash_prevented_is_written_down_with_the_next(
     assert faults(data) == []
     assert any("is not in signatures.jsonl yet" in note for note in verify(data).notes)
     sign_again(data)
-    assert verify(data).notes == ()
+    assert faults(data) == []
+    (note,) = verify(data).notes
+    assert f"2 lines were missing from the end of {NAME}" in note
+    assert "and written again, as after a power failure" in note
+    for _ in range(3):
+        sign_again(data)
+    assert verify(data).notes == (note,), "once, and for ever"
 
 
 def test_only_the_newest_signatures_may_lack_their_line(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each signature writes down those that a crash left out, so that an older one without a line was taken out."""
     really = SignatureLog.add
+
+    def add_the_last(log: SignatureLog, end: LogEnd, made: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
+        really(log, end, made[-1:], key)
+
     with monkeypatch.context() as patched:
-        patched.setattr(SignatureLog, "add", lambda *_: None)
+        patched.setattr(SignatureLog, "add", add_the_last)
         sign_again(data)
+    (fault,) = faults(data)
+    assert f"its signature is not in {NAME}" in fault
+    sign_again(data)
+    (fault,) = faults(data)
+    assert f"1 line was missing from the end of {NAME}" in fault
+
+
+@pytest.mark.parametrize("lines", [4, 6])
+def test_a_log_that_was_cut_by_more_stays_a_fault_of_the_runs_concerned(data: Path, lines: int) -> None:
+    """Two lines a signature: more than two signatures were never without a line at once."""
+    whole = (data / NAME).read_bytes()
+    (data / NAME).write_bytes(b"".join(whole.splitlines(keepends=True)[:-lines]))
+    assert len(faults(data)) == lines
+    with Store.open(data) as store:
+        other = start_run(store)
+        capture(store, other, "v1")
+        checkpoint(store, other)
+    assert (data / NAME).read_bytes().count(b"\n") > whole.count(b"\n")
+    (fault,) = faults(data)
+    assert f"{lines} lines were missing from the end of {NAME}" in fault
+    assert "and written again: the log was cut" in fault
+    report = verify(data, other)
+    assert report.ok, "a run that was signed since is not in doubt"
+    assert any("None of them was of this run" in note for note in report.notes)
+
+
+def test_a_log_that_is_cut_while_it_is_in_use_is_told_as_well(data: Path) -> None:
+    with Store.open(data) as store:
+        run = run_of(data)
+        capture(store, run, "v4")
+        checkpoint(store, run)
+        lines = (data / NAME).read_bytes().splitlines(keepends=True)
+        (data / NAME).write_bytes(b"".join(lines[:-6]))
+        capture(store, run, "v5")
+        checkpoint(store, run)
+    (fault,) = faults(data)
+    assert f"6 lines were missing from the end of {NAME}" in fault
+
+
+def test_a_line_altered_while_the_log_is_in_use_forbids_the_next_signature(data: Path) -> None:
+    with Store.open(data) as store:
+        run = run_of(data)
+        capture(store, run, "v4")
+        checkpoint(store, run)
+        sign_the_last_line_otherwise(data)
+        capture(store, run, "v5")
+        checkpoint(store, run)  # of a line that is signed otherwise only `audit verify` knows
+        assert any("its own signature is not valid" in fault for fault in faults(data))
+        alter_a_line(data)
+        (data / NAME).write_bytes((data / NAME).read_bytes()[:-20])
+        capture(store, run, "v6")
+        with pytest.raises(IntegrityError, match="nothing is signed"):
+            checkpoint(store, run)
+
+
+def test_missing_lines_are_written_before_anything_new_is_signed(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So a disk that refuses for long leaves no more lines missing than one signature has."""
+
+    def refused(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with Store.open(data) as store:
+        run = run_of(data)
+        with monkeypatch.context() as patched:
+            patched.setattr(store.files, "append", refused)
+            for viewpoint in ("v4", "v5", "v6"):
+                capture(store, run, viewpoint)
+                with pytest.raises(StoreError, match="cannot be written: No space left on device"):
+                    checkpoint(store, run)
         assert faults(data) == []
-        patched.setattr(SignatureLog, "add", lambda log, every, key: really(log, every[-1:], key))
-        sign_again(data)
-    assert any(f"its signature is not in {NAME}" in fault for fault in faults(data)), faults(data)
+        site = store.head(SITE)
+        checkpoint(store, run)
+        assert store.head(SITE) == site + 1, "what was missing is told once"
+    assert faults(data) == []
+    assert verify(data).unsigned_events == dict.fromkeys(verify(data).unsigned_events, 0)
+
+
+def test_whoever_signs_waits_for_the_one_who_signs(data: Path) -> None:
+    with (
+        Store.open(data) as first,
+        Store.open(data, patience_s=0.02) as second,
+        first.signature_log.alone(),
+        pytest.raises(StoreError, match="another process has been signing for too long"),
+    ):
+        checkpoint(second, SITE)
+
+
+def test_the_first_look_of_a_process_which_reads_everything_keeps_nobody_waiting(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    really, free = SeenSignatures.look, list[bool]()
+
+    def look(seen: SeenSignatures, connection: Connection) -> None:
+        try:
+            with SignatureLog(data, DurableFiles(), patience_s=0.0).alone():
+                free.append(True)
+        except StoreError:
+            free.append(False)
+        really(seen, connection)
+
+    run = run_of(data)
+    monkeypatch.setattr(SeenSignatures, "look", look)
+    with Store.open(data) as store:
+        for viewpoint in ("v4", "v5"):
+            capture(store, run, viewpoint)
+            checkpoint(store, run)
+    assert free == [True, False, False], "first without the others waiting, then for what is new"
+
+
+def test_a_signature_costs_the_same_however_old_the_site_is(data: Path) -> None:
+    """Counted in executed lines of the program and of the libraries by which it reads the database and the log."""
+
+    def signature(store: Store) -> int:
+        store.record_site([SignInRecorded(account="ada", outcome="signed_in")], actor="ada")
+        return lines_of(lambda: checkpoint(store, SITE), "/")
+
+    with Store.open(data) as store:
+        run = run_of(data)
+        signature(store)
+        young = signature(store)
+        for number in range(40):
+            capture(store, run, f"w{number}")
+            checkpoint(store, run)
+        signature(store)
+        assert signature(store) <= 1.02 * young
 
 
 def test_a_passed_step_that_is_followed_by_another_has_its_signature(data: Path) -> None:
@@ -317,14 +446,15 @@ def test_a_passed_step_that_is_followed_by_another_has_its_signature(data: Path)
 def test_a_run_keeps_the_copy_that_its_rig_file_names(tmp_path: Path) -> None:
     rig_file = tmp_path / "rig.yaml"
     rig_file.write_text("name: r\ndevices: {}\nsignature_copy: share/signatures.jsonl\n")
-    copy = signature_copy(load_rig(rig_file))
+    rig = load_rig(rig_file)
+    copy = signature_copy(rig)
     assert copy is not None
     assert copy == tmp_path / "share" / "signatures.jsonl"
     copy.parent.mkdir()
     data = tmp_path / "data"
     with Store.open(data) as store:
         bench = begin_run(store, PROTOCOL, tmp_path)
-        bench.signature_copy = copy
+        bench.second_place = second_place(rig, store)
         assert bench.run().status == "completed"
     assert copy.read_bytes() == (data / NAME).read_bytes()
     words = ["audit", "verify", "--data", str(data), "--signatures", str(copy)]

@@ -25,7 +25,7 @@ from service.store.records import SITE, Checkpoint
 from service.store.signatures.checkpoints import RowsDigest, key_fingerprint
 from service.store.signatures.checkpoints import statement as signed_text
 from service.store.signatures.keys import public_bytes
-from service.store.signatures.log import NAME, SignatureLog
+from service.store.signatures.log import NAME, LogEnd, SignatureLog
 from tests.support.record.tampering import WORDS_AGAIN
 
 CAN_WRITE = ("database", "site's chain", "log", "second place")
@@ -294,7 +294,12 @@ class _Forger:
         if keys and "database" in self._can:
             order = [parse_canonical(line.decode())["checkpoint"] for line in lines]
             left = [present[place] for item in order if (place := (item["run_id"], item["seq"])) in present]
-            SignatureLog(path.parent, DurableFiles()).add(left, keys[-1])
+            log = SignatureLog(path.parent, DurableFiles(), patience_s=0.0)
+            read = log.lines_after(LogEnd())
+            assert read is not None
+            whole, end = read
+            held = {(one.checkpoint.run_id, one.checkpoint.seq) for one in whole if one.checkpoint is not None}
+            log.add(end, [one for one in left if (one.run_id, one.seq) not in held], keys[-1])
 
 
 def _checkpoints(record: Record, *, stamped: bool = False) -> list[tuple[Any, ...]]:

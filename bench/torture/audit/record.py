@@ -23,7 +23,8 @@ from service.store.database.engine import database_path
 from service.store.durable_effects import DurableFiles
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.signatures.log import NAME
-from service.store.signatures.log_copy import bring_up_to_date
+from service.store.signatures.log_copy import LogCopy, bring_up_to_date
+from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store
@@ -148,7 +149,8 @@ def _start(store: Store, folder: Path, people: People) -> None:
 
 def _complete_run(store: Store, folder: Path, authority: Authority) -> str:
     bench = begin_run(store, PROTOCOL.replace("count: 4", "count: 3"), folder)
-    bench.signature_copy, bench.authority = folder / COPY, authority
+    log = LogCopy(folder / "data" / NAME, folder / COPY, store.files)
+    bench.second_place, bench.authority = SecondPlace([log], store.clock), authority
     _jobs(store, bench.run_id)
     if bench.run().status != "completed":
         raise DataError("the run that is to be attacked did not complete", where=bench.run_id)

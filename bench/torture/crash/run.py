@@ -27,7 +27,9 @@ from service.runner import loop as runner_loop
 from service.runner.software import software_versions
 from service.steps import params_models
 from service.store.durable_effects import SystemClock
-from service.store.signatures.log_copy import keep_elsewhere
+from service.store.signatures.log import NAME as LOG_NAME
+from service.store.signatures.log_copy import LogCopy
+from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.worker import loop
@@ -132,6 +134,10 @@ class Place:
         """The second copy of the signature log."""
         return self.folder / "elsewhere.jsonl"
 
+    def second_place(self, store: Store) -> SecondPlace:
+        """Where that copy is kept."""
+        return SecondPlace([LogCopy(self.data / LOG_NAME, self.signature_copy, store.files)], store.clock)
+
     @property
     def motions(self) -> Path:
         """The log of the arm's motions."""
@@ -227,7 +233,7 @@ def _run(store: Store, place: Place, _parent: int, person: str) -> None:
 
     rig.keep_time(store.clock)
     operator = ScriptedOperator(name=person)
-    runner_loop.Runner(store, run_id, protocol, rig, operator, signature_copy=place.signature_copy).run()
+    runner_loop.Runner(store, run_id, protocol, rig, operator, second_place=place.second_place(store)).run()
 
 
 def _work(store: Store, place: Place, parent: int, _person: str) -> None:
@@ -256,7 +262,7 @@ def _release(store: Store, place: Place, _parent: int, person: str) -> None:
             raise refusal
         store.record(run_id, [RunReleased(meaning="released", signed_sha256=state.completed_sha256)], actor=person)
     checkpoint(store, run_id)
-    keep_elsewhere(place.data, place.signature_copy, print, store.files)
+    place.second_place(store).update()
 
 
 _ROLES: dict[Role, Callable[[Store, Place, int, str], None]] = {

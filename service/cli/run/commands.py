@@ -48,7 +48,7 @@ from service.run_start import (
     require_rig_free,
     require_runnable,
     require_simulated,
-    signature_copy,
+    second_place,
     start_run,
     time_stamp_authority,
 )
@@ -56,7 +56,7 @@ from service.runner.loop import Runner
 from service.station import Station, devices_of, layout_of
 from service.steps import params_models
 from service.store.access import kept_to
-from service.store.signatures.log_copy import keep_elsewhere
+from service.store.signatures.second_place import away_words
 from service.store.signatures.timestamps import stamp_end
 from service.store.store import Store
 
@@ -181,10 +181,10 @@ def drive(
         )
     beside = worker_beside(data, error_console.print) if worker else nullcontext()
     with sigterm_like_ctrl_c(), kept_to(data), file_log(data, "runner", run=run_id), beside:
-        authority, copy = time_stamp_authority(rig), signature_copy(rig)
+        authority, elsewhere = time_stamp_authority(rig), second_place(rig, store)
         reporter.begin()
         try:
-            state = Runner(store, run_id, protocol, station, operator, authority, copy).run()
+            state = Runner(store, run_id, protocol, station, operator, authority, elsewhere).run()
             reporter.outcome = f"it is {state.status}: {state.stop_reason}".removesuffix(": ")
         finally:
             reporter.end()
@@ -194,7 +194,9 @@ def drive(
         if worker and state.status == "completed":
             wait_for_results(store, run_id, protocol, display)
             stamp_end(store, run_id, authority)
-            keep_elsewhere(data, copy, error_console.print)
+            away = elsewhere.update()
+            if away is not None:
+                error_console.print(away_words(away), markup=False)
             state = fold(protocol, store.events(run_id))
         return state
 

@@ -31,11 +31,16 @@ from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.events import HostClock
 from service.core.units import gigabytes
 from service.monitor.host_clock import host_clock
-from service.rig import load_rig
+from service.rig import Rig, load_rig
+from service.run_start import signature_copy
 from service.station import Station
 from service.steps import params_models
 from service.store.database.engine import database_path
+from service.store.durable_effects import SystemClock
 from service.store.files.space_used import forecast_of
+from service.store.signatures.log import NAME as LOG_NAME
+from service.store.signatures.log_copy import LogCopy
+from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store
 
 # Optional libraries, which lack wheels for some Pythons and machines, and what is not possible without them.
@@ -63,9 +68,10 @@ def doctor_command(
         found = _reports(station, quiet=json)
         existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
         free_bytes = shutil.disk_usage(existing).free
+        place = _second_place(rig_file, data)
         space = None if loaded is None else _foresee(data, loaded, free_bytes, simulated=rig_file.section.simulated)
     healthy = all(isinstance(r, DeviceReport) and not r.problems for r in found.values())
-    healthy = healthy and (space is None or space.verdict == "enough")
+    healthy = healthy and (space is None or space.verdict == "enough") and not place.get("problem")
     clock = host_clock()
     missing = [what for module, what in _PARTS.items() if importlib.util.find_spec(module) is None]
     if json:
@@ -74,13 +80,26 @@ def doctor_command(
         if space is not None:
             folder["forecast"] = dataclasses.asdict(space) | {"verdict": space.verdict, "words": space.words}
         found_clock = clock.model_dump()
-        print_json({"ok": healthy, "devices": devices, "data": folder, "host_clock": found_clock, "missing": missing})
+        print_json(
+            {
+                "ok": healthy,
+                "devices": devices,
+                "data": folder,
+                "host_clock": found_clock,
+                "missing": missing,
+                "second_place": place or None,
+            }
+        )
     else:
         for what in missing:
             console.tell(("!", "bold yellow"), f" not installed: {what} (see docs/howto/installation.md)")
         for name, report in found.items():
             _print(name, report)
         _print_machine(data, free_bytes, space, clock)
+        if place:
+            console.print(
+                f"second place of the signatures {place['path']}: {place['problem'] or 'up to date'}", markup=False
+            )
     if not healthy:
         raise typer.Exit(1)
 
@@ -99,6 +118,18 @@ def _reports(station: Station, *, quiet: bool) -> dict[str, DeviceReport | Ortho
     finally:
         station.close()
     return found
+
+
+def _second_place(rig: Rig, data: Path) -> dict[str, str]:
+    """The path of the second place of the signatures and what is wrong with it; nothing if the rig names none.
+
+    What is missing there is written.
+    """
+    copy = signature_copy(rig)
+    if copy is None:
+        return {}
+    away = SecondPlace([LogCopy(data / LOG_NAME, copy)], SystemClock()).update()
+    return {"path": str(copy), "problem": "" if away is None else away.why}
 
 
 def _print_machine(data: Path, free_bytes: int, space: Forecast | None, clock: HostClock) -> None:

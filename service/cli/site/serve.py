@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import fcntl
+import getpass
 import importlib
+import json as json_module
+import os
 import socket
 import threading
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from io import FileIO
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated
@@ -22,17 +30,18 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.shipped_protocols import shipped_protocols
-from service.core.errors import ConfigurationError
+from service.core.errors import ConfigurationError, StoreError
+from service.core.text.clock_time import local_time
 from service.logs.file_log import file_log
 from service.people.sessions import People
-from service.rig import Rig, load_rig
-from service.run_start import signature_copy
+from service.rig import load_rig
 from service.station import devices_of
 from service.steps import params_models
 from service.store.access import kept_to
 from service.store.database.engine import BUSY_TIMEOUT_S
+from service.store.durable_effects import utc_text
 from service.store.records import SITE
-from service.store.signatures.log_copy import keep_elsewhere
+from service.store.signatures.second_place import away_words
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.web.app import create_app
@@ -44,7 +53,19 @@ from service.web.server.sparing_log import sparing_log, told
 from service.web.site import Site
 
 _PROTOCOLS = shipped_protocols()
+_SERVED = "serving.json"  # in the data folder, locked while a server uses it
 _LIMITS = ConnectionLimits()
+
+
+@dataclass(frozen=True, slots=True)
+class _Server:
+    """The server of a data folder, as others are told of it."""
+
+    address: str
+    user: str
+    pid: int
+    host: str
+    since_utc: str
 
 
 def serve_command(
@@ -102,13 +123,15 @@ def serve_command(
         proxies = known_proxies(trusted_proxy or [])
         limits = ConnectionLimits(affordable_connections(connections), address_connections, client_wait_s)
         with (
-            listening(host, port, limits, proxies) as listener,
             Store.open(data, patience_s=BUSY_TIMEOUT_S) as store,  # a page does not wait for minutes
             kept_to(data),
+            _only_server(store) as say_where,
+            listening(host, port, limits, proxies) as listener,
             sparing_log(store.clock) as log,
             file_log(data, "web", admits=told),
         ):
             address = f"{'https' if tls else 'http'}://{_shown(host)}:{listener.getsockname()[1]}"
+            say_where(address)
             people = People(store)
             site = Site(
                 data=data.resolve(),
@@ -124,13 +147,70 @@ def serve_command(
             )
             record_start(store, rig_file, site.protocol_files(), address)
             link = people.first_link()
-            _seal(store, data, rig_file)
+            _seal(site)
             http = server(create_app(site), listener, proxies, tls, log)
             with http.capture_signals():
                 _announce(address, f"{address}/set-up/{link}" if link else "", json=json)
                 threading.Thread(target=_load_the_rest, daemon=True).start()
+                ended = store.clock.signal()
+                threading.Thread(target=site.second_place.look_after, args=(ended,), daemon=True).start()
                 http.run(sockets=[listener])
-            _seal(store, data, rig_file)
+                ended.set()
+            _seal(site)
+
+
+@contextmanager
+def _only_server(store: Store) -> Generator[Callable[[str], None]]:
+    """Be the only server of a data folder; yields what tells others the address of this one.
+
+    The system lets go of the lock when the process ends, however it ends. Raises ConfigurationError where the folder
+    is served already, StoreError if the folder cannot be written to.
+    """
+    path = store.database_path.with_name(_SERVED)
+    with _locked(path) as file:
+
+        def say_where(address: str) -> None:
+            since_utc = utc_text(store.clock.utc_now())
+            who = _Server(address, getpass.getuser(), os.getpid(), socket.gethostname(), since_utc)
+            file.write(json_module.dumps(asdict(who)).encode())
+
+        try:
+            yield say_where
+        finally:
+            file.truncate(0)
+
+
+def _locked(path: Path) -> FileIO:
+    """The file that tells of this server, empty and locked. Raises ConfigurationError, StoreError."""
+    try:
+        file = FileIO(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "r+")
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # which no child process inherits
+        except (BlockingIOError, PermissionError):
+            with file:
+                raise _served_already(path, file.read()) from None
+        file.truncate(0)
+    except OSError as error:
+        raise StoreError(
+            f"the data folder cannot be written to: {error.strerror or error}",
+            where=str(path),
+            remedy="Check free space and permissions of the data folder",
+        ) from error
+    return file
+
+
+def _served_already(path: Path, said: bytes) -> ConfigurationError:
+    what = "another server is using this data folder"
+    try:
+        one = _Server(**json_module.loads(said))
+    except (ValueError, TypeError):  # it has just started, or writes this
+        return ConfigurationError(what, where=str(path), remedy="It is starting: wait for its address, or end it")
+    since = f"{local_time(one.since_utc) or one.since_utc}"
+    return ConfigurationError(
+        f"{what}: process {one.pid} of {one.user} on {one.host}, since {since}",
+        where=one.address,
+        remedy=f"Open {one.address} in a browser, or end that server first",
+    )
 
 
 def _load_the_rest() -> None:
@@ -148,10 +228,12 @@ def _unprotected(host: str) -> ConfigurationError:
     )
 
 
-def _seal(store: Store, data: Path, rig: Rig) -> None:
+def _seal(site: Site) -> None:
     """Sign the end of the site's chain, and keep a copy of the signature where the rig says."""
-    checkpoint(store, SITE)
-    keep_elsewhere(data, signature_copy(rig), error_console.print)
+    checkpoint(site.store, SITE)
+    away = site.second_place.update()
+    if away is not None:
+        error_console.print(away_words(away), markup=False)
 
 
 def _announce(address: str, set_up: str, *, json: bool) -> None:

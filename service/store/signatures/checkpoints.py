@@ -75,19 +75,26 @@ def last_checkpoint(connection: Connection, run_id: str) -> Checkpoint | None:
     """The newest checkpoint of a run, or None."""
     newest = select(checkpoints).where(checkpoints.c.run_id == run_id).order_by(checkpoints.c.seq.desc()).limit(1)
     row = connection.execute(newest).one_or_none()
-    return None if row is None else _to_checkpoint(row)
+    return None if row is None else to_checkpoint(row)
 
 
 def read_checkpoints(connection: Connection, run_id: str) -> list[Checkpoint]:
     """All checkpoints of a run, oldest first."""
     found = select(checkpoints).where(checkpoints.c.run_id == run_id).order_by(checkpoints.c.seq)
-    return [_to_checkpoint(row) for row in connection.execute(found)]
+    return [to_checkpoint(row) for row in connection.execute(found)]
+
+
+def read_checkpoint(connection: Connection, run_id: str, seq: int) -> Checkpoint | None:
+    """The checkpoint of one event, or None."""
+    found = select(checkpoints).where(checkpoints.c.run_id == run_id, checkpoints.c.seq == seq)
+    row = connection.execute(found).one_or_none()
+    return None if row is None else to_checkpoint(row)
 
 
 def read_every_checkpoint(connection: Connection) -> list[Checkpoint]:
     """The checkpoints of all chains, in the order in which they were made."""
     made = select(checkpoints).order_by(checkpoints.c.site_seq, checkpoints.c.run_id == SITE, checkpoints.c.seq)
-    return [_to_checkpoint(row) for row in connection.execute(made)]
+    return [to_checkpoint(row) for row in connection.execute(made)]
 
 
 def read_timestamps(connection: Connection, run_id: str) -> list[Timestamp]:
@@ -96,7 +103,8 @@ def read_timestamps(connection: Connection, run_id: str) -> list[Timestamp]:
     return [Timestamp(row.run_id, row.seq, row.authority, row.at_utc, row.token) for row in connection.execute(found)]
 
 
-def _to_checkpoint(row: Row[Any]) -> Checkpoint:
+def to_checkpoint(row: Row[Any]) -> Checkpoint:
+    """A row of the table as a Checkpoint."""
     return Checkpoint(**{name: getattr(row, name) for name in _COLUMNS})
 
 

@@ -12,7 +12,10 @@ import binascii
 import fcntl
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import os
+import time
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -21,9 +24,10 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 from service.core.errors import StoreError
+from service.core.records.events import SignaturesWrittenAgain
 from service.store.durable_effects import Files
 from service.store.events import canonical_parsed
-from service.store.records import Checkpoint
+from service.store.records import SITE, Checkpoint
 from service.store.signatures.checkpoints import key_fingerprint
 from service.store.signatures.keys import public_bytes
 from service.store.verification.chain_checks import Fault
@@ -31,6 +35,7 @@ from service.store.verification.chain_checks import Fault
 NAME = "signatures.jsonl"
 PURPOSE = "orthocapture signature log v1"  # keeps a signature from being used for anything else
 _FIRST = "0" * 64
+_LOOK_AGAIN_S = 0.005
 _MOST_AT_ONCE = 3  # most signatures in one transaction: a new key's, a run's, and the site's chain's
 _COLUMNS = {field.name: int if field.type == "int" else str for field in fields(Checkpoint)}
 
@@ -67,16 +72,55 @@ class LogLine:
         return True
 
 
-class SignatureLog:
-    """The log of one data folder."""
+@dataclass(frozen=True, slots=True)
+class LogEnd:
+    """A place in the log where a line ends: the beginning of the log, or how far it was read."""
 
-    def __init__(self, data_dir: Path, files: Files) -> None:
+    offset: int = 0  # bytes before it
+    number: int = 0  # of the last line before it
+    last_bytes: int = 0  # length of that line
+    previous: str = _FIRST  # SHA-256 of that line
+
+
+class SignatureLog:
+    """The log of one data folder. `patience_s` is how long it waits for another process that signs."""
+
+    def __init__(self, data_dir: Path, files: Files, patience_s: float) -> None:
         self.path = data_dir / NAME
         self._files = files
+        self._patience_s = patience_s
 
-    def lines(self) -> list[LogLine] | None:
-        """Every line, oldest first; None if there is no log. Raises StoreError if it cannot be read."""
-        return read_log(self.path)
+    @contextmanager
+    def alone(self) -> Generator[None]:
+        """Wait until no other process or thread signs, and keep them waiting. Raises StoreError.
+
+        A signature is a row and then a line: whoever signs next finds both.
+        """
+        try:
+            descriptor = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        except OSError as error:
+            raise _unwritten(self.path, error) from error
+        try:
+            self._wait_for(descriptor)
+            yield
+        finally:
+            os.close(descriptor)
+
+    def _wait_for(self, descriptor: int) -> None:
+        ends_s = time.monotonic() + self._patience_s
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                if time.monotonic() > ends_s:
+                    raise StoreError(
+                        "another process has been signing for too long",
+                        where=str(self.path),
+                        remedy="Look for a process of this data folder that hangs",
+                    ) from error
+                time.sleep(_LOOK_AGAIN_S)
+            else:
+                return
 
     def begin(self) -> None:
         """Create the log before the first signature; from then on a missing log is a fault. Raises StoreError."""
@@ -87,18 +131,49 @@ class SignatureLog:
         except OSError as error:
             raise _unwritten(self.path, error) from error
 
-    def add(self, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
-        """Append, durably, those checkpoints that the log does not hold yet. Raises StoreError."""
+    def lines_after(self, end: LogEnd) -> tuple[list[LogLine], LogEnd] | None:
+        """The lines after a place, and where the last of them ends.
+
+        None if there is no log, or the line before that place is no longer there. Raises StoreError if it cannot be
+        read.
+        """
+        content = _content(self.path, end.offset - end.last_bytes)
+        if content is None or (end.number and _sha256(content[: end.last_bytes]) != end.previous):
+            return None
+        lines: list[LogLine] = []
+        for line, after in _parsed(content[end.last_bytes :], end):
+            lines.append(line)
+            end = after
+        return lines, end
+
+    def add(self, end: LogEnd, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
+        """Append checkpoints durably where the last whole line ends. Raises StoreError.
+
+        What follows is part of a line that a power failure interrupted. Callers are `alone`.
+        """
+        number, previous, key_id = end.number, end.previous, key_fingerprint(public_bytes(key))
+        new = b""
+        for checkpoint in checkpoints:
+            number += 1
+            signature = base64.b64encode(key.sign(_message(number, previous, checkpoint, key_id))).decode()
+            data = _fields(number, previous, checkpoint, key_id) | {"signature": signature}
+            raw = canonical_parsed(data).encode() + b"\n"
+            new += raw
+            previous = _sha256(raw)
         try:
-            _add(self._files, self.path, checkpoints, key)
+            self._files.append(self.path, end.offset, new)
+            self._files.sync_file(self.path)
         except OSError as error:
             raise _unwritten(self.path, error) from error
 
 
-def unlogged(checkpoints: Sequence[Checkpoint], lines: Sequence[LogLine]) -> bool:
-    """Whether a checkpoint has no line yet, because the log could not be written when it was made."""
-    held = {(one.checkpoint.run_id, one.checkpoint.seq) for one in lines if one.checkpoint is not None}
-    return any((one.run_id, one.seq) not in held for one in checkpoints)
+def power_cut_explains(missing: Sequence[Checkpoint], newest: int) -> bool:
+    """Whether one interrupted signature explains that these checkpoints have no line.
+
+    The next signature writes the lines that are missing before anything else, so that no more than those of one
+    signature can be. `newest` is the greatest `site_seq` that has a line.
+    """
+    return len(missing) <= _MOST_AT_ONCE and all(item.site_seq >= newest for item in missing)
 
 
 def _unwritten(path: Path, error: OSError) -> StoreError:
@@ -111,8 +186,16 @@ def _unwritten(path: Path, error: OSError) -> StoreError:
 
 def read_log(path: Path) -> list[LogLine] | None:
     """The lines of a log; None if the file does not exist. Raises StoreError if it cannot be read."""
+    content = _content(path, 0)
+    return None if content is None else [line for line, _ in _parsed(content, LogEnd())]
+
+
+def _content(path: Path, offset: int) -> bytes | None:
+    """The log from an offset on; None if the file does not exist. Raises StoreError."""
     try:
-        content = path.read_bytes()
+        with path.open("rb") as stream:
+            stream.seek(offset)
+            return stream.read()
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -121,16 +204,21 @@ def read_log(path: Path) -> list[LogLine] | None:
             where=str(path),
             remedy="Check the permissions of the data folder",
         ) from error
-    return list(_parsed(content))
 
 
-def _parsed(content: bytes) -> Iterator[LogLine]:
-    previous = _FIRST
+def _parsed(content: bytes, end: LogEnd) -> Iterator[tuple[LogLine, LogEnd]]:
+    """The lines that follow a place, each with its own end."""
     # A line without a line end was cut off by a power failure and was never reported as written.
     whole = content[: content.rfind(b"\n") + 1]
-    for number, raw in enumerate(whole.splitlines(keepends=True), start=1):
-        yield _line(number, raw, previous)
-        previous = hashlib.sha256(raw).hexdigest()
+    for raw in whole.splitlines(keepends=True):
+        number = end.number + 1
+        line = _line(number, raw, end.previous)
+        end = LogEnd(end.offset + len(raw), number, len(raw), _sha256(raw))
+        yield line, end
+
+
+def _sha256(raw: bytes) -> str:
+    return hashlib.sha256(raw).hexdigest()
 
 
 def _line(number: int, raw: bytes, previous: str) -> LogLine:
@@ -158,30 +246,6 @@ def _message(number: int, previous: str, checkpoint: Checkpoint, key_id: str) ->
 
 def _fields(number: int, previous: str, checkpoint: Checkpoint, key_id: str) -> dict[str, Any]:
     return {"number": number, "previous_sha256": previous, "checkpoint": asdict(checkpoint), "key_id": key_id}
-
-
-def _add(files: Files, path: Path, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
-    with path.open("rb") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)  # one process appends at a time
-        content = stream.read()
-        end = content.rfind(b"\n") + 1  # a power failure may have left part of a line after it
-        lines = list(_parsed(content[:end]))
-        held = {(line.checkpoint.run_id, line.checkpoint.seq) for line in lines if line.checkpoint is not None}
-        last = content[:end].splitlines(keepends=True)[-1:]
-        number, previous = len(lines), hashlib.sha256(last[0]).hexdigest() if last else _FIRST
-        key_id = key_fingerprint(public_bytes(key))
-        new = b""
-        for checkpoint in checkpoints:
-            if (checkpoint.run_id, checkpoint.seq) in held:
-                continue
-            number += 1
-            signature = base64.b64encode(key.sign(_message(number, previous, checkpoint, key_id))).decode()
-            data = _fields(number, previous, checkpoint, key_id) | {"signature": signature}
-            raw = canonical_parsed(data).encode() + b"\n"
-            new += raw
-            previous = hashlib.sha256(raw).hexdigest()
-        files.append(path, end, new)
-        files.sync_file(path)
 
 
 def log_findings(
@@ -218,10 +282,35 @@ def log_findings(
             gone = (signed.run_id, signed.seq) not in here
             change = "is no longer here: what it signed was removed" if gone else "is another one here"
             faults.append(Fault(signed.run_id, signed.seq, "", f"the signature of {place}, {change}"))
-    # A power failure between a signature and its line leaves out the newest lines; the next signature adds them.
     newest = max((line.checkpoint.site_seq for line in lines if line.checkpoint is not None), default=0)
     unlogged = {place: item for place, item in here.items() if place not in held}
-    if len(unlogged) <= _MOST_AT_ONCE and all(item.site_seq >= newest for item in unlogged.values()):
+    if power_cut_explains(list(unlogged.values()), newest):
         return faults, [f"{run_id}: the signature at event {seq} is not in {NAME} yet" for run_id, seq in unlogged]
     faults += [Fault(run_id, seq, "", f"its signature is not in {NAME}") for run_id, seq in unlogged]
     return faults, []
+
+
+def written_again_findings(
+    said: Sequence[tuple[int, SignaturesWrittenAgain]], run_id: str | None
+) -> tuple[list[Fault], list[str]]:
+    """Faults and notes on lines that were missing and were written again.
+
+    What an interrupted signature does not explain stays a fault of the runs whose signatures these were.
+
+    Args:
+        said: what the site's chain says of them, with the numbers of its events.
+        run_id: the run that is verified; None for all.
+    """
+    faults: list[Fault] = []
+    notes: list[str] = []
+    for seq, again in said:
+        lines = "1 line was" if again.lines == 1 else f"{again.lines} lines were"
+        since = f"of signatures since {again.since_utc}"
+        what = f"{lines} missing from the end of {NAME}, {since}, and written again"
+        if again.explained:
+            notes.append(f"{SITE}, event {seq}: {what}, as after a power failure")
+        elif run_id is None or run_id in again.runs:
+            faults.append(Fault(SITE, seq, "", f"{what}: the log was cut, for no power failure explains it"))
+        else:
+            notes.append(f"{SITE}, event {seq}: {what}: the log was cut. None of them was of this run")
+    return faults, notes

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import fcntl
+import os
 from pathlib import Path
 
 from service.core.errors import IntegrityError, StoreError
@@ -14,43 +15,74 @@ from service.store.verification.chain_checks import Fault
 _FILES = DurableFiles()
 
 
-def keep_elsewhere(data_dir: Path, copy: Path | None, tell: Callable[[str], object], files: Files = _FILES) -> None:
-    """Bring the copy up to date, if one is configured. A problem with it is passed to `tell` and raises nothing."""
-    if copy is None:
-        return
-    try:
-        bring_up_to_date(data_dir, copy, files)
-    except StoreError as error:
-        tell(f"the copy of the signatures: {error}")
+class LogCopy:
+    """A copy of a file of lines to which lines are only appended.
+
+    What was compared is not read again, but for the last line of it.
+    """
+
+    def __init__(self, source: Path, copy: Path, files: Files = _FILES) -> None:
+        self.source = source
+        self.copy = copy
+        self._files = files
+        self._same = 0  # bytes at the beginning of both that are the same: whole lines
+        self._last = b""  # the last of these lines
+
+    def bring_up_to_date(self) -> None:
+        """Append to the copy the lines that it lacks. A copy with other content is left as it is.
+
+        Raises:
+            IntegrityError: the copy is not a beginning of the source: one of them was changed.
+            StoreError: the copy cannot be written; the next call will add what is missing.
+        """
+        try:
+            descriptor = os.open(self.source, os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError:
+            self._update()  # nothing was signed yet
+            return
+        except OSError as error:
+            raise _unread(self.source, error) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)  # one process writes to the copy at a time
+            self._update()
+        finally:
+            os.close(descriptor)
+
+    def _update(self) -> None:
+        start = self._same - len(self._last)
+        ours, theirs = _bytes(self.source, start), _bytes(self.copy, start)
+        if not (ours.startswith(self._last) and theirs.startswith(self._last)):
+            start, self._same, self._last = 0, 0, b""
+            ours, theirs = _bytes(self.source), _bytes(self.copy)
+        ours, held = _whole_lines(ours), _whole_lines(theirs)
+        if not ours.startswith(held):
+            raise IntegrityError(
+                "the copy of the log of signatures is not the beginning of the log: one of the two was changed",
+                where=str(self.copy),
+                remedy="Keep both; see `orthocapture audit verify --signatures`. Each data folder needs its own copy",
+            )
+        try:
+            if not self.copy.exists():
+                self._files.write(self.copy, ())
+                self._files.sync_directory(self.copy.parent)
+            if theirs != ours:
+                self._files.append(self.copy, start + len(held), ours[len(held) :])  # over a partly written line
+                self._files.sync_file(self.copy)
+            elif not os.access(self.copy, os.W_OK):
+                raise PermissionError(None, "it is read-only", str(self.copy))
+        except OSError as error:
+            raise StoreError(
+                f"the copy of the log of signatures cannot be written: {error.strerror or error}",
+                where=str(self.copy),
+                remedy="Check that the share or the medium is there and that it has space",
+            ) from error
+        self._same = start + len(ours)
+        self._last = ours[ours.rfind(b"\n", 0, -1) + 1 :]
 
 
 def bring_up_to_date(data_dir: Path, copy: Path, files: Files = _FILES) -> None:
-    """Append to `copy` the lines of the log that it lacks. A copy with other content is left as it is.
-
-    Raises:
-        IntegrityError: the copy is not a beginning of the log: one of them was changed.
-        StoreError: the copy cannot be written; the next call will add what is missing.
-    """
-    log = _bytes(data_dir / NAME)
-    held = _whole_lines(_bytes(copy))
-    if not log.startswith(held):
-        raise IntegrityError(
-            "the copy of the log of signatures is not the beginning of the log: one of the two was changed",
-            where=str(copy),
-            remedy="Keep both; see `orthocapture audit verify --signatures`. Each data folder needs its own copy",
-        )
-    try:
-        if not copy.exists():
-            files.write(copy, ())
-            files.sync_directory(copy.parent)
-        files.append(copy, len(held), log[len(held) :])  # overwrites a partly written line
-        files.sync_file(copy)
-    except OSError as error:
-        raise StoreError(
-            f"the copy of the log of signatures cannot be written: {error.strerror or error}",
-            where=str(copy),
-            remedy="Check that the share or the medium is there and that it has space",
-        ) from error
+    """Append to `copy` the lines of a data folder's log that it lacks. Raises IntegrityError, StoreError."""
+    LogCopy(data_dir / NAME, copy, files).bring_up_to_date()
 
 
 def copy_faults(data_dir: Path, copy: Path) -> tuple[list[Fault], list[str]]:
@@ -79,12 +111,17 @@ def _whole_lines(content: bytes) -> bytes:
     return content[: content.rfind(b"\n") + 1]
 
 
-def _bytes(path: Path) -> bytes:
+def _bytes(path: Path, offset: int = 0) -> bytes:
     try:
-        return path.read_bytes()
+        with path.open("rb") as stream:
+            if offset:
+                stream.seek(offset)
+            return stream.read()
     except FileNotFoundError:
         return b""
     except OSError as error:
-        raise StoreError(
-            f"the log of signatures cannot be read: {error.strerror}", where=str(path), remedy=LOOK
-        ) from error
+        raise _unread(path, error) from error
+
+
+def _unread(path: Path, error: OSError) -> StoreError:
+    return StoreError(f"the log of signatures cannot be read: {error.strerror}", where=str(path), remedy=LOOK)

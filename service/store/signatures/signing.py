@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from sqlalchemy import Connection, select
 
-from service.core.records.events import KeyChanged, RunSigned
-from service.store.database.tables import runs
+from service.core.records.events import KeyChanged, Payload, RunSigned, SignaturesWrittenAgain
+from service.store.database.tables import event_index, events, runs
 from service.store.durable_effects import utc_text
 from service.store.errors import SigningKeyError, UnknownRunError
-from service.store.events import read_head
+from service.store.events import read_head, to_event
 from service.store.records import SITE, Checkpoint
 from service.store.signatures.checkpoints import (
     artefacts_digest,
@@ -20,13 +20,12 @@ from service.store.signatures.checkpoints import (
     key_fingerprint,
     last_checkpoint,
     read_checkpoints,
-    read_every_checkpoint,
     read_key_changes,
     signed_by,
     statement,
 )
 from service.store.signatures.keys import KeyFolder, public_bytes
-from service.store.signatures.log import SignatureLog, unlogged
+from service.store.signatures.seen import SeenSignatures
 from service.store.store import Store
 from service.store.verification.soundness import require_sound
 
@@ -58,29 +57,30 @@ def checkpoint(store: Store, run_id: str) -> Checkpoint:
         SigningKeyError: the private key is missing or cannot be used.
         StoreError: the log of signatures cannot be written.
     """
-    log = _log_of(store)
-    with store.database.writing() as connection:
-        if run_id != SITE:
-            _require_run(connection, run_id, store)
-        lines = log.lines()
-        require_sound(store, connection, run_id, lines)
-        if lines is None:
-            log.begin()
-            lines = []
-        every = read_every_checkpoint(connection)
-        signed = _signed_end(connection, run_id)
-        if signed is not None and not unlogged(every, lines):
+    log, seen = store.signature_log, store.seen_signatures
+    if run_id not in store.sound_until:
+        _look(store, run_id)  # the first time takes long, and keeps nobody waiting
+    with log.alone():
+        signed = _look(store, run_id)
+        if seen.missing:
+            _write_missing_lines(store)
+        elif signed is not None:
             return signed
-        key = _present_key(store, connection)
-        if signed is None:
-            signed = _sign(store, connection, run_id, key)
-            if run_id != SITE:
-                require_sound(store, connection, SITE, lines)
-                entry = RunSigned(run=run_id, seq=signed.seq, sha256=signed.sha256)
-                store.append_site(connection, [entry], actor=_ACTOR)
-                _sign(store, connection, SITE, key)
-            every = read_every_checkpoint(connection)  # also those that a power failure or full disk kept out
-    log.add(every, key)
+        if not seen.there:
+            log.begin()
+        with store.database.writing() as connection:
+            for chain in dict.fromkeys((run_id, SITE)):
+                require_sound(store, connection, chain)
+            key = _present_key(store, connection)
+            signed = _signed_end(connection, run_id)
+            if signed is None:
+                signed = _sign(store, connection, run_id, key)
+                if run_id != SITE:
+                    entry = RunSigned(run=run_id, seq=signed.seq, sha256=signed.sha256)
+                    store.append_site(connection, [entry], actor=_ACTOR)
+            _sign(store, connection, SITE, key)
+            made = seen.made_since(connection)
+        log.add(seen.end, made, key)
     return signed
 
 
@@ -98,23 +98,30 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
         SigningKeyError: the old key cannot be used and `lost` is false, or it can be used and `lost` is true.
     """
     folder = KeyFolder(store.database_path.parent, store.files)
-    log = _log_of(store)
-    with store.database.writing() as connection:
-        lines = log.lines()
-        require_sound(store, connection, SITE, lines)
-        if lines is None:
+    log, seen = store.signature_log, store.seen_signatures
+    with log.alone():
+        with store.database.reading() as connection:
+            seen.look(connection)
+            require_sound(store, connection, SITE)
+        if seen.missing and not lost:
+            _write_missing_lines(store)
+        if not seen.there:
             log.begin()
-        if lost:
-            _require_lost(connection, folder)
-        old = None if lost else _present_key(store, connection)
-        changes = read_key_changes(connection)
-        if old is not None:
-            _sign(store, connection, SITE, old)
-        new = folder.make()
-        _record_key(store, connection, new, previous=changes[-1][1]["key_id"], reason=reason, actor=actor)
-        _sign(store, connection, SITE, old or new)
-        every = read_every_checkpoint(connection)
-    log.add(every, old or new)
+        with store.database.writing() as connection:
+            require_sound(store, connection, SITE)
+            if lost:
+                _require_lost(connection, folder)
+            old = None if lost else _present_key(store, connection)
+            changes = read_key_changes(connection)
+            if old is not None:
+                _sign(store, connection, SITE, old)
+            if seen.missing and lost:
+                store.append_site(connection, [_written_again(seen)], actor=_ACTOR)
+            new = folder.make()
+            _record_key(store, connection, new, previous=changes[-1][1]["key_id"], reason=reason, actor=actor)
+            _sign(store, connection, SITE, old or new)
+            made = seen.made_since(connection)
+        log.add(seen.end, [*seen.missing, *made], old or new)
     with store.database.writing() as connection:  # under the lock again, because another process may make a key
         folder.destroy_all_but(read_key_changes(connection)[-1][1]["key_id"])
     return public_keys(store)[-1]
@@ -145,8 +152,51 @@ def public_keys(store: Store) -> list[PublicKey]:
     return keys
 
 
-def _log_of(store: Store) -> SignatureLog:
-    return SignatureLog(store.database_path.parent, store.files)
+def _look(store: Store, run_id: str) -> Checkpoint | None:
+    """Look at what is new and require that it is sound. Returns the signature of the chain's end, if it has one."""
+    with store.database.reading() as connection:
+        if run_id != SITE:
+            _require_run(connection, run_id, store)
+        store.seen_signatures.look(connection)
+        require_sound(store, connection, run_id)
+        return _signed_end(connection, run_id)
+
+
+def _write_missing_lines(store: Store) -> None:
+    """Write the lines that the log lacks, before anything new is signed; the site's chain says how many they are.
+
+    An interrupted signature leaves lines missing, and so does somebody who cuts the log. Raises StoreError.
+    """
+    log, seen = store.signature_log, store.seen_signatures
+    again = _written_again(seen)
+    with store.database.writing() as connection:
+        require_sound(store, connection, SITE)
+        key = _present_key(store, connection)
+        if _last_written_again(connection) != again:  # else that failed before, or was interrupted
+            store.append_site(connection, [again], actor=_ACTOR)
+    log.add(seen.end, seen.missing, key)
+    with store.database.reading() as connection:
+        seen.look(connection)
+
+
+def _written_again(seen: SeenSignatures) -> SignaturesWrittenAgain:
+    return SignaturesWrittenAgain(
+        lines=len(seen.missing),
+        runs=tuple(dict.fromkeys(item.run_id for item in seen.missing)),
+        since_utc=seen.missing[0].at_utc,
+        explained=seen.explained,
+    )
+
+
+def _last_written_again(connection: Connection) -> Payload | None:
+    of_kind = select(event_index.c.seq).where(
+        event_index.c.run_id == SITE, event_index.c.kind == "signatures_written_again"
+    )
+    seq = connection.execute(of_kind.order_by(event_index.c.seq.desc()).limit(1)).scalar()
+    if seq is None:
+        return None
+    row = connection.execute(select(events).where(events.c.run_id == SITE, events.c.seq == seq)).one()
+    return to_event(row).payload
 
 
 def _require_run(connection: Connection, run_id: str, store: Store) -> None:
@@ -170,9 +220,8 @@ def _require_lost(connection: Connection, folder: KeyFolder) -> None:
 def _present_key(store: Store, connection: Connection) -> Ed25519PrivateKey:
     """The key in use; if there is none yet, one is made and recorded, and signs its own KeyChanged."""
     folder = KeyFolder(store.database_path.parent, store.files)
-    changes = read_key_changes(connection)
-    if changes:
-        key_id = changes[-1][1]["key_id"]
+    key_id = store.seen_signatures.key_in_use(connection)
+    if key_id:
         key = folder.load(key_id)
         folder.destroy_all_but(key_id)  # keys left by a crash during a replacement
         return key

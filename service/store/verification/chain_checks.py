@@ -10,7 +10,7 @@ from typing import Any
 from pydantic_core import ValidationError
 
 from service.core.errors import StoreError
-from service.core.records.events import PAYLOAD, ArtefactRef
+from service.core.records.events import PAYLOAD, ArtefactRef, SignaturesWrittenAgain
 from service.store.events import ROOT, canonical_parsed, event_sha256_of_text, parse_canonical, references
 from service.store.files.artefacts import record_sha256
 from service.store.records import SITE
@@ -71,6 +71,9 @@ class ChainFacts:
     stamps: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # time_stamp_kept, of the site
     heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of service_started
     runs_signed: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # run_signed, of the site
+    written_again: list[tuple[int, SignaturesWrittenAgain]] = field(
+        default_factory=list[tuple[int, SignaturesWrittenAgain]]
+    )  # of the site
     to_sign: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])  # events that are signed at once
     last_own: int = 0  # seq of the last event that is not about a job
     to_sign_before: dict[int, int] = field(
@@ -131,6 +134,8 @@ class ChainFacts:
             self.stamps.append((seq, payload))
         elif kind == "run_signed":
             self.runs_signed.append((seq, payload))
+        elif kind == "signatures_written_again":
+            self.written_again.append((seq, SignaturesWrittenAgain.model_validate(payload)))
         elif kind == "service_started":
             self.heads_at_start.append((seq, payload["heads"]))
 

@@ -19,7 +19,7 @@ from service.store.files.artefacts import read_artefacts
 from service.store.records import SITE, Artefact, RunRow
 from service.store.run_rows import read_runs
 from service.store.signatures.log import NAME as LOG_NAME
-from service.store.signatures.log import LogLine, log_findings, read_log
+from service.store.signatures.log import LogLine, log_findings, read_log, written_again_findings
 from service.store.signatures.log_copy import copy_faults
 from service.store.verification import chain_checks as checks
 from service.store.verification import derived_checks as derived
@@ -160,7 +160,7 @@ def _verify(
     orphans, foreign = unlisted_files(folder, evidence.every_sha256) if with_files else ([], [])
     if not with_files:
         notes.append("the files were not read again: only records and signatures were checked")
-    of_log, said_of_log = _log_findings(lines, evidence, site, keys)
+    of_log, said_of_log = _log_findings(lines, evidence, site, keys, run_id)
     every_run = run_id is None
     ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]
     faults = [
@@ -177,11 +177,17 @@ def _verify(
 
 
 def _log_findings(
-    lines: Sequence[LogLine] | None, evidence: EvidenceRows, site: ChainFacts, keys: signatures.Keys
+    lines: Sequence[LogLine] | None,
+    evidence: EvidenceRows,
+    site: ChainFacts,
+    keys: signatures.Keys,
+    run_id: str | None,
 ) -> tuple[list[Fault], list[str]]:
     """Faults and notes of the log of signatures that is kept beside the database."""
     public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
-    return log_findings(lines, evidence.checkpoints, public_keys, awaited=bool(site.key_changes))
+    faults, notes = log_findings(lines, evidence.checkpoints, public_keys, awaited=bool(site.key_changes))
+    before, said = written_again_findings(site.written_again, run_id)
+    return [*before, *faults], [*said, *notes]
 
 
 def _check_chains(

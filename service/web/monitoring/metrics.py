@@ -44,6 +44,7 @@ class DataFolderMetrics(Collector):
             "data_folder": health.data_folder,
             "worker": health.worker,
             "runners": health.runners,
+            "second_place": health.second_place,
         }
         yield _gauge(
             "healthy", "1 if nothing is wrong with a part.", ("part",), {(p,): not w for p, w in parts.items()}

@@ -54,7 +54,7 @@ def install_metrics(app: FastAPI) -> None:
             lambda: read_figures(site.store, site.data, site.launcher.driven_runs()),
             lambda: _forecasts(site),
             lambda run_ids: {run_id: clock_readings(site.run(run_id).events) for run_id in run_ids},
-            lambda: read_health(site.store, site.data, _driven(site)),
+            lambda: read_health(site.store, site.data, _driven(site), site.second_place.away),
         )
     )
     ProcessCollector(namespace="orthocapture_web", registry=registry)
@@ -76,13 +76,14 @@ def _driven(site: Site) -> list[str]:
 
 @router.get("/health", name="health")
 def health(site: CurrentSite) -> JSONResponse:
-    """Health of database, data folder, workers and runners. Status 200 if all are well, else 503."""
-    found = read_health(site.store, site.data, _driven(site))
+    """Health of database, data folder, workers, runners and second place. Status 200 if all are well, else 503."""
+    found = read_health(site.store, site.data, _driven(site), site.second_place.away)
     parts = {
         "database": found.database,
         "data_folder": found.data_folder,
         "worker": found.worker,
         "runners": found.runners,
+        "second_place": found.second_place,
     }
     content = {"ok": found.ok} | {name: {"ok": not wrong, "what": wrong} for name, wrong in parts.items()}
     return JSONResponse(content, status_code=200 if found.ok else 503)

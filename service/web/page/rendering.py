@@ -92,6 +92,7 @@ def render(
         person=person,
         robots=partial(driven_frames, request.app.state.site),  # asked by whole pages, not by parts
         robots_lost=LOST,
+        second_place_away=request.app.state.site.second_place.away,
         **own,
         **more,
     )

@@ -9,10 +9,8 @@ from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
 
 from service.core.errors import OrthocaptureError
-from service.run_start import signature_copy
 from service.store.errors import UnknownRunError
 from service.store.records import SITE
-from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.signing import checkpoint
 from service.web.site import CurrentSite, Site
 
@@ -39,7 +37,7 @@ def seal(site: Site) -> None:
         if seq != site.sealed_seq:
             checkpoint(site.store, SITE)
             site.sealed_seq = seq
-            keep_elsewhere(site.data, signature_copy(site.rig), _log.error)
+            site.second_place.update()
     except UnknownRunError:
         return  # nothing has happened here yet
     except OrthocaptureError as error:

@@ -16,6 +16,7 @@ from service.run_start import recorded_run, start_run
 from service.runner.loop import Runner
 from service.steps import params_models
 from service.store.durable_effects import SystemClock
+from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store
 from service.store.verification.verify import verify
@@ -74,7 +75,7 @@ class Bench:
     rig: BenchRig = field(default_factory=BenchRig)
     operator: ScriptedOperator = field(default_factory=ScriptedOperator)
     authority: Authority | None = None
-    signature_copy: Path | None = None
+    second_place: SecondPlace | None = None
     on_wait: Callable[[float], None] | None = None  # called when the runner waits, in a store of `bench_store`
 
     @property
@@ -102,7 +103,7 @@ class Bench:
             self.rig,
             self.operator,
             self.authority,
-            self.signature_copy,
+            self.second_place,
         ).run()
 
     def act(self, verb: str, **fields: object) -> None:

@@ -38,6 +38,7 @@ from service.core.records.events.site import (
     ProtocolApproved,
     RunSigned,
     ServiceStarted,
+    SignaturesWrittenAgain,
     SignInRecorded,
     SiteOpened,
     TimeStampKept,
@@ -94,6 +95,7 @@ Payload = Annotated[
     | SignInRecorded
     | KeyChanged
     | RunSigned
+    | SignaturesWrittenAgain
     | TimeStampKept
     | LeftoversRemoved
     | ActionAfterEnd

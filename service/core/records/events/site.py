@@ -85,6 +85,16 @@ class RunSigned(Record):
     sha256: str  # of that event
 
 
+class SignaturesWrittenAgain(Record):
+    """Signatures had no line in the log of signatures beside the database; their lines are written again."""
+
+    kind: Literal["signatures_written_again"] = "signatures_written_again"
+    lines: int
+    runs: tuple[str, ...]  # whose signatures these were, or the site's
+    since_utc: str  # time of the first of them
+    explained: bool  # whether one interrupted signature, as by a power failure, explains it
+
+
 class TimeStampKept(Record):
     """A time-stamp authority stamped a checkpoint; this event shows if the stamp is removed later."""
 

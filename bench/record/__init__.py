@@ -1,0 +1,1 @@
+"""Measurements of the record: what an event and a signature cost."""
