@@ -323,6 +323,12 @@ class BenchRig:
         ended, self.ended = tuple(self.ended), []
         return ended
 
+    def hold_arms(self) -> None:
+        if self.arm.connected:
+            self.arm.stop()
+            self.arm.close()
+            self.arm.opened = 0  # it is opened anew when a step asks for it
+
     def reopen(self, device: Device) -> None:
         device.close()
         self._open("robot" if device is self.arm else "camera", device, opened=False)
@@ -391,6 +397,9 @@ class ScriptedOperator:
         if not self.attended or self.attended[-1] != (doing, pedal_armed):
             self.attended.append((doing, pedal_armed))
         self.on_attend(doing)
+
+    def stuck(self, why: str, for_s: float) -> None:
+        assert for_s < 600, f"the run waits for nothing: {why}"
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
         return question.checklist
