@@ -9,13 +9,17 @@ from dataclasses import dataclass, field
 from os import getpid
 from pathlib import Path
 
+from drivers.errors import DeviceChangedError
 from drivers.interfaces import DeviceReport, PedalReading
+from service.core.equipment.exchanged import CHANGED, NOT_CALIBRATED, exchanged, exchanged_words
+from service.core.equipment.recorded_devices import recorded_report
 from service.core.errors import OrthocaptureError
 from service.core.gates.verdict import describe_judged
 from service.core.protocol.models import Protocol
 from service.core.records.events import (
     ActionRefused,
     DeviceOpened,
+    DeviceTrouble,
     OperatorAction,
     RunCompleted,
     SessionStarted,
@@ -265,5 +269,25 @@ class Runner:
         return None if lightbox is None else lightbox.pedal()
 
     def _opened(self, device: str, report: DeviceReport) -> None:
-        self._run.append(DeviceOpened(device=device, report=dataclasses.asdict(report)))
+        """Record what was opened.
+
+        Raises DeviceChangedError if it is another one than before, until a person has decided to go on.
+        """
+        before = self._run.follower.now().events
+        opened = DeviceOpened(device=device, report=dataclasses.asdict(report))
+        self._run.append(opened)
         self._clocks.look()
+        identity = recorded_report(opened.report).identity
+        other = exchanged(before, device, identity)
+        if other is None:
+            return
+        changed = DeviceChangedError(
+            exchanged_words(device, other, identity),
+            where=device,
+            remedy="What was calibrated with the other one does not hold for this one: connect the other one again, "
+            "or repeat the calibration",
+        )
+        if identity.kind not in NOT_CALIBRATED:
+            raise changed
+        self.operator.tell(changed.what)
+        self._run.append(DeviceTrouble(device=device, error=CHANGED, message=changed.what))

@@ -237,7 +237,7 @@ class _CaptureLoop:
 
     def _open_killed(self, robot: RobotArm, *, arrived: bool) -> None:
         """Start the driver anew that was ended from outside, for the try after a person's answer."""
-        with suppress(DeviceError):  # that try says it again
+        with suppress(DeviceError):  # that try says it again, also that it is another device
             if arrived:
                 self._reopen_cameras()
             if not arrived or not _streams(robot):
