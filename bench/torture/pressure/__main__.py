@@ -48,7 +48,6 @@ from tests.support.protocols.small_demo import COARSE, small_demo
 from tests.support.rig.rig import command
 
 _MOST_DECISIONS = 40  # of the person, after whom the run counts as going round in a circle
-_HOST = "127.0.0.66"
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +107,7 @@ def _under_way(data: Path) -> str | None:
     return step
 
 
-def run(name: str, pressure: Pressure, folder: Path, longest_s: float) -> dict[str, Any]:
+def run(name: str, pressure: Pressure, folder: Path, host: str, longest_s: float) -> dict[str, Any]:
     """One whole run; its figures."""
     data = folder / "data"
     (folder / "rig").mkdir(parents=True)
@@ -122,7 +121,7 @@ def run(name: str, pressure: Pressure, folder: Path, longest_s: float) -> dict[s
         (folder / "log").open("w") as log,
     ):
         groups = (everything, program)
-        rig = _begin_rig(folder / "rig", log, everything)
+        rig = _begin_rig(folder / "rig", host, log, everything)
         try:
             assert rig.stdout is not None
             ready = json.loads(rig.stdout.readline())
@@ -146,7 +145,7 @@ def run(name: str, pressure: Pressure, folder: Path, longest_s: float) -> dict[s
     }
 
 
-def _begin_rig(folder: Path, log: Any, everything: Group) -> subprocess.Popen[str]:
+def _begin_rig(folder: Path, host: str, log: Any, everything: Group) -> subprocess.Popen[str]:
     options = (
         "--scene",
         "7",
@@ -156,7 +155,7 @@ def _begin_rig(folder: Path, log: Any, everything: Group) -> subprocess.Popen[st
         "10",
         *COARSE,
         "--host",
-        _HOST,
+        host,
         "--patience",
         "20",
     )
@@ -310,19 +309,23 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=sorted(PRESSURES), default=list(PRESSURES))
     parser.add_argument("--longest-s", type=float, default=1800.0)
+    parser.add_argument("--host", default="127.0.0.66", help="address of the simulated arm")
     options = parser.parse_args()
     day = datetime.datetime.now(datetime.UTC).date().isoformat()
     path = RESULTS / f"pressure-{day}.json"
-    found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"runs": {}}
+    complete = True
     for name in options.only:
         with tempfile.TemporaryDirectory(prefix="orthocapture-pressure-") as folder:
-            found["runs"][name] = run(name, PRESSURES[name], Path(folder), options.longest_s)
-        found |= {"machine": machine(), "commit": commit()}
-        found["runs"] = {known: found["runs"][known] for known in PRESSURES if known in found["runs"]}
+            row = run(name, PRESSURES[name], Path(folder), options.host, options.longest_s)
+        found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"runs": {}}
+        runs = found["runs"] | {name: row}
+        found = {"runs": {known: runs[known] for known in PRESSURES if known in runs}, "machine": machine()}
+        found["commit"] = commit()
         path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
         path.with_suffix(".md").write_text(_table(found), encoding="utf-8")
-        print(name, found["runs"][name]["statuses"], found["runs"][name]["wall_s"], flush=True)
-    return 0 if all(row["completed"] and row["verified"] for row in found["runs"].values()) else 1
+        print(name, row["statuses"], row["wall_s"], flush=True)
+        complete = complete and row["completed"] and row["verified"]
+    return 0 if complete else 1
 
 
 if __name__ == "__main__":
