@@ -62,8 +62,8 @@ class Pressure:
 
 PRESSURES: Mapping[str, Pressure] = {
     "quiet": Pressure("as it is"),
-    "starved": Pressure("0.6 of a processor for the rig and the program", everything=Limits(processors=0.6)),
-    "memory": Pressure("450 MB for the program", program=Limits(memory_mb=450)),
+    "starved": Pressure("0.3 of a processor for the rig and the program", everything=Limits(processors=0.3)),
+    "memory": Pressure("700 MB for the program", program=Limits(memory_mb=700)),
     "killed": Pressure(
         "a driver is killed in each step that uses one", kills=(signal.SIGKILL, signal.SIGALRM, signal.SIGTERM)
     ),
