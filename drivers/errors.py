@@ -13,12 +13,24 @@ class DeviceUnavailableError(DeviceError):
     """The device does not answer, or the link dropped. Reconnecting may help."""
 
 
+class DriverKilledError(DeviceUnavailableError):
+    """The system or a person ended the driver's process: for want of memory, say. A person decides what follows."""
+
+
+class DeviceChangedError(DeviceError):
+    """Another device answers than the one that answered before: what was calibrated was calibrated with that one."""
+
+
 class DriverMissingError(DeviceError):
     """The vendor's library is not installed, because it has no wheel for this Python or this machine."""
 
 
 class DeviceTimeoutError(DeviceError):
     """The device or its driver process did not answer in time."""
+
+
+class MachineBusyError(DeviceTimeoutError):
+    """A time limit ran out because this computer had no processor or memory to spare; the device may be sound."""
 
 
 class DeviceBusyError(DeviceError):

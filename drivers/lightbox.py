@@ -74,7 +74,10 @@ class LightboxConfig(DriverConfig):
 
 
 class SerialLightbox:
-    """drivers.interfaces.Lightbox over pyserial. After the link broke, the next call reopens the port."""
+    """drivers.interfaces.Lightbox over pyserial. After the link broke, the next call reopens the port.
+
+    Another box that answers there then is no longer read until `open`, which tells of it.
+    """
 
     def __init__(self, config: LightboxConfig) -> None:
         self._config = config
@@ -82,12 +85,15 @@ class SerialLightbox:
         self._pending = b""
         self._has_tower = True  # until the box refuses the request
         self._checks = False  # whether this box ends its lines with a checksum
+        self._serial = ""  # of the box that was opened
 
     def open(self) -> DeviceIdentity:
         """Open the port and return the box's identity; skips unsolicited lines such as the banner."""
         self.close()
-        self._has_tower, self._checks = True, False
-        return self._identity()
+        self._has_tower, self._checks, self._serial = True, False, ""
+        identity = self._identity()
+        self._serial = identity.serial
+        return identity
 
     def close(self) -> None:
         """Close the port; does not raise if the link is dead."""
@@ -238,7 +244,20 @@ class SerialLightbox:
                 ) from error
             port.write_timeout = self._config.timeout_s
             self._port = port
+            if self._serial:
+                self._require_same()
         return self._port
+
+    def _require_same(self) -> None:
+        """Close the port again if another box answers than the one that was opened. Raises DeviceUnavailableError."""
+        found = self._identity().serial
+        if found != self._serial:
+            self.close()
+            raise DeviceUnavailableError(
+                f"another light box answers: it has the serial number {found}, not {self._serial}",
+                where=self._config.port,
+                remedy="Open it again",
+            )
 
     def _line(self, port: serial.Serial, deadline_s: float) -> bytes | None:
         """The next complete line without its line end; None at the deadline."""

@@ -7,6 +7,7 @@ import os
 import socket
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache, partial
 from importlib.metadata import EntryPoint
 from typing import Any, TypeVar, cast
@@ -233,6 +234,15 @@ class Station:
             self._refused(name, error)
             raise
         self._open[name] = device
+
+    def hold_arms(self) -> None:
+        """Stop and close every open arm, which is told a leave once only; a dead link holds none of this up."""
+        for name in self.opened("robot"):
+            arm = cast(RobotArm, self._open.pop(name))
+            with suppress(OrthocaptureError):
+                arm.stop()
+            arm.close()
+            self._unlock(name)
 
     def ended_connections(self) -> tuple[ConnectionEnd, ...]:
         """The connections to arms that have ended since the last call, in order."""

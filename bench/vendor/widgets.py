@@ -29,18 +29,20 @@ LISTED: dict[str, tuple[str, str]] = {
     ),
     "focusindication": (AS_REAL, "read-only"),
     "focalposition": (AS_REAL, "read-only, 0 to 100"),
-    "manualfocus": (AS_REAL, "a step of −7 to 7, in manual focus only"),
+    "manualfocus": (AS_REAL, "a step of −7 to 7, in manual focus and in direct manual focus"),
     **dict.fromkeys(
         ("prioritymode", "imagesize", "iso", "f-number", "imagequality", "jpegquality", "focusmode", "shutterspeed"),
         (AS_REAL, _SETTING),
     ),
     "whitebalance": (AS_REAL, f"{_SETTING}; it does not change the picture"),
     "capturemode": (AS_REAL, f"{_SETTING}; one picture is taken in every mode"),
+    "exposurecompensation": (AS_REAL, f"{_SETTING}; with the dial on M it does not change the picture"),
     "expprogram": (AS_REAL, "read-only: the dial is on M"),
     **dict.fromkeys(
-        ("5005", "5007", "500a", "5013", "d203", "d20d", "d21e", "d222", "d252", "d253", "d25a"), (AS_REAL, _RAW)
+        ("5005", "5007", "500a", "5010", "5013", "d203", "d20d", "d21e", "d222", "d252", "d253", "d25a"),
+        (AS_REAL, _RAW),
     ),
-    **dict.fromkeys(("500e", "5010", "d213", "d215", "d218", "d24c"), (AS_REAL, f"{_RAW}; read-only")),
+    **dict.fromkeys(("500e", "d213", "d215", "d218", "d235", "d24c"), (AS_REAL, f"{_RAW}; read-only")),
     **dict.fromkeys(_CONTROLS, (AS_REAL, "a control: it has no value to read")),
 }
 

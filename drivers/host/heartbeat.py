@@ -18,6 +18,7 @@ BEAT = "heartbeat"  # sent in place of a method name
 BEAT_S = 0.04
 START_TIMEOUT_S = 60.0  # time to import the driver and its vendor library on a busy machine
 CLOSE_TIMEOUT_S = 10.0
+MOST_STRETCHED = 4.0  # how many times as long as its limit a call may take on a machine that keeps its driver waiting
 
 
 class Line:

@@ -20,9 +20,16 @@ from typing import Any, Literal, TypeVar, cast
 
 from pydantic import BaseModel
 
-from drivers.errors import DeviceError, DeviceTimeoutError, DeviceUnavailableError
-from drivers.host.heartbeat import CLOSE_TIMEOUT_S, START_TIMEOUT_S, Line
+from drivers.errors import (
+    DeviceError,
+    DeviceTimeoutError,
+    DeviceUnavailableError,
+    DriverKilledError,
+    MachineBusyError,
+)
+from drivers.host.heartbeat import CLOSE_TIMEOUT_S, MOST_STRETCHED, START_TIMEOUT_S, Line
 from drivers.interfaces import DeviceIdentity
+from drivers.machine_pressure import HeldUp, killed_for_memory
 from drivers.plugin import READING_TIMEOUT_S
 from service.core.errors import OrthocaptureError
 
@@ -33,6 +40,11 @@ OnEnd = Callable[[Ending, DeviceError], None]
 
 PING_TIMEOUT_S = 15.0
 _READING = frozenset({"report", "settings"})  # calls that only read what the device knows
+# Of these a process does not die by a fault of its own: the system or a person sends them.
+_FROM_OUTSIDE = frozenset({signal.SIGKILL, signal.SIGALRM, signal.SIGTERM, signal.SIGXCPU})
+_PROMPT_S = 0.1
+_WORTH_WAITING_S = 0.02
+_BUSY_SHARE = 0.25  # of a call's time limit; held up for longer, the driver is not to blame
 
 _LOG = logging.getLogger("drivers.host")
 _LEVELS = logging.getLevelNamesMapping()
@@ -56,7 +68,8 @@ def hosted(
         interface: RobotArm, Camera, … (a Protocol derived from Device).
         spec_path: entry point of the driver, "module:ATTRIBUTE" naming a DriverSpec.
         config: the validated configuration; the child validates its JSON again.
-        call_timeout_s: longest time that one call may take before the child is killed.
+        call_timeout_s: longest time that one call may take before the child is killed, not counting the time in
+            which the machine kept it from running, up to MOST_STRETCHED times as long in all.
         name: the device's name in rig.yaml, for messages and logs.
         reading_timeout_s: the same for `report` and `settings`, if shorter.
         on_end: called by any thread when the connection to a device that was open has ended; must return at once.
@@ -97,6 +110,14 @@ def _forwarder(method: str, function: Callable[..., Any]) -> Callable[..., Any]:
     return forward
 
 
+class _NoAnswerError(Exception):
+    """The child did not answer in time, of which the machine had held it up for `held_up_s`."""
+
+    def __init__(self, held_up_s: float) -> None:
+        super().__init__(held_up_s)
+        self.held_up_s = held_up_s
+
+
 @dataclass(frozen=True, slots=True)
 class _Child:
     """A running child process, with the parent's end of its connection and of its log."""
@@ -130,6 +151,8 @@ class HostedDevice:
         self._child: _Child | None = None
         self._sequence = 0
         self._obituary = "not opened yet"
+        self._killed = False  # the last child died of a signal from outside
+        self._memory_kills = 0  # of the kernel, when the child began
         self._suspect = False  # the driver reported a lost link
         self._on_end = on_end
         self._opened = False  # in this child
@@ -156,7 +179,7 @@ class HostedDevice:
             try:
                 identity = cast("DeviceIdentity", self.call("open"))
             except DeviceError as error:
-                if fresh or self._child is not None:
+                if fresh or self._child is not None or isinstance(error, DriverKilledError):
                     raise
                 # The rest of the old connection crashed the child; a new child starts clean.
                 _LOG.warning("%s: %s; trying once more", self._name, error)
@@ -175,7 +198,7 @@ class HostedDevice:
             except DeviceError as error:
                 _LOG.warning("%s: closing: %s", self._name, error)
             self._bury()
-            self._obituary = "closed"
+            self._obituary, self._killed = "closed", False
         self._watch_stop.set()
 
     def call(self, method: str, *args: Any, **kwargs: Any) -> Any:
@@ -185,6 +208,8 @@ class HostedDevice:
             OrthocaptureError: as raised by the driver.
             DeviceFaultError: the driver raised any other exception.
             DeviceTimeoutError: no answer within the call timeout; the child was killed.
+            MachineBusyError: the same, and the machine had kept the child from running.
+            DriverKilledError: the child was ended from outside, such as by the kernel for want of memory.
             DeviceUnavailableError: the child is not running.
         """
         with self._lock:
@@ -201,15 +226,12 @@ class HostedDevice:
         try:
             child.line.send((self._sequence, method, args, kwargs))
             ok, value = self._receive(child, timeout_s)
-        except TimeoutError:
+        except _NoAnswerError as silence:
             child.process.kill()
             opened = self._bury()
+            self._killed = False
             self._obituary = f"killed after {method or 'ping'} did not return within {timeout_s:g} s"
-            stalled = DeviceTimeoutError(
-                f"driver call {method or 'ping'} did not return within {timeout_s:g} s; its process was ended",
-                where=self._name,
-                remedy="Check the device and its cable, then open it again",
-            )
+            stalled = _stalled(method or "ping", timeout_s, silence.held_up_s, self._name)
             if opened:
                 self._on_end("stalled", stalled)
             raise stalled from None
@@ -228,15 +250,34 @@ class HostedDevice:
         return value
 
     def _receive(self, child: _Child, timeout_s: float) -> tuple[bool, Any]:
-        deadline = time.monotonic() + timeout_s
+        """The answer to the last request; the time in which the machine held the child up does not count.
+
+        Raises _NoAnswerError, EOFError, OSError.
+        """
+        began_s = time.monotonic()
+        held_up: HeldUp | None = None  # measured only where an answer is late: there are hundreds in a second
+        deadline_s = began_s + min(timeout_s / 2, _PROMPT_S)
         while True:
-            if not child.line.poll(max(0.0, deadline - time.monotonic())):
-                raise TimeoutError
-            sequence, ok, value = cast("tuple[int, bool, Any]", child.line.receive())
-            if sequence == self._sequence:  # older answers belong to calls that Ctrl-C interrupted
-                return ok, value
+            if child.line.poll(max(0.0, deadline_s - time.monotonic())):
+                sequence, ok, value = cast("tuple[int, bool, Any]", child.line.receive())
+                if sequence == self._sequence:  # older answers belong to calls that Ctrl-C interrupted
+                    return ok, value
+                continue
+            held_up = held_up or HeldUp(child.process.pid)
+            longest_s = min(timeout_s + held_up.seconds, MOST_STRETCHED * timeout_s)
+            if began_s + longest_s <= deadline_s + _WORTH_WAITING_S:
+                raise _NoAnswerError(held_up.seconds)
+            deadline_s = began_s + longest_s
 
     def _unavailable(self) -> DeviceUnavailableError:
+        if self._killed:
+            short = killed_for_memory() > self._memory_kills
+            by = "the system ended it for want of memory" if short else "it was ended from outside"
+            return DriverKilledError(
+                f"driver process is not running: {self._obituary}; {by}",
+                where=self._name,
+                remedy="End programs that are not needed on this computer, look at the device, then try again",
+            )
         return DeviceUnavailableError(
             f"driver process is not running: {self._obituary}", where=self._name, remedy="Open the device again"
         )
@@ -246,18 +287,28 @@ class HostedDevice:
     def _start(self) -> None:
         ours, theirs = socket.socketpair()
         path = os.pathsep.join(p for p in sys.path if p)
-        process = Popen(
-            [sys.executable, "-m", "drivers.host", str(theirs.fileno())],
-            stdin=DEVNULL,  # libgphoto2 closes descriptor 0
-            stdout=PIPE,
-            stderr=STDOUT,
-            pass_fds=[theirs.fileno()],
-            env={**os.environ, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"},
-            start_new_session=True,  # Ctrl-C must reach only the parent, which then closes the device properly
-            text=True,
-            errors="replace",
-        )
-        theirs.close()
+        self._killed, self._memory_kills = False, killed_for_memory()
+        try:
+            process = Popen(
+                [sys.executable, "-m", "drivers.host", str(theirs.fileno())],
+                stdin=DEVNULL,  # libgphoto2 closes descriptor 0
+                stdout=PIPE,
+                stderr=STDOUT,
+                pass_fds=[theirs.fileno()],
+                env={**os.environ, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"},
+                start_new_session=True,  # Ctrl-C must reach only the parent, which then closes the device properly
+                text=True,
+                errors="replace",
+            )
+        except OSError as error:
+            ours.close()
+            raise MachineBusyError(
+                f"the driver's process cannot be started: {error.strerror}",
+                where=self._name,
+                remedy="End programs that are not needed on this computer, then try again",
+            ) from error
+        finally:
+            theirs.close()
         package = self._spec_path.partition(".")[0].partition(":")[0]
         reader = threading.Thread(target=_log_output, args=(process, self._name, package), daemon=True)
         reader.start()
@@ -289,6 +340,7 @@ class HostedDevice:
         child.log_reader.join(CLOSE_TIMEOUT_S)
         if child.process.stdout is not None:
             child.process.stdout.close()
+        self._killed = status < 0 and -status in _FROM_OUTSIDE
         self._obituary = f"died of {signal.Signals(-status).name}" if status < 0 else f"exited with status {status}"
         if status != 0:
             _LOG.error("%s: driver process %d %s", self._name, child.process.pid, self._obituary)
@@ -308,6 +360,21 @@ class HostedDevice:
                 return
             finally:
                 self._lock.release()
+
+
+def _stalled(method: str, timeout_s: float, lost_s: float, name: str) -> DeviceError:
+    """Why a call was given up, after the machine had held the driver up for `lost_s`."""
+    said = f"driver call {method} did not return within {timeout_s:g} s"
+    if lost_s > _BUSY_SHARE * timeout_s:
+        return MachineBusyError(
+            f"{said}, nor in the {lost_s:.0f} s more in which it had waited for a processor or for memory; its "
+            "process was ended",
+            where=name,
+            remedy="End what else this computer computes, or wait until it is done; then try again",
+        )
+    return DeviceTimeoutError(
+        f"{said}; its process was ended", where=name, remedy="Check the device and its cable, then open it again"
+    )
 
 
 def _log_output(process: Popen[str], name: str, package: str) -> None:

@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection
 from typing import Any, cast
 
 from drivers.errors import DeviceFaultError
-from drivers.host.heartbeat import BEAT, CLOSE_TIMEOUT_S, START_TIMEOUT_S
+from drivers.host.heartbeat import BEAT, CLOSE_TIMEOUT_S, MOST_STRETCHED, START_TIMEOUT_S
 from drivers.interfaces import Device
 from drivers.plugin import DriverSpec, NeedsHeartbeat
 from service.core.errors import ConfigurationError, OrthocaptureError
@@ -44,8 +44,8 @@ class _Server:
         while (request := self._requests.get()) is not None:
             sequence, method, args, kwargs = request
             # A vendor call may hold the GIL for ever while the parent is gone: the default action of SIGALRM
-            # ends this process without any help from Python.
-            signal.setitimer(signal.ITIMER_REAL, self._call_timeout_s + SELF_DESTRUCT_GRACE_S)
+            # ends this process without any help from Python. A parent that lives has given up before.
+            signal.setitimer(signal.ITIMER_REAL, MOST_STRETCHED * self._call_timeout_s + SELF_DESTRUCT_GRACE_S)
             reply = self._answer(sequence, method, args, kwargs)
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the reader thread ends the process

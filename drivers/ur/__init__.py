@@ -26,6 +26,11 @@ class UrConfig(DriverConfig):
     stale_after_s: float = Field(
         default=1.0, gt=0, description="age of the newest sample above which the link counts as dead"
     )
+    upper_registers: bool = Field(
+        default=False,
+        description="use the controller's registers 24 to 47, where a fieldbus (EtherNet/IP, PROFINET) or another "
+        "program uses those below",
+    )
     stop_deceleration_rad_s2: float = Field(default=2.0, gt=0)  # with which a motion is stopped
     watchdog_s: float = Field(
         default=0.2,

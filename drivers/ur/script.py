@@ -13,6 +13,7 @@ from drivers.errors import DeviceError, DeviceRefusedError, DeviceTimeoutError, 
 from drivers.ur import UrConfig
 from drivers.ur import vendor as library
 from drivers.ur.link import vendor
+from drivers.ur.registers import IN_USE, registers_refused
 from drivers.ur.watchdog import Watchdog
 
 SCRIPT_START_S = 5.0
@@ -51,9 +52,18 @@ class ControlScript:
                 yield control
 
     def _connect(self) -> library.Control:
-        """Connect to the controller, which also sends the script."""
+        """Connect to the controller, which also sends the script.
+
+        Raises DeviceRefusedError if its registers are used by somebody else.
+        """
+        upper = self._config.upper_registers
         with self._watchdog.commanding(), vendor(self._where, "starting the control script"):
-            self._control = control = library.control(self._config.host, STREAM_HZ)
+            try:
+                self._control = control = library.control(self._config.host, STREAM_HZ, upper_registers=upper)
+            except RuntimeError as error:
+                if IN_USE not in str(error):
+                    raise
+                raise registers_refused(self._where, self._config.connect_timeout_s, upper=upper) from error
             self.sent += 1
             self._coming = True
             self._watchdog.guard(control)

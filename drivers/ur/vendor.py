@@ -84,13 +84,15 @@ def receive(host: str, frequency_hz: float, variables: list[str]) -> Receive:
         return cast("Receive", rtde_receive.RTDEReceiveInterface(host, frequency_hz, variables))
 
 
-def control(host: str, frequency_hz: float) -> Control:
+def control(host: str, frequency_hz: float, *, upper_registers: bool) -> Control:
     """Connect the control interface and start its script, without the registers of an external force sensor.
 
-    Raises RuntimeError.
+    With `upper_registers` it uses registers 24 to 47. Raises RuntimeError.
     """
     interface = rtde_control.RTDEControlInterface
     flags = interface.FLAG_UPLOAD_SCRIPT | interface.FLAG_NO_EXT_FT
+    if upper_registers:
+        flags |= interface.FLAG_UPPER_RANGE_REGISTERS
     with _slack():
         return cast("Control", interface(host, frequency_hz, flags))
 

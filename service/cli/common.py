@@ -21,9 +21,11 @@ from rich.table import Table
 from typer.models import OptionInfo
 
 from service.cli.terminal_output import Terminal, bar_of_shares
-from service.core.errors import ConfigurationError, OrthocaptureError
+from service.core.errors import ConfigurationError, OrthocaptureError, PersonNeededError
 from service.core.shown_text import shown, shown_json, shown_lines
 
+# The run waits for a decision of a person, and this command had nobody to ask: EX_TEMPFAIL of sysexits.h.
+WAITS_FOR_A_PERSON = 75
 PROGRESS_AFTER_S = 2.0
 _NUMBER = re.compile(r"[-+−±]?\d[\d.,:+−± e%-]*|more|–|-|")
 
@@ -84,27 +86,33 @@ def print_document(text: str) -> None:
     sys.stdout.flush()
 
 
+def exit_status(error: OrthocaptureError) -> int:
+    """With which status a command ends that met this error."""
+    return WAITS_FOR_A_PERSON if isinstance(error, PersonNeededError) else 1
+
+
 def error_record(error: OrthocaptureError) -> dict[str, str]:
     """An error as plain data, for JSON output."""
     return {"kind": type(error).__name__, "what": error.what, "where": error.where, "remedy": error.remedy}
 
 
 def fail(error: OrthocaptureError, *, json: bool = False) -> typer.Exit:
-    """Print an error and return the exit to raise, as in `raise fail(error)`, with status 1."""
+    """Print an error and return the exit to raise, as in `raise fail(error)`, with `exit_status`."""
+    status = exit_status(error)
     if json:
-        print_json({"error": error_record(error)})
+        print_json({"error": error_record(error), **({"exit_status": status} if status != 1 else {})})
     else:
         error_console.tell(("Error:", "bold red"), f" {error.what}")
         if error.where:
             error_console.print(f"  where: {error.where}")
         if error.remedy:
             error_console.print(f"  what to do: {error.remedy}")
-    return typer.Exit(1)
+    return typer.Exit(status)
 
 
 @contextmanager
 def reporting_errors(json: bool = False) -> Generator[None]:
-    """Wrap a command's body: an OrthocaptureError is printed and ends it with status 1; others are bugs and pass.
+    """Wrap a command's body: an OrthocaptureError is printed and ends it with its status; others are bugs and pass.
 
     With `json` a bug is printed as JSON too, so that the program that reads it is told.
     """

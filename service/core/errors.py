@@ -64,6 +64,10 @@ class IllegalTransitionError(OrthocaptureError):
     """The lifecycle does not allow this action in this state."""
 
 
+class PersonNeededError(OrthocaptureError):
+    """The run waits for a decision that only a person can make, and nobody attends; it can be resumed."""
+
+
 class StoreError(OrthocaptureError):
     """The evidence could not be written or read."""
 

@@ -66,7 +66,10 @@ def _data_folder(data: Path) -> str:
         return f"it cannot be reached: {error.strerror}"
     if not os.access(data / "artefacts", os.W_OK):
         return "it cannot be written to"
-    return f"{gigabytes(free):.2f} GB are free: too little to capture" if free < LEAST_FREE_BYTES else ""
+    if free >= LEAST_FREE_BYTES:
+        return ""
+    kept = f"the last {gigabytes(LEAST_FREE_BYTES):.2f} GB are kept for what is under way"
+    return f"{gigabytes(free):.2f} GB are free: too little to capture; {kept}"
 
 
 def _worker(data: Path, queued: int, clock: Clock) -> str:

@@ -4,29 +4,22 @@ from __future__ import annotations
 
 import threading
 import time
-from pathlib import Path
 
-from service.core.units import seconds_of_ns
+from drivers.machine_pressure import processor_time
 
 
 def processor_s() -> float:
     """Seconds that this thread has computed or waited for a processor, as far as the system tells of waits."""
     try:
-        computed_s, waited_s = _scheduled(threading.get_native_id())
+        times = processor_time(threading.get_native_id())
     except OSError:
         return time.thread_time()
-    return computed_s + waited_s
+    return times.computed_s + times.waited_s
 
 
 def waited_s(thread: int) -> float:
     """Seconds that a thread (its native id) has waited for a processor; 0 where no system tells it."""
     try:
-        return _scheduled(thread)[1]
+        return processor_time(thread).waited_s
     except OSError:
         return 0.0
-
-
-def _scheduled(thread: int) -> tuple[float, float]:
-    """Seconds on a processor, and waiting for one, as Linux counts them. Raises OSError."""
-    computed_ns, waited_ns, _ = Path(f"/proc/self/task/{thread}/schedstat").read_text().split()
-    return seconds_of_ns(int(computed_ns)), seconds_of_ns(int(waited_ns))

@@ -8,13 +8,15 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Protocol as Interface
 
 from drivers.errors import DeviceError
+from drivers.machine_pressure import HeldUp
 from service.core.errors import OrthocaptureError, UnforeseenError
 from service.core.protocol.models import Protocol, Step
 from service.core.records.base import recorded
-from service.core.records.events import DeviceTrouble, Payload, StepFailed, StepMeasured
-from service.core.recovery.policy import recovery_policy
+from service.core.records.events import DeviceTrouble, Payload, StepFailed, StepMeasured, StepNote
+from service.core.recovery.policy import PASSING, recovery_policy
 from service.core.run.state import JobState
 from service.core.text.counts import counted
 from service.logs.where import at
@@ -32,6 +34,28 @@ _LOG = logging.getLogger(__name__)
 _NOBODY_S = 30.0  # a worker that died has been replaced by then
 _TOLD_AGAIN_S = 300.0
 _EVERY_S = 5.0
+# A machine is short of processors if this program could not run for this share of the time in which it wanted to, and
+# for a second at least.
+_SHORT_SHARE, _SHORT_S = 0.4, 1.0
+
+
+class Starvation(Interface):
+    """How long this program was kept from running, since it was made."""
+
+    @property
+    def seconds(self) -> float:
+        """The longest that one of its threads has waited."""
+        ...
+
+    @property
+    def share(self) -> float:
+        """Of the time in which it wanted to run, the part in which it could not: 0 to 1."""
+        ...
+
+
+def held_up_here() -> Starvation:
+    """Measure this program from now on."""
+    return HeldUp("self")
 
 
 @dataclass
@@ -74,10 +98,15 @@ class StepExecution:
     workers: WorkerWatch
     leave: LeaveWatch
     clock: Clock
+    held_up: Callable[[], Starvation] = held_up_here
 
     def execute(self, step_id: str, attempt: int) -> None:
-        """Execute a step and record its outcome or failure; an interruption by an operator is only told."""
+        """Execute a step and record its outcome or failure; an interruption by an operator is only told.
+
+        No error of a step ends the run: after one that nobody foresaw the arms stand, and a person is asked.
+        """
         step = self.protocol.step(step_id)
+        starvation = self.held_up()
         at(step=step_id, viewpoint="")
         checkpoint = partial(self._checkpoint, step_id, attempt)
         context = self._context(step, attempt, checkpoint)
@@ -92,14 +121,12 @@ class StepExecution:
         except StepInterruptedError as interruption:
             self.operator.tell(str(interruption))
         except OrthocaptureError as error:
-            self._failed(step_id, attempt, error)
-        except Exception as error:
-            # A step that reads strangers' files may not end the run. One that moves the robot may: then the arm's
-            # watchdog no longer hears of this program, and stops it.
-            if step.moves_robot:
-                raise
+            self.failed(step_id, attempt, error, starvation)
+        except Exception as error:  # noqa: BLE001 - of a library, over a stranger's file, say
             _LOG.info("%s", step_id, exc_info=True)  # below what the terminal shows
-            self._failed(step_id, attempt, _unforeseen(step_id, error))
+            if step.moves_robot:
+                self.devices.hold_arms()
+            self.failed(step_id, attempt, _unforeseen(step, error), starvation)
         else:
             self._measured(step_id, attempt, outcome)
 
@@ -157,15 +184,27 @@ class StepExecution:
             )
         )
 
-    def _failed(self, step_id: str, attempt: int, error: OrthocaptureError) -> None:
+    def failed(
+        self, step_id: str, attempt: int, error: OrthocaptureError, starvation: Starvation | None = None
+    ) -> None:
+        """Record that a step failed, and what follows; `starvation` is that of this program during the attempt."""
         self.note_connections()
         state = self.run.refresh().steps[step_id]
         name = type(error).__name__
-        policy = recovery_policy(self.protocol.step(step_id).recovery, name, state.failures + 1)
+        short = name in PASSING and starvation is not None and _short(starvation)
+        policy = recovery_policy(self.protocol.step(step_id).recovery, name, state.failures + 1, starved=short)
         payloads: list[Payload] = []
+        message = str(error)
+        if short and starvation is not None:
+            lacked = {"waited_s": round(starvation.seconds, 1), "share": round(starvation.share, 2)}
+            payloads.append(StepNote(step=step_id, attempt=attempt, note="processor_short", data=lacked))
+            message += (
+                f". This computer is short of processor time: the program wanted to run and could not for "
+                f"{lacked['waited_s']:.0f} s, {100 * lacked['share']:.0f} % of the time"
+            )
         if isinstance(error, DeviceError):
             payloads.append(DeviceTrouble(device=error.where or step_id, error=name, message=str(error)))
-        payloads.append(StepFailed(step=step_id, attempt=attempt, error=name, message=str(error), recovery=policy))
+        payloads.append(StepFailed(step=step_id, attempt=attempt, error=name, message=message, recovery=policy))
         self.run.append(*payloads)
         kept = self.run.state.origin
         self.operator.tell(f"{step_id}: {error}. What was {kept} is safe")
@@ -183,9 +222,17 @@ class StepExecution:
             raise StepInterruptedError(f"the operator has ended this attempt; the run is {state.status}")
 
 
-def _unforeseen(step_id: str, error: Exception) -> UnforeseenError:
+def _short(starvation: Starvation) -> bool:
+    return starvation.seconds >= _SHORT_S and starvation.share >= _SHORT_SHARE
+
+
+def _unforeseen(step: Step, error: Exception) -> UnforeseenError:
+    if step.moves_robot:
+        remedy = "The robot was stopped and moves for nobody until you confirm: look at it, then repeat the step"
+    else:
+        remedy = "Take the file away that it was about, or use another one, then repeat the step"
     return UnforeseenError(
         f"this was not foreseen: {type(error).__name__}: {error}",
-        where=str(getattr(error, "filename", None) or f"step {step_id}"),
-        remedy="Take the file away that it was about, or use another one, then repeat the step; the log says more",
+        where=str(getattr(error, "filename", None) or f"step {step.id}"),
+        remedy=f"{remedy}; the log says more",
     )

@@ -81,13 +81,17 @@ class LeaveWatch:
         if state.leave is None or not self.protocol.step(state.current).moves_robot:
             return False
         self._account(counts=True)
-        limit_s = self.protocol.motion.confirmed_for_s
-        if self._idle_s <= limit_s and not self._unknown:
+        if self._idle_s <= self.protocol.motion.confirmed_for_s and not self._unknown:
             return False
         tries = state.step.tries
-        why = self._unknown or ("" if tries is None else failed_words(tries))
-        self.run.append(LeaveLapsed(leave_seq=state.leave.seq, idle_s=self._idle_s, limit_s=limit_s, why=why))
+        self.end(state, self._unknown or ("" if tries is None else failed_words(tries)))
         return True
+
+    def end(self, state: RunState, why: str) -> None:
+        """Record that the leave is over, if there is one, of a step that moves the robot."""
+        if state.leave is not None and self.protocol.step(state.current).moves_robot:
+            limit_s = self.protocol.motion.confirmed_for_s
+            self.run.append(LeaveLapsed(leave_seq=state.leave.seq, idle_s=self._idle_s, limit_s=limit_s, why=why))
 
     @contextmanager
     def motion(self) -> Generator[None]:

@@ -4,26 +4,31 @@ from __future__ import annotations
 
 import dataclasses
 import socket
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from os import getpid
 
+from drivers.errors import DeviceChangedError
 from drivers.interfaces import DeviceReport, PedalReading
+from service.core.equipment.exchanged import CHANGED, NOT_CALIBRATED, exchanged, exchanged_words
+from service.core.equipment.recorded_devices import recorded_report
+from service.core.errors import OrthocaptureError
 from service.core.gates.verdict import describe_judged
 from service.core.protocol.models import Protocol
 from service.core.records.events import (
     ActionRefused,
     DeviceOpened,
+    DeviceTrouble,
     OperatorAction,
-    RunAborted,
     RunCompleted,
     SessionStarted,
+    StepNote,
     StepPassed,
     StepRetried,
     StepStarted,
 )
 from service.core.run.actions import refuse
 from service.core.run.decide import (
-    AbortRun,
     Accept,
     AskOperator,
     EvaluateGates,
@@ -34,12 +39,13 @@ from service.core.run.decide import (
     decide,
     evaluate_gates,
 )
+from service.core.run.noted import HandWork
 from service.core.run.state import RunState
 from service.core.run.tries import tries_words
 from service.monitor.host_clock import host_clock
 from service.runner.clocks import ClockWatch
 from service.runner.disk import DiskWatch
-from service.runner.execution import StepExecution, WorkerWatch
+from service.runner.execution import Starvation, StepExecution, WorkerWatch, held_up_here
 from service.runner.held_run import HeldRun, held_run
 from service.runner.leave import LeaveWatch
 from service.runner.memory import short_collections
@@ -47,6 +53,7 @@ from service.runner.operator import AnswerBy, Operator
 from service.runner.pedal import Pedal
 from service.runner.sealing import Seal
 from service.runner.software import software_versions
+from service.runner.trouble import PASSING, Trouble
 from service.steps.context import Devices
 from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.timestamps import Authority
@@ -59,7 +66,8 @@ _POLL_S = 0.1
 class Runner:
     """Drives one run to its end, by the store's clock.
 
-    `authority`, if given, stamps the record when the run ends; `second_place` gets copies of the signatures.
+    `authority`, if given, stamps the record when the run ends; `second_place` gets copies of the signatures; `held_up`
+    begins to measure how long the machine keeps this program from running.
     """
 
     store: Store
@@ -69,17 +77,21 @@ class Runner:
     operator: Operator
     authority: Authority | None = None
     second_place: SecondPlace | None = None
+    held_up: Callable[[], Starvation] = held_up_here
     _run: HeldRun = field(init=False)
     _seal: Seal = field(init=False)
     _pedal: Pedal = field(init=False)
     _clocks: ClockWatch = field(init=False)
     _leave: LeaveWatch = field(init=False)
     _steps: StepExecution = field(init=False)
+    _unprepared: set[str] = field(init=False, default_factory=set[str])  # steps whose simulated technician failed
 
     def run(self) -> RunState:
         """Take the lease, record the session, and execute decisions until the run ends; a paused run waits here.
 
-        Raises LeaseHeldError if another runner drives the run, LeaseLostError if one has taken it over.
+        Only a person ends the run: what fails is asked about or waited out. Raises LeaseHeldError if another runner
+        drives the run, LeaseLostError if one has taken it over, IntegrityError if the record is not what it was,
+        PersonNeededError if nobody attends who could decide.
         """
         operator, clock = self.operator, self.store.clock
         with short_collections(), held_run(self.store, self.run_id, self.protocol) as self._run:
@@ -95,18 +107,38 @@ class Runner:
             workers = WorkerWatch(data, operator.tell, clock)
             self._leave = LeaveWatch(self._run, self.protocol, data, clock, operator.tell)
             self._steps = StepExecution(
-                self._run, self.protocol, self.devices, operator, disk, workers, self._leave, clock
+                self._run, self.protocol, self.devices, operator, disk, workers, self._leave, clock, self.held_up
             )
             self._begin_session()
             disk.forecast()
+            trouble = Trouble(self.store, self.devices, operator)
             try:
-                while not (state := self._run.refresh()).terminal:
-                    self._leave.look(state)
-                    self._steps.note_connections()
-                    self._act(state)
-                return state
+                while not self._run.state.terminal:
+                    try:
+                        trouble.over(self._note_wait)
+                        self._go_on()
+                    except PASSING as error:
+                        trouble.wait_out(error)
+                return self._run.state
             finally:
                 self._seal.sign(ended=self._run.state.terminal)
+
+    def _go_on(self) -> None:
+        """Read what is new, and do what is due."""
+        state = self._run.refresh()
+        if not state.terminal:
+            self._leave.look(state)
+            self._steps.note_connections()
+            self._act(state)
+
+    def _note_wait(self, why: str, waited_s: float) -> None:
+        """Record that the run could not go on for a time; what lets the robot move does not outlast that."""
+        state = self._run.refresh()
+        if state.terminal:
+            return
+        data = {"why": why, "waited_s": round(waited_s, 1)}
+        self._run.append(StepNote(step=state.current, attempt=state.step.attempt, note="run_waited", data=data))
+        self._leave.end(self._run.refresh(), why)
 
     def submit(self, action: OperatorAction, actor: str) -> None:
         """Record an action if it is allowed now; otherwise record its refusal and tell the operator why."""
@@ -140,8 +172,11 @@ class Runner:
                 self._ask(decision, state)
             case RunStep(step, attempt, begin):
                 if begin:
-                    self.operator.prepare(step, attempt)
+                    if not self._prepared(step, attempt):
+                        return
                     self._run.append(StepStarted(step=step, attempt=attempt))
+                elif step in self._unprepared and not self._prepared(step, attempt):
+                    return
                 self._steps.execute(step, attempt)
                 self._clocks.look()
             case EvaluateGates():
@@ -154,12 +189,23 @@ class Runner:
                 self._retry(decision, state)
             case FinishRun(deviations):
                 self._run.append(RunCompleted(deviations=deviations))
-            case AbortRun(reason):
-                self._run.append(RunAborted(reason=reason))
             case Halt():
                 self.operator.show("paused", 0, 0)
                 self.operator.attend("paused", state, pedal_armed=False)
                 self.store.clock.sleep(_POLL_S)
+
+    def _prepared(self, step: str, attempt: int) -> bool:
+        """Let a simulated technician do what was confirmed; if that fails, so does the attempt."""
+        self._unprepared.add(step)
+        try:
+            self.operator.prepare(step, attempt)
+        except OrthocaptureError as error:
+            if self._run.state.phase == "ready":
+                self._run.append(StepStarted(step=step, attempt=attempt))
+            self._steps.failed(step, attempt, error)
+            return False
+        self._unprepared.discard(step)
+        return True
 
     def _judge(self, due: EvaluateGates, state: RunState) -> None:
         step = self.protocol.step(due.step)
@@ -185,10 +231,21 @@ class Runner:
             self.operator.attend("working", now, pedal_armed=False)
         if not state.step.retry_granted and self._leave.lapsed(self._run.refresh()):
             return
+        unable = None
         if state.step.retry_granted:
             hands = () if state.step.mend is None else state.step.mend.hands
-            self.operator.mend(decision.step, decision.attempt, hands)
+            unable = self._mended(decision, hands)
         self._run.append(StepRetried(step=decision.step, attempt=decision.attempt, why=decision.why))
+        if unable is not None:
+            self._steps.failed(decision.step, decision.attempt, unable)
+
+    def _mended(self, decision: Retry, hands: tuple[HandWork, ...]) -> OrthocaptureError | None:
+        """Let a simulated technician do what the step asked for; the error if that cannot be done."""
+        try:
+            self.operator.mend(decision.step, decision.attempt, hands)
+        except OrthocaptureError as error:
+            return error
+        return None
 
     def _ask(self, question: AskOperator, state: RunState) -> None:
         answer = self._by_pedal(question, state) or self.operator.poll(question, state)
@@ -211,5 +268,25 @@ class Runner:
         return None if lightbox is None else lightbox.pedal()
 
     def _opened(self, device: str, report: DeviceReport) -> None:
-        self._run.append(DeviceOpened(device=device, report=dataclasses.asdict(report)))
+        """Record what was opened.
+
+        Raises DeviceChangedError if it is another one than before, until a person has decided to go on.
+        """
+        before = self._run.follower.now().events
+        opened = DeviceOpened(device=device, report=dataclasses.asdict(report))
+        self._run.append(opened)
         self._clocks.look()
+        identity = recorded_report(opened.report).identity
+        other = exchanged(before, device, identity)
+        if other is None:
+            return
+        changed = DeviceChangedError(
+            exchanged_words(device, other, identity),
+            where=device,
+            remedy="What was calibrated with the other one does not hold for this one: connect the other one again, "
+            "or repeat the calibration",
+        )
+        if identity.kind not in NOT_CALIBRATED:
+            raise changed
+        self.operator.tell(changed.what)
+        self._run.append(DeviceTrouble(device=device, error=CHANGED, message=changed.what))

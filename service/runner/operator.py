@@ -26,7 +26,10 @@ class Operator(Interface):
     name: str
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
-        """The answer, if there is one yet; called about ten times per second while a question is open."""
+        """The answer, if there is one yet; called about ten times per second while a question is open.
+
+        Raises PersonNeededError where nobody attends who could give it.
+        """
         ...
 
     def show(self, what: str, done: int, total: int) -> None:
@@ -43,6 +46,10 @@ class Operator(Interface):
 
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
         """Update what screens show; called several times per second, whatever the runner does."""
+        ...
+
+    def stuck(self, why: str, for_s: float) -> None:
+        """Called every second while the run cannot go on. Raises PersonNeededError where nobody attends for long."""
         ...
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:

@@ -151,6 +151,10 @@ class Devices(Protocol):
         """Open a device again after its connection was lost. An arm then needs a new leave to move."""
         ...
 
+    def hold_arms(self) -> None:
+        """Stop and close every open arm: it moves again only after it is opened anew and a person has confirmed."""
+        ...
+
     def ended_connections(self) -> tuple[ConnectionEnd, ...]:
         """The connections to arms that have ended since the last call, in order."""
         ...

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from simulators.faults import FaultPlan
 from simulators.sony_camera.exif import PLATE
 from simulators.sony_camera.properties import (
+    DIRECT_MANUAL_FOCUS,
     MANUAL_FOCUS,
     Code,
     PropertyTable,
@@ -67,7 +68,7 @@ class SonyBody(CameraBody):
             self._step_focus(state - 0x10000 if state & 0x8000 else state)
 
     def _step_focus(self, steps: int) -> None:
-        if self.properties.value(Code.FOCUS_MODE) != MANUAL_FOCUS:
+        if self.properties.value(Code.FOCUS_MODE) not in (MANUAL_FOCUS, DIRECT_MANUAL_FOCUS):
             raise NotWritableError("the focus can only be moved in manual focus")
         position = self.properties.value(Code.FOCAL_POSITION) + steps
         self.properties.put(Code.FOCAL_POSITION, min(100, max(0, position)))

@@ -31,6 +31,7 @@ class Code(IntEnum):
     BATTERY = 0xD218
     ISO = 0xD21E
     CAPTURE_TARGET = 0xD222
+    FOCUS_CAN_BE_DRIVEN = 0xD235
     FOCAL_POSITION = 0xD24C
     JPEG_QUALITY = 0xD252
     FILE_FORMAT = 0xD253
@@ -42,7 +43,7 @@ class Code(IntEnum):
 
 
 CONTROLS = (Code.HALF_PRESS, Code.FULL_PRESS, Code.FOCUS_STEP, Code.FOCUS_REST)
-MANUAL_FOCUS = 1
+MANUAL_FOCUS, DIRECT_MANUAL_FOCUS = 1, 0x8006
 FILE_RAW, FILE_RAW_JPEG, FILE_JPEG = 1, 2, 3
 TARGET_COMPUTER, TARGET_CARD, TARGET_BOTH = 1, 16, 17
 
@@ -121,6 +122,9 @@ _SHUTTERS = tuple(shutter_code(tenths, 10) for tenths in _TENTHS) + tuple(
 )
 _ISO = (50, 64, 80, 100, 125, 160, 200, 250, 320, 400, 500, 640, 800, 1000, 1250, 1600, 2000, 2500, 3200, 6400, 12800)
 _WHITE_BALANCE = (2, 4, 0x8011, 0x8010, 6, 0x8001, 0x8002, 0x8003, 0x8004, 7, 0x8012, 0x8020, 0x8021, 0x8022)
+# Thousandths of a stop, from +5 to -5 by thirds; with the dial on M they change no picture.
+_ABOVE_ZERO = tuple(round(third * 1000 / 3, -2) for third in range(15, 0, -1))
+_COMPENSATIONS = (*map(int, _ABOVE_ZERO), 0, *(-int(number) for number in reversed(_ABOVE_ZERO)))
 _U8, _I16, _U16, _U32, _I8 = 2, 3, 4, 6, 1
 
 
@@ -129,9 +133,9 @@ def initial_properties() -> list[CameraProperty]:
     return [
         CameraProperty(Code.WHITE_BALANCE, _U16, 4, _WHITE_BALANCE),
         CameraProperty(Code.F_NUMBER, _U16, 800, _APERTURES),
-        CameraProperty(Code.FOCUS_MODE, _U16, 2, (2, 0x8005, 0x8004, 0x8006, MANUAL_FOCUS)),
+        CameraProperty(Code.FOCUS_MODE, _U16, 2, (2, 0x8005, 0x8004, DIRECT_MANUAL_FOCUS, MANUAL_FOCUS)),
         CameraProperty(Code.EXPOSURE_PROGRAM, _U32, 1, (), enabled=Enabled.DISPLAY_ONLY),
-        CameraProperty(Code.EXPOSURE_COMPENSATION, _I16, 0, (), enabled=Enabled.DISPLAY_ONLY),
+        CameraProperty(Code.EXPOSURE_COMPENSATION, _I16, 0, _COMPENSATIONS),
         CameraProperty(Code.DRIVE_MODE, _U32, 1, (1, 0x8010, 2, 0x8012, 0x8003, 0x8004, 0x8005)),
         CameraProperty(Code.IMAGE_SIZE, _U8, 1, (1, 2, 3)),
         CameraProperty(Code.SHUTTER_SPEED, _U32, shutter_code(1, 60), _SHUTTERS),
@@ -140,6 +144,7 @@ def initial_properties() -> list[CameraProperty]:
         CameraProperty(Code.BATTERY, _I8, 87, limits=(-1, 100, 1), enabled=Enabled.DISPLAY_ONLY),
         CameraProperty(Code.ISO, _U32, 400, _ISO),
         CameraProperty(Code.CAPTURE_TARGET, _U16, TARGET_COMPUTER, (TARGET_COMPUTER, TARGET_BOTH, TARGET_CARD)),
+        CameraProperty(Code.FOCUS_CAN_BE_DRIVEN, _U8, 1, (), enabled=Enabled.DISPLAY_ONLY),
         CameraProperty(Code.FOCAL_POSITION, _U8, 50, limits=(0, 100, 1), enabled=Enabled.DISPLAY_ONLY),
         CameraProperty(Code.JPEG_QUALITY, _U8, 2, (1, 2, 3, 4)),
         CameraProperty(Code.FILE_FORMAT, _U8, FILE_JPEG, (FILE_RAW, FILE_RAW_JPEG, FILE_JPEG)),

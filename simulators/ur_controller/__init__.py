@@ -12,7 +12,7 @@ import numpy as np
 from simulators.serve import SimulatorError, Termination, add_patience, announce
 from simulators.ur_controller.controller import Controller
 from simulators.ur_controller.kinematics import MODELS
-from simulators.ur_controller.server import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT, Server
+from simulators.ur_controller.server import CUT_OFF_S, DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT, Server
 from simulators.world_link import WorldLink
 
 HOME_RAD = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
@@ -33,6 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--arm", default="robot", help="name of the arm in the world and in fault plans")
     parser.add_argument(
         "--pendant-port", type=int, default=30090, help="port for what a person does at the pendant (pendant.py)"
+    )
+    parser.add_argument(
+        "--cut-off", type=float, default=CUT_OFF_S, metavar="S", help="seconds without reading that end a connection"
+    )
+    parser.add_argument(
+        "--fieldbus", action="store_true", help="a fieldbus is on, which reserves the input registers 0 to 23"
     )
     add_patience(parser)
 
@@ -65,7 +71,7 @@ def serve(args: argparse.Namespace) -> None:
     if args.world:
         host, _, port = args.world.rpartition(":")
         world = WorldLink((host, int(port)), args.arm)
-    server = Server(controller, args.host, world, args.pendant_port)
+    server = Server(controller, args.host, world, args.pendant_port, cut_off_s=args.cut_off, fieldbus=args.fieldbus)
     announce(
         host=args.host,
         rtde=f"{args.host}:{RTDE_PORT}",

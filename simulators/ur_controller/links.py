@@ -32,11 +32,21 @@ class Link(Connection):
     def __init__(self, accepted: socket.socket) -> None:
         super().__init__(accepted)
         self.muted_until_s = 0.0
+        self.unread_since_s: float | None = None  # the time.monotonic() since which the peer has read nothing
 
     def send(self, data: bytes) -> None:
         """Send now, or later when the peer reads again; nothing while silenced."""
         if not self.dead and time.monotonic() >= self.muted_until_s:
             super().send(data)
+
+    def flush(self) -> None:
+        """Send the queued bytes, and note since when the peer has read none of them."""
+        waiting = len(self.out)
+        super().flush()
+        if not self.out:
+            self.unread_since_s = None
+        elif self.unread_since_s is None or len(self.out) < waiting:
+            self.unread_since_s = time.monotonic()
 
     def receive(self, data: bytes) -> None:
         """Handle bytes from the peer."""
@@ -113,10 +123,8 @@ class RtdeLink(Link):
     def _set_up_inputs(self, payload: bytes) -> None:
         names = codec.parse_names(payload)
         owners = self._server.owners
-        types = [
-            "IN_USE" if owners.get(name, self) is not self else self._server.input_types.get(name, "NOT_FOUND")
-            for name in names
-        ]
+        taken = {name for name in names if owners.get(name, self) is not self} | self._server.reserved
+        types = ["IN_USE" if name in taken else self._server.input_types.get(name, "NOT_FOUND") for name in names]
         number = len(self._inputs) + 1
         if not names or "NOT_FOUND" in types or "IN_USE" in types or number > MOST_RECIPES:
             number = 0

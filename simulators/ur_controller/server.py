@@ -21,13 +21,28 @@ _LOG = logging.getLogger(__name__)
 
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
 LONGEST_REST_S = 0.008
+CUT_OFF_S = 10.0  # without a byte read, after which a client is disconnected
+_SEND_BUFFER_BYTES = 1 << 14  # of the system, for a client that does not read
+# EtherNet/IP and PROFINET reserve the lower half of the general purpose registers.
+_FIELDBUS = frozenset(f"input_{kind}_register_{number}" for kind in ("int", "double") for number in range(24))
 
 
 class Server:
     """Listens on the three ports and the pendant's, and advances the controller in real time."""
 
-    def __init__(self, controller: Controller, host: str, world: WorldLink | None, pendant_port: int) -> None:
+    def __init__(
+        self,
+        controller: Controller,
+        host: str,
+        world: WorldLink | None,
+        pendant_port: int,
+        *,
+        cut_off_s: float = CUT_OFF_S,
+        fieldbus: bool = False,
+    ) -> None:
         self.controller = controller
+        self.reserved = _FIELDBUS if fieldbus else frozenset[str]()  # registers that no client may write
+        self._cut_off_s = cut_off_s
         self.interpreter = Interpreter(controller)
         self.output_types = fields.outputs(controller.version)
         self.input_types = fields.inputs(controller.version)
@@ -139,7 +154,9 @@ class Server:
         return bool(ready)
 
     def _accept(self, listener: socket.socket, make: Callable[[socket.socket], Link]) -> None:
-        link = make(accept(listener))
+        accepted = accept(listener)
+        accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
+        link = make(accepted)
         self._links.append(link)
         self._selector.register(link.socket, selectors.EVENT_READ, link)
         if isinstance(link, RtdeLink):
@@ -174,6 +191,9 @@ class Server:
         for link in self._links:
             if link.out:
                 link.flush()
+            if link.unread_since_s is not None and now_s - link.unread_since_s > self._cut_off_s:
+                _LOG.warning("a client that has not read for %.1f s is disconnected", self._cut_off_s)
+                link.dead = True
             if isinstance(link, RtdeLink) and link.streaming:
                 link.stream(now_s)
 

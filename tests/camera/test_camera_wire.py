@@ -83,6 +83,34 @@ def test_the_focal_position_is_read_and_moved_by_hand_in_manual_focus_only(camer
     assert near == 53.0
 
 
+@pytest.mark.parametrize("mode", ["Manual", "DMF"])
+def test_the_focus_is_moved_by_three_steps_either_way(camera: RunningCamera, mode: str) -> None:
+    def position() -> float:
+        (found,) = vendor_session(camera.gphoto_port, ["value", "focalposition"])  # a client caches a value
+        return found
+
+    vendor_session(camera.gphoto_port, ["set", "focusmode", mode])
+    before = position()
+    (up,) = vendor_session(camera.gphoto_port, ["set", "manualfocus", 3.0])
+    assert isinstance(up, float)
+    assert position() == before + 3
+    (down,) = vendor_session(camera.gphoto_port, ["set", "manualfocus", -3.0])
+    assert isinstance(down, float)
+    assert position() == before
+
+
+def test_the_exposure_compensation_has_thirds_of_a_stop_from_5_to_minus_5(camera: RunningCamera) -> None:
+    choices, set_s = vendor_session(
+        camera.gphoto_port, ["choices", "exposurecompensation"], ["set", "exposurecompensation", "-1.3"]
+    )
+    assert len(choices) == 31
+    assert choices[:4] == ["5", "4.7", "4.3", "4"]
+    assert choices[-1] == "-5"
+    assert isinstance(set_s, float)
+    assert vendor_session(camera.gphoto_port, ["value", "exposurecompensation"]) == ["-1.3"]
+    vendor_session(camera.gphoto_port, ["set", "exposurecompensation", "0"])
+
+
 def test_an_empty_value_is_refused_and_the_link_goes_on(camera: RunningCamera) -> None:
     """libgphoto2 sends an empty data phase for `capturetarget` set by name."""
     words = (["set", "capturetarget", "card+sdram"], ["value", "cameramodel"], ["set", "iso", "200"])

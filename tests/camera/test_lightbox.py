@@ -75,6 +75,32 @@ def test_a_box_without_a_tower_is_no_error_and_is_asked_once(tmp_path: Path) -> 
         assert sum(line.startswith(b"TOWER") for line in asked) == 1
 
 
+def test_another_box_that_answers_after_the_link_broke_is_not_read_before_it_is_opened(tmp_path: Path) -> None:
+    """Its pedal could otherwise confirm, unseen."""
+    serials = ["LB-1"]
+
+    def reply(line: bytes) -> bytes:
+        return f"*IDN a,b,{serials[-1]},1.0\n".encode() if line[:1] == b"*" else b"LIGHT 5.0\nTEMP 20\nSHUTTER 0\n"
+
+    first, second = answering(reply), answering(reply)
+    link = tmp_path / "lightbox"
+    with first as one, second as other:
+        link.symlink_to(one)
+        with opened(link) as driver:
+            assert driver.read().light_lux == 5.0
+            driver.close()  # as after a broken link, which the next call opens again
+            assert driver.read().light_lux == 5.0
+            driver.close()
+            link.unlink()
+            link.symlink_to(other)
+            serials.append("LB-2")
+            for _ in range(2):
+                with pytest.raises(DeviceUnavailableError, match="serial number LB-2, not LB-1"):
+                    driver.read()
+            assert driver.open().serial == "LB-2"
+            assert driver.read().light_lux == 5.0
+
+
 def test_a_box_that_does_not_know_a_light_has_a_tower_all_the_same() -> None:
     wrong = answering(lambda line: b"*IDN a,b,c,1.3\n" if line[:1] == b"*" else b"ERR 2 wrong argument\n")
     with wrong as port, opened(port) as driver:

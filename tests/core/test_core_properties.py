@@ -14,7 +14,6 @@ from service.core.errors import IntegrityError
 from service.core.records.events import (
     OperatorAction,
     Payload,
-    RunAborted,
     RunCompleted,
     StepFailed,
     StepMeasured,
@@ -26,7 +25,6 @@ from service.core.records.events import (
 from service.core.recovery.policy import recovery_policy
 from service.core.run.actions import refuse
 from service.core.run.decide import (
-    AbortRun,
     Accept,
     AskOperator,
     EvaluateGates,
@@ -172,8 +170,6 @@ class Runs(RuleBasedStateMachine):
                 self.log.append(StepRetried(step=step, attempt=attempt, why="again"))
             case FinishRun(deviations):
                 self.log.append(RunCompleted(deviations=deviations))
-            case AbortRun(reason):
-                self.log.append(RunAborted(reason=reason))
             case AskOperator() | Halt():
                 pass
 

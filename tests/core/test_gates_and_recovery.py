@@ -19,7 +19,6 @@ from service.core.records.events import (
 from service.core.recovery.policy import NEEDS_A_PERSON, PASSING, recovery_policy
 from service.core.recovery.ways_on import ways_on
 from service.core.run.decide import (
-    AbortRun,
     Halt,
     Retry,
     RunStep,
@@ -230,11 +229,13 @@ def test_an_operator_grants_a_retry_and_what_was_given_up_gets_another_chance() 
     assert log.state.step.failures == 0
 
 
-def test_recovery_can_abort_the_run(log: Log) -> None:
+def test_a_protocol_can_recommend_to_end_the_run_and_only_a_person_ends_it(log: Log) -> None:
     log.begin()
-    log.append(failure(log, "IntegrityError", "abort"))
-    assert log.decision == AbortRun("IntegrityError: no answer")
-    log.append(RunAborted(reason="evidence"))
+    log.append(failure(log, "ComputeError", "abort"))
+    assert log.question.for_ == "recovery"
+    assert "The protocol recommends to end the run here" in log.question.text
+    assert log.question.ways[0].verb == "abort"
+    log.append(RunAborted(reason="evidence"))  # as earlier versions recorded it without asking
     assert log.decision == Halt("aborted")
     assert log.state.stop_reason == "evidence"
 

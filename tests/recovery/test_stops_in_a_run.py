@@ -67,14 +67,14 @@ def test_a_driver_killed_in_mid_motion_is_asked_about_before_the_arm_moves_on(tm
                 os.kill(run.station.driver_pid, signal.SIGKILL)
 
         run.operator.on_attend = kill
-        run.answers(looks_for(3.0, arm, "nobody has let the arm move since it was connected"))
+        run.answers(looks_for(3.0, arm, "died of SIGKILL; it was ended from outside"))
         assert run.drive().status == "completed"
         payloads = [event.payload for event in store.events(run.run_id)]
         (trouble,) = [p for p in payloads if isinstance(p, DeviceTrouble) and p.connection]
         assert trouble.connection == "died"
         assert "SIGKILL" in trouble.message
     assert killed
-    assert run.failures() == ["LeaveNeededError"]
+    assert run.failures() == ["DriverKilledError"]
     assert run.captured() == VIEWS
 
 

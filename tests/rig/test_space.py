@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Generator
 from pathlib import Path
@@ -111,6 +112,10 @@ def test_a_run_pauses_with_a_question_before_the_disk_is_full_and_goes_on(bench:
     assert (failed.error, failed.recovery) == ("SpaceShortError", "ask")
     assert "The disk of the data folder is nearly full" in asked[0]
     assert "exports that were copied elsewhere: 3 MB" in asked[0]
+    assert "the last 1.1 GB are kept free, so that work under way can be recorded" in asked[0]
+    needed = re.search(r"Nothing begins until (\d+\.\d) GB are free", asked[0])
+    assert needed is not None
+    assert float(needed[1]) + 0.05 >= LEAST_FREE_BYTES / GB
     assert len(set(bench.captured())) == len(bench.captured()) == 4
     (note,) = [note.data for note in bench.payloads(StepNote) if note.note == "disk_space"]
     assert (note["verdict"], note["free_bytes"]) == ("stop", LEAST_FREE_BYTES + 100)
@@ -125,6 +130,7 @@ def test_a_run_that_will_not_fit_says_so_once_with_the_figures(tmp_path: Path, s
         notes = [note.data for note in bench.payloads(StepNote) if note.note == "disk_space"]
         assert [(note["verdict"], note["views_left"]) for note in notes] == [("short", 20)]
         (told,) = [words for words in bench.operator.told if "The disk is too small" in words]
+        assert "the last 1.1 GB are kept free" in told
         assert "the run needs about 80 MB more (20 views of 4 MB each, from a guess)" in told
 
 

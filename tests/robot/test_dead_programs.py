@@ -82,7 +82,7 @@ def test_killed(name: str, victim: str, tmp_path: Path) -> None:
         comes_to_rest(watch, since_s, lateness)
         rested_s = watch.mark()
         if victim == "driver":  # the program reopens it and tries to continue, again and again
-            assert program.next("error")["error"] == "DeviceUnavailableError"
+            assert program.next("error")["error"] == "DriverKilledError"
             assert program.next("error")["error"] == "LeaveNeededError"
             stays(watch, rested_s)
             goes_on_for_a_person(program, watch)

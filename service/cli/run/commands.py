@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from collections.abc import Generator
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Annotated, cast
@@ -29,7 +30,7 @@ from service.cli.run.terminal.import_operator import ImportOperator
 from service.cli.run.terminal.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
 from service.cli.run.terminal.waiting import wait_for_results
 from service.cli.shipped_protocols import protocol_file
-from service.core.errors import ConfigurationError
+from service.core.errors import ConfigurationError, PersonNeededError
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.entered import about_run
 from service.core.run.fold import fold
@@ -62,7 +63,11 @@ from service.store.store import Store
 
 RigOption = Annotated[Path, typer.Option("--rig", help="The rig file: devices and stations of this site.")]
 AutoOption = Annotated[
-    bool, typer.Option("--auto-confirm", help="Answer every question automatically; simulated rigs only.")
+    bool,
+    typer.Option(
+        "--auto-confirm",
+        help="Answer every question automatically; simulated rigs only. Ends with 75 where a person must decide.",
+    ),
 ]
 WorkerOption = Annotated[
     bool, typer.Option("--worker/--no-worker", help="Compute in this command, or leave it to other workers.")
@@ -105,7 +110,8 @@ def run_command(
             if not auto_confirm:  # simulated rigs need no approval
                 approve(store, loaded, who.name, reason=approve_change, identified=who.identified)
             run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm, about=about)
-            state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker, who=who)
+            with _waiting_run_named(run_id):
+                state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker, who=who)
         _report_end(run_id, state, json=json)
 
 
@@ -129,10 +135,21 @@ def resume_command(
         who = None
         if not (auto_confirm or screens):
             who = acting_person(store, operator or root.operator, password_stdin=password_stdin)
-        state = drive(
-            store, run_id, rig, data=data, auto_confirm=auto_confirm, worker=worker, screens=screens, who=who
-        )
+        with _waiting_run_named(run_id):
+            state = drive(
+                store, run_id, rig, data=data, auto_confirm=auto_confirm, worker=worker, screens=screens, who=who
+            )
         _report_end(run_id, state, json=json)
+
+
+@contextmanager
+def _waiting_run_named(run_id: str) -> Generator[None]:
+    """Let the error of a run that waits for a person name the run."""
+    try:
+        yield
+    except PersonNeededError as error:
+        where = f"run {run_id}, {error.where}".removesuffix(", ")
+        raise PersonNeededError(error.what, where=where, remedy=error.remedy) from error
 
 
 def drive(

@@ -50,9 +50,14 @@ class Forecast:
         return LEAST_FREE_BYTES + _VIEWS_UNDER_WAY * self.view_bytes
 
     @property
+    def begins_from_bytes(self) -> int:
+        """Free space from which new work begins."""
+        return min(self.stop_below_bytes, LEAST_FREE_BYTES + self.needed_bytes)
+
+    @property
     def verdict(self) -> Verdict:
         """`stop`: no new work begins. `short`: the space will run out before the end of the run."""
-        if self.free_bytes < min(self.stop_below_bytes, LEAST_FREE_BYTES + self.needed_bytes):
+        if self.free_bytes < self.begins_from_bytes:
             return "stop"
         return "short" if self.free_bytes - self.needed_bytes < LEAST_FREE_BYTES else "enough"
 
@@ -65,8 +70,16 @@ class Forecast:
         if self.verdict == "enough":
             return f"Disk: {figures}"
         if self.verdict == "short":
-            return f"The disk is too small: {figures}; the last {size_words(LEAST_FREE_BYTES)} are kept free"
-        return f"The disk of the data folder is nearly full: {figures}. Nothing begins until there is more room"
+            return f"The disk is too small: {figures}; {self.reserve}"
+        return (
+            f"The disk of the data folder is nearly full: {figures}; {self.reserve}. Nothing begins until "
+            f"{size_words(self.begins_from_bytes)} are free"
+        )
+
+    @property
+    def reserve(self) -> str:
+        """What is kept free, in words."""
+        return f"the last {size_words(LEAST_FREE_BYTES)} are kept free, so that work under way can be recorded"
 
 
 def forecast(

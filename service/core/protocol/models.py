@@ -142,7 +142,8 @@ class Recovery(Record):
 
     retries: Annotated[int, Field(ge=0, le=20)] = 2  # after transient device errors without progress in between
     wait_s: Annotated[float, Field(ge=0, le=600)] = 1.0  # before a retry
-    on_failure: Literal["ask", "abort"] = "ask"  # when no retry is left: ask a person, or end the run
+    # When no retry is left a person is asked; with `abort`, to end the run is what the question recommends.
+    on_failure: Literal["ask", "abort"] = "ask"
 
 
 class HandAction(Record):

@@ -49,7 +49,8 @@ def trouble_of(protocol: Protocol, state: RunState) -> Trouble | None:
 def ways_on(protocol: Protocol, state: RunState) -> tuple[WayOn, ...]:
     """Every way on for a stopped run, the available ones first; empty while nothing stops it.
 
-    Ending the run is always available and is the last of the available ones.
+    Ending the run is always available. It is the last of the available ones, unless the protocol recommends it
+    (`on_failure: abort`).
     """
     trouble = trouble_of(protocol, state)
     if trouble is None:
@@ -61,12 +62,20 @@ def ways_on(protocol: Protocol, state: RunState) -> tuple[WayOn, ...]:
     else:
         again, redos = _again(protocol, state, trouble), _redos(protocol, state, step)
         same = trouble == "gates" and (step.repeated.same or _all_taken(step, state.step))
-        found = [*redos, again] if same else [again, *redos]
+        found = [*redos, again] if same or _changed(state) else [again, *redos]
         found += [_accept(protocol, state)] if trouble == "gates" else []
         found.append(_skip(protocol, state))
     found.sort(key=lambda way: not way.available)  # stable
     done = [way for way in found if way.available]
-    return (*done, _end(protocol, state), *_together(way for way in found if not way.available))
+    end, failure = _end(protocol, state), state.step.failure
+    ends_first = trouble == "failure" and failure is not None and failure.recovery == "abort"
+    possible = (end, *done) if ends_first else (*done, end)
+    return (*possible, *_together(way for way in found if not way.available))
+
+
+def _changed(state: RunState) -> bool:
+    """Whether another device answers than the one that was calibrated: another try would not make it the same."""
+    return state.step.failure is not None and state.step.failure.error == "DeviceChangedError"
 
 
 def planned_views(step: Step) -> int:

@@ -9,6 +9,9 @@ REMEDIES: Mapping[str, str] = {
     "DeviceError": "Check the device",
     "DeviceUnavailableError": "Check that the device is switched on and its cable or network is connected",
     "DeviceTimeoutError": "Check that the device is awake, or that the expected file has arrived",
+    "MachineBusyError": "End what else this computer computes, or wait until it is done",
+    "DriverKilledError": "End programs that are not needed on this computer, and look at the device",
+    "DeviceChangedError": "Connect the device that was calibrated, or repeat the calibration with this one",
     "DeviceBusyError": "Wait until the device has finished what it is doing",
     "DeviceRefusedError": "Set the device as the message says",
     "DeviceFaultError": "Switch the device off and on; replace it if the fault remains",
@@ -30,7 +33,7 @@ REMEDIES: Mapping[str, str] = {
     "ProtocolError": "Put right what the message names",
     "StoreError": "Check the disk that holds the evidence: free space, cable, permissions",
     "SpaceShortError": "Make room on the disk of the data folder, as the message says",
-    "UnforeseenError": "Take away the file that the message names, or use another one; report it with the log",
+    "UnforeseenError": "Put right what the message names; report it with the log",
     "IntegrityError": "Restore the damaged file from a copy; it is checked against its hash when it is read",
 }
 UNKNOWN_REMEDY = "Put right what the message names"

@@ -26,7 +26,6 @@ from service.core.run.state import Deviation, JobState, Lapse, Note, RunState, S
 from service.core.text.clock_time import time_utc
 
 __all__ = [
-    "AbortRun",
     "Accept",
     "AskOperator",
     "Decision",
@@ -110,20 +109,13 @@ class FinishRun:
 
 
 @dataclass(frozen=True, slots=True)
-class AbortRun:
-    """The step's recovery policy ends the run: append RunAborted."""
-
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
 class Halt:
     """No motion and no work, until an operator resumes a paused run, or for good."""
 
     status: Literal["paused", "completed", "aborted"]
 
 
-Decision = AskOperator | RunStep | EvaluateGates | Accept | Retry | FinishRun | AbortRun | Halt
+Decision = AskOperator | RunStep | EvaluateGates | Accept | Retry | FinishRun | Halt
 
 
 def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - one return per phase
@@ -212,8 +204,8 @@ def _decide_recovering(protocol: Protocol, state: RunState) -> Decision:
     match now.failure.recovery:
         case "retry":
             return Retry(now.step, now.attempt + 1, why, step.recovery.wait_s)
-        case "abort":
-            return AbortRun(why)
+        case "abort":  # only a person ends a run
+            return _ask(protocol, state, "recovery", f"{why}. The protocol recommends to end the run here")
         case "ask":
             return _ask(protocol, state, "recovery", why)
 

@@ -11,6 +11,7 @@ from typing import Literal
 from drivers.errors import (
     DeviceError,
     DeviceTimeoutError,
+    DriverKilledError,
     ReleasedElsewhereError,
     StaleImageError,
     UnreadableFileError,
@@ -20,7 +21,7 @@ from service.core.records.events import ViewHeld, ViewpointFailed
 from service.core.run.state import WAITING_FOR_HAND
 from service.steps.capture.exposure import camera_record, environment_now, settings_agree, wanted_settings
 from service.steps.capture.image_files import put_image
-from service.steps.capture.views import WORTH_ANOTHER_TRY, photograph
+from service.steps.capture.views import WORTH_ANOTHER_TRY, apply_settings, photograph
 from service.steps.context import StepContext
 from service.store.records import NewArtefact
 
@@ -74,6 +75,8 @@ class HeldCamera:
         except WORTH_ANOTHER_TRY as error:
             self._failed(error)
             self.context.devices.reopen(camera)
+            if isinstance(error, DriverKilledError):
+                raise
             self._set(camera)
         return "camera", ()
 
@@ -100,11 +103,7 @@ class HeldCamera:
             return None  # the camera can still be released in other ways
 
     def _set(self, camera: Camera) -> None:
-        try:
-            camera.apply(wanted_settings(self.context))
-        except WORTH_ANOTHER_TRY:
-            self.context.devices.reopen(camera)
-            camera.apply(wanted_settings(self.context))
+        apply_settings(self.context, camera, wanted_settings(self.context))
 
     def _record(self, image: CapturedImage, by: By) -> ViewHeld:
         """Record an image: first its files, then its rows and its event in one transaction."""

@@ -13,6 +13,7 @@ from drivers.errors import (
     DeviceError,
     DeviceTimeoutError,
     DeviceUnavailableError,
+    DriverKilledError,
     StaleImageError,
     UnreachablePoseError,
     UnreadableFileError,
@@ -36,7 +37,7 @@ from service.steps.capture.motion import MotionLimits, move_and_settle, require_
 from service.steps.capture.plan.viewpoints import Viewpoint, flange_target
 from service.steps.context import FurtherCamera, StepContext
 
-#: Errors after which a viewpoint is tried again with the device reopened.
+#: Errors after which a viewpoint is tried again with the device reopened; a DriverKilledError among them is not.
 WORTH_ANOTHER_TRY = (
     DeviceUnavailableError,
     DeviceTimeoutError,
@@ -103,10 +104,10 @@ def capture_viewpoints(context: StepContext, task: CaptureTask) -> CaptureTotals
     """
     camera = context.devices.camera()
     wanted = wanted_settings(context)
-    _apply(context, camera, wanted)
+    apply_settings(context, camera, wanted)
     further = context.devices.further_cameras() if task.all_cameras else ()
     for one in further:
-        _apply(context, one.camera, settings_of(one, wanted))
+        apply_settings(context, one.camera, settings_of(one, wanted))
     loop = _CaptureLoop(context, camera, wanted, task, further)
     try:
         loop.run()
@@ -222,6 +223,9 @@ class _CaptureLoop:
                 was_busy = isinstance(error, DeviceBusyError)
                 self.keep()
                 self._record_failure(viewpoint, error, skipped=False)
+                if isinstance(error, DriverKilledError):
+                    self._open_killed(robot, arrived=arrived)
+                    raise
                 if tries_left == 0:
                     raise
                 context.checkpoint()
@@ -230,6 +234,14 @@ class _CaptureLoop:
                 if not arrived or not _streams(robot):
                     context.devices.reopen(robot)
         raise AssertionError
+
+    def _open_killed(self, robot: RobotArm, *, arrived: bool) -> None:
+        """Start the driver anew that was ended from outside, for the try after a person's answer."""
+        with suppress(DeviceError):  # that try says it again, also that it is another device
+            if arrived:
+                self._reopen_cameras()
+            if not arrived or not _streams(robot):
+                self.context.devices.reopen(robot)
 
     def _reopen_cameras(self) -> None:
         """Open all cameras again, because an error does not say which of them it came from."""
@@ -317,11 +329,15 @@ def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, fol
         inside = folder / str(tries_left)  # of its own, because an earlier try may have left files
         inside.mkdir()
         try:
-            _apply(context, camera, wanted)
+            apply_settings(context, camera, wanted)
             context.busy("taking a photograph and fetching it from the camera")
             return expose_when_free(context, camera, inside, was_busy=was_busy)
         except WORTH_ANOTHER_TRY as error:
             was_busy = isinstance(error, DeviceBusyError)
+            if isinstance(error, DriverKilledError):
+                with suppress(DeviceError):  # the try after a person's answer says it again
+                    context.devices.reopen(camera)
+                raise
             if tries_left == 0:
                 raise
             context.note("photograph_repeated", why=str(error))
@@ -330,13 +346,18 @@ def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, fol
     raise AssertionError
 
 
-def _apply(context: StepContext, camera: Camera, wanted: CameraSettings) -> None:
-    """Apply the settings; the camera is reopened if its connection was lost since its last use."""
+def apply_settings(context: StepContext, camera: Camera, wanted: CameraSettings) -> None:
+    """Apply the settings; the camera is reopened if its connection was lost since its last use.
+
+    Raises DriverKilledError if its driver was ended from outside meanwhile; it is open again then.
+    """
     context.busy("setting the camera")
     try:
         camera.apply(wanted)
-    except WORTH_ANOTHER_TRY:
+    except WORTH_ANOTHER_TRY as error:
         context.devices.reopen(camera)
+        if isinstance(error, DriverKilledError):
+            raise
         camera.apply(wanted)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from drivers.interfaces import DeviceIdentity, DeviceReport, EnvironmentReading, PedalReading, TowerLight
@@ -14,6 +15,8 @@ class BenchLightbox:
 
     presses: int = 0
     tower: bool = True
+    serial: str = "L-1"
+    on_read: Callable[[], None] = lambda: None  # may raise
     shown: list[TowerLight] = field(default_factory=list[TowerLight])
     clock: Clock = field(default_factory=SystemClock)
     _counted: int = field(init=False, default=0)
@@ -26,9 +29,10 @@ class BenchLightbox:
         pass
 
     def report(self) -> DeviceReport:
-        return DeviceReport(DeviceIdentity("lightbox", "Bench box", "L-1", "1", "bench", "1", "memory"))
+        return DeviceReport(DeviceIdentity("lightbox", "Bench box", self.serial, "1", "bench", "1", "memory"))
 
     def read(self) -> EnvironmentReading:
+        self.on_read()
         return EnvironmentReading(812.0, 21.5, False, self.clock.monotonic_s())
 
     def pedal(self) -> PedalReading:

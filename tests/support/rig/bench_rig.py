@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import DeviceUnavailableError, UnreachablePoseError
+from drivers.errors import DeviceError, DeviceUnavailableError, UnreachablePoseError
 from drivers.interfaces import (
     Camera,
     CameraSettings,
@@ -62,6 +62,7 @@ class BenchArm:
     """
 
     clock: Clock = field(default_factory=SystemClock)
+    serial: str = "A-1"
     safety: SafetyState = SafetyState.NORMAL
     on_move: Callable[[int], None] = _nothing  # called with the number of the motion once it has begun
     reachable: Callable[[Transform], bool] = lambda _T: True
@@ -86,7 +87,7 @@ class BenchArm:
         self.connected = False
 
     def report(self) -> DeviceReport:
-        return DeviceReport(DeviceIdentity("robot", "Bench arm", "A-1", "5.12", "bench", "1", "memory"))
+        return DeviceReport(DeviceIdentity("robot", "Bench arm", self.serial, "5.12", "bench", "1", "memory"))
 
     def let_move(self, confirmed_by: str, not_before_monotonic_s: float) -> None:
         self.let_by.append(confirmed_by)
@@ -172,6 +173,7 @@ class BenchCamera:
     """A camera that writes a small real JPEG, a different one each time."""
 
     clock: Clock = field(default_factory=SystemClock)
+    serial: str = "C-1"
     on_capture: Callable[[int], None] = _nothing  # called with the exposure's number; may raise
     exif: Callable[[CameraSettings], CameraSettings] = lambda applied: applied
     picture: Callable[[int], NDArray[np.uint8]] = numbered  # of the exposure with this number
@@ -191,7 +193,7 @@ class BenchCamera:
         self.connected, self.applied = False, None
 
     def report(self) -> DeviceReport:
-        return DeviceReport(DeviceIdentity("camera", "Bench camera", "C-1", "2.0", "bench", "1", "memory"))
+        return DeviceReport(DeviceIdentity("camera", "Bench camera", self.serial, "2.0", "bench", "1", "memory"))
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
         if not self.connected:
@@ -323,15 +325,27 @@ class BenchRig:
         ended, self.ended = tuple(self.ended), []
         return ended
 
+    def hold_arms(self) -> None:
+        if self.arm.connected:
+            self.arm.stop()
+            self.arm.close()
+            self.arm.opened = 0  # it is opened anew when a step asks for it
+
     def reopen(self, device: Device) -> None:
         device.close()
-        self._open("robot" if device is self.arm else "camera", device, opened=False)
+        name = "robot" if device is self.arm else "lightbox" if device is self.box else "camera"
+        self._open(name, device, opened=False)
 
     def _open(self, name: str, device: Device, *, opened: bool) -> None:
         if not opened:
             device.open()
-            if self._on_open is not None:
-                self._on_open(name, device.report())
+            try:
+                if self._on_open is not None:
+                    self._on_open(name, device.report())
+            except DeviceError:  # as a station does: the next caller opens it from scratch
+                device.close()
+                vars(device)["opened"] = 0
+                raise
 
 
 Answer = Callable[[AskOperator, RunState], OperatorAction | None]
@@ -391,6 +405,9 @@ class ScriptedOperator:
         if not self.attended or self.attended[-1] != (doing, pedal_armed):
             self.attended.append((doing, pedal_armed))
         self.on_attend(doing)
+
+    def stuck(self, why: str, for_s: float) -> None:
+        assert for_s < 600, f"the run waits for nothing: {why}"
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
         return question.checklist

@@ -13,6 +13,7 @@ from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.rig import load_rig
 from service.run_start import recorded_run, start_run
+from service.runner.execution import Starvation, held_up_here
 from service.runner.loop import Runner
 from service.steps import params_models
 from service.store.durable_effects import SystemClock
@@ -76,6 +77,7 @@ class Bench:
     operator: ScriptedOperator = field(default_factory=ScriptedOperator)
     authority: Authority | None = None
     second_place: SecondPlace | None = None
+    held_up: Callable[[], Starvation] = held_up_here
     on_wait: Callable[[float], None] | None = None  # called when the runner waits, in a store of `bench_store`
 
     @property
@@ -104,6 +106,7 @@ class Bench:
             self.operator,
             self.authority,
             self.second_place,
+            self.held_up,
         ).run()
 
     def act(self, verb: str, **fields: object) -> None:

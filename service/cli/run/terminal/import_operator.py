@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 
 from service.cli.run.terminal.operators import TerminalOperator
-from service.core.errors import OrthocaptureError
+from service.core.errors import PersonNeededError
 from service.core.protocol.models import Protocol
 from service.core.records.events import OperatorAction
 from service.core.records.import_list import FileRole, ImportList, PhotographRole
@@ -43,7 +43,7 @@ class ImportOperator(TerminalOperator):
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
         """Confirm or skip the import of a part; ask at the terminal about anything else.
 
-        Raises OrthocaptureError if there is no terminal.
+        Raises PersonNeededError if there is no terminal.
         """
         part = part_of(self.protocol, question.step)
         if question.for_ == "confirm" and part is not None and self.listing is not None:
@@ -55,7 +55,7 @@ class ImportOperator(TerminalOperator):
             self._retried = True  # giving the command again asks for one retry of what failed
             return OperatorAction(action="confirm", step=question.step)
         if not os.isatty(self.descriptor):
-            raise OrthocaptureError(
+            raise PersonNeededError(
                 question.text,
                 where=f"step {question.step}",
                 remedy="Nothing is lost: give the same command in a terminal and decide, or `orthocapture resume`",

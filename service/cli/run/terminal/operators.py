@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.terminal_output import Terminal, bar_of_counts, styled
-from service.core.errors import ConfigurationError, OrthocaptureError
+from service.core.errors import PersonNeededError
 from service.core.gates.acceptance import demanded_role
 from service.core.protocol.models import Protocol
 from service.core.records.events import OperatorAction
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from service.cli.terminal_output import Progress
 
 _MOST_MENDS = 4  # how often a step's advice is followed automatically before a person must decide
+_STUCK_S = 120.0  # for which a run that nobody attends waits for a disk or a database
 
 
 class Display:
@@ -94,6 +95,9 @@ class _Operator:
         asks, words = _elsewhere(self.protocol, state, asked) if asked is not None else ("", "")
         attempt = state.step.attempt
         self.display.reporter.attend(doing, state.current, attempt, pedal_armed=pedal_armed, asks=asks, words=words)
+
+    def stuck(self, why: str, for_s: float) -> None:
+        """Let the person who was told put it right, however long that takes."""
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
         """The items that a confirmation ticks: the whole list, as the terminal says."""
@@ -167,9 +171,15 @@ class TerminalOperator(_Operator):
         while b"\n" not in self._typed:
             if not select.select([self.descriptor], [], [], 0)[0]:
                 return None
-            read = os.read(self.descriptor, 4096)
+            try:
+                read = os.read(self.descriptor, 4096)
+            except OSError:  # it hung up
+                read = b""
             if not read:
-                raise ConfigurationError("the terminal was closed while a question was open", remedy="Resume the run")
+                raise PersonNeededError(
+                    "the terminal was closed while a question was open",
+                    remedy="Resume the run with `orthocapture resume`; nothing is lost",
+                )
             self._typed += read
         line, _, self._typed = self._typed.partition(b"\n")
         return line.decode(errors="replace")
@@ -291,13 +301,13 @@ class AutomaticOperator(_Operator):
         self.hands.read(message)
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction:
-        """Confirm the step, recorded as automatic. Raises OrthocaptureError if there is no advice left to follow."""
+        """Confirm the step, recorded as automatic. Raises PersonNeededError if there is no advice left to follow."""
         if question.for_ == "recovery":
             mends = self._mends.get(question.step, 0)
             if state.step.mend and "confirm" in question.options and mends < _MOST_MENDS:
                 self._mends[question.step] = mends + 1
                 return OperatorAction(action="confirm", step=question.step, via="auto", automatic=True)
-            raise OrthocaptureError(
+            raise PersonNeededError(
                 question.text,
                 where=f"step {question.step}",
                 remedy="Resume the run without --auto-confirm and decide",
@@ -306,3 +316,10 @@ class AutomaticOperator(_Operator):
         if question.for_ == "sign":
             return OperatorAction(**base, meaning="automatic, simulated rig", signed_sha256=question.sign_sha256)
         return OperatorAction(**base, checklist=question.checklist)
+
+    def stuck(self, why: str, for_s: float) -> None:
+        """Wait for two minutes. Raises PersonNeededError then: nobody attends who could put it right."""
+        if for_s > _STUCK_S:
+            raise PersonNeededError(
+                f"for {for_s:.0f} s the run could not go on: {why}", remedy="Put that right, then resume the run"
+            )

@@ -1,0 +1,96 @@
+"""How long processes of this machine were kept from running, for want of a processor or memory, as Linux counts it.
+
+Where the system tells nothing of this, the answer is that nothing was kept waiting.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from service.core.units import seconds_of_ns, seconds_of_us
+
+_MEMORY = Path("/proc/pressure/memory")
+_KILLED = Path("/proc/vmstat")
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessorTime:
+    """How long a thread has computed, and how long it was ready to and had to wait for a processor."""
+
+    computed_s: float
+    waited_s: float
+
+
+def processor_time(thread: int, process: int | str = "self") -> ProcessorTime:
+    """The times of one thread (its native id) since it began. Raises OSError where no system tells them."""
+    words = Path(f"/proc/{process}/task/{thread}/schedstat").read_text().split()
+    return ProcessorTime(seconds_of_ns(int(words[0])), seconds_of_ns(int(words[1])))
+
+
+def processor_times(process: int | str) -> dict[int, ProcessorTime]:
+    """The times of every living thread of a process, by its native id; empty where no system tells them."""
+    found: dict[int, ProcessorTime] = {}
+    try:
+        threads = [int(entry.name) for entry in Path(f"/proc/{process}/task").iterdir()]
+    except OSError:
+        return found
+    for thread in threads:
+        try:
+            found[thread] = processor_time(thread, process)
+        except OSError:  # it has ended meanwhile
+            continue
+    return found
+
+
+def memory_stall_s() -> float:
+    """Seconds since boot in which all that was to run waited for memory at once; 0 where nothing tells them."""
+    try:
+        told = re.search(r"^full .*total=(\d+)", _MEMORY.read_text(), re.MULTILINE)
+    except OSError:
+        return 0.0
+    return 0.0 if told is None else seconds_of_us(int(told[1]))
+
+
+def killed_for_memory() -> int:
+    """How many processes the kernel has killed for want of memory since boot; 0 where nothing tells it."""
+    try:
+        told = re.search(r"^oom_kill (\d+)", _KILLED.read_text(), re.MULTILINE)
+    except OSError:
+        return 0
+    return 0 if told is None else int(told[1])
+
+
+@dataclass
+class HeldUp:
+    """Measures, from when it is made, how long a process was kept from running."""
+
+    process: int | str
+    _began: dict[int, ProcessorTime] = field(init=False)
+    _memory_s: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._began, self._memory_s = processor_times(self.process), memory_stall_s()
+
+    @property
+    def seconds(self) -> float:
+        """The longest that one of its threads has waited for a processor, and the time lost to want of memory."""
+        waits_s = [times.waited_s - self._before(thread).waited_s for thread, times in self._now().items()]
+        return max(waits_s, default=0.0) + memory_stall_s() - self._memory_s
+
+    @property
+    def share(self) -> float:
+        """Of the time in which its threads wanted to run, the part in which they could not: 0 to 1."""
+        computed_s = waited_s = 0.0
+        for thread, times in self._now().items():
+            computed_s += times.computed_s - self._before(thread).computed_s
+            waited_s += times.waited_s - self._before(thread).waited_s
+        waited_s += memory_stall_s() - self._memory_s
+        return waited_s / (computed_s + waited_s) if waited_s > 0 else 0.0
+
+    def _now(self) -> dict[int, ProcessorTime]:
+        return processor_times(self.process)
+
+    def _before(self, thread: int) -> ProcessorTime:
+        return self._began.get(thread, ProcessorTime(0.0, 0.0))

@@ -1,0 +1,98 @@
+"""A run whose driver the system killed waits for a person, and goes on with little processor time and memory."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Generator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import psutil
+import pytest
+
+from service.cli.common import WAITS_FOR_A_PERSON
+from service.cli.run.ending import end_with_children
+from service.core.records.events import DeviceTrouble, RunCompleted, SessionStarted, StepFailed
+from tests.recovery.test_resume import captured, recorded, short_protocol, wait_for, wait_for_captures
+from tests.support.processes.waiting import until
+from tests.support.rig.rig import REPOSITORY, command, orthocapture, simulated_rig
+
+pytestmark = [pytest.mark.timeout(500)]
+HOST = "127.0.0.32"
+MEMORY_BYTES = 600_000_000  # of data, for each process
+# Low priority on one processor, which others want as well, and little memory; its drivers inherit all of it.
+PRESSED = (
+    "import os, resource, sys\n"
+    "os.nice(5)\n"
+    "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+    f"resource.setrlimit(resource.RLIMIT_DATA, ({MEMORY_BYTES}, {MEMORY_BYTES}))\n"
+    "os.execv(sys.executable, [sys.executable, *sys.argv[1:]])\n"
+)
+RIVAL = "import os\nos.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nwhile True: pass\n"
+
+
+@contextmanager
+def begun(words: list[str], log: Path, *before: str) -> Generator[subprocess.Popen[bytes]]:
+    """The command as a real start, so that its drivers can be told from its other processes."""
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            [sys.executable, *before, *command(*words)[1:]],
+            cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=output, stderr=output,
+        )  # fmt: skip
+    try:
+        yield process
+    finally:
+        end_with_children(process, 30.0)
+
+
+@contextmanager
+def pressed(words: list[str], log: Path, rivals: int = 2) -> Generator[subprocess.Popen[bytes]]:
+    """The command on a machine that has little for it."""
+    with ExitStack() as stack:
+        for _ in range(rivals):
+            rival = stack.enter_context(subprocess.Popen([sys.executable, "-c", RIVAL]))
+            stack.callback(rival.kill)
+        yield stack.enter_context(begun(words, log, "-c", PRESSED))
+
+
+def drivers_of(runner: subprocess.Popen[bytes]) -> list[psutil.Process]:
+    children = psutil.Process(runner.pid).children()
+    return [child for child in children if "drivers.host" in " ".join(child.cmdline())]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGALRM], ids=lambda number: number.name)
+def test_a_killed_driver_ends_no_run_and_it_is_resumed_on_a_pressed_machine(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    data, log = tmp_path / "data", tmp_path / "run.log"
+    with simulated_rig(tmp_path, "--scene", "3", "--image-width", "320", "--speed-up", "3", host=HOST) as ready:
+        words = ["run", str(short_protocol(tmp_path)), "--rig", ready["rig"], "--data", str(data)]
+        with begun([*words, "--auto-confirm", "--no-worker", "--json"], log) as runner:
+            wait_for_captures(data, 2, runner, log)
+            drivers_of(runner)[-1].send_signal(number)
+            assert runner.wait(timeout=120) == WAITS_FOR_A_PERSON, log.read_text()
+        before = captured(data)
+        assert 2 <= len(before) < 6
+        assert number.name in recorded(data, StepFailed)[-1].message
+        assert any(number.name in trouble.message for trouble in recorded(data, DeviceTrouble))
+        asked = json.loads(next(line for line in log.read_text().splitlines() if line.startswith('{"error"')))
+        assert asked["exit_status"] == WAITS_FOR_A_PERSON
+        assert number.name in asked["error"]["what"]
+
+        sessions = len(recorded(data, SessionStarted))
+        with pressed(["resume", "latest", "--data", str(data), "--screens", "--no-worker"], log) as again:
+            wait_for(lambda: len(recorded(data, SessionStarted)) > sessions, again, log)
+            assert captured(data) == before, "nothing goes on before a person has confirmed"
+            answer = orthocapture("act", "confirm", "--data", str(data), "--operator", "Grace")
+            assert answer.returncode == 0, answer.stdout + answer.stderr
+            until(lambda: again.poll() is not None, log.read_text, 400.0, every_s=0.5)
+            assert again.returncode == 0, log.read_text()
+    assert len(recorded(data, RunCompleted)) == 1
+    after = captured(data)
+    assert after[: len(before)] == before, "what was captured is kept as it was"
+    assert [event["artefacts"][0]["viewpoint"] for event in after] == [f"v1_{i:03d}" for i in range(1, 7)]
+    assert orthocapture("audit", "verify", "latest", "--data", str(data)).returncode == 0
