@@ -50,6 +50,10 @@ _COMMANDS = {
         "service.cli.run.act:act_command",
         "Answer or stop a run that another terminal drives. A confirmation ticks the whole checklist.",
     ),
+    "cancel": _Command(
+        "service.cli.run.cancel:cancel_command",
+        "End one computation of a run. The step that waits for it asks what to do, as if it had failed.",
+    ),
     "note": _Command(
         "service.cli.run.act:note_command",
         "Write a note on a step of a run, with or without a photograph; the run goes on as it was.",
