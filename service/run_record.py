@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING, Literal
 
 from service.core.errors import ComputeError, IntegrityError
 from service.core.jobs.keys import arguments_name, job_key
+from service.core.jobs.priorities import lane_of
 from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import ArtefactRef, Event, Payload, RecordedView, RunStarted
 from service.core.run.decide import advance, fold
 from service.core.run.state import JobState, RunState
+from service.core.text.clock_time import time_here
+from service.jobs.memory_grants import waiting_for_memory
 from service.jobs.words import term
 from service.steps import params_models
 from service.steps.context import JobRequest, JobResult
@@ -127,6 +130,35 @@ def results_to_come(log: RunRecord) -> list[PendingResult]:
     return [replace(one, waits=not started) for one in left]
 
 
+@dataclass(frozen=True, slots=True)
+class OpenJob:
+    """A job of a run that waits or is computed: its name, step and words, and how it stands."""
+
+    job: str
+    step: str
+    words: str
+    standing: str
+
+    @property
+    def text(self) -> str:
+        """On a line of its own."""
+        return f"{self.words} of step {self.step}, {self.standing}"
+
+
+def open_jobs(log: RunRecord) -> list[OpenJob]:
+    """The jobs of a run that are computed, and those in the queue for which a step waits, the oldest first."""
+    waiting = waiting_for_memory(log.store.database_path.parent)
+    started = log.store.jobs_started(log.run_id)
+    jobs = [(name, job) for name, step in log.state.steps.items() for job in step.jobs.values()]
+    found: list[OpenJob] = []
+    for step, job in sorted(jobs, key=lambda one: one[1].enqueued_seq):
+        since = started.get(job.job)
+        if job.status == "enqueued" and (since is not None or lane_of(job.priority) == "waited"):
+            standing = waiting.get(job.job) or ("in the queue" if since is None else f"since {time_here(since)}")
+            found.append(OpenJob(job.job, step, term(job.kind), standing))
+    return found
+
+
 @dataclass
 class StepEvidence:
     """The evidence interface (service.steps.context.Evidence) for one execution of one step."""
@@ -194,8 +226,10 @@ class StepEvidence:
                         remedy="Correct what the message names, or take what is missing; then try again",
                     )
             done = sum(mine[key].status == "finished" for key in keys)
-            open_kinds = [mine[key].kind for key in keys if mine[key].status != "finished"]
-            self.progress(", ".join(map(term, dict.fromkeys(open_kinds))) or "computed", done, len(keys))
+            waiting = waiting_for_memory(self.log.store.database_path.parent)
+            left = [mine[key] for key in keys if mine[key].status != "finished"]
+            doing = dict.fromkeys(f"{term(job.kind)} {waiting.get(job.job, '')}".rstrip() for job in left)
+            self.progress(", ".join(doing) or "computed", done, len(keys))
             if done == len(keys):
                 return tuple(JobResult.of(mine[key]) for key in keys)
             self.wait(0.2)

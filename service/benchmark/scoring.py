@@ -11,9 +11,11 @@ import trimesh
 from service.benchmark.records import Score
 from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, chamfer
 from service.compute.ground_truth.distances.heat_map import HeatScale, heat_picture
+from service.compute.ground_truth.fusion.fuse import compact
 from service.compute.ground_truth.fusion.regions import Box
 from service.compute.ground_truth.ply import write_ply
 from service.compute.ground_truth.surface import Surface
+from service.compute.memory import large_arrays_returned
 from service.core.errors import DataError
 from service.core.geometry import inverse
 from service.core.units import mm
@@ -33,6 +35,7 @@ class Scored:
     score: Score
 
 
+@large_arrays_returned()
 def score_mesh(found: Surface, truth: Mesh, settings: ChamferSettings | None = None) -> Scored:
     """Compare a mesh with the truth; both in the world frame, metres.
 
@@ -61,9 +64,10 @@ def _box_around(mesh: Mesh, margin_m: float) -> Box:
 
 def _cropped(surface: Surface, box: Box) -> Surface:
     """The faces whose centres are in a box."""
-    within = box.contains(surface.vertices_m[surface.faces].mean(axis=1))
-    kept, faces = np.unique(surface.faces[within], return_inverse=True)
-    return Surface(surface.vertices_m[kept], faces.reshape(-1, 3).astype(np.int64))
+    within = np.empty(len(surface.faces), dtype=np.bool_)
+    for block in surface.blocks():
+        within[block] = box.contains(surface.vertices_m[surface.faces[block]].mean(axis=1))
+    return compact(surface.vertices_m, surface.faces[within])[0]
 
 
 def compare(

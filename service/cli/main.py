@@ -59,6 +59,10 @@ _COMMANDS = {
         "service.cli.run.act:draw_region_command",
         "Draw a region in which the CT or the scan counts; the next fusion uses it, as one drawn on the 3D view.",
     ),
+    "cancel": _Command(
+        "service.cli.run.cancel:cancel_command",
+        "End one computation of a run. The step that waits for it asks what to do, as if it had failed.",
+    ),
     "note": _Command(
         "service.cli.run.act:note_command",
         "Write a note on a step of a run, with or without a photograph; the run goes on as it was.",

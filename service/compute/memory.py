@@ -1,13 +1,19 @@
-"""Makes this process keep freed memory for its next arrays, or return it."""
+"""Makes this process keep freed memory for its next arrays, or return it; and the pages of files that it maps."""
 
 from __future__ import annotations
 
 import ctypes
-from contextlib import suppress
+import mmap
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+
+import numpy as np
+from numpy.typing import NDArray
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 _LARGEST_KEPT = 32 << 20  # the largest value that glibc accepts
 _MOST_KEPT = 1 << 30
+_RETURNED, _USUALLY_KEPT = 1 << 20, 128 << 10  # glibc's own limit for what it keeps
 
 
 def keep_freed_memory() -> None:
@@ -23,7 +29,39 @@ def keep_freed_memory() -> None:
         libc.mallopt(_M_TRIM_THRESHOLD, _MOST_KEPT)
 
 
+@contextmanager
+def large_arrays_returned() -> Generator[None]:
+    """Within this block, return each freed array of a megabyte or more to the system at once.
+
+    Surfaces and their samples have few, large arrays of ever other sizes: of what is kept for the next ones, most
+    would lie unused. Afterwards the process keeps what it frees, as a worker does.
+    """
+    return_freed_memory()
+    with suppress(OSError, AttributeError):
+        libc = ctypes.CDLL("libc.so.6")
+        libc.mallopt(_M_MMAP_THRESHOLD, _RETURNED)
+        libc.mallopt(_M_TRIM_THRESHOLD, _USUALLY_KEPT)
+    try:
+        yield
+    finally:
+        keep_freed_memory()
+
+
 def return_freed_memory() -> None:
     """Return to the system what was freed and kept, before a step whose arrays have other sizes."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
+def forget_pages(array: NDArray[np.generic]) -> None:
+    """Give back the memory in which the file behind a mapped array is cached for this process; it is read again.
+
+    No effect on other arrays, and on systems without this advice.
+    """
+    if isinstance(array, np.memmap) and array.mode == "c":
+        return  # what was changed in memory alone would be lost
+    base: object = array
+    while isinstance(base, np.ndarray):
+        base = base.base
+    if isinstance(base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        base.madvise(mmap.MADV_DONTNEED)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -33,6 +33,24 @@ class NoAnswer(JobRecord):
     """The answer of a job that yields only measures and files."""
 
 
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """What a job takes from the machine that computes it.
+
+    Attributes:
+        memory_mb: the most that it and the processes that it starts need together.
+        limit_s: the time after which it is ended: many times what it takes on a slow machine.
+    """
+
+    memory_mb: float
+    limit_s: float
+
+
+def usual_demand(_arguments: JobRecord) -> Demand:
+    """The demand of a kind that states none, such as one of a plug-in."""
+    return Demand(memory_mb=1000, limit_s=7200)
+
+
 _NO_JOBS: Jobs = {}
 _FIRST_NUMBERS = 2  # versions up to this one differ in their arguments alone
 A = TypeVar("A", bound=JobRecord)
@@ -56,6 +74,7 @@ class JobKind(Generic[A, R]):
         order: position among the kinds in lists and texts, as a run uses them.
         replayed: whether a replay recomputes it by default; not for kinds that only help during a capture.
         aside: whether the provenance drawing omits it, because no result depends on it.
+        demand: what a job with these arguments takes (measured: bench/results/job_memory-*.json).
     """
 
     name: str
@@ -67,6 +86,7 @@ class JobKind(Generic[A, R]):
     order: int = 100
     replayed: bool = True
     aside: bool = False
+    demand: Callable[[A], Demand] = usual_demand
 
     def other_numbers(self, recorded_version: int) -> str:
         """That another version computed a recorded job, with other numbers; "" if this one did."""

@@ -66,8 +66,8 @@ _POLL_S = 0.1
 class Runner:
     """Drives one run to its end, by the store's clock.
 
-    `authority`, if given, stamps the record when the run ends; `second_place` gets copies of the signatures; `held_up`
-    begins to measure how long the machine keeps this program from running.
+    `authority`, if given, stamps the record when the run ends; `second_place` gets copies of the signatures;
+    `held_up` begins to measure how long the machine keeps this program from running.
     """
 
     store: Store

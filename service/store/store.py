@@ -419,6 +419,22 @@ class Store:
         tell(events)
         return events
 
+    def holds_job(self, job: Job) -> bool:
+        """Whether a claimed job is still this worker's: not cancelled, not failed, not taken over."""
+        with self._database.reading() as connection:
+            return queue.holds(connection, job)
+
+    def cancel_job(self, run_id: str, job_id: str, *, actor: str, reason: str) -> Event:
+        """End one job by a person's decision; the step that waits for it asks, as for a job that failed.
+
+        Raises IllegalTransitionError if the run has no such job, or it has ended.
+        """
+        with self._database.writing() as connection:
+            self._require_run(connection, run_id)
+            event = queue.cancel(connection, self._clock, run_id, job_id, actor=actor, reason=reason)
+        tell([event])
+        return event
+
     def release_jobs(self, pids: Collection[int]) -> None:
         """Queue the jobs of these local processes again without counting a try: they were told to stop and have."""
         with self._database.writing() as connection:

@@ -6,12 +6,13 @@ import importlib
 import json
 import math
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from service.core.records.events import ArtefactRef
-from service.jobs.kind import JobKind, JobRecord, NoAnswer
+from service.jobs.kind import Demand, JobKind, JobRecord, NoAnswer
 
 A = TypeVar("A")
 
@@ -25,6 +26,10 @@ class ArtefactStore(Protocol):
 
     def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
         """Store bytes; returns the reference to them."""
+        ...
+
+    def put_file(self, path: Path, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Store a copy of a file; returns the reference to it."""
         ...
 
 
@@ -44,12 +49,16 @@ class JobAnswer:
 
 @dataclass(frozen=True, slots=True)
 class JobContext(Generic[A]):
-    """What a job may use: its arguments, verified inputs, a scratch folder and the store for its outputs."""
+    """What a job may use: its arguments, verified inputs, a scratch folder and the store for its outputs.
+
+    `begin` surrounds the computation: a worker waits there until the machine has what the job demands.
+    """
 
     arguments: A
     store: ArtefactStore
     scratch: Path
     progress: Callable[[str, int, int], None]
+    begin: Callable[[Demand], AbstractContextManager[None]] = lambda _demand: nullcontext()
 
     def input(self, sha256: str) -> Path:
         """An artefact's file, its hash verified."""
@@ -67,6 +76,10 @@ class JobContext(Generic[A]):
     def keep_bytes(self, data: bytes, *, kind: str, media_type: str, name: str) -> ArtefactRef:
         """Store an artefact."""
         return self.store.put_bytes(data, kind=kind, media_type=media_type, original_name=name)
+
+    def keep_file(self, path: Path, *, kind: str, media_type: str) -> ArtefactRef:
+        """Store a file of the scratch folder as an artefact of its name; a large one is never in memory."""
+        return self.store.put_file(path, kind=kind, media_type=media_type, original_name=path.name)
 
 
 def finite(measures: Mapping[str, float]) -> dict[str, float]:
@@ -87,6 +100,8 @@ def handler_of(kind: JobKind[Any, Any]) -> Handler:
     def handle(context: RecordedContext) -> JobAnswer:
         module, _, function = kind.compute.partition(":")
         compute: Callable[[JobContext[Any]], JobAnswer] = getattr(importlib.import_module(module), function)
-        return compute(replace(context, arguments=kind.read_arguments(context.arguments)))
+        arguments = kind.read_arguments(context.arguments)
+        with context.begin(kind.demand(arguments)):
+            return compute(replace(context, arguments=arguments))
 
     return handle

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import socket
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -17,6 +19,8 @@ from service.core.equipment.disk_space import LEAST_FREE_BYTES
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
 from service.core.jobs.priorities import Lane
 from service.jobs import job_kinds
+from service.jobs.kind import Demand
+from service.jobs.memory_grants import MemoryGrants
 from service.jobs.words import term
 from service.logs.where import at
 from service.store.errors import LeaseLostError
@@ -30,6 +34,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _LEASE_S = 30.0
 _POLL_S = 0.2
+_LOOK_S = 2.0  # between looks whether the job was cancelled or takes too long
 
 # Kind → function that computes it, from arguments with references resolved. Tests replace some.
 HANDLERS: dict[str, Handler] = {name: handler_of(kind) for name, kind in job_kinds().items()}
@@ -43,6 +48,7 @@ def work(
     progress: Callable[[str, int, int], None],
     lane: Lane | None = None,
     finished: Callable[[], None] = lambda: None,
+    end: Callable[[], None] = lambda: None,
 ) -> int:
     """Compute one job after the other until `stop()`.
 
@@ -53,6 +59,8 @@ def work(
         progress: called with what a job does, how much is done, and the total.
         lane: only jobs that a step waits for, or only the others; None: all.
         finished: called after each job.
+        end: called from another thread when the job that is computed has been cancelled, or has taken too long; ends
+            the process if the computation is to end with it.
 
     Returns:
         the number of jobs computed.
@@ -73,7 +81,7 @@ def work(
             store.clock.sleep(_POLL_S)
             continue
         following = following or _following(store)
-        _do(store, job, progress, following)
+        _do(store, job, progress, following, end)
         done += 1
         finished()
     return done
@@ -93,15 +101,32 @@ def _following(store: Store) -> FollowedRuns:
     return FollowedRuns(store)
 
 
-def _do(store: Store, job: Job, progress: Callable[[str, int, int], None], following: FollowedRuns) -> None:
+def _do(
+    store: Store,
+    job: Job,
+    progress: Callable[[str, int, int], None],
+    following: FollowedRuns,
+    end: Callable[[], None],
+) -> None:
     started_s = store.clock.monotonic_s()
     at(run=job.run_id, step=job.step, job=job.job_id)
     answer = JobAnswer({})
-    attempt = _JobAttempt(store, job)
+    attempt = _JobAttempt(store, job, end)
+    grants = MemoryGrants(store.database_path.parent, store.clock)
+
+    @contextmanager
+    def begin(demand: Demand) -> Generator[None]:
+        with grants.granted(job.job_id, demand.memory_mb, lambda why: progress(f"{term(job.kind)} {why}", 0, 0)):
+            attempt.limit(demand.limit_s)
+            progress(term(job.kind), 0, 0)
+            yield
+
     progress(term(job.kind), 0, 0)
     with attempt, tempfile.TemporaryDirectory(prefix="orthocapture-job-") as scratch:
         arguments = following.resolved(job)
-        answer = HANDLERS[job.kind](JobContext(arguments, store, Path(scratch), progress))
+        answer = HANDLERS[job.kind](JobContext(arguments, store, Path(scratch), progress, begin))
+    if attempt.over:
+        return
     try:
         if attempt.error is not None:
             store.fail_job(job, attempt.error, retry=_worth_another_try(attempt.error))
@@ -120,11 +145,17 @@ def _worth_another_try(error: Exception) -> bool:
 
 
 class _JobAttempt:
-    """Renews a job's lease while it is computed, and holds the error that ends it."""
+    """Renews a job's lease while it is computed, ends it if it takes too long, and holds the error that ends it.
 
-    def __init__(self, store: Store, job: Job) -> None:
+    `over` says that the job ended meanwhile, so that its answer does not count: it was cancelled, took too long, or
+    belongs to another worker.
+    """
+
+    def __init__(self, store: Store, job: Job, end: Callable[[], None]) -> None:
         self.error: Exception | None = None
-        self._store, self._job = store, job
+        self.over = False
+        self._store, self._job, self._end = store, job, end
+        self._limit_s, self._ends_s = math.inf, math.inf
         self._stop = store.clock.signal()
         self._thread = threading.Thread(target=self._renew, daemon=True)
 
@@ -143,11 +174,36 @@ class _JobAttempt:
             _log.error("job %s failed", self._job.kind, exc_info=error)
         return True
 
+    def limit(self, limit_s: float) -> None:
+        """Let it take so long from now on."""
+        self._limit_s, self._ends_s = limit_s, self._store.clock.monotonic_s() + limit_s
+
     def _renew(self) -> None:
-        while not self._stop.wait(_LEASE_S / 3):
+        due_s = self._store.clock.monotonic_s() + _LEASE_S / 3
+        while not self._stop.wait(_LOOK_S):
+            now_s = self._store.clock.monotonic_s()
             try:
-                self._store.renew_job(self._job, _LEASE_S)
+                if now_s >= self._ends_s:
+                    self._store.fail_job(self._job, _too_long(self._limit_s), retry=False)
+                    break
+                if now_s >= due_s:
+                    self._store.renew_job(self._job, _LEASE_S)
+                    due_s = now_s + _LEASE_S / 3
+                elif not self._store.holds_job(self._job):
+                    break
             except LeaseLostError:
-                return
+                break
             except StoreError as error:  # the disk was full or busy for a moment; the lease may outlive it
                 _log.warning("the lease of job %s was not renewed: %s", self._job.job_id, error)
+        else:
+            return
+        self.over = True
+        _log.warning("job %s has ended and is computed no further", self._job.job_id)
+        self._end()
+
+
+def _too_long(limit_s: float) -> ComputeError:
+    return ComputeError(
+        f"it was ended after {limit_s / 60:.0f} minutes, many times what such a job takes",
+        remedy="See what else keeps the machine busy, and try again; if that does not help, its input may be damaged",
+    )

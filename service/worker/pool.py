@@ -46,6 +46,7 @@ class _Child:
     scratch: Path
     died_s: float | None = None
     busy: bool = False  # it has started a job and not reported its end
+    ended: bool = False  # it has ended itself, with a job that was cancelled or took too long
 
 
 class Pool:
@@ -73,12 +74,14 @@ class Pool:
                 by_pipe[ready].busy = total >= 0
                 if total < 0:
                     self.done += 1
+                    by_pipe[ready].ended = done < 0
                 else:
                     progress(what, done, total)
         for index, child in enumerate(self._children):
             if child.died_s is None and not child.process.is_alive():
                 child.died_s = self._store.clock.monotonic_s()
-                _log.warning("process %s of the worker died; its job is computed again", child.process.pid)
+                if not child.ended:
+                    _log.warning("process %s of the worker died; its job is computed again", child.process.pid)
             if child.died_s is not None and self._store.clock.monotonic_s() - child.died_s > _RESTART_S:
                 self._end(child)
                 self._children[index] = self._start(child.lane)
@@ -179,8 +182,20 @@ def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int)
         with contextlib.suppress(OSError):  # the worker has ended, and this process will too
             pipe.send((what, done, total))
 
+    def end() -> None:
+        tell("", -1, -1)
+        _kill(os.getpid())  # no thread can stop a computation in another one; the worker starts a new child
+
     with file_log(data, "worker"), Store.open(data) as store:
-        work(store, until_idle=False, stop=lambda: False, progress=tell, lane=lane, finished=lambda: tell("", 0, -1))
+        work(
+            store,
+            until_idle=False,
+            stop=lambda: False,
+            progress=tell,
+            lane=lane,
+            finished=lambda: tell("", 0, -1),
+            end=end,
+        )
 
 
 def _end_with(parent: int) -> None:

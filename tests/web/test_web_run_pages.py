@@ -12,6 +12,7 @@ from service.core.records.events import (
     DeviceOpened,
     DeviceTrouble,
     ItemTicked,
+    JobFailed,
     OperatorAction,
     RunAborted,
     SessionStarted,
@@ -19,6 +20,7 @@ from service.core.records.events import (
 )
 from service.monitor.snapshot import Message, Snapshot, write_snapshot
 from service.people.roles import ROLES, Role
+from service.store.records import NewJob
 from tests.support.pages.web import WebSite, web_site
 
 PARTS = ("banner", "control", "vitals", "step", "actions", "dialogs", "side")
@@ -286,3 +288,25 @@ def test_the_step_says_how_long_it_takes_on_this_site(web: WebSite) -> None:
     assert re.search(
         r"Usually \d+ s \(one earlier run on this site\); begun at \d\d:\d\d:\d\d UTC, so until about", page
     )
+
+
+def test_a_computation_is_ended_by_whoever_controls_the_run_and_by_nobody_else(web: WebSite, run_id: str) -> None:
+    job = NewJob("fuse", "fixation", 1, "fixation/0/fuse/x/0", {})
+    web.store.record(run_id, [], actor="runner", jobs=[job])
+    (enqueued,) = web.store.jobs(run_id)
+    where = f"/runs/{run_id}/jobs/{enqueued.job_id}/cancel"
+    technician, other, auditor = web.browser("technician"), web.browser("supervisor"), web.browser("auditor")
+    web.take_control(run_id, technician)
+    assert "ground-truth mesh of step fixation, in the queue" in auditor.get(f"/runs/{run_id}").text
+    assert where not in auditor.get(f"/runs/{run_id}").text
+    assert where in technician.get(f"/runs/{run_id}").text
+    assert auditor.send_form(where, reason="it hangs").status_code == 403
+    assert other.send_form(where, reason="it hangs").status_code in (403, 409)
+    assert technician.send_form(where, reason=" ").status_code == 409
+    assert [job.state for job in web.store.jobs(run_id)] == ["queued"]
+    assert technician.send_form(where, reason="it hangs").status_code == 303
+    assert technician.send_form(where, reason="it hangs").status_code == 409
+    (end,) = [event for event in web.store.events(run_id) if isinstance(event.payload, JobFailed)]
+    assert end.actor == web.account("technician")
+    assert end.payload.message == f"{end.actor} cancelled it: it hangs"
+    assert "ground-truth mesh of step fixation" not in technician.get(f"/runs/{run_id}").text

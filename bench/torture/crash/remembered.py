@@ -33,6 +33,9 @@ class _Recording:
         self.put.append({"data": data, "kind": kind, "media_type": media_type, "original_name": original_name})
         return self.store.put_bytes(data, kind=kind, media_type=media_type, original_name=original_name)
 
+    def put_file(self, path: Path, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        return self.put_bytes(path.read_bytes(), kind=kind, media_type=media_type, original_name=original_name)
+
 
 def remembering(handlers: Mapping[str, Handler], folder: Path) -> dict[str, Handler]:
     """Wrap the handlers so that they keep their answers in a folder."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from pathlib import Path
 
 from service.audit.record.run import RecordedFiles
 from service.core.records.events import ArtefactRef
+from service.store.files.artefacts import hash_file
 
 
 class ScratchStore:
@@ -28,4 +30,13 @@ class ScratchStore:
         (self._folder / digest).write_bytes(data)
         return ArtefactRef(
             sha256=digest, kind=kind, media_type=media_type, size_bytes=len(data), original_name=original_name
+        )
+
+    def put_file(self, path: Path, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Keep a copy of a file in the scratch folder."""
+        digest, size = hash_file(path)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, self._folder / digest)
+        return ArtefactRef(
+            sha256=digest, kind=kind, media_type=media_type, size_bytes=size, original_name=original_name
         )

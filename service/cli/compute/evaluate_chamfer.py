@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,7 +25,6 @@ from service.cli.common import (
 from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, Direction, chamfer
 from service.compute.ground_truth.distances.heat_map import HeatScale, heat_picture
 from service.compute.ground_truth.distances.heat_mesh import write_heat_mesh
-from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.surface import Surface
 from service.core.errors import ConfigurationError
 from service.core.units import metres, mm
@@ -58,11 +58,10 @@ def chamfer_command(
         for path, file in zip((pred, gt), files, strict=True):
             tell_doubt(path, file.polygons_in_doubt)
         judged, truth = (Surface(file.vertices_m, file.faces, file.normals) for file in files)
-        score = chamfer(judged, truth, settings)
+        score = chamfer(judged, truth, replace(settings, of_vertices=heat_map is not None))
         scale = HeatScale.of(score, settings.outlier_m)
-        if heat_map is not None:
-            distance_m = PointIndex(score.gt.samples.points_m).nearest(judged.vertices_m, scale.outlier_m)[0]
-            write_heat_mesh(heat_map, judged, distance_m, scale, METRES_PER_UNIT[files[0].unit])
+        if heat_map is not None and score.vertex_distance_m is not None:
+            write_heat_mesh(heat_map, judged, score.vertex_distance_m, scale, METRES_PER_UNIT[files[0].unit])
         if picture is not None:
             write_whole(picture, cv2.imencode(".png", heat_picture(judged, truth, score, scale))[1].tobytes())
         if json:

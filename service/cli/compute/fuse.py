@@ -24,7 +24,6 @@ from service.compute.ground_truth.align import TRANSPORT_GATE_M, Aligned, align
 from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, chamfer
 from service.compute.ground_truth.distances.heat_map import HeatScale
 from service.compute.ground_truth.distances.heat_mesh import write_heat_mesh
-from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.fusion.common import CommonPart, common_part
 from service.compute.ground_truth.fusion.cut_out import Markers, without_markers
 from service.compute.ground_truth.fusion.fuse import Fused, FusionSettings, Source, fuse
@@ -81,7 +80,7 @@ def fuse_command(
             tomogram = tomogram.moved(aligned.T_scan_ct)
             report("distances", 1, 3)
             common = common_part(tomogram, aligned, metres(radius_mm))
-            score = chamfer(common.ct, scanned, ChamferSettings(metres(spacing_mm)))
+            score = chamfer(common.ct, scanned, ChamferSettings(metres(spacing_mm), of_vertices=heat_map is not None))
             report("fusion", 2, 3)
             fused = _fused(common, scanned, aligned, metres(blend_mm))
         if post_radius_mm is not None:
@@ -92,9 +91,8 @@ def fuse_command(
         unit_m = METRES_PER_UNIT[of_scan.unit]
         write_ply(out, fused.surface, unit_m, {"source": fused.source, "sigma_mm": mm(fused.sigma_m)}, _COMMENTS)
         scale = HeatScale.of(score, ChamferSettings().outlier_m)
-        if heat_map is not None:
-            distance_m = PointIndex(score.gt.samples.points_m).nearest(common.ct.vertices_m, scale.outlier_m)[0]
-            write_heat_mesh(heat_map, common.ct, distance_m, scale, unit_m)
+        if heat_map is not None and score.vertex_distance_m is not None:
+            write_heat_mesh(heat_map, common.ct, score.vertex_distance_m, scale, unit_m)
         if picture is not None:
             write_whole(picture, fusion_picture(common.ct, scanned, score, scale, fused))
         record = fusion_record(aligned, score, fused)

@@ -27,7 +27,7 @@ from service.core.run.state import RunState, StepState
 from service.core.run.tries import tries_words
 from service.core.text.clock_time import time_utc
 from service.jobs.capture import live_summary, live_view
-from service.run_record import read_log, results_to_come
+from service.run_record import open_jobs, read_log, results_to_come
 from service.run_start import recorded_run
 from service.steps.capture.live_numbers import describe_view
 from service.steps.coats import coats
@@ -46,11 +46,19 @@ def status_command(
         protocol, root = recorded_run(store, run_id)
         log = read_log(store, run_id, protocol)
         state, missing = log.state, [left.text for left in results_to_come(log)]
+        computing = open_jobs(log)
         aging = coats(protocol, state, moment_of(store.clock))
     if json:
         ways = [asdict(way) for way in ways_on(protocol, state)]
         about = None if root.about is None else root.about.model_dump()
-        told = {"about": about, "still_to_come": missing, "coats": [f"{coat.title} {coat.text}" for coat in aging]}
+        jobs = [asdict(one) for one in computing]
+        aged = [f"{coat.title} {coat.text}" for coat in aging]
+        told = {
+            "about": about,
+            "still_to_come": missing,
+            "open_jobs": jobs,
+            "coats": aged,
+        }
         print_json(status_record(run_id, state) | told | {"ways_on": ways})
         return
     table = Table(title=f"Run {run_id}: {state.status}", title_justify="left")
@@ -74,6 +82,8 @@ def status_command(
     live = [job for job in state.step.jobs.values() if job.kind == live_view.KIND.name and job.status != "enqueued"]
     for job in live[-3:]:
         console.print(describe_view(job))
+    for one in computing:
+        console.print(f"{one.text}: `orthocapture cancel {one.job}` ends it")
     for line in missing:
         console.print(f"result to come: {line}")
     for way in ways_on(protocol, state):

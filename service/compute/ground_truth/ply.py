@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from service.core.errors import DataError
 _STORED = {"f": "<f4", "u": "u1", "b": "u1"}
 _NAMES = {"<f4": "float", "<f8": "double", "|u1": "uchar"}
 _KINDS = {name: kind for kind, name in _NAMES.items()}
+_ROWS = 500_000  # written at a time
 _FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
 
 
@@ -36,7 +37,8 @@ def write_ply(
     columns = {name: surface.vertices_m[:, k] / metres_per_unit for k, name in enumerate("xyz")}
     columns |= {name: np.asarray(values) for name, values in properties.items()}
     stored = {name: values.astype(_STORED[values.dtype.kind]) for name, values in columns.items()}
-    path.write_bytes(ply_bytes(stored, surface.faces, comments))
+    with path.open("wb") as file:
+        file.writelines(_ply_blocks(stored, surface.faces, comments))
 
 
 def ply_bytes(
@@ -49,23 +51,35 @@ def ply_bytes(
         faces: (F, 3).
         comments: lines for the header, in ASCII.
     """
+    return b"".join(_ply_blocks(columns, faces, comments))
+
+
+def _ply_blocks(
+    columns: Mapping[str, NDArray[np.generic]], faces: NDArray[np.integer], comments: Sequence[str]
+) -> Iterator[bytes]:
+    """The file in blocks."""
     kinds = {name: values.dtype.newbyteorder("<").str for name, values in columns.items()}
-    vertex = np.zeros(len(columns["x"]), dtype=list(kinds.items()))
-    for name, values in columns.items():
-        vertex[name] = values
-    face = np.zeros(len(faces), dtype=_FACE)
-    face["count"], face["vertices"] = 3, faces
+    vertices = len(columns["x"])
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         *(f"comment {comment}" for comment in comments),
-        f"element vertex {len(vertex)}",
+        f"element vertex {vertices}",
         *(f"property {_NAMES[kind]} {name}" for name, kind in kinds.items()),
-        f"element face {len(face)}",
+        f"element face {len(faces)}",
         "property list uchar int vertex_indices",
         "end_header",
     ]
-    return ("\n".join(lines) + "\n").encode("ascii") + vertex.tobytes() + face.tobytes()
+    yield ("\n".join(lines) + "\n").encode("ascii")
+    for begin in range(0, vertices, _ROWS):
+        vertex = np.zeros(min(_ROWS, vertices - begin), dtype=list(kinds.items()))
+        for name, values in columns.items():
+            vertex[name] = values[begin : begin + _ROWS]
+        yield vertex.tobytes()
+    for begin in range(0, len(faces), _ROWS):
+        face = np.zeros(min(_ROWS, len(faces) - begin), dtype=_FACE)
+        face["count"], face["vertices"] = 3, faces[begin : begin + _ROWS]
+        yield face.tobytes()
 
 
 def read_ply(path: Path) -> tuple[dict[str, NDArray[np.generic]], IntArray]:

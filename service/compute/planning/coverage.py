@@ -85,21 +85,18 @@ def coverage_surface(
     centre = spheres_m.mean(axis=0)
     low, high = spheres_m.min(axis=0) - _MARGIN_M, spheres_m.max(axis=0) + _MARGIN_M
     near = np.all((vertices_m > low) & (vertices_m < high), axis=1)
-    mesh_faces = np.asarray(faces, dtype=np.int64)
-    mesh_faces = mesh_faces[near[mesh_faces].all(axis=1)]
-    if len(mesh_faces) < 100:
+    surface = Surface(vertices_m, np.asarray(faces)[_all_near(near, faces)])
+    if len(surface.faces) < 100:
         raise ComputeError("the surface does not reach the spheres", remedy="Check the frame and unit of the mesh")
-    triangles = vertices_m[mesh_faces]
-    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    area = np.linalg.norm(cross, axis=1)
-    up = _up(spheres_m, triangles.mean(axis=1), area)
+    up = _up(spheres_m, surface)
     rng = np.random.default_rng(seed)
-    picked = rng.choice(len(triangles), size=40 * n_points, p=area / area.sum())
-    points = random_places(Surface(vertices_m, mesh_faces), picked, rng)
-    normals = cross[picked] / area[picked][:, None]
+    doubled = 2 * surface.face_areas_m2
+    picked = rng.choice(len(doubled), size=40 * n_points, p=doubled / doubled.sum())
+    points = random_places(surface, picked, rng)
+    normals = surface.normals_of(picked)
     keep = _between(points, spheres_m, radius_m, up) & ~_on_board(points, normals, up, centre) & (normals @ up > -0.5)
     points, normals = points[keep][: 2 * n_points], normals[keep][: 2 * n_points]
-    vertices, simple = _simplified(vertices_m, mesh_faces)
+    vertices, simple = _simplified(surface)
     whole = CoverageSurface(points, normals, vertices, simple)
     visible = np.zeros(len(points), dtype=bool)
     reach = min(0.65, 0.9 * limits.max_distance_m)
@@ -141,10 +138,19 @@ def covered_fraction(views: Sequence[NDArray[np.bool_]], min_views: int) -> floa
     return float(np.mean(np.sum(views, axis=0) >= min_views))
 
 
-def _up(spheres_m: Array, middles: Array, area: Array) -> Array:
+def _all_near(near: NDArray[np.bool_], faces: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """(F,) whether all corners of a face are near."""
+    return near[faces[:, 0]] & near[faces[:, 1]] & near[faces[:, 2]]
+
+
+def _up(spheres_m: Array, surface: Surface) -> Array:
     """Unit vector (3,) away from the board, on which the spheres stand: most surface around them is the board's."""
     normal = np.linalg.svd(spheres_m - spheres_m.mean(axis=0))[2][2]
-    below = (np.average(middles, axis=0, weights=area) - spheres_m.mean(axis=0)) @ normal
+    total = np.zeros(3)
+    for block in surface.blocks():
+        middles = surface.vertices_m[surface.faces[block]].mean(axis=1)
+        total += surface.face_areas_m2[block] @ middles
+    below = (total / surface.area_m2 - spheres_m.mean(axis=0)) @ normal
     return np.asarray(normal if below < 0 else -normal, dtype=np.float64)
 
 
@@ -194,13 +200,26 @@ def _dome(centre: Array, up: Array, distance_m: float) -> list[Array]:
     return eyes
 
 
-def _simplified(vertices_m: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """The mesh with vertices merged within cells of _CELL_M: fine enough for occlusion, and fast."""
-    cells = np.floor(vertices_m[faces.ravel()] / _CELL_M).astype(np.int64)
+def _simplified(surface: Surface) -> tuple[Array, NDArray[np.int64]]:
+    """The mesh with vertices merged within cells of _CELL_M: fine enough for occlusion, and fast.
+
+    A cell has the place of its vertex that comes first in the faces.
+    """
+    used = np.zeros(len(surface.vertices_m), dtype=np.bool_)
+    used[surface.faces.ravel()] = True
+    cells = np.floor(surface.vertices_m[used] / _CELL_M).astype(np.int64)
     cells -= cells.min(axis=0)
     extent = cells.max(axis=0) + 1
-    key = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
-    _, first, index = np.unique(key, return_index=True, return_inverse=True)
-    joined = index.reshape(-1, 3)
-    solid = (joined[:, 0] != joined[:, 1]) & (joined[:, 1] != joined[:, 2]) & (joined[:, 0] != joined[:, 2])
-    return vertices_m[faces.ravel()[first]], np.unique(joined[solid], axis=0)
+    keys, number = np.unique((cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2], return_inverse=True)
+    of_vertex = np.zeros(len(used), dtype=np.int64)
+    of_vertex[used] = number
+    first = np.full(len(keys), -1, dtype=np.int64)
+    joined: list[NDArray[np.int64]] = [np.zeros((0, 3), dtype=np.int64)]
+    for block in surface.blocks():
+        faces = of_vertex[surface.faces[block]]
+        met, at = np.unique(faces.ravel(), return_index=True)
+        new = first[met] < 0
+        first[met[new]] = surface.faces[block].ravel()[at[new]]
+        solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])
+        joined.append(np.unique(faces[solid], axis=0))
+    return surface.vertices_m[first], np.unique(np.concatenate(joined), axis=0)

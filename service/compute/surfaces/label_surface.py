@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from tempfile import TemporaryFile
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from service.compute.memory import forget_pages
 from service.compute.surfaces.isosurface import surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply
@@ -14,6 +17,7 @@ SIGMA_VOXELS = 0.7  # of the smoothing, without which the surface would be the s
 LEAST_CONTRAST_HU = 100.0  # of a sphere to its surroundings; the mean over a sphere has a noise of a few HU
 _FULL = 1000
 _HALO = 4  # slices on each side that the smoothing reaches
+_SLICES = 64  # smoothed at a time
 _INNER, _SHELL = 0.8, (1.2, 1.5)  # of the radius
 
 
@@ -38,17 +42,21 @@ def label_surface(inside: NDArray[np.bool_], T_ct_voxel: Transform) -> tuple[Arr
         raise ComputeError(
             "nothing, or the whole volume, is segmented", remedy="Check the segments that the step names"
         )
-    padded = np.pad(inside, 1)  # so that a segment at the border is closed
-    smooth = np.empty(padded.shape, dtype=np.int16)
-    for first in range(0, len(padded), 64):
-        low, high = max(0, first - _HALO), min(len(padded), first + 64 + _HALO)
-        part = gaussian_filter(
-            padded[low:high].astype(np.float32), SIGMA_VOXELS, mode="nearest", truncate=_HALO / SIGMA_VOXELS
-        )
-        smooth[first : first + 64] = np.rint(_FULL * part[first - low : first - low + 64])
+    size = (len(inside) + 2, inside.shape[1] + 2, inside.shape[2] + 2)  # so that a segment at the border is closed
     T = T_ct_voxel.copy()
     T[:3, 3] = apply(T_ct_voxel, -np.ones(3))
-    return surface(smooth, T, _FULL / 2)
+    with TemporaryFile() as file:  # twice as large as the segmentation
+        smooth = np.memmap(file, np.int16, "w+", shape=size)
+        for first in range(0, size[0], _SLICES):
+            low, high = max(0, first - _HALO), min(size[0], first + _SLICES + _HALO)
+            part = np.zeros((high - low, *size[1:]), dtype=np.float32)
+            begin, end = max(low, 1), min(high, size[0] - 1)
+            part[begin - low : end - low, 1:-1, 1:-1] = inside[begin - 1 : end - 1]
+            part = gaussian_filter(part, SIGMA_VOXELS, mode="nearest", truncate=_HALO / SIGMA_VOXELS)
+            smooth[first : first + _SLICES] = np.rint(_FULL * part[first - low : first - low + _SLICES])
+            forget_pages(inside)
+            forget_pages(smooth)
+        return surface(smooth, T, _FULL / 2)
 
 
 def sphere_contrasts(

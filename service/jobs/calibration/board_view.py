@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import BoardSize, ImageFile
 
 
@@ -38,4 +38,5 @@ KIND = JobKind(
     words="board images",
     order=10,
     replayed=False,
+    demand=lambda _: Demand(memory_mb=1200, limit_s=900),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from service.jobs.calibration.records import BoardSeen, HandEye, Intrinsics, KnownBoard
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import BoardSize, Camera, Hash, Matrix, PosedPhotograph
 
 
@@ -67,4 +67,7 @@ KIND = JobKind(
     words="camera calibration",
     version=3,  # weighs the board's stated size against the robot's lengths, and knows boards that are bent
     order=12,
+    demand=lambda arguments: Demand(
+        memory_mb=800 + 5 * len(arguments.images), limit_s=3600 + 60 * len(arguments.images)
+    ),
 )

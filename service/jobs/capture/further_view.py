@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Hash, ImageFile, Matrix, Point
 
 
@@ -51,4 +51,5 @@ KIND = JobKind(
     order=32,
     replayed=False,
     aside=True,
+    demand=lambda _: Demand(memory_mb=1200, limit_s=900),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.jobs.capture.hand_view import Answer, HeldArguments, HemisphereArguments
-from service.jobs.kind import JobKind
+from service.jobs.kind import Demand, JobKind
 
 
 class BoardArguments(HemisphereArguments):
@@ -27,4 +27,5 @@ KIND = JobKind(
     words="board images taken by hand",
     order=11,
     replayed=False,
+    demand=lambda _: Demand(memory_mb=1200, limit_s=900),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Camera, Hash, Limits, Matrix, ParameterCovariance, Point
 
 
@@ -103,4 +103,5 @@ KIND = JobKind(
     version=3,
     order=33,
     replayed=False,
+    demand=lambda _: Demand(memory_mb=1200, limit_s=900),
 )

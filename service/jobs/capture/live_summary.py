@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.jobs.capture.live_view import LiveArguments
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Hash, Matrix
 
 
@@ -57,4 +57,5 @@ KIND = JobKind(
     order=32,
     replayed=False,
     aside=True,
+    demand=lambda _: Demand(memory_mb=600, limit_s=600),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Point, PosedPhotograph
 
 
@@ -55,4 +55,5 @@ KIND = JobKind(
     order=31,
     replayed=False,
     aside=True,
+    demand=lambda _: Demand(memory_mb=1200, limit_s=900),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.jobs.kind import JobKind, JobRecord, NoAnswer
+from service.jobs.kind import Demand, JobKind, JobRecord, NoAnswer
 from service.jobs.records import ImageFile, ImagesCamera
 
 
@@ -45,4 +45,5 @@ KIND = JobKind(
     words="features of the images",
     order=40,
     aside=True,
+    demand=lambda arguments: Demand(memory_mb=1500, limit_s=3600 + 300 * len(arguments.images)),
 )

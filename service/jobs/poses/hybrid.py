@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.jobs.kind import JobKind, JobRecord, NoAnswer
+from service.jobs.kind import Demand, JobKind, JobRecord, NoAnswer
 from service.jobs.records import Hash, Matrix
 from service.jobs.registration.detect_spheres import SceneArguments
 
@@ -55,4 +55,5 @@ KIND = JobKind(
     compute="service.worker.poses.models:hybrid",
     words="hybrid camera poses",
     order=51,
+    demand=lambda arguments: Demand(memory_mb=600 + 10 * len(arguments.images), limit_s=14400),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.jobs.kind import JobKind, JobRecord, NoAnswer
+from service.jobs.kind import Demand, JobKind, JobRecord, NoAnswer
 from service.jobs.poses.features import FrontEndArguments
 from service.jobs.records import Hash
 
@@ -26,4 +26,5 @@ KIND = JobKind(
     words="matches between images",
     order=41,
     aside=True,
+    demand=lambda _: Demand(memory_mb=800, limit_s=14400),
 )

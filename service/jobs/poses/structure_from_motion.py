@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from service.jobs.kind import JobKind, JobRecord, NoAnswer
+from service.jobs.kind import Demand, JobKind, JobRecord, NoAnswer
 from service.jobs.poses.features import SfmEffort
 from service.jobs.records import Hash, ImagesCamera, Matrix, PosedPhotograph
 
@@ -42,4 +42,7 @@ KIND = JobKind(
     compute="service.worker.poses.models:structure_from_motion",
     words="camera poses from images",
     order=50,
+    demand=lambda arguments: Demand(
+        memory_mb=1000 + 10 * len(arguments.images), limit_s=14400 + 120 * len(arguments.images)
+    ),
 )

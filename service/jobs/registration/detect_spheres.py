@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from service.jobs.kind import JobKind, NoAnswer
+from service.jobs.kind import Demand, JobKind, NoAnswer
 from service.jobs.records import Hash, ImagesCamera, Matrix, Mounting, ParameterCovariance, Point, PosedPhotograph
 
 DetectorName = Literal["classical", "paper", "grounded", "vote"]
@@ -52,4 +52,5 @@ KIND = JobKind(
     words="spheres in images",
     version=3,
     order=60,
+    demand=lambda arguments: Demand(memory_mb=2400, limit_s=3600 + 120 * len(arguments.images)),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Hash
 
 
@@ -76,4 +76,5 @@ KIND = JobKind(
     compute="service.worker.registration.develop:develop_raw",
     words="developed raw files",
     order=58,
+    demand=lambda _: Demand(memory_mb=2000, limit_s=1800),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import PosedPhotograph, SpheresFound
 from service.jobs.registration.register import Registration
 
@@ -128,4 +128,5 @@ KIND = JobKind(
     words="evaluation",
     version=3,
     order=70,
+    demand=lambda arguments: Demand(memory_mb=1200, limit_s=3600 + 120 * len(arguments.images)),
 )

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Camera, Hash, ImageFile, Matrix, ParameterCovariance, Point
 
 
@@ -99,4 +99,5 @@ KIND = JobKind(
     compute="service.worker.registration.further_camera:further_camera",
     words="further camera",
     order=62,
+    demand=lambda arguments: Demand(memory_mb=2400, limit_s=3600 + 120 * len(arguments.images)),
 )

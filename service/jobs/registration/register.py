@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Camera, Hash, Matrix
 from service.jobs.registration import further_camera
 from service.jobs.registration.detect_spheres import SceneArguments
@@ -131,4 +131,5 @@ KIND = JobKind(
     words="registration",
     version=3,
     order=61,
+    demand=lambda arguments: Demand(memory_mb=500 + len(arguments.images), limit_s=3600 + 20 * len(arguments.images)),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.jobs.kind import JobKind, JobRecord, NoAnswer
+from service.jobs.kind import Demand, JobKind, JobRecord, NoAnswer
 from service.jobs.records import Hash, Limits, Point
 
 
@@ -24,4 +24,5 @@ KIND = JobKind(
     order=30,
     replayed=False,
     aside=True,
+    demand=lambda _: Demand(memory_mb=1400, limit_s=1800),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Hash, Matrix, SpheresFound
 
 
@@ -30,4 +30,5 @@ KIND = JobKind(
     compute="service.worker.surfaces.mesh_spheres:ct_surface",
     words="CT surface",
     order=20,
+    demand=lambda _: Demand(memory_mb=1500, limit_s=7200),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Hash, Matrix, Point, SpheresFound
 from service.jobs.registration.register import Registration
 
@@ -89,6 +89,7 @@ KIND = JobKind(
     answer=Answer,
     compute="service.worker.surfaces.fuse:fuse",
     words="ground-truth mesh",
-    version=3,  # leaves no face turned over
+    version=4,  # leaves no face turned over; compares two million samples of a larger surface, not all
     order=65,
+    demand=lambda _: Demand(memory_mb=1500, limit_s=7200),
 )

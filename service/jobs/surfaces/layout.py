@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import ConfigDict, Field
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Hash, JudgedLayout, Point
 
 
@@ -66,4 +66,5 @@ KIND = JobKind(
     words="layout of the spheres",
     version=3,  # takes no outline of a known sphere for a sphere of its own
     order=22,
+    demand=lambda arguments: Demand(memory_mb=1200, limit_s=1800 + 300 * len(arguments.images)),
 )

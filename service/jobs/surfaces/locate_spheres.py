@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Hash, Matrix, Point, SpheresFound
 
 
@@ -23,4 +23,5 @@ KIND = JobKind(
     compute="service.worker.surfaces.mesh_spheres:locate_spheres",
     words="spheres in the mesh",
     order=21,
+    demand=lambda _: Demand(memory_mb=1000, limit_s=3600),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.jobs.kind import JobKind, JobRecord
+from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Hash, Matrix, Point, SpheresFound
 
 
@@ -29,4 +29,5 @@ KIND = JobKind(
     compute="service.worker.surfaces.merge_scans:merge_scans",
     words="merging of the scan's parts",
     order=23,
+    demand=lambda arguments: Demand(memory_mb=1000 + 200 * len(arguments.meshes), limit_s=7200),
 )

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 from sqlalchemy import ColumnElement, Connection, Row, and_, func, insert, select, true, update
 
+from service.core.errors import IllegalTransitionError
 from service.core.jobs.priorities import EARLY, Lane
 from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished, StepNote
 from service.core.shown_text import storable
@@ -19,6 +20,7 @@ from service.store.queue.leases import ProcessIdentity, identity_of, identity_va
 from service.store.records import Job, NewJob
 
 ACTOR = "store"  # actor of events about a worker that is gone
+CANCELLED = "JobCancelled"  # as the error of a job that a person has cancelled
 
 
 def enqueue(
@@ -207,6 +209,38 @@ def fail(
         .values(state="queued", token=None, until_utc_s=None, error=storable(f"{error}: {message}"))
     )
     return [event]
+
+
+def holds(connection: Connection, job: Job) -> bool:
+    """Whether the lease of a job is still `job.token`."""
+    row = connection.execute(select(jobs.c.state, jobs.c.token).where(jobs.c.job_id == job.job_id)).one_or_none()
+    return row is not None and row.state == "running" and row.token == job.token
+
+
+def cancel(connection: Connection, clock: Clock, run_id: str, job_id: str, *, actor: str, reason: str) -> Event:
+    """Fail a job for good because a person has decided so; whoever computes it will find its lease lost.
+
+    Raises IllegalTransitionError if the run has no such job, or it has ended.
+    """
+    row = connection.execute(select(jobs).where(jobs.c.job_id == job_id, jobs.c.run_id == run_id)).one_or_none()
+    if row is None:
+        raise IllegalTransitionError(
+            f"the run has no job {job_id!r}", where=run_id, remedy="`orthocapture status` lists the jobs that run"
+        )
+    if row.state not in ("queued", "running"):
+        raise IllegalTransitionError(f"the job has {row.state} already", where=job_id)
+    payload = JobFailed(
+        job=row.job_id,
+        job_kind=row.kind,
+        step=row.step,
+        attempt=row.attempt,
+        worker=row.worker or "",
+        error=CANCELLED,
+        message=f"{actor} cancelled it: {reason}",
+    )
+    (event,) = append(connection, clock, run_id, [payload], actor)
+    _end(connection, row, event, state="failed", error=f"{payload.error}: {payload.message}")
+    return event
 
 
 def held_row(connection: Connection, job: Job) -> Row[Any]:

@@ -24,7 +24,7 @@ from service.monitor.snapshot import read_snapshot
 from service.people.control import Control
 from service.people.person import Account, Person
 from service.rig import SigningSection
-from service.run_record import RunRecord, results_to_come
+from service.run_record import RunRecord, open_jobs, results_to_come
 from service.steps import step_kinds
 from service.store.durable_effects import utc_text
 from service.store.files.space_used import forecast_of
@@ -115,6 +115,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         driven=site.launcher.driven(run_id),
         show=step,
         to_come=[left.text for left in results_to_come(log)],
+        computing=open_jobs(log),
         space=None if log.state.terminal else forecast_of(site.store, log.protocol, log.state),
         earlier={} if log.state.terminal else site.step_times(run_id),
         now_utc=now_utc,

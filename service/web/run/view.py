@@ -21,6 +21,7 @@ from service.core.run.tries import tries_words
 from service.core.text.clock_time import time_here
 from service.dataset.registrations import evaluated
 from service.monitor.snapshot import STOPS, Snapshot
+from service.run_record import OpenJob
 from service.web.page.run_standing import run_standing
 from service.web.page.run_words import (
     count,
@@ -67,6 +68,7 @@ def run_view(
     driven: bool,
     show: str = "",
     to_come: Sequence[str] = (),
+    computing: Sequence[OpenJob] = (),
     space: Forecast | None = None,
     earlier: EarlierTimes = NOT_MEASURED,
     now_utc: str = "",
@@ -80,6 +82,7 @@ def run_view(
         driven: whether a running process drives the run.
         show: step to look at; the current one if it is "" or unknown.
         to_come: what is still being computed, in words.
+        computing: the jobs that wait or are computed, which a person may end.
         space: forecast of what the run will still write; None if it is not known.
         earlier: how long the steps took in earlier runs.
         now_utc: the time of the page; "" where none is to be compared with it.
@@ -115,6 +118,7 @@ def run_view(
         deviations=tuple(reversed(state.deviations)),
         news=tuple((m.at_utc, m.text) for m in reversed(snapshot.messages)),
         to_come=tuple(to_come),
+        computing=tuple(computing),
         pedal_armed=snapshot.pedal_armed,
         stop_reason=state.stop_reason,
         operator=state.operator,

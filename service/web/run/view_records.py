@@ -11,6 +11,7 @@ from service.core.protocol.models import Protocol
 from service.core.records.events import Event, OperatorVerb
 from service.core.run.state import Deviation, RunState
 from service.jobs.registration.evaluate import Row
+from service.run_record import OpenJob
 from service.web.run.figures import CaptureProgress, GateLine, Reading
 
 
@@ -266,6 +267,7 @@ class RunView:
     deviations: tuple[Deviation, ...]
     news: tuple[tuple[str, str], ...]
     to_come: tuple[str, ...]  # results that are still being computed, with the time left
+    computing: tuple[OpenJob, ...]  # jobs that wait or are computed, which a person may end
     pedal_armed: bool
     stop_reason: str
     operator: str

@@ -6,12 +6,14 @@ import io
 
 import numpy as np
 
+from service.compute.memory import large_arrays_returned
 from service.compute.planning.coverage import coverage_surface
 from service.jobs.surfaces import coverage_points as job
 from service.worker.capture.scene import limits_of
 from service.worker.job import JobAnswer, JobContext
 
 
+@large_arrays_returned()
 def coverage_points(context: JobContext[job.Arguments]) -> JobAnswer:
     """Sample the surface of the CT outside the spheres."""
     arguments = context.arguments

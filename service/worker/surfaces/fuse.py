@@ -10,7 +10,6 @@ from service.compute.ground_truth.align import Aligned, MeshSpheres, align_spher
 from service.compute.ground_truth.distances.chamfer import ChamferScore, ChamferSettings, chamfer
 from service.compute.ground_truth.distances.heat_map import HeatScale
 from service.compute.ground_truth.distances.heat_mesh import write_heat_mesh
-from service.compute.ground_truth.distances.neighbours import PointIndex
 from service.compute.ground_truth.frames import TransformLoop, close_transforms
 from service.compute.ground_truth.fusion.common import common_part
 from service.compute.ground_truth.fusion.cut_out import Markers, without_markers
@@ -20,6 +19,7 @@ from service.compute.ground_truth.fusion.picture import fusion_picture
 from service.compute.ground_truth.fusion.regions import Box, Prism, RegionCorrection, outline, seen_along
 from service.compute.ground_truth.ply import write_ply
 from service.compute.ground_truth.surface import Surface
+from service.compute.memory import large_arrays_returned
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.records.events import ArtefactRef
@@ -33,19 +33,22 @@ _MM = 1e-3  # metres in the unit of the files
 _COMMENTS = ("in the frame of the scan, mm", "source 0: CT, 1: scan, 2: blend; sigma along the normal")
 
 
+@large_arrays_returned()
 def fuse(context: JobContext[job.Arguments]) -> JobAnswer:
     """Bring the CT into the frame of the scan, compare both, and fuse them."""
     arguments = context.arguments
     context.progress("spheres", 0, 4)
     aligned = align_spheres(_spheres(arguments.ct), _spheres(arguments.scan))
     scan = Surface.kept(context.input(arguments.scan_mesh))
-    ct = Surface.kept(context.input(arguments.ct_mesh)).moved(aligned.T_scan_ct)
     up = scan.area_vectors_m2.sum(axis=0)  # a scan sees its scene from above only: its faces together point up
     frames = _frames(arguments, aligned)
     corrections = tuple(_correction(region, frames, up) for region in arguments.regions)
     context.progress("distances", 1, 4)
-    common = common_part(ct, aligned, arguments.radius_m)
-    score = chamfer(common.ct, scan, ChamferSettings(arguments.spacing_m, to_faces=False))
+    # The whole CT is named nowhere: most of its faces may be noise, and are freed as soon as they are left out.
+    common = common_part(
+        Surface.kept(context.input(arguments.ct_mesh)).moved(aligned.T_scan_ct), aligned, arguments.radius_m
+    )
+    score = chamfer(common.ct, scan, ChamferSettings(arguments.spacing_m, to_faces=False, of_vertices=True))
     context.progress("fusion", 2, 4)
     fused = fuse_surfaces(common.ct, scan, up, _settings(arguments, aligned), corrections, common.taken)
     wound_m = _wound(fused, up)
@@ -147,15 +150,14 @@ def _files(context: JobContext[job.Arguments], compared: _ComparedSurfaces, fuse
     properties = {"source": fused.source, "sigma_mm": mm(fused.sigma_m)}
     mark = [SIMULATED] if context.arguments.simulated else []
     write_ply(mesh, fused.surface, _MM, properties, [*_COMMENTS, *mark])
-    distance_m = PointIndex(compared.score.gt.samples.points_m).nearest(compared.ct.vertices_m, scale.outlier_m)[0]
-    write_heat_mesh(heat, compared.ct, distance_m, scale, _MM, mark)
+    assert compared.score.vertex_distance_m is not None  # asked for above
+    write_heat_mesh(heat, compared.ct, compared.score.vertex_distance_m, scale, _MM, mark)
     picture = fusion_picture(compared.ct, compared.scan, compared.score, scale, fused)
-    kept = (
-        (mesh.read_bytes(), "ground_truth_mesh", "model/ply", mesh.name),
-        (heat.read_bytes(), "fusion_heat_map", "model/ply", heat.name),
-        (picture, "fusion_picture", "image/png", "fusion.png"),
+    return (
+        context.keep_file(mesh, kind="ground_truth_mesh", media_type="model/ply"),
+        context.keep_file(heat, kind="fusion_heat_map", media_type="model/ply"),
+        context.keep_bytes(picture, kind="fusion_picture", media_type="image/png", name="fusion.png"),
     )
-    return tuple(context.keep_bytes(data, kind=kind, media_type=media, name=name) for data, kind, media, name in kept)
 
 
 def _measures(aligned: Aligned, loop: TransformLoop | None, score: ChamferScore, fused: Fused) -> dict[str, float]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 
+from service.compute.memory import large_arrays_returned
 from service.compute.surfaces.part_merging import merge_parts
 from service.core.errors import ComputeError
 from service.core.geometry import apply
@@ -17,6 +16,7 @@ from service.worker.job import JobAnswer, JobContext
 from service.worker.surfaces.mesh_spheres import found_spheres, search_spheres
 
 
+@large_arrays_returned()
 def merge_scans(context: JobContext[merge_job.Arguments]) -> JobAnswer:
     """Put the parts into the frame of the first by their spheres; their surfaces lie over each other, unchanged."""
     arguments = context.arguments
@@ -35,9 +35,9 @@ def merge_scans(context: JobContext[merge_job.Arguments]) -> JobAnswer:
     vertices = np.concatenate([apply(T, own) for T, (own, _) in zip(merged.T_first_part, parts, strict=True)])
     first = np.cumsum([0, *(len(own) for own, _ in parts[:-1])])
     faces = np.concatenate([own + start for start, (_, own) in zip(first, parts, strict=True)])
-    buffer = io.BytesIO()
-    np.savez(buffer, vertices_m=vertices, faces=faces)
-    mesh = context.keep_bytes(buffer.getvalue(), kind="scan_mesh", media_type="application/x-npz", name="merged.npz")
+    file = context.scratch / "merged.npz"
+    np.savez(file, vertices_m=vertices, faces=faces)
+    mesh = context.keep_file(file, kind="scan_mesh", media_type="application/x-npz")
     located = locate_job.Arguments(
         mesh=mesh.sha256,
         radius_m=arguments.radius_m,

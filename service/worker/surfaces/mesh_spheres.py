@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 
 import numpy as np
 
 from service.compute.layout.ambiguity import check_layout, layout_measures
 from service.compute.layout.confusions import SUBSET as LAYOUT_SUBSET
+from service.compute.memory import large_arrays_returned
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.cut_ends import cut_voxels
 from service.compute.surfaces.isosurface import surface
@@ -28,6 +28,7 @@ from service.worker.job import JobAnswer, JobContext
 from service.worker.surfaces.records import judged_layout, measured_sphere
 
 
+@large_arrays_returned()
 def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
     """Compute the surface of a volume (Hounsfield units) at the threshold, and find the spheres in the CT frame.
 
@@ -43,11 +44,9 @@ def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
         labels = np.load(context.input(arguments.labels), allow_pickle=False, mmap_mode="r")
         vertices_m, faces = label_surface(labels, T_ct_voxel)
         ends = labels[[0, -1]] != 0
-    buffer = io.BytesIO()
-    np.savez(buffer, vertices_m=vertices_m, faces=faces)
-    mesh = context.keep_bytes(
-        buffer.getvalue(), kind="ct_mesh", media_type="application/x-npz", name="ct_surface.npz"
-    )
+    file = context.scratch / "ct_surface.npz"
+    np.savez(file, vertices_m=vertices_m, faces=faces)
+    mesh = context.keep_file(file, kind="ct_mesh", media_type="application/x-npz")
     try:
         measures, found = search_spheres(arguments, vertices_m, faces)
     except ComputeError as error:
@@ -107,6 +106,7 @@ def _contrast(arguments: ct_job.Arguments, hounsfield: Any, T_ct_voxel: Array, c
     )
 
 
+@large_arrays_returned()
 def locate_spheres(context: JobContext[locate_job.Arguments]) -> JobAnswer:
     """Find the spheres of a mesh; with `reference_m`, also how they moved since an earlier measurement."""
     with np.load(context.input(context.arguments.mesh), allow_pickle=False) as mesh:

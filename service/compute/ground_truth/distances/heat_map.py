@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.compute.ground_truth.distances.chamfer import ChamferScore, DistanceSamples
 from service.compute.ground_truth.distances.neighbours import PointIndex
-from service.compute.ground_truth.distances.sampling import normals_of
+from service.compute.ground_truth.distances.sampling import normals_at
 from service.compute.ground_truth.surface import Surface
 from service.core.geometry import Array
 from service.core.units import mm
@@ -65,10 +65,8 @@ class Panel:
     @classmethod
     def of_distances(cls, surface: Surface, compared: DistanceSamples, scale: HeatScale, title: str) -> Panel:
         """The samples of a surface in the colours of their distances."""
-        points = compared.samples.points_m
-        everything = np.arange(len(points))
-        colours = scale.colours(compared.distance_m)
-        return cls(points, colours, normals_of(surface, compared.samples, everything), title)
+        samples = compared.samples
+        return cls(samples.points_m, scale.colours(compared.distance_m), normals_at(surface, samples.origin), title)
 
 
 def heat_picture(

@@ -6,9 +6,12 @@ of tree: in random order a search takes several times as long (bench/results/cha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from pykdtree.kdtree import KDTree
+from scipy.ndimage import distance_transform_edt
 
 from service.compute.ground_truth.surface import IntArray
 from service.core.geometry import Array
@@ -16,6 +19,8 @@ from service.core.geometry import Array
 _CHUNK = 1_000_000  # queries at a time, which limits the memory
 _PROBE = 4096  # consecutive points that are looked at to tell whether their order is spatial
 _NEAR = 0.02  # of the extent: a usual step between consecutive points in spatial order is shorter
+_CELLS = 128  # along the longest side of a block of points, in the grid that says how far it is
+_GROUP = 4096  # queries that lie together
 
 
 class PointIndex:
@@ -53,6 +58,78 @@ class PointIndex:
         return index if self._order is None else self._order[index]
 
 
+class NearestOfBlocks:
+    """The nearest of many points that are shown block by block, so that never all of them are in memory.
+
+    Attributes:
+        distance_m: (Q,) from each query to the nearest point shown so far; infinite if none is within the limit.
+        label: (Q,) of that point; -1 if there is none.
+    """
+
+    def __init__(self, queries_m: Array, within_m: float = np.inf) -> None:
+        self.distance_m = np.full(len(queries_m), np.inf)
+        self.label = np.full(len(queries_m), -1, dtype=np.int64)
+        self._queries, self._within = queries_m, within_m
+        # Queries that lie together are looked at together: most of them are far from most blocks.
+        order = z_order(queries_m) if len(queries_m) else np.zeros(0, dtype=np.int64)
+        self._groups = [order[begin : begin + _GROUP] for begin in range(0, len(order), _GROUP)]
+        boxes = [(queries_m[group].min(axis=0), queries_m[group].max(axis=0)) for group in self._groups]
+        low, high = np.array(boxes).reshape(-1, 2, 3).swapaxes(0, 1)
+        self._middles, self._radii = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
+
+    def asked(self, block: Block) -> IntArray:
+        """Indices of the queries to which a point of a block may be the nearest."""
+        reach = np.array([float(self.distance_m[group].max()) for group in self._groups])
+        near = np.flatnonzero(block.least_distance(self._middles) - self._radii < np.minimum(reach, self._within))
+        found: list[IntArray] = [np.zeros(0, dtype=np.int64)]
+        for group in (self._groups[k] for k in near):
+            least = block.least_distance(self._queries[group])
+            found.append(group[least < np.minimum(self.distance_m[group], self._within)])
+        return np.concatenate(found)
+
+    def look(self, asked: IntArray, points: PointIndex, labels: IntArray) -> None:
+        """Look among further points, with their labels (N,), for these queries."""
+        distance, index = points.nearest(self._queries[asked], self._within)
+        nearer = distance < self.distance_m[asked]
+        at = asked[nearer]
+        self.distance_m[at], self.label[at] = distance[nearer], labels[index[nearer]]
+
+
+def show(points_m: Array, labels: IntArray, to: Sequence[NearestOfBlocks]) -> None:
+    """Show a block of points (N, 3), with their labels (N,), to all who look for the nearest."""
+    block = Block(points_m)
+    index: PointIndex | None = None
+    for nearest in to:
+        asked = nearest.asked(block)
+        if len(asked):
+            index = index or PointIndex(points_m)
+            nearest.look(asked, index, labels)
+
+
+class Block:
+    """A coarse grid of points (N, 3), which says how far they are at least."""
+
+    def __init__(self, points_m: Array) -> None:
+        self._low, self._high = points_m.min(axis=0), points_m.max(axis=0)
+        self._cell = max(float(np.max(self._high - self._low)) / _CELLS, 1e-300)
+        self._size = np.floor((self._high - self._low) / self._cell).astype(np.int64) + 1
+        empty = np.ones(tuple(self._size), dtype=np.bool_)
+        for begin in range(0, len(points_m), _CHUNK // 10):
+            empty[self._cells(points_m[begin : begin + _CHUNK // 10])] = False
+        apart = self._cell * np.asarray(distance_transform_edt(empty), dtype=np.float64)  # of the cells' middles
+        self._apart = np.maximum(apart - np.sqrt(3.0) * self._cell, 0.0)
+
+    def _cells(self, points_m: Array) -> tuple[IntArray, ...]:
+        return tuple(np.minimum((points_m - self._low) / self._cell, self._size - 1).astype(np.int64).T)
+
+    def least_distance(self, places_m: Array) -> Array:
+        """(Q,) a distance than which no point of the block is nearer to a place (Q, 3)."""
+        inside = np.clip(places_m, self._low, self._high)
+        # The box is convex: the way to a point in it is at least as long as both legs of a right angle.
+        legs = np.linalg.norm(places_m - inside, axis=1), self._apart[self._cells(inside)]
+        return np.hypot(*legs) * (1 - 1e-9)
+
+
 def spatial_order(points: Array) -> IntArray | None:
     """An order (N,) along a Z curve; None if consecutive points (N, 3) are mostly neighbours already."""
     if len(points) < _PROBE:
@@ -69,9 +146,12 @@ def z_order(points: Array) -> IntArray:
     """The order (N,) of points (N, 3) along a Z curve, so that neighbours are mostly near one another."""
     low = points.min(axis=0)
     extent = max(float(np.max(points.max(axis=0) - low)), 1e-300)
-    cells = ((points - low) * (((1 << 21) - 1) / extent)).astype(np.uint64)
-    x, y, z = (_spread(cells[:, k]) for k in range(3))
-    return np.argsort(x | (y << np.uint64(1)) | (z << np.uint64(2)))
+    keys = np.empty(len(points), dtype=np.uint64)
+    for begin in range(0, len(points), _CHUNK):
+        cells = ((points[begin : begin + _CHUNK] - low) * (((1 << 21) - 1) / extent)).astype(np.uint64)
+        x, y, z = (_spread(cells[:, k]) for k in range(3))
+        keys[begin : begin + _CHUNK] = x | (y << np.uint64(1)) | (z << np.uint64(2))
+    return np.argsort(keys)
 
 
 def _spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,8 +13,9 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.core.units import mm
 
-MOST_SAMPLES = 40_000_000  # of one surface; a score needs about 100 bytes for each
-_CHUNK = 1_000_000
+MOST_SAMPLES = 40_000_000  # of one surface; more are nearly always a mistaken unit
+_BLOCK = 1_000_000
+_PLACES = 50_000  # made at a time, which fits into the processor's cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,18 +33,57 @@ class Samples:
     normals: Array | None = field(repr=False)
 
 
-def sample(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Samples:
-    """Sample a mesh at random, with one point per spacing²; thin a cloud to one point per cube of the spacing.
+class BlockedSamples:
+    """The samples of a surface, made block by block whenever they are wanted: all of them may take gigabytes.
 
+    A mesh is sampled at random, with one point per spacing²; a cloud is thinned to one point per cube of the spacing.
     Every face gets its share of the points, rounded up or down, at random places. The draws do not depend on the
     frame. A cloud that is sparser than the spacing stays as it is: points cannot be invented.
 
     Raises:
         ComputeError: the surface has no area, or would need more than MOST_SAMPLES points.
     """
-    if not surface.is_mesh:
-        return _thinned(surface, spacing_m)
-    area = np.linalg.norm(surface.area_vectors_m2, axis=1)
+
+    def __init__(self, surface: Surface, spacing_m: float, rng: np.random.Generator) -> None:
+        self._surface = surface
+        self._draws: list[np.random.Generator] = []  # as they were before each block
+        if not surface.is_mesh:
+            self._cloud = _thinned(surface, spacing_m)
+            self.n = len(self._cloud.points_m)
+            return
+        self._upto = _counts(surface, spacing_m, rng)
+        self.n = int(self._upto[-1])
+        for begin in range(0, self.n, _BLOCK):
+            self._draws.append(copy.deepcopy(rng))
+            rng.random((2, min(_BLOCK, self.n - begin), 1))  # those of the block, which is made later
+
+    def blocks(self) -> Iterator[Samples]:
+        """All samples in order, in blocks of up to a million; the same ones each time."""
+        for number, begin in enumerate(range(0, self.n, _BLOCK)):
+            end = min(begin + _BLOCK, self.n)
+            if not self._surface.is_mesh:
+                of = self._cloud
+                normals = None if of.normals is None else of.normals[begin:end]
+                yield Samples(of.points_m[begin:end], of.origin[begin:end], normals)
+                continue
+            origin = np.searchsorted(self._upto, np.arange(begin, end), side="right")
+            yield Samples(random_places(self._surface, origin, copy.deepcopy(self._draws[number])), origin, None)
+
+
+def sample(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Samples:
+    """All samples of a surface at once. Raises as BlockedSamples."""
+    blocks = list(BlockedSamples(surface, spacing_m, rng).blocks())
+    normals = [block.normals for block in blocks if block.normals is not None]
+    return Samples(
+        np.concatenate([block.points_m for block in blocks]),
+        np.concatenate([block.origin for block in blocks]),
+        np.concatenate(normals) if normals else None,
+    )
+
+
+def _counts(surface: Surface, spacing_m: float, rng: np.random.Generator) -> IntArray:
+    """(F,) number of samples on each face and those before it."""
+    area = surface.face_areas_m2
     total = area.sum() / spacing_m**2
     if not total > 0:
         raise ComputeError("the mesh has no area", remedy="Export it again")
@@ -51,38 +93,38 @@ def sample(surface: Surface, spacing_m: float, rng: np.random.Generator) -> Samp
             f"{MOST_SAMPLES:.0e}",
             remedy="Check the unit of the mesh, cut it to what is to be compared, or choose a larger spacing",
         )
-    edges = np.floor(np.cumsum(area) / spacing_m**2 + rng.random()).astype(np.int64)
-    origin = np.repeat(np.arange(len(area)), np.diff(edges, prepend=0))
-    if len(origin) == 0:  # less than one cell of area
-        origin = np.array([int(area.argmax())])
-    points = np.empty((len(origin), 3))
-    for begin in range(0, len(origin), _CHUNK):
-        part = slice(begin, begin + _CHUNK)
-        points[part] = random_places(surface, origin[part], rng)
-    return Samples(points, origin, None)
+    upto = np.floor(np.cumsum(area) / spacing_m**2 + rng.random()).astype(np.int64)
+    if upto[-1] == 0:  # less than one cell of area
+        upto[int(area.argmax()) :] = 1
+    return upto
 
 
 def random_points(surface: Surface, n: int, rng: np.random.Generator) -> Array:
     """(n, 3) points of a mesh, independent of one another and uniform in area."""
-    share = np.cumsum(np.linalg.norm(surface.area_vectors_m2, axis=1))
+    share = np.cumsum(surface.face_areas_m2)
     chosen = np.searchsorted(share, rng.random(n) * share[-1], side="right")
     return random_places(surface, np.minimum(chosen, len(share) - 1), rng)
 
 
-def normals_of(surface: Surface, samples: Samples, chosen: IntArray | slice) -> Array | None:
-    """Unit normals (K, 3) of the chosen samples; None where the surface is a cloud without normals."""
+def normals_at(surface: Surface, origin: IntArray) -> Array | None:
+    """Unit normals (K, 3) of samples of this origin (K,); None where the surface is a cloud without normals."""
     if surface.is_mesh:
-        return surface.face_normals[samples.origin[chosen]]
-    return None if samples.normals is None else samples.normals[chosen]
+        return surface.normals_of(origin)
+    return None if surface.normals is None else surface.normals[origin]
 
 
 def random_places(surface: Surface, faces: IntArray, rng: np.random.Generator) -> Array:
     """(K, 3) one random point on each of these faces (K,)."""
-    a, b, c = (surface.vertices_m[surface.faces[faces, k]] for k in range(3))
-    u, v = rng.random((2, len(faces), 1))
-    folded = u + v > 1
-    u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
-    return a + u * (b - a) + v * (c - a)
+    drawn = rng.random((2, len(faces), 1))
+    out = np.empty((len(faces), 3))
+    for begin in range(0, len(faces), _PLACES):
+        part = slice(begin, begin + _PLACES)
+        a, b, c = (surface.vertices_m[surface.faces[faces[part], k]] for k in range(3))
+        u, v = drawn[:, part]
+        folded = u + v > 1
+        u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
+        out[part] = a + u * (b - a) + v * (c - a)
+    return out
 
 
 def _thinned(surface: Surface, spacing_m: float) -> Samples:

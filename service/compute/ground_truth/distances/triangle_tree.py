@@ -11,8 +11,9 @@ from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.geometry import Array
 
 _LEAF = 4  # faces in a leaf
+_LEAVES = 200_000  # made at a time
 _QUERIES = 20_000  # at a time, which limits the memory
-_PAIRS = 2_000_000  # of a query and a face, compared at a time
+_PAIRS = 1_000_000  # of a query and a face, compared at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,12 +29,19 @@ class TriangleTree:
     """The faces of a mesh, in which the nearest place of the surface to any point is found exactly."""
 
     def __init__(self, surface: Surface) -> None:
-        corners = surface.vertices_m[surface.faces]
-        self._order = z_order(corners.mean(axis=1))
-        self._corners = corners[self._order]
-        leaves = np.arange(0, len(corners), _LEAF)
-        low = np.minimum.reduceat(self._corners.min(axis=1), leaves, axis=0)
-        high = np.maximum.reduceat(self._corners.max(axis=1), leaves, axis=0)
+        faces, self._vertices = surface.faces, surface.vertices_m
+        middles = np.empty((len(faces), 3))
+        for block in surface.blocks():
+            middles[block] = self._vertices[faces[block]].mean(axis=1)
+        self._order = z_order(middles)
+        del middles
+        self._faces = faces[self._order]
+        low, high = (np.empty((-(-len(faces) // _LEAF), 3)) for _ in range(2))
+        for begin in range(0, len(low), _LEAVES):
+            corners = self._vertices[self._faces[_LEAF * begin : _LEAF * (begin + _LEAVES)]]
+            leaves = np.arange(0, len(corners), _LEAF)
+            low[begin : begin + _LEAVES] = np.minimum.reduceat(corners.min(axis=1), leaves, axis=0)
+            high[begin : begin + _LEAVES] = np.maximum.reduceat(corners.max(axis=1), leaves, axis=0)
         self._levels = [(low, high)]  # from the leaves to the root; two boxes have one parent
         while len(low) > 1:
             pairs = np.arange(0, len(low), 2)
@@ -90,9 +98,9 @@ class TriangleTree:
         for begin in range(0, len(query), step):
             which = np.repeat(query[begin : begin + step], _LEAF)
             faces = (leaf[begin : begin + step, None] * _LEAF + np.arange(_LEAF)).ravel()
-            there = faces < len(self._corners)
+            there = faces < len(self._faces)
             which, faces = which[there], faces[there]
-            p = closest_on_triangles(queries[which], self._corners[faces])
+            p = closest_on_triangles(queries[which], self._vertices[self._faces[faces]])
             d = np.linalg.norm(p - queries[which], axis=1)
             best = np.lexsort((d, which))
             best = best[np.flatnonzero(np.diff(which[best], prepend=-1))]

@@ -25,4 +25,6 @@ class CommonPart:
 def common_part(ct: Surface, aligned: Aligned, radius_m: float) -> CommonPart:
     """Leave out of a CT, in the scan's frame, the spheres of a radius that the scan lacks, and small loose parts."""
     taken = SphereRegion(aligned.taken_away_m, radius_m + _MARGIN_M)
-    return CommonPart(without_specks(outside(ct, taken), _LEAST_PART_M2), taken)
+    left = outside(ct, taken)
+    del ct
+    return CommonPart(without_specks(left, _LEAST_PART_M2), taken)

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.sparse import csr_matrix, diags
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import cg
+from scipy.sparse.linalg import LinearOperator, cg
 
 from service.compute.ground_truth.fusion.overlap import Mask
 from service.compute.ground_truth.surface import IntArray, Surface
@@ -19,6 +19,7 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array
 
 _ITERATIONS, _RELATIVE = 2000, 1e-3
+_FACES = 500_000  # whose edges are sorted at a time, which limits the memory
 _AVERAGED = 4  # times in each attempt
 _ALIKE = (1, 1, 2)  # rings of neighbours around faces that turn over: in them, moves become alike
 _ROUNDED = (0,) * 10  # then their own corners are evened out
@@ -71,9 +72,11 @@ def deviation_field(surface: Surface, known_m: Array, known: Mask, lengths: Fiel
     edge_m = _usual_edge(surface)
     pull = np.where(known, (edge_m / lengths.smoothing_m) ** 2, (edge_m / lengths.reach_m) ** 2)
     diagonal = np.asarray(links.sum(axis=1)).ravel() + pull
-    matrix = (diags(diagonal) - links).tocsr()
     wanted = np.where(known, pull * known_m, 0.0)
-    field, left = cg(matrix, wanted, rtol=_RELATIVE, maxiter=_ITERATIONS, M=diags(1 / diagonal))
+    n = len(wanted)
+    matrix = LinearOperator((n, n), matvec=lambda x: diagonal * x - links @ x, dtype=np.float64)
+    inverse = LinearOperator((n, n), matvec=lambda x: x / diagonal, dtype=np.float64)
+    field, left = cg(matrix, wanted, rtol=_RELATIVE, maxiter=_ITERATIONS, M=inverse)
     if left != 0:
         raise ComputeError("the deviation of the CT from the scan has no smooth field", remedy="Check both meshes")
     return np.asarray(field, dtype=np.float64)
@@ -136,19 +139,39 @@ def _pieces(surface: Surface, links: csr_matrix, folded: IntArray, rings: int) -
 def adjacency(surface: Surface) -> csr_matrix:
     """(V, V) 1 for each pair of vertices with an edge between them."""
     f, n = surface.faces, len(surface.vertices_m)
-    ends = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
-    ends = np.concatenate([ends, ends[:, ::-1]])
-    links = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n, n)).tocsr()
-    links.data[:] = 1.0  # an edge of two faces was counted twice
-    return links
+    begun = np.zeros(n + 1, dtype=np.int64)
+    for k in range(3):
+        np.add.at(begun, f[:, k] + 1, 2)  # each face gives each of its corners two neighbours
+    np.cumsum(begun, out=begun)
+    neighbours = np.empty(int(begun[-1]), dtype=np.int32)
+    filled = begun[:-1].copy()
+    for begin in range(0, len(f), _FACES):
+        part = f[begin : begin + _FACES]
+        one = np.concatenate([part[:, [0, 1, 2]].ravel(), part[:, [0, 1, 2]].ravel()])
+        other = np.concatenate([part[:, [1, 2, 0]].ravel(), part[:, [2, 0, 1]].ravel()])
+        order = np.argsort(one, kind="stable")
+        one, other = one[order], other[order]
+        vertex, start, count = np.unique(one, return_index=True, return_counts=True)
+        neighbours[filled[one] + np.arange(len(one)) - np.repeat(start, count)] = other
+        filled[vertex] += count
+    links = csr_matrix((np.ones(len(neighbours), dtype=np.float32), neighbours, begun.astype(np.int32)), shape=(n, n))
+    links.sum_duplicates()  # an edge of two faces is there twice
+    return csr_matrix((np.ones(links.nnz), links.indices, links.indptr), shape=(n, n))
 
 
 def _usual_edge(surface: Surface) -> float:
-    ends = surface.vertices_m[surface.faces[:, :2]]
-    return float(np.median(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)))
+    lengths = np.empty(len(surface.faces))
+    for block in surface.blocks():
+        ends = surface.vertices_m[surface.faces[block, :2]]
+        lengths[block] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    return float(np.median(lengths))
 
 
 def _folded(surface: Surface, points_m: Array) -> IntArray:
     """Indices of the faces whose normal turns by more than a right angle when the vertices move to these points."""
     moved = Surface(points_m, surface.faces)
-    return np.flatnonzero(np.einsum("fi,fi->f", moved.area_vectors_m2, surface.area_vectors_m2) < 0)
+    folded = np.empty(len(surface.faces), dtype=np.bool_)
+    for block in surface.blocks():
+        after, before = moved.area_vectors_of(block), surface.area_vectors_of(block)
+        folded[block] = np.einsum("fi,fi->f", after, before) < 0
+    return np.flatnonzero(folded)

@@ -32,6 +32,7 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array, place_jacobian
 
 _DETAIL_FROM = 0.3  # of the overlap: from here on the scan's own detail comes in
+_VERTICES = 200_000  # computed at a time, which limits the memory
 
 
 class Source(IntEnum):
@@ -162,8 +163,10 @@ def _sigma(carrier: Surface, weight: Array, gap: Array, sigma_ct_m: float, setti
     ct = np.full(len(weight), sigma_ct_m**2)
     if settings.alignment_covariance is not None:
         normals = carrier.vertex_normals
-        J = np.einsum("ni,nik->nk", normals, place_jacobian(carrier.vertices_m))
-        ct += np.einsum("nk,kl,nl->n", J, settings.alignment_covariance, J)
+        for begin in range(0, len(weight), _VERTICES):
+            part = slice(begin, begin + _VERTICES)
+            J = np.einsum("ni,nik->nk", normals[part], place_jacobian(carrier.vertices_m[part]))
+            ct[part] += np.einsum("nk,kl,nl->n", J, settings.alignment_covariance, J)
     between = (weight * (1 - weight) * gap) ** 2
     return np.sqrt((weight * settings.sigma_scan_m) ** 2 + (1 - weight) ** 2 * ct + between)
 
@@ -176,20 +179,27 @@ def without_specks(ct: Surface, least_m2: float) -> Surface:
         return compact(ct.vertices_m, ct.faces)[0]
     labels = components(ct, np.ones(len(ct.vertices_m), dtype=np.bool_))
     part = labels[ct.faces[:, 0]]
-    area = np.bincount(part, np.linalg.norm(ct.area_vectors_m2, axis=1))
+    area = np.bincount(part, ct.face_areas_m2)
     return compact(ct.vertices_m, ct.faces[area[part] >= least_m2])[0]
 
 
 def outside(surface: Surface, region: Region) -> Surface:
     """The surface without the faces that touch a region."""
     inside = region.contains(surface.vertices_m)
+    if not inside.any():
+        return compact(surface.vertices_m, surface.faces)[0]
     return compact(surface.vertices_m, surface.faces[~inside[surface.faces].any(axis=1)])[0]
 
 
 def compact(vertices: Array, faces: IntArray) -> tuple[Surface, IntArray]:
     """The mesh without vertices that no face has, and the former index (V,) of each that is left."""
-    kept, index = np.unique(faces, return_inverse=True)
-    return Surface(vertices[kept], index.reshape(-1, 3)), kept
+    used = np.zeros(len(vertices), dtype=np.bool_)
+    used[faces.ravel()] = True
+    kept = np.flatnonzero(used)
+    if len(kept) == len(vertices):
+        return Surface(vertices, faces), kept
+    index = np.cumsum(used, dtype=faces.dtype) - faces.dtype.type(1)
+    return Surface(vertices[kept], index[faces]), kept
 
 
 @dataclass(frozen=True, slots=True)

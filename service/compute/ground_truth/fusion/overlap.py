@@ -16,6 +16,8 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array
 
 Mask = NDArray[np.bool_]
+_POINTS = 200_000  # compared with faces at a time, which limits the memory
+_FACES = 1_000_000  # whose connections are looked at together
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,16 +58,19 @@ def overlap(ct: Surface, scan: Surface, limits: OverlapLimits | None = None) -> 
     reach_m = bounds.distance_m + _longest_edge(scan)
     rough, vertex = PointIndex(scan.vertices_m[used]).nearest(ct.vertices_m, reach_m)
     near = np.flatnonzero(np.isfinite(rough))
-    place, face = _on_faces_around(scan, used[vertex[near]], ct.vertices_m[near])
     normals = ct.vertex_normals
-    way = ct.vertices_m[near] - place
     nearest, covered = ct.vertices_m.copy(), np.zeros(len(rough), dtype=np.bool_)
     offset = np.full(len(rough), np.inf)
-    nearest[near] = place
-    offset[near] = np.einsum("ni,ni->n", way, normals[near])
-    covered[near] = (np.linalg.norm(way, axis=1) <= bounds.distance_m) & (
-        np.einsum("ni,ni->n", normals[near], scan.face_normals[face]) >= bounds.cosine
-    )
+    around = _FacesAround(scan)
+    for begin in range(0, len(near), _POINTS):
+        part = near[begin : begin + _POINTS]
+        place, face = around.nearest(used[vertex[part]], ct.vertices_m[part])
+        way = ct.vertices_m[part] - place
+        nearest[part] = place
+        offset[part] = np.einsum("ni,ni->n", way, normals[part])
+        covered[part] = (np.linalg.norm(way, axis=1) <= bounds.distance_m) & (
+            np.einsum("ni,ni->n", normals[part], scan.normals_of(face)) >= bounds.cosine
+        )
     rim = rim_vertices(scan)
     if len(rim):
         index = np.flatnonzero(covered)
@@ -74,26 +79,33 @@ def overlap(ct: Surface, scan: Surface, limits: OverlapLimits | None = None) -> 
     return Overlap(nearest, offset, covered)
 
 
-def _on_faces_around(surface: Surface, vertex: IntArray, points: Array) -> tuple[Array, IntArray]:
-    """Find, among the faces around a vertex (N,), the place nearest to a point (N, 3), and the face (N,) that has it.
+class _FacesAround:
+    """The faces around each vertex of a mesh."""
 
-    With the vertex nearest to the point, that is nearly always the nearest place of the whole surface.
-    """
-    corner = surface.faces.ravel()
-    order = np.argsort(corner, kind="stable")
-    first = np.searchsorted(corner[order], np.arange(len(surface.vertices_m) + 1))
-    count = np.diff(first)[vertex]
-    best = np.full(len(points), np.inf)
-    place, face = np.empty_like(points), np.zeros(len(points), dtype=np.int64)
-    for k in range(int(count.max(initial=0))):
-        index = np.flatnonzero(count > k)
-        candidate = order[first[vertex[index]] + k] // 3
-        p = closest_on_triangles(points[index], surface.vertices_m[surface.faces[candidate]])
-        d = np.linalg.norm(p - points[index], axis=1)
-        nearer = d < best[index]
-        at = index[nearer]
-        best[at], place[at], face[at] = d[nearer], p[nearer], candidate[nearer]
-    return place, face
+    def __init__(self, surface: Surface) -> None:
+        corner = surface.faces.ravel()
+        self._surface = surface
+        self._order = np.argsort(corner, kind="stable")
+        self._first = np.searchsorted(corner[self._order], np.arange(len(surface.vertices_m) + 1))
+
+    def nearest(self, vertex: IntArray, points: Array) -> tuple[Array, IntArray]:
+        """Find, among the faces around a vertex (N,), the place nearest to a point (N, 3), and the face that has it.
+
+        With the vertex nearest to the point, that is nearly always the nearest place of the whole surface.
+        """
+        surface = self._surface
+        count = np.diff(self._first)[vertex]
+        best = np.full(len(points), np.inf)
+        place, face = np.empty_like(points), np.zeros(len(points), dtype=np.int64)
+        for k in range(int(count.max(initial=0))):
+            index = np.flatnonzero(count > k)
+            candidate = self._order[self._first[vertex[index]] + k] // 3
+            p = closest_on_triangles(points[index], surface.vertices_m[surface.faces[candidate]])
+            d = np.linalg.norm(p - points[index], axis=1)
+            nearer = d < best[index]
+            at = index[nearer]
+            best[at], place[at], face[at] = d[nearer], p[nearer], candidate[nearer]
+        return place, face
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,10 +140,7 @@ def propose_wound(ct: Surface, covered: Mask, up: Array, limits: WoundLimits | N
     if not lacking.any():
         return wound
     height = ct.vertices_m @ (up / np.linalg.norm(up))
-    vectors = np.repeat(ct.area_vectors_m2 / 3, 3, axis=0)
-    corner = ct.faces.ravel()
-    size = np.bincount(corner, np.linalg.norm(vectors, axis=1), len(lacking))
-    facing = np.bincount(corner, vectors @ (up / np.linalg.norm(up)), len(lacking))
+    size, facing = ct.sums_at_vertices(lambda faces: _size_and_facing(ct, faces, up)).T
     rim = np.zeros(len(lacking), dtype=np.bool_)
     crossing = lacking[ct.faces].any(axis=1) & ~lacking[ct.faces].all(axis=1)
     rim[ct.faces[crossing].ravel()] = True
@@ -148,25 +157,48 @@ def propose_wound(ct: Surface, covered: Mask, up: Array, limits: WoundLimits | N
     return wound
 
 
+def _size_and_facing(surface: Surface, faces: slice, up: Array) -> Array:
+    """(N, 2) a third of the area of some faces, and of that area as seen from above: each corner's part."""
+    vectors = surface.area_vectors_of(faces) / 3
+    return np.stack([np.linalg.norm(vectors, axis=1), vectors @ (up / np.linalg.norm(up))], axis=1)
+
+
 def components(surface: Surface, chosen: Mask) -> IntArray:
     """(V,) number of the connected part that each chosen vertex is in; -1 for the others."""
-    index = np.full(len(chosen), -1, dtype=np.int64)
-    index[chosen] = np.arange(int(chosen.sum()))
-    faces = index[surface.faces]
-    a = np.concatenate([faces[:, 0], faces[:, 1], faces[:, 2]])
-    b = np.concatenate([faces[:, 1], faces[:, 2], faces[:, 0]])
-    both = (a >= 0) & (b >= 0)
+    index = np.full(len(chosen), -1, dtype=np.int32)
     n = int(chosen.sum())
-    graph = coo_matrix((np.ones(int(both.sum()), dtype=np.int8), (a[both], b[both])), shape=(n, n))
+    index[chosen] = np.arange(n)
+    ends: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = [(np.zeros(0, np.int32), np.zeros(0, np.int32))]
+    for begin in range(0, len(surface.faces), _FACES):
+        ends.append(_spanning(index[surface.faces[begin : begin + _FACES]]))
+    a, b = (np.concatenate(parts) for parts in zip(*ends, strict=True))
+    graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(n, n))
     out = np.full(len(chosen), -1, dtype=np.int64)
     out[chosen] = connected_components(graph, directed=False)[1]
     return out
 
 
+def _spanning(faces: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Pairs of vertices (K,), (K,) that connect what these faces (N, 3) connect; there are fewer pairs than edges.
+
+    Vertices of number -1 are left out.
+    """
+    a, b = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
+    both = (a >= 0) & (b >= 0)
+    a, b = a[both], b[both]
+    there = np.unique(np.concatenate([a, b]))
+    own = (np.searchsorted(there, a), np.searchsorted(there, b))
+    graph = coo_matrix((np.ones(len(a)), own), shape=(len(there), len(there)))
+    label = connected_components(graph, directed=False)[1]
+    first = np.full(int(label.max(initial=-1)) + 1, -1, dtype=np.int32)
+    first[label[::-1]] = there[::-1]
+    return there, first[label]
+
+
 def rim_vertices(surface: Surface) -> IntArray:
     """(K,) vertices on edges that only one face has."""
     f, n = surface.faces, len(surface.vertices_m)
-    ends = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
+    ends = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).astype(np.int64), axis=1)
     keys, counts = np.unique(ends[:, 0] * n + ends[:, 1], return_counts=True)
     alone = keys[counts == 1]
     return np.unique(np.concatenate([alone // n, alone % n]))
@@ -189,5 +221,8 @@ def _closed(points: Array, chosen: Mask, radius: float) -> Mask:
 def _longest_edge(surface: Surface) -> float:
     if not surface.is_mesh:
         raise ComputeError("fusion needs meshes, not point clouds", remedy="Export the scan with faces")
-    p = surface.vertices_m[surface.faces]
-    return float(np.sqrt(np.max(np.sum((p - np.roll(p, 1, axis=1)) ** 2, axis=2))))
+    longest = 0.0
+    for block in surface.blocks():
+        p = surface.vertices_m[surface.faces[block]]
+        longest = max(longest, float(np.max(np.sum((p - np.roll(p, 1, axis=1)) ** 2, axis=2))))
+    return float(np.sqrt(longest))

@@ -1,0 +1,175 @@
+"""What memory the jobs on a machine have been granted, in small files that all its workers of a data folder share.
+
+A job begins when it fits beside what runs. What was granted and is not used yet counts as used.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import logging
+import os
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+from pydantic import ValidationError
+
+from service.compute.machine_memory import MachineMemory, machine_memory
+from service.core.errors import ComputeError
+from service.core.records.events import Record
+from service.core.units import megabytes
+from service.store.durable_effects import Clock
+from service.store.queue.leases import ProcessIdentity
+
+_RESERVE_MB = 400.0  # for what else runs on the machine
+_POLL_S = 0.5
+_log = logging.getLogger(__name__)
+
+
+class Grant(Record):
+    """What one process has been granted for its job, or waits for."""
+
+    host: str
+    boot: str
+    pid: int
+    process_started_s: float
+    job: str
+    memory_mb: float
+    waits: str = ""  # why, in words; "" for one that has been granted
+
+    @property
+    def lives(self) -> bool:
+        """Whether its process is not known to be dead."""
+        identity = ProcessIdentity(self.host, self.boot, self.pid, self.process_started_s)
+        return identity.life() != "dead"
+
+
+@dataclass(frozen=True, slots=True)
+class MemoryGrants:
+    """The grants of this machine, as one process of a worker sees them.
+
+    Attributes:
+        data: the data folder.
+        clock: of the worker.
+        memory: of the machine.
+    """
+
+    data: Path
+    clock: Clock
+    memory: Callable[[], MachineMemory] = machine_memory
+
+    @contextmanager
+    def granted(self, job: str, memory_mb: float, tell: Callable[[str], None]) -> Generator[None]:
+        """Wait until a job fits beside what runs; within the block its memory is granted.
+
+        Args:
+            job: id.
+            memory_mb: that it needs at most, with what this process has already.
+            tell: called with why it waits, whenever that changes.
+
+        Raises:
+            ComputeError: the machine does not have that much.
+        """
+        whole = self.memory()
+        if memory_mb > whole.total_mb - _RESERVE_MB:
+            raise ComputeError(
+                f"the job needs {memory_mb:.0f} MB of memory, and this machine has {whole.total_mb:.0f} MB, of which "
+                f"{_RESERVE_MB:.0f} MB are kept for others",
+                remedy="Start `orthocapture worker` on the same data folder on a machine with more memory, or give "
+                "this one or its container more; then try again",
+            )
+        own = _folder(self.data) / f"{_here().host}-{os.getpid()}.json"
+        told = ""
+        try:
+            while (why := self._take(own, job, memory_mb)) != "":
+                if why != told:
+                    tell(why)
+                    told = why
+                self.clock.sleep(_POLL_S)
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                own.unlink(missing_ok=True)
+
+    def _take(self, own: Path, job: str, memory_mb: float) -> str:
+        """Write down the grant, or what is waited for and why; returns why, or "" once it is granted."""
+        grant = Grant(
+            host=_here().host,
+            boot=_here().boot,
+            pid=os.getpid(),
+            process_started_s=_here().process_started_s,
+            job=job,
+            memory_mb=memory_mb,
+        )
+        try:
+            with _alone(own.parent):
+                others = [found for found in _grants(self.data) if found.pid != os.getpid() and not found.waits]
+                free_mb = self.memory().available_mb - _RESERVE_MB
+                free_mb -= sum(max(0.0, other.memory_mb - _used_mb(other.pid)) for other in others)
+                needed_mb = max(0.0, memory_mb - _used_mb(os.getpid()))
+                if needed_mb > free_mb:
+                    why = f"waits for memory: it needs {_rounded(needed_mb)} MB, {_rounded(free_mb)} MB are free"
+                    grant = grant.model_copy(update={"waits": why})
+                part = own.with_suffix(".part")
+                part.write_text(grant.model_dump_json(), encoding="utf-8")
+                part.replace(own)
+        except OSError as error:  # a disk that is full must not keep a job from being computed
+            _log.warning("the memory of jobs on this machine cannot be written down: %s", error)
+            return ""
+        return grant.waits
+
+
+def waiting_for_memory(data: Path) -> dict[str, str]:
+    """Why each job on this machine that waits for memory does so, in words, by the job's id."""
+    return {grant.job: grant.waits for grant in _grants(data) if grant.waits}
+
+
+def _grants(data: Path) -> Iterator[Grant]:
+    """Those of living processes of this machine; the files of dead ones are removed."""
+    for path in sorted(_folder(data).glob(f"{_here().host}-*.json")):
+        try:
+            grant = Grant.model_validate_json(path.read_bytes())
+        except (OSError, ValidationError):
+            continue
+        if grant.lives:
+            yield grant
+        else:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _alone(folder: Path) -> Generator[None]:
+    """Hold the lock of the folder. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _used_mb(pid: int) -> float:
+    """Memory of a process and of those that it started; 0 for one that has ended."""
+    try:
+        process = psutil.Process(pid)
+        return sum(megabytes(one.memory_info().rss) for one in (process, *process.children(recursive=True)))
+    except psutil.Error:
+        return 0.0
+
+
+def _rounded(memory_mb: float) -> int:
+    """To 50 MB, so that the words do not change all the time."""
+    return max(0, 50 * round(memory_mb / 50))
+
+
+def _here() -> ProcessIdentity:
+    return ProcessIdentity.of_this_process()
+
+
+def _folder(data: Path) -> Path:
+    return data / "monitor" / "memory"

@@ -1,0 +1,236 @@
+"""Jobs begin when the machine has their memory, end at their time limit, and can be cancelled one at a time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from service.compute.machine_memory import MachineMemory, machine_memory, processes_for
+from service.core.errors import IllegalTransitionError
+from service.core.records.events import JobFailed
+from service.jobs import job_kinds
+from service.jobs.kind import Demand
+from service.jobs.memory_grants import Grant, MemoryGrants, waiting_for_memory
+from service.store.errors import LeaseLostError
+from service.store.queue.leases import ProcessIdentity
+from service.store.records import NewJob
+from service.store.store import Store
+from service.store.verification.verify import verify
+from service.worker import loop
+from service.worker.job import JobAnswer, RecordedContext
+from service.worker.loop import work
+from tests.support.record.stepped_clock import SteppedClock
+from tests.support.record.store import CountedIds, enqueue, start_run
+
+LARGE = MachineMemory(total_mb=64_000, available_mb=60_000)
+JOB = NewJob("layout", "register", 1, "layout-1", {})
+
+
+def silent(_what: str, _done: int, _total: int) -> None:
+    pass
+
+
+@pytest.fixture
+def clock() -> SteppedClock:
+    return SteppedClock()
+
+
+@pytest.fixture
+def store(tmp_path: Path, clock: SteppedClock) -> Iterator[Store]:
+    with Store.open(tmp_path / "data", clock, CountedIds()) as opened:
+        yield opened
+        assert verify(tmp_path / "data").ok
+
+
+# --- memory -------------------------------------------------------------------------------------------------------
+
+
+def group(root: Path, files: dict[str, str]) -> Path:
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text, encoding="ascii")
+    return root
+
+
+def test_the_limit_of_a_group_or_of_one_above_it_counts_as_the_machines_memory(tmp_path: Path) -> None:
+    base = "sys/fs/cgroup/"
+    second = group(
+        tmp_path / "second",
+        {
+            "proc/self/cgroup": "0::/site/worker\n",
+            f"{base}site/worker/memory.max": "max\n",
+            f"{base}site/worker/memory.current": "9\n",
+            f"{base}site/worker/memory.stat": "inactive_file 0\n",
+            f"{base}site/memory.max": "900000000\n",
+            f"{base}site/memory.current": "700000000\n",
+            f"{base}site/memory.stat": "anon 5\ninactive_file 300000000\n",
+        },
+    )
+    assert machine_memory(second) == MachineMemory(900, 500)
+    first = group(
+        tmp_path / "first",
+        {
+            "proc/self/cgroup": "7:cpu:/x\n4:hugetlb,memory:/docker/abc\n0::/\n",
+            f"{base}memory/memory.limit_in_bytes": "800000000\n",
+            f"{base}memory/memory.usage_in_bytes": "600000000\n",
+            f"{base}memory/memory.stat": "total_inactive_file 100000000\n",
+        },
+    )
+    assert machine_memory(first) == MachineMemory(800, 300)
+    free = group(tmp_path / "free", {"proc/self/cgroup": "0::/\n", f"{base}memory.max": "max\n"})
+    assert machine_memory(free).total_mb == machine_memory(tmp_path / "none").total_mb
+
+
+def test_a_job_shares_its_work_among_no_more_processes_than_fit_into_half_of_the_memory() -> None:
+    assert processes_for(1, 10, LARGE) == 1
+    assert processes_for(500, 10, LARGE) == (os.cpu_count() or 1)
+    assert processes_for(500, 1000, MachineMemory(1500, 1000)) == 1
+
+
+def test_a_job_waits_until_it_fits_beside_those_of_all_workers_and_says_so(store: Store, clock: SteppedClock) -> None:
+    data = store.database_path.parent
+    free = {"mb": 2000.0}
+    grants = MemoryGrants(data, clock, lambda: MachineMemory(8000, free["mb"]))
+    folder = data / "monitor" / "memory"
+    folder.mkdir(parents=True)
+    here = ProcessIdentity.of_this_process()
+    # Another worker's process: this one's parent, which lives, and a dead one, which does not count.
+    for pid, job in ((os.getppid(), "theirs"), (4_000_000, "a dead one's")):
+        other = ProcessIdentity(here.host, here.boot, pid, here.process_started_s)
+        alive = _started_as(other) if pid == os.getppid() else other
+        grant = Grant(
+            host=alive.host,
+            boot=alive.boot,
+            pid=pid,
+            process_started_s=alive.process_started_s,
+            job=job,
+            memory_mb=900_000 if pid != os.getppid() else 50_000,
+        )
+        (folder / f"{here.host}-{pid}.json").write_text(grant.model_dump_json(), encoding="utf-8")
+    told: list[str] = []
+
+    def tell(why: str) -> None:
+        told.append(why)
+        assert waiting_for_memory(data) == {"mine": why}
+        (folder / f"{here.host}-{os.getppid()}.json").unlink()  # it has ended its job
+
+    with grants.granted("mine", 1500, tell):
+        assert waiting_for_memory(data) == {}
+    assert len(told) == 1
+    assert "waits for memory: it needs" in told[0]
+    assert not list(folder.glob("*.json"))
+
+
+def _started_as(identity: ProcessIdentity) -> ProcessIdentity:
+    import psutil  # noqa: PLC0415 - only here
+
+    process = psutil.Process(identity.pid)
+    started_s = process.create_time() - psutil.boot_time()
+    return ProcessIdentity(identity.host, identity.boot, identity.pid, started_s)
+
+
+def test_a_job_that_can_never_fit_is_refused_in_words_and_not_tried_again(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = start_run(store)
+    enqueue(store, run, JOB, actor="runner")
+
+    def too_large(context: RecordedContext) -> JobAnswer:
+        with context.begin(Demand(memory_mb=1e9, limit_s=60)):
+            raise AssertionError("it has begun")
+
+    monkeypatch.setitem(loop.HANDLERS, "layout", too_large)
+    assert work(store, until_idle=True, stop=lambda: False, progress=silent) == 1
+    end = store.events(run)[-1].payload
+    assert isinstance(end, JobFailed)
+    assert end.error == "ComputeError"
+    assert "needs 1000000000 MB of memory, and this machine has" in end.message
+    assert "on a machine with more memory" in end.message
+
+
+def test_a_full_disk_keeps_no_job_from_being_computed(tmp_path: Path, clock: SteppedClock) -> None:
+    (tmp_path / "monitor").write_text("no folder", encoding="ascii")
+    with MemoryGrants(tmp_path, clock, lambda: LARGE).granted("job", 100, lambda _: None):
+        pass
+
+
+def test_every_kind_states_what_it_demands() -> None:
+    from service.jobs.kind import usual_demand  # noqa: PLC0415 - only here
+
+    assert [name for name, kind in job_kinds().items() if kind.demand is usual_demand] == []
+
+
+# --- time limits and cancelling -----------------------------------------------------------------------------------
+
+
+def test_a_job_that_takes_too_long_is_ended_and_fails_in_words(
+    store: Store, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = start_run(store)
+    enqueue(store, run, JOB, actor="runner")
+    ended: list[bool] = []
+
+    def for_ever(context: RecordedContext) -> JobAnswer:
+        with context.begin(Demand(memory_mb=1, limit_s=600)):
+            while not ended:
+                clock.sleep(1.0)
+        return JobAnswer({"found": 1.0})
+
+    monkeypatch.setitem(loop.HANDLERS, "layout", for_ever)
+    work(store, until_idle=True, stop=lambda: False, progress=silent, end=lambda: ended.append(True))
+    end = store.events(run)[-1].payload
+    assert isinstance(end, JobFailed)
+    assert "it was ended after 10 minutes, many times what such a job takes" in end.message
+    assert [job.state for job in store.jobs(run)] == ["failed"]
+
+
+def test_a_person_cancels_one_job_and_touches_no_other(
+    store: Store, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = start_run(store)
+    first = enqueue(store, run, JOB, actor="runner")
+    enqueue(store, run, NewJob("layout", "register", 1, "layout-2", {}), actor="runner")
+    ended: list[bool] = []
+
+    def cancelled(context: RecordedContext) -> JobAnswer:
+        if not ended:
+            store.cancel_job(run, first.job_id, actor="Ada", reason="the wrong series")
+        while not ended:
+            clock.sleep(1.0)
+        return JobAnswer({"found": 1.0})
+
+    monkeypatch.setitem(loop.HANDLERS, "layout", cancelled)
+    work(store, until_idle=True, stop=lambda: False, progress=silent, end=lambda: ended.append(True))
+    assert [job.state for job in store.jobs(run)] == ["failed", "finished"]
+    (end,) = [event for event in store.events(run) if isinstance(event.payload, JobFailed)]
+    assert end.actor == "Ada"
+    assert end.payload.error == "JobCancelled"
+    assert end.payload.message == "Ada cancelled it: the wrong series"
+    with pytest.raises(IllegalTransitionError, match="has failed already"):
+        store.cancel_job(run, first.job_id, actor="Ada", reason="again")
+    with pytest.raises(IllegalTransitionError, match="has no job 'nothing'"):
+        store.cancel_job(run, "nothing", actor="Ada", reason="again")
+
+
+def test_a_job_in_the_queue_is_cancelled_and_no_worker_gets_it(store: Store) -> None:
+    run = start_run(store)
+    job = enqueue(store, run, JOB, actor="runner")
+    store.cancel_job(run, job.job_id, actor="Ada", reason="not needed")
+    assert store.claim_job("w", 10) is None
+
+
+def test_the_worker_of_a_cancelled_job_cannot_finish_it(store: Store) -> None:
+    run = start_run(store)
+    enqueue(store, run, JOB, actor="runner")
+    job = store.claim_job("w", 10)
+    assert job is not None
+    assert store.holds_job(job)
+    store.cancel_job(run, job.job_id, actor="Ada", reason="not needed")
+    assert not store.holds_job(job)
+    with ExitStack() as stack:
+        stack.enter_context(pytest.raises(LeaseLostError))
+        store.finish_job(job, measures={}, duration_s=1.0)
