@@ -7,13 +7,13 @@ import os
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 from typer.testing import CliRunner, Result
 
 from service.cli.common import WAITS_FOR_A_PERSON
 from service.cli.main import app
 from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.operators import AutomaticOperator, Display, TerminalOperator
+from service.cli.terminal_output import Terminal
 from service.core.errors import PersonNeededError
 from service.core.records.events import StepFailed
 from service.core.run.decide import AskOperator
@@ -99,7 +99,7 @@ def test_an_ordinary_error_has_status_1_as_before(tmp_path: Path) -> None:
 @pytest.fixture
 def display(tmp_path: Path) -> Display:
     reporter = Reporter(tmp_path, "run", lambda: OpenDevices({}, {}, {}), lambda _name: BenchCamera())
-    return Display(Console(stderr=True), reporter)
+    return Display(Terminal(stderr=True), reporter)
 
 
 def test_a_killed_driver_or_a_starved_machine_ends_an_unattended_run_with_it(display: Display) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
@@ -37,7 +36,7 @@ def cancel_command(
         if json:
             print_json({"run": run_id, "cancelled": chosen.job_id, "event": event.seq})
         else:
-            console.print(f"Cancelled: {escape(term(chosen.kind))} of step {escape(chosen.step)} by {escape(name)}")
+            console.print(f"Cancelled: {term(chosen.kind)} of step {chosen.step} by {name}")
 
 
 def _open_job(store: Store, run_id: str, name: str) -> Job:
