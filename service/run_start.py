@@ -18,8 +18,6 @@ from service.runner.software import software_versions
 from service.steps.protocol_check import require_devices, require_plausible
 from service.store.files.space_used import forecast_of, require_space
 from service.store.records import NewArtefact
-from service.store.signatures.log import NAME as LOG_NAME
-from service.store.signatures.log_copy import LogCopy
 from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store
 
@@ -154,9 +152,7 @@ def signature_copy(rig: Rig) -> Path | None:
 
 def second_place(rig: Rig, store: Store) -> SecondPlace:
     """The second place of the signatures of a data folder, as the rig names it."""
-    copy = signature_copy(rig)
-    log = store.database_path.parent / LOG_NAME
-    return SecondPlace([] if copy is None else [LogCopy(log, copy, store.files)], store.clock)
+    return SecondPlace.of(store.database_path.parent, signature_copy(rig), store.clock, store.files)
 
 
 def require_rig_free(store: Store, rig: Path, *, run_id: str = "") -> None:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.records.events import DeviceTrouble, SignInRecorded
+from service.store.durable_effects import DurableFiles
 from service.store.records import SITE
 from service.store.signatures.log import NAME
 from service.store.signatures.log_copy import LogCopy
@@ -70,7 +71,7 @@ def test_a_place_that_is_away_is_told_and_gets_what_is_missing_when_it_is_back(
 def test_a_place_goes_away_in_between_and_comes_back(data: Path, tmp_path: Path) -> None:
     copy = tmp_path / "share" / NAME
     copy.parent.mkdir()
-    place = SecondPlace([LogCopy(data / NAME, copy)], SteppedClock())
+    place = SecondPlace.of(data, copy, SteppedClock(), DurableFiles())
     assert place.update() is None
     copy.parent.rename(tmp_path / "unmounted")
     sign(data)
@@ -96,7 +97,7 @@ def test_nobody_waits_twice_for_a_place_that_hangs(data: Path, tmp_path: Path) -
 def test_it_is_tried_again_where_nobody_signs(data: Path, tmp_path: Path) -> None:
     ailing = Ailing("no folder", tmp_path)
     clock = SteppedClock()
-    place = SecondPlace([LogCopy(data / NAME, ailing.copy)], clock)
+    place = SecondPlace.of(data, ailing.copy, clock, DurableFiles())
     place.update()
     ended = clock.signal()
     looking = threading.Thread(target=place.look_after, args=(ended,))
@@ -116,7 +117,7 @@ def test_it_is_tried_again_where_nobody_signs(data: Path, tmp_path: Path) -> Non
 def test_a_copy_of_another_folder_is_told_and_left(data: Path, tmp_path: Path) -> None:
     copy = tmp_path / NAME
     copy.write_bytes(b'{"number":1}\n')
-    away = SecondPlace([LogCopy(data / NAME, copy)], SteppedClock()).update()
+    away = SecondPlace.of(data, copy, SteppedClock(), DurableFiles()).update()
     assert away is not None
     assert "is not the beginning of the log" in away.why
     assert copy.read_bytes() == b'{"number":1}\n'

@@ -23,7 +23,7 @@ from service.store.database.engine import database_path
 from service.store.durable_effects import DurableFiles
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.signatures.log import NAME
-from service.store.signatures.log_copy import LogCopy, bring_up_to_date
+from service.store.signatures.log_copy import bring_up_to_date
 from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.signatures.timestamps import Authority
@@ -149,8 +149,8 @@ def _start(store: Store, folder: Path, people: People) -> None:
 
 def _complete_run(store: Store, folder: Path, authority: Authority) -> str:
     bench = begin_run(store, PROTOCOL.replace("count: 4", "count: 3"), folder)
-    log = LogCopy(folder / "data" / NAME, folder / COPY, store.files)
-    bench.second_place, bench.authority = SecondPlace([log], store.clock), authority
+    bench.second_place = SecondPlace.of(folder / "data", folder / COPY, store.clock, store.files)
+    bench.authority = authority
     _jobs(store, bench.run_id)
     if bench.run().status != "completed":
         raise DataError("the run that is to be attacked did not complete", where=bench.run_id)

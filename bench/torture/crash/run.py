@@ -27,8 +27,6 @@ from service.runner import loop as runner_loop
 from service.runner.software import software_versions
 from service.steps import params_models
 from service.store.durable_effects import SystemClock
-from service.store.signatures.log import NAME as LOG_NAME
-from service.store.signatures.log_copy import LogCopy
 from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
@@ -136,7 +134,7 @@ class Place:
 
     def second_place(self, store: Store) -> SecondPlace:
         """Where that copy is kept."""
-        return SecondPlace([LogCopy(self.data / LOG_NAME, self.signature_copy, store.files)], store.clock)
+        return SecondPlace.of(self.data, self.signature_copy, store.clock, store.files)
 
     @property
     def motions(self) -> Path:

@@ -36,10 +36,8 @@ from service.run_start import signature_copy
 from service.station import Station
 from service.steps import params_models
 from service.store.database.engine import database_path
-from service.store.durable_effects import SystemClock
+from service.store.durable_effects import DurableFiles, SystemClock
 from service.store.files.space_used import forecast_of
-from service.store.signatures.log import NAME as LOG_NAME
-from service.store.signatures.log_copy import LogCopy
 from service.store.signatures.second_place import SecondPlace
 from service.store.store import Store
 
@@ -128,7 +126,7 @@ def _second_place(rig: Rig, data: Path) -> dict[str, str]:
     copy = signature_copy(rig)
     if copy is None:
         return {}
-    away = SecondPlace([LogCopy(data / LOG_NAME, copy)], SystemClock()).update()
+    away = SecondPlace.of(data, copy, SystemClock(), DurableFiles()).update()
     return {"path": str(copy), "problem": "" if away is None else away.why}
 
 

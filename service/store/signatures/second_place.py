@@ -10,10 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Lock, Thread
+from typing import Protocol, Self
 
 from service.core.errors import StoreError
 from service.core.text.clock_time import time_here
-from service.store.durable_effects import Clock, Signal, utc_text
+from service.store.durable_effects import Clock, Files, Signal, utc_text
+from service.store.signatures.log import NAME
 from service.store.signatures.log_copy import LogCopy
 
 AGAIN_S = 30.0  # until a place that may be away is tried again where nothing is signed
@@ -29,10 +31,23 @@ class Away:
     why: str
 
 
+class KeptCopy(Protocol):
+    """A copy that is kept in the second place."""
+
+    @property
+    def copy(self) -> Path:
+        """The file there."""
+        ...
+
+    def bring_up_to_date(self) -> None:
+        """Write there what is missing. Raises StoreError; the next call will add what is missing."""
+        ...
+
+
 class SecondPlace:
     """The copies of one data folder. Without `copies`, none is kept, and nothing is ever away."""
 
-    def __init__(self, copies: Sequence[LogCopy], clock: Clock, *, patience_s: float = _PATIENCE_S) -> None:
+    def __init__(self, copies: Sequence[KeptCopy], clock: Clock, *, patience_s: float = _PATIENCE_S) -> None:
         self._copies = tuple(copies)
         self._clock = clock
         self._patience_s = patience_s
@@ -41,10 +56,13 @@ class SecondPlace:
         self._busy = False
         self._again = False  # asked for while the thread was busy
 
-    @property
-    def kept(self) -> bool:
-        """Whether there is a second place."""
-        return bool(self._copies)
+    @classmethod
+    def of(
+        cls, data_dir: Path, copy: Path | None, clock: Clock, files: Files, *, patience_s: float = _PATIENCE_S
+    ) -> Self:
+        """That of a data folder whose log of signatures is copied to `copy`; None if it has no second place."""
+        kept = () if copy is None else (LogCopy(data_dir / NAME, copy, files),)
+        return cls(kept, clock, patience_s=patience_s)
 
     @property
     def away(self) -> Away | None:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from service.store.durable_effects import DurableFiles
 from service.store.signatures.log import NAME
-from service.store.signatures.log_copy import LogCopy
 from service.store.signatures.second_place import SecondPlace
 from tests.support.record.stepped_clock import SteppedClock
 
@@ -49,7 +48,7 @@ class Ailing:
             os.mkfifo(self.copy)
 
     def place(self, data: Path) -> SecondPlace:
-        return SecondPlace([LogCopy(data / NAME, self.copy, self.files)], SteppedClock(), patience_s=QUICK_S)
+        return SecondPlace.of(data, self.copy, SteppedClock(), self.files, patience_s=QUICK_S)
 
     def mend(self) -> None:
         """The share is back."""
