@@ -196,6 +196,7 @@ def test_where_there_are_none_nobody_acts_under_a_name_that_is_no_persons(withou
     refused_at(without, place, FEW_OF_NOBODY)
 
 
+@pytest.mark.slow
 @pytest.mark.sweep
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.usefixtures("elsewhere")
