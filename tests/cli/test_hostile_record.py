@@ -15,8 +15,9 @@ from service.cli.main import app
 from service.cli.terminal_output import Terminal
 from service.core.records.events import DeviceTrouble, OperatorAction, StepNote
 from service.core.shown_text import shown
+from service.store.durable_effects import DurableFiles, SystemClock
 from service.store.records import NewArtefact
-from service.store.signatures.log_copy import keep_elsewhere
+from service.store.signatures.second_place import SecondPlace, away_words
 from service.store.signatures.signing import checkpoint, rotate_key
 from tests.support.hostile_text import HOSTILE, obeyed
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
@@ -107,6 +108,9 @@ def test_a_second_place_of_signatures_that_is_away_is_told_as_it_is_named(
     recorded: tuple[Path, str, str], tmp_path: Path, folder: str
 ) -> None:
     stream = io.StringIO()
-    keep_elsewhere(recorded[0], tmp_path / folder / "signatures.jsonl", Terminal(file=stream, width=300).print)
+    place = tmp_path / folder / "signatures.jsonl"
+    away = SecondPlace.of(recorded[0], place, SystemClock(), DurableFiles()).update()
+    assert away is not None
+    Terminal(file=stream, width=300).print(away_words(away))
     assert shown(folder) in stream.getvalue()
     assert obeyed(stream.getvalue()) == []

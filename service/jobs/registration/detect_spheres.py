@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from service.compute.machine_memory import IMAGE_MB, processes_for
 from service.jobs.kind import Demand, JobKind, NoAnswer
 from service.jobs.records import Hash, ImagesCamera, Matrix, Mounting, ParameterCovariance, Point, PosedPhotograph
 
@@ -52,5 +53,8 @@ KIND = JobKind(
     words="spheres in images",
     version=3,
     order=60,
-    demand=lambda arguments: Demand(memory_mb=2400, limit_s=3600 + 120 * len(arguments.images)),
+    demand=lambda arguments: Demand(
+        memory_mb=600 + IMAGE_MB * processes_for(len(arguments.images), IMAGE_MB),
+        limit_s=3600 + 120 * len(arguments.images),
+    ),
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from service.compute.machine_memory import IMAGE_MB, processes_for
 from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import PosedPhotograph, SpheresFound
 from service.jobs.registration.register import Registration
@@ -128,5 +129,8 @@ KIND = JobKind(
     words="evaluation",
     version=3,
     order=70,
-    demand=lambda arguments: Demand(memory_mb=1200, limit_s=3600 + 120 * len(arguments.images)),
+    demand=lambda arguments: Demand(
+        memory_mb=600 + IMAGE_MB * processes_for(len(arguments.images), IMAGE_MB),
+        limit_s=3600 + 120 * len(arguments.images),
+    ),
 )

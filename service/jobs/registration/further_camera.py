@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from service.compute.machine_memory import IMAGE_MB, processes_for
 from service.jobs.kind import Demand, JobKind, JobRecord
 from service.jobs.records import Camera, Hash, ImageFile, Matrix, ParameterCovariance, Point
 
@@ -99,5 +100,8 @@ KIND = JobKind(
     compute="service.worker.registration.further_camera:further_camera",
     words="further camera",
     order=62,
-    demand=lambda arguments: Demand(memory_mb=2400, limit_s=3600 + 120 * len(arguments.images)),
+    demand=lambda arguments: Demand(
+        memory_mb=600 + IMAGE_MB * processes_for(len(arguments.images), IMAGE_MB),
+        limit_s=3600 + 120 * len(arguments.images),
+    ),
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -15,6 +14,7 @@ import cv2
 from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_image
 from service.compute.images.resolution import resample
+from service.compute.machine_memory import IMAGE_MB, processes_for
 from service.jobs.kind import JobRecord
 from service.jobs.records import ImageFile, ImagesCamera
 from service.worker.camera import camera_reduced, camera_used
@@ -41,7 +41,7 @@ def photographs_at(
     folder.mkdir(exist_ok=True)
     copies = [folder / f"{image.viewpoint}.jpg" for image in images]
     reduce = partial(_reduce, full=full, width=camera.width, height=camera.height)
-    with ProcessPoolExecutor(min(len(images), os.cpu_count() or 1), mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(processes_for(len(images), IMAGE_MB), mp_context=get_context("spawn")) as pool:
         for done, _ in enumerate(pool.map(reduce, originals, copies), 1):
             context.progress(f"images at {camera.width} × {camera.height}", done, len(images))
     return copies

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, partial
@@ -26,6 +25,7 @@ from service.compute.evaluation.error_budget import (
 )
 from service.compute.images.files import read_image
 from service.compute.images.resolution import resample
+from service.compute.machine_memory import IMAGE_MB, processes_for
 from service.compute.markers.cones import Cone
 from service.compute.markers.detectors import options_for
 from service.compute.markers.records import SphereOutline
@@ -289,7 +289,7 @@ class _Searched:
                 tasks,
                 camera,
                 options_for(context.arguments.colour),
-                min(len(tasks), os.cpu_count() or 1),
+                processes_for(len(tasks), IMAGE_MB),
                 lambda done, total: context.progress("control spheres", done, total),
             )
             for (i, lacking), outlines in zip(new, found, strict=True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ import numpy as np
 
 from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
 from service.compute.camera_model import CameraModel
+from service.compute.machine_memory import IMAGE_MB, processes_for
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.detectors import options_for
 from service.compute.markers.developed import remeasure_file
@@ -126,7 +126,7 @@ def _outlines(context: JobContext[job.Arguments], camera: CameraModel) -> dict[s
         files,
         camera,
         options,
-        min(len(files), os.cpu_count() or 1),
+        processes_for(len(files), IMAGE_MB),
         lambda done, total: context.progress(f"spheres in images of {arguments.device}", done, total),
     )
     by_name = {image.viewpoint: outlines for image, outlines in zip(arguments.images, found, strict=True)}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from service.compute.camera_model import CameraModel
+from service.compute.machine_memory import IMAGE_MB, processes_for
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.detectors import options_for
 from service.compute.markers.developed import remeasure_file
@@ -101,7 +101,7 @@ def _located(
 ) -> LocatedOutlines:
     arguments = context.arguments
     files = photographs(context, images)
-    workers = min(len(files), os.cpu_count() or 1)
+    workers = processes_for(len(files), IMAGE_MB)
 
     def show(done: int, total: int) -> None:
         context.progress("spheres in images", done, total)
