@@ -396,24 +396,24 @@ class ZipLayout:
 class FolderBundle(Bundle):
     """An unpacked bundle."""
 
-    folders: list[str]
-    left_by_others: list[str]
-
     def __init__(self, folder: Path, fault: Callable[[str, str], None]) -> None:
         self._folder = folder
-        self.sizes, self.folders, self.left_by_others = {}, [], []
+        self.sizes = {}
+        folders: list[str] = []
+        left: list[str] = []
         for path in sorted(folder.rglob("*")):
             name = path.relative_to(folder).as_posix()
             if path.is_symlink():
                 fault(name, "it is a link, not a file")
             elif path.is_dir():
-                self.folders.append(name)
+                folders.append(name)
             elif not path.is_file():
                 fault(name, "it is a device or a pipe, not a file")
             elif path.name in LEFT_BY_FILE_MANAGERS:
-                self.left_by_others.append(name)
+                left.append(name)
             else:
                 self.sizes[name] = path.stat().st_size
+        self.folders, self.left_by_others = folders, left
 
     def open(self, name: str) -> IO[bytes]:
         """Open a file of the folder for reading."""
