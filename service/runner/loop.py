@@ -53,7 +53,7 @@ from service.runner.operator import AnswerBy, Operator
 from service.runner.pedal import Pedal
 from service.runner.sealing import Seal
 from service.runner.software import software_versions
-from service.runner.trouble import PASSING, Trouble
+from service.runner.trouble import PASSING, RecordTrouble
 from service.steps.context import Devices
 from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.timestamps import Authority
@@ -111,7 +111,7 @@ class Runner:
             )
             self._begin_session()
             disk.forecast()
-            trouble = Trouble(self.store, self.devices, operator)
+            trouble = RecordTrouble(self.store, self.devices, operator)
             try:
                 while not self._run.state.terminal:
                     try:

@@ -19,7 +19,7 @@ _TOLD_AGAIN_S = 60.0
 
 
 @dataclass
-class Trouble:
+class RecordTrouble:
     """Waits while the runner cannot read or write its record. The arms stand, and move only after a new leave.
 
     A record that is not what it was, or that another process writes, is not waited for.

@@ -63,7 +63,9 @@ class Pressure:
 PRESSURES: Mapping[str, Pressure] = {
     "quiet": Pressure("as it is"),
     "starved": Pressure("0.3 of a processor for the rig and the program", everything=Limits(processors=0.3)),
+    "starved more": Pressure("0.12 of a processor for the rig and the program", everything=Limits(processors=0.12)),
     "memory": Pressure("700 MB for the program", program=Limits(memory_mb=700)),
+    "less memory": Pressure("380 MB for the program", program=Limits(memory_mb=380)),
     "killed": Pressure(
         "a driver is killed in each step that uses one", kills=(signal.SIGKILL, signal.SIGALRM, signal.SIGTERM)
     ),
@@ -116,8 +118,8 @@ def run(name: str, pressure: Pressure, folder: Path, host: str, longest_s: float
     statuses: list[int] = []
     began_s = time.monotonic()
     with (
-        group(f"{name}-all", pressure.everything) as everything,
-        group(f"{name}-program", pressure.program) as program,
+        group(f"{name.replace(' ', '-')}-all", pressure.everything) as everything,
+        group(f"{name.replace(' ', '-')}-program", pressure.program) as program,
         (folder / "log").open("w") as log,
     ):
         groups = (everything, program)
@@ -185,8 +187,17 @@ class Person:
             runner.terminate()
         elif self.attends and (verb := _asked(self.data)):
             self.asked += 1
-            answer = command("act", verb, "--data", str(self.data), "--operator", "Grace")
-            subprocess.run(answer, cwd=REPOSITORY, stdout=log, stderr=log, check=False)
+            words = (
+                "act",
+                verb,
+                "--data",
+                str(self.data),
+                "--operator",
+                "Grace",
+                "--meaning",
+                "checked and approved",
+            )
+            subprocess.run(command(*words), cwd=REPOSITORY, stdout=log, stderr=log, check=False)
 
 
 def _asked(data: Path) -> str:

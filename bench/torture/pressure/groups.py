@@ -8,6 +8,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from service.core.units import seconds_of_ns
+
 _ROOT = Path("/sys/fs/cgroup")
 _PERIOD_US = 100_000
 
@@ -41,7 +43,7 @@ class Group:
     def throttled_s(self) -> float:
         """Seconds in which the group was to run and was not let."""
         told = [line.split() for folder in self.folders for line in _lines(folder / "cpu.stat")]
-        return sum(int(number) for name, number in told if name == "throttled_time") / 1e9
+        return sum(seconds_of_ns(int(number)) for name, number in told if name == "throttled_time")
 
 
 @contextmanager
