@@ -17,23 +17,8 @@ from service.store.records import SITE
 from service.store.verification.chain_checks import Fault
 
 _MOST_OF_A_TABLE = 10  # faults of one table that are named one by one
-_OF_THE_MOMENT = frozenset(  # columns of a job that is not over
-    [
-        "state",
-        "tries",
-        "started_utc",
-        "ended_utc",
-        "ended_seq",
-        "error",
-        "worker",
-        "token",
-        "until_utc_s",
-        "host",
-        "boot",
-        "pid",
-        "process_started_s",
-    ]
-)
+_OF_A_WORKER = {"worker", "token", "until_utc_s", "host", "boot", "pid", "process_started_s"}
+_OF_THE_MOMENT = {"state", "tries", "started_utc", "ended_utc", "ended_seq", "error", *_OF_A_WORKER}  # while it waits
 _Key = tuple[str, tuple[Value, ...]]
 
 

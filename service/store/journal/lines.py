@@ -136,10 +136,10 @@ def parse_line(raw: bytes, number: int, previous_sha256: str, end: int) -> Journ
 
 def _row(item: Any) -> RowImage:
     gone = "gone" in item
-    values = cast("dict[str, Value]", item["gone" if gone else "row"])
+    values = cast("dict[str, object]", item["gone" if gone else "row"])
     if any(not isinstance(value, str | int | float | None) for value in values.values()):
         raise TypeError("a column is of another kind")
-    return RowImage(str(item["table"]), values, gone)
+    return RowImage(str(item["table"]), cast("dict[str, Value]", values), gone)
 
 
 def said_by(raw: bytes) -> LineFields | None:

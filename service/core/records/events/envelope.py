@@ -36,6 +36,7 @@ from service.core.records.events.site import (
     KeyChanged,
     LeftoversRemoved,
     ProtocolApproved,
+    RecordRebuilt,
     RunSigned,
     ServiceStarted,
     SignInRecorded,
@@ -98,7 +99,8 @@ Payload = Annotated[
     | LeftoversRemoved
     | ActionAfterEnd
     | ProtocolApproved
-    | DataRestored,
+    | DataRestored
+    | RecordRebuilt,
     Field(discriminator="kind"),
 ]
 PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)
