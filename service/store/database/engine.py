@@ -198,6 +198,12 @@ class Database:
         address = f"file:{quote(str(self._path.absolute()))}?mode=ro"
         status = self._path.stat()
         now = status.st_mtime_ns, status.st_size
+        if not status.st_size:  # SQLite would take it for a new database and delete the write-ahead log
+            raise RecordDamagedError(
+                "the database was cut to nothing in place; nothing is written any more",
+                where=str(self._path),
+                remedy=REBUILD,
+            )
         try:
             with closing(sqlite3.connect(address, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)) as fresh:
                 (held,) = fresh.execute("PRAGMA user_version").fetchone()
@@ -254,8 +260,9 @@ class Database:
                     f"{path.name} was {'removed' if place is None else 'replaced'} while it was in use; nothing is "
                     "written any more",
                     where=str(path),
-                    remedy="Put the file back as it was, with those of the same name beside it, then resume the run; "
-                    "files that were captured lie in the data folder",
+                    remedy="Put the file back as it was, with those of the same name beside it; or stop every "
+                    "orthocapture process of this data folder and run `orthocapture store rebuild`. Then resume the "
+                    "run; nothing that was captured is lost",
                 )
 
     def close(self) -> None:

@@ -67,7 +67,7 @@ def _notes(surveyed: Survey, held: int) -> Iterator[str]:
         yield f"{NAME}: {surveyed.earlier_events} events were recorded before the journal was begun"
     if surveyed.torn_bytes:
         yield f"{NAME}: its end is cut off, as after a power cut"
-    interrupted = len(surveyed.void) + (held < surveyed.last)
+    interrupted = len(surveyed.void) + (held == surveyed.before_last and not surveyed.is_behind(held))
     if interrupted:
         lines = "1 line was" if interrupted == 1 else f"{interrupted} lines were"
         yield f"{NAME}: {lines} never committed; the writer was interrupted"

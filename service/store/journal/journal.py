@@ -211,6 +211,19 @@ def _locked(path: Path) -> Generator[int]:
         os.close(descriptor)
 
 
+def read_tail(path: Path) -> Tail | None:
+    """The end of any journal, such as a copy; None if the file has no line or does not exist.
+
+    Raises RecordDamagedError if a line near the end does not follow the one before it, OSError.
+    """
+    try:
+        with path.open("rb") as stream:
+            status = os.fstat(stream.fileno())
+            return _last(stream.fileno(), status.st_size, (status.st_dev, status.st_ino))
+    except FileNotFoundError:
+        return None
+
+
 def _last(descriptor: int, size: int, place: tuple[int, int]) -> Tail | None:
     """The tail of a file that was not read before, from its end; None if it has no line."""
     length = _BLOCK_BYTES

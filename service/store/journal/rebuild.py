@@ -222,9 +222,7 @@ def _replay(work: Path, journal: Path, surveyed: Survey, until: int, lost: list[
     """Make a database of all rows up to line `until`; returns the number of events. `lost` gets what it refuses."""
     open_database(work, DurableFiles()).close()
     with closing(sqlite3.connect(database_path(work), isolation_level=None)) as connection:
-        connection.execute(
-            "PRAGMA foreign_keys = OFF"
-        )  # checked at the end
+        connection.execute("PRAGMA foreign_keys = OFF")  # checked at the end
         connection.execute("PRAGMA recursive_triggers = ON")
         connection.execute("BEGIN")
         for row in committed_rows(journal, surveyed, until):

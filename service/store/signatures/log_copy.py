@@ -1,4 +1,4 @@
-"""The copy of the log of signatures in a second place, such as a network share: updating and comparing it."""
+"""The copies of the log of signatures and of the journal in a second place, such as a network share."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from service.core.errors import IntegrityError, StoreError
 from service.store.database.engine import LOOK
 from service.store.durable_effects import DurableFiles, Files
+from service.store.journal.copies import journal_copy, journal_copy_faults, keep_journal
 from service.store.signatures.log import NAME
 from service.store.verification.chain_checks import Fault
 
@@ -15,13 +16,14 @@ _FILES = DurableFiles()
 
 
 def keep_elsewhere(data_dir: Path, copy: Path | None, tell: Callable[[str], object], files: Files = _FILES) -> None:
-    """Bring the copy up to date, if one is configured. A problem with it is passed to `tell` and raises nothing."""
+    """Bring the copies up to date, if there is a second place. `tell` is told of a problem; nothing is raised."""
     if copy is None:
         return
     try:
         bring_up_to_date(data_dir, copy, files)
+        keep_journal(data_dir, journal_copy(copy), files)
     except StoreError as error:
-        tell(f"the copy of the signatures: {error}")
+        tell(f"the copy in the second place: {error}")
 
 
 def bring_up_to_date(data_dir: Path, copy: Path, files: Files = _FILES) -> None:
@@ -54,7 +56,7 @@ def bring_up_to_date(data_dir: Path, copy: Path, files: Files = _FILES) -> None:
 
 
 def copy_faults(data_dir: Path, copy: Path) -> tuple[list[Fault], list[str]]:
-    """Faults and notes on differences between the log and its copy.
+    """Faults and notes on differences between the log and its copy, and between the journal and the copy beside it.
 
     Raises:
         StoreError: the copy is missing or cannot be read.
@@ -72,7 +74,8 @@ def copy_faults(data_dir: Path, copy: Path) -> tuple[list[Fault], list[str]]:
         if log[number - 1] != line:
             return [Fault(None, None, f"{NAME}, line {number}", f"it is not the line that {copy} holds")], []
     missing = len(log) - len(held)
-    return [], [f"{copy} does not have the last {missing} lines of {NAME} yet"] if missing else []
+    notes = [f"{copy} does not have the last {missing} lines of {NAME} yet"] if missing else []
+    return list(journal_copy_faults(data_dir, journal_copy(copy))), notes
 
 
 def _whole_lines(content: bytes) -> bytes:
