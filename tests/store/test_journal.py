@@ -34,7 +34,7 @@ from tests.support.record.store import CountedIds, capture, enqueue, rows, start
 from tests.support.record.tampering import cut
 
 WAL = f"{DATABASE_NAME}-wal"
-Meddle = Callable[[Path, Path], None]  # with the data folder, and one that holds its files as they were earlier
+Meddle = Callable[[Path, Path], object]  # with the data folder, and one that holds its files as they were earlier
 
 
 def lines_of(data: Path) -> list[JournalLine]:

@@ -29,7 +29,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, capture, start_run, tamper
-from tests.support.record.tampering import WORDS_AGAIN, cut, rewrite_to_the_end, without_signatures_from
+from tests.support.record.tampering import WORDS_AGAIN, cut, journal_anew, rewrite_to_the_end, without_signatures_from
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 
 
@@ -249,6 +249,7 @@ def test_a_log_that_was_cut_or_changed_shows_against_its_copy(data: Path, tmp_pa
     lines = (data / NAME).read_bytes().splitlines(keepends=True)
     (data / NAME).write_bytes(b"".join(lines[:-2]))
     tamper(data, *cut(run_of(data), 5), *cut(SITE, 7))
+    journal_anew(data)
     assert faults(data) == []
     (fault,) = verify(data, signatures_copy=copy).faults
     assert f"{NAME} ends before line {len(lines) - 1} of its copy: it was cut" in str(fault)

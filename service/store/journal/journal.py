@@ -143,8 +143,13 @@ class Journal:
         number = tail.number + 1
         raw = line_bytes(LineFields(number, held, tail.sha256), rows)
         with _locked(self.path):
-            self._files.append(self.path, tail.end, raw)
-            self._files.sync_file(self.path)
+            try:
+                self._files.append(self.path, tail.end, raw)
+                self._files.sync_file(self.path)
+            except OSError:
+                with suppress(OSError):  # what cannot be synced is not committed
+                    self._files.append(self.path, tail.end, b"")
+                raise
         sha256 = hashlib.sha256(raw).hexdigest()
         self._known = Tail(tail.place, number, held, sha256, tail.end, tail.end + len(raw), None)
         return self._known
