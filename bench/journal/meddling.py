@@ -13,11 +13,12 @@ import multiprocessing
 import os
 import shutil
 import signal
+import sqlite3
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -36,7 +37,7 @@ from tests.support.record.store import capture, start_run
 
 FILES = (DATABASE_NAME, f"{DATABASE_NAME}-wal", f"{DATABASE_NAME}-shm", JOURNAL_NAME, LOG_NAME, "key", "photograph")
 MOMENTS = ("idle", "between two captures", "while the run waits", "before a signature", "in a transaction")
-_BEFORE = 4  # photographs that are recorded before the file is altered
+_BEFORE = 6  # photographs that are recorded before the file is altered
 _LONGEST_S = 120.0
 
 
@@ -156,9 +157,13 @@ def _noticed_in_use(work: Path, file: str, way: str, moment: str) -> str:
     run_id = start_run(store)
     capture(store, run_id, "v0")
     checkpoint(store, run_id)
+    _moved_into_the_database(data)
+    capture(store, run_id, "v1")
     shutil.copytree(data, work / "old")
-    for number in range(1, _BEFORE):
+    for number in range(2, _BEFORE):
         capture(store, run_id, f"v{number}")
+        if number == _BEFORE - 2:
+            _moved_into_the_database(data)
     checkpoint(store, run_id)
     if moment == "idle":
         store.close()
@@ -191,6 +196,12 @@ def _noticed_in_use(work: Path, file: str, way: str, moment: str) -> str:
         except OrthocaptureError as error:
             return f"{name}: {type(error).__name__}"
     return "-"
+
+
+def _moved_into_the_database(data: Path) -> None:
+    """Have SQLite move what is in the write-ahead log into the database, as it does from time to time."""
+    with closing(sqlite3.connect(data / DATABASE_NAME)) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
 
 def _meddling(work: Path, file: str, way: str) -> Callable[[], object]:

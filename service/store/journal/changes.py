@@ -82,24 +82,25 @@ def _image(name: str, row: Sequence[Value]) -> RowImage:
     return RowImage(name, dict(zip(_COLUMNS[name], row, strict=True)))
 
 
+def is_known(row: RowImage) -> bool:
+    """Whether the journal keeps this table, and the row has its key and no foreign column."""
+    columns = _COLUMNS.get(row.table, ())
+    return set(_KEYS.get(row.table, ("",))) <= row.values.keys() <= set(columns)
+
+
 def key_of(row: RowImage) -> tuple[str, tuple[Value, ...]]:
     """The table and the primary key of a row. Raises KeyError for a table that the journal does not keep."""
     return row.table, tuple(row.values[column] for column in _KEYS[row.table])
 
 
 def apply(connection: sqlite3.Connection, row: RowImage) -> None:
-    """Bring a row of another database to what it is in the journal.
-
-    Raises KeyError for a table or a column that the journal does not keep, sqlite3.Error for what the tables refuse.
-    """
+    """Bring a known row of another database to what it is in the journal. Raises sqlite3.Error if it is refused."""
     key = _KEYS[row.table]
     if row.gone:
         where = " AND ".join(f"{column} = ?" for column in key)
         connection.execute(f"DELETE FROM {row.table} WHERE {where}", [row.values[column] for column in key])
         return
-    columns = [column for column in _COLUMNS[row.table] if column in row.values]  # an older line may have fewer
-    if len(columns) != len(row.values):
-        raise KeyError(*(row.values.keys() - set(columns)))
+    columns = list(row.values)  # an older line may have fewer than the table
     marks = ", ".join("?" for _ in columns)
     values = [row.values[column] for column in columns]
     connection.execute(f"INSERT OR REPLACE INTO {row.table} ({', '.join(columns)}) VALUES ({marks})", values)

@@ -50,6 +50,8 @@ def journal_findings(
         faults.append(Fault(None, None, NAME, f"it ends at line {surveyed.last}, the database holds line {held}"))
     elif surveyed.is_behind(now := held_now()):
         faults.append(Fault(None, None, DATABASE_NAME, _behind(surveyed, now)))
+    if surveyed.problems:  # the rows of a damaged line would look as if they had been put into the database
+        return faults, list(_notes(surveyed, held_now()))
     wanted = None if run_ids is None else {*run_ids, SITE}
     rows = committed_rows(data_dir / NAME, surveyed, held)
     return faults + list(_differences(raw, rows, wanted)), list(_notes(surveyed, held_now()))

@@ -23,6 +23,7 @@ from service.store.errors import RecordDamagedError
 from service.store.journal.lines import (
     FIRST,
     NAME,
+    UNREADABLE,
     LineFields,
     Mark,
     RowImage,
@@ -31,7 +32,6 @@ from service.store.journal.lines import (
     mark_bytes,
     parse_line,
     parse_mark,
-    said_by,
     unreadable,
 )
 
@@ -278,14 +278,13 @@ def _next(found: Tail | None, raw: bytes, offset: int, place: tuple[int, int]) -
     if mark is not None:
         fits = found is not None and (mark.number, mark.sha256) == (found.number, found.sha256)
         return replace(found, word=mark.word) if found is not None and fits else found
-    fields = said_by(raw)
-    if fields is None or not raw.endswith(b"\n"):
+    line = parse_line(raw, offset + len(raw))
+    if line.problem == UNREADABLE or not raw.endswith(b"\n"):
         return found
-    line = parse_line(raw, fields.number, fields.previous_sha256, offset + len(raw))
-    follows = found is None or (fields.number, fields.previous_sha256) == (found.number + 1, found.sha256)
+    follows = found is None or (line.number, line.previous_sha256) == (found.number + 1, found.sha256)
     if line.problem or not follows:
         raise RecordDamagedError(
-            f"line {fields.number} of {NAME} was altered; nothing is written any more",
+            f"line {line.number} of {NAME} was altered; nothing is written any more",
             where=NAME,
             remedy=REBUILD,
         )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -40,18 +40,20 @@ class JournalLine:
     """One line.
 
     Attributes:
-        number: from 1, by its place in the file.
+        number: from 1, as it says; 0 if it cannot be read.
         after: number of the line that the database held when this one was written; 0 for none.
+        previous_sha256: of the line before it, as it says.
         rows: what its transaction changed.
         continued: whether the next line belongs to the same transaction.
         earlier_events: of a journal's first line: how many events were recorded before there was a journal.
         sha256: of its bytes.
         end: offset in the file after it.
-        problem: why it cannot be read or does not follow the line before it; "" if it is as it was written.
+        problem: why it is not as it was written, as far as it shows by itself; "" if it does not.
     """
 
     number: int
     after: int
+    previous_sha256: str
     rows: tuple[RowImage, ...]
     continued: bool
     earlier_events: int
@@ -108,8 +110,8 @@ def mark_bytes(mark: Mark) -> bytes:
     return _JSON.encode({"mark": mark.word, "number": mark.number, "sha256": mark.sha256}).encode() + b"\n"
 
 
-def parse_line(raw: bytes, number: int, previous_sha256: str, end: int) -> JournalLine:
-    """A line from its bytes, with what is wrong with it; `number` and `previous_sha256` are those it should say."""
+def parse_line(raw: bytes, end: int) -> JournalLine:
+    """A line from its bytes, which end at this offset of the file, with what is wrong with it."""
     sha256 = hashlib.sha256(raw).hexdigest()
     try:
         data: Any = json.loads(raw)
@@ -123,15 +125,10 @@ def parse_line(raw: bytes, number: int, previous_sha256: str, end: int) -> Journ
         rows = tuple(_row(item) for item in data["rows"])
         written = line_bytes(fields, rows)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        return JournalLine(
-            number, 0, (), continued=False, earlier_events=0, sha256=sha256, end=end, problem=UNREADABLE
-        )
-    problem = ""
-    if (fields.number, fields.previous_sha256) != (number, previous_sha256) or not 0 <= fields.after < number:
-        problem = "it does not follow the line before it"
-    elif raw != written:
-        problem = "it is not as it was written: its text was altered"
-    return JournalLine(number, fields.after, rows, fields.continued, fields.earlier_events, sha256, end, problem)
+        return JournalLine(0, 0, "", (), False, 0, sha256, end, UNREADABLE)
+    problem = "" if raw == written else "it is not as it was written: its text was altered"
+    said = fields.number, fields.after, fields.previous_sha256
+    return JournalLine(*said, rows, fields.continued, fields.earlier_events, sha256, end, problem)
 
 
 def _row(item: Any) -> RowImage:
@@ -140,15 +137,6 @@ def _row(item: Any) -> RowImage:
     if any(not isinstance(value, str | int | float | None) for value in values.values()):
         raise TypeError("a column is of another kind")
     return RowImage(str(item["table"]), cast("dict[str, Value]", values), gone)
-
-
-def said_by(raw: bytes) -> LineFields | None:
-    """What a line says of itself; None if it is no line."""
-    try:
-        data: Any = json.loads(raw)
-        return LineFields(int(data["number"]), int(data["after"]), str(data["previous_sha256"]))
-    except (ValueError, TypeError, KeyError, RecursionError):
-        return None
 
 
 def parse_mark(raw: bytes) -> Mark | None:
@@ -175,25 +163,21 @@ def read_lines(path: Path) -> Iterator[JournalLine | Ending]:
         raise unreadable(path, error) from error
 
 
-def _lines(stream: Iterator[bytes]) -> Iterator[JournalLine | Ending]:
-    number, previous, end = 0, FIRST, 0
+def _lines(stream: Iterable[bytes]) -> Iterator[JournalLine | Ending]:
+    end, last = 0, (0, FIRST)
     waiting: list[tuple[bytes, int]] = []  # what may be the ending: a mark, or what a power cut left
     for raw in stream:
         end += len(raw)
-        line = parse_line(raw, number + 1, previous, end)
+        line = parse_line(raw, end)
         if line.problem == UNREADABLE or not raw.endswith(b"\n"):
             waiting.append((raw, end))
             continue
-        for lost, at in waiting:  # lines follow, so this was no ending
-            number, previous = number + 1, hashlib.sha256(lost).hexdigest()
-            yield parse_line(lost, number, previous, at)
-        if waiting:
-            line = parse_line(raw, number + 1, previous, end)
-            waiting = []
-        number, previous = number + 1, line.sha256
+        yield from (parse_line(lost, at) for lost, at in waiting)  # lines follow, so this was no ending
+        waiting = []
+        last = line.number, line.sha256
         yield line
     mark = parse_mark(waiting[0][0]) if waiting else None
-    if mark is not None and (mark.number, mark.sha256) != (number, previous):
+    if mark is not None and (mark.number, mark.sha256) != last:
         mark = None
     yield Ending(mark, sum(len(raw) for raw, _ in waiting[(mark is not None) :]))
 

@@ -228,7 +228,7 @@ def _replay(work: Path, journal: Path, surveyed: Survey, until: int, lost: list[
         for row in committed_rows(journal, surveyed, until):
             try:
                 changes.apply(connection, row)
-            except (sqlite3.Error, KeyError) as error:
+            except sqlite3.Error as error:
                 lost.append(f"a row of {row.table}: {error}")
         connection.execute(_LATEST_HEADS)
         connection.execute(f"PRAGMA user_version = {until}")
