@@ -164,7 +164,7 @@ def _noticed_in_use(work: Path, file: str, way: str, moment: str) -> str:
         capture(store, run_id, f"v{number}")
         if number == _BEFORE - 2:
             _moved_into_the_database(data)
-    checkpoint(store, run_id)
+            checkpoint(store, run_id)
     if moment == "idle":
         store.close()
     meddle = _meddling(work, file, way)

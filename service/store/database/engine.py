@@ -38,6 +38,7 @@ LOOK = "Look at the disk of the data folder: room, cable, permissions; then resu
 _EVENT = "SELECT 1 FROM events WHERE run_id = ? AND seq = ? AND sha256 = ?"
 _SHORTER = "SELECT run_id FROM heads WHERE seq <> (SELECT count(*) FROM events WHERE events.run_id = heads.run_id)"
 _WRITING = ["journal_mode = WAL", "synchronous = FULL", "temp_store = MEMORY"]  # notes of changes stay in memory
+_LOOK_EVERY_S = 1.0
 _ENDS_KEPT = 20  # chains whose last event is looked for
 _ONLY_NOW = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_CANTOPEN", "SQLITE_NOMEM", "SQLITE_INTERRUPT")
 _MIGRATIONS = "service.store.database:migrations"  # package:folder, which Alembic reads with importlib.resources
@@ -94,7 +95,8 @@ class Database:
         self._journal = journal
         self._opened: dict[Path, tuple[int, int]] = {}  # device and inode of the files written to
         self._ends: OrderedDict[str, tuple[int, str]] = OrderedDict()  # chain → its last event written here
-        self._looked_at: tuple[int, int] | None = None  # the file's time of change and size then
+        self._looked_at: tuple[int, int] | None = None  # the file's time of change and size at the last look
+        self._looked_s = 0.0  # when it was looked at closely
 
     @contextmanager
     def reading(self) -> Generator[Connection]:
@@ -139,7 +141,7 @@ class Database:
     def _commit(self, raw: sqlite3.Connection, transaction: RootTransaction) -> None:
         """Write the changes to the journal, then commit them, then say in the journal that this was done."""
         rows = changes.changed_rows(raw)
-        held = self._require_record()
+        held = self._require_record(signs=any(row.table == "checkpoints" for row in rows))
         line = self._write_first(raw, rows, held) if rows else None
         try:
             self._files.commit(transaction.commit)
@@ -174,26 +176,27 @@ class Database:
             self.require_in_place()
             if self._journal is not None:
                 before = self._journal.tail()  # another process may write between the two
-                held = self._looked_up()
+                held = self._looked_up(closely=True)
                 self._journal.require_not_behind(before, held)
                 self._journal.require_not_cut(self._journal.tail(), held)
 
-    def _require_record(self) -> int:
+    def _require_record(self, *, signs: bool) -> int:
         """The number of the journal's line that the database holds. Raises RecordDamagedError unless both agree.
 
-        Called with the write lock held.
+        Called with the write lock held. What is signed is looked at closely, and so is a write once a second.
         """
         assert self._journal is not None
-        held, tail = self._looked_up(), self._journal.tail()
+        held, tail = self._looked_up(closely=signs), self._journal.tail()
         self._journal.require_not_behind(tail, held)
         self._journal.require_not_cut(tail, held)
         return held
 
-    def _looked_up(self) -> int:
+    def _looked_up(self, *, closely: bool) -> int:
         """The number of the journal's line that the database holds, as a new connection finds it.
 
-        This one reads pages of the file that other connections only remember. The last events that were written here
-        must still be there; if the file itself has changed, by SQLite or by somebody else, every chain is counted.
+        This one reads pages of the file that other connections only remember, and each commit writes the number.
+        Looked at closely, the last events that were written here must still be there, too. If the file itself has
+        changed, by SQLite or by somebody else, every chain is counted.
         """
         address = f"file:{quote(str(self._path.absolute()))}?mode=ro"
         status = self._path.stat()
@@ -207,11 +210,9 @@ class Database:
         try:
             with closing(sqlite3.connect(address, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)) as fresh:
                 (held,) = fresh.execute("PRAGMA user_version").fetchone()
-                lost = [
-                    run for run, end in self._ends.items() if fresh.execute(_EVENT, (run, *end)).fetchone() is None
-                ]
-                if not lost and self._looked_at not in (None, now):
-                    lost = [str(row[0]) for row in fresh.execute(_SHORTER)]
+                changed = self._looked_at != now
+                due = time.monotonic() - self._looked_s >= _LOOK_EVERY_S
+                lost = self._missing(fresh, count=changed) if closely or changed or due else []
         except sqlite3.Error as error:
             if getattr(error, "sqlite_errorname", "").startswith(_ONLY_NOW):
                 raise
@@ -229,6 +230,14 @@ class Database:
             )
         self._looked_at = now
         return int(held)
+
+    def _missing(self, fresh: sqlite3.Connection, *, count: bool) -> list[str]:
+        """Chains whose last event is gone, or with `count`, that have fewer events than their end says."""
+        self._looked_s = time.monotonic()
+        ends = [(run, *end) for run, end in self._ends.items()]
+        gone = [end[0] for end in ends if fresh.execute(_EVENT, end).fetchone() is None]
+        known = self._looked_at is not None  # not of a folder that was just opened, perhaps without tables
+        return gone or ([str(row[0]) for row in fresh.execute(_SHORTER)] if count and known else [])
 
     def _begun(self, connection: Connection) -> RootTransaction:
         """Begin a write transaction as soon as no other process writes."""
