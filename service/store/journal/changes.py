@@ -93,6 +93,11 @@ def key_of(row: RowImage) -> tuple[str, tuple[Value, ...]]:
     return row.table, tuple(row.values[column] for column in _KEYS[row.table])
 
 
+def row_of_key(table: str, key: Sequence[Value]) -> RowImage:
+    """A row of which only the key is known."""
+    return RowImage(table, dict(zip(_KEYS[table], key, strict=True)))
+
+
 def apply(connection: sqlite3.Connection, row: RowImage) -> None:
     """Bring a known row of another database to what it is in the journal. Raises sqlite3.Error if it is refused."""
     key = _KEYS[row.table]

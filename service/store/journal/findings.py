@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from sqlalchemy import Connection
@@ -79,7 +82,7 @@ def _differences(
     connection: sqlite3.Connection, rows: Iterator[RowImage], wanted: set[str] | None
 ) -> Iterator[Fault]:
     """Rows that the database lacks, has otherwise, or has beside the journal."""
-    expected: dict[_Key, RowImage] = {}
+    expected: dict[_Key, _Written] = {}
     for row in rows:
         if not _is_of(row, wanted):
             continue
@@ -87,7 +90,7 @@ def _differences(
         if row.gone:
             expected.pop(key, None)
         else:
-            expected[key] = row
+            expected[key] = _written(row)
     told: Counter[str] = Counter()
     for row in changes.every_row(connection):
         if not _is_of(row, wanted):
@@ -95,9 +98,10 @@ def _differences(
         written = expected.pop(changes.key_of(row), None)
         if written is None:
             yield from _fault(told, row, "is not in the journal: it was put into the database past it")
-        elif not _same(written, row):
+        elif written.digest != _digest(row, written.columns):
             yield from _fault(told, row, "is not as it is in the journal: it was altered")
-    for row in expected.values():
+    for key in expected:
+        row = changes.row_of_key(*key)
         yield from _fault(told, row, "is in the journal and no longer in the database: it was removed")
     for table, number in told.items():
         if number > _MOST_OF_A_TABLE:
@@ -109,13 +113,27 @@ def _is_of(row: RowImage, wanted: set[str] | None) -> bool:
     return wanted is None or row.values.get("run_id", SITE) in wanted
 
 
-def _same(written: RowImage, found: RowImage) -> bool:
-    over = written.table != "jobs" or written.values["state"] in ("finished", "failed")
-    return all(
-        found.values[column] == value
-        for column, value in written.values.items()
-        if over or column not in _OF_THE_MOMENT
-    )
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """What must still be as it was written: these columns of a row, of which there may be many, as a digest."""
+
+    columns: tuple[str, ...]  # an older line may have fewer than the table
+    digest: bytes
+
+
+def _written(row: RowImage) -> _Written:
+    waits = row.table == "jobs" and row.values["state"] not in ("finished", "failed")
+    columns = _sorted(tuple(row.values), frozenset(_OF_THE_MOMENT) if waits else frozenset())
+    return _Written(columns, _digest(row, columns))
+
+
+@cache
+def _sorted(columns: tuple[str, ...], without: frozenset[str]) -> tuple[str, ...]:
+    return tuple(sorted(set(columns) - without))
+
+
+def _digest(row: RowImage, columns: tuple[str, ...]) -> bytes:
+    return hashlib.sha256(repr([row.values[column] for column in columns]).encode()).digest()
 
 
 def _fault(told: Counter[str], row: RowImage, what: str) -> Iterator[Fault]:
