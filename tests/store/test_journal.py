@@ -67,6 +67,12 @@ def written_over(source: Path, target: Path) -> None:
         stream.write(content)
 
 
+def moved_into_the_database(data: Path) -> None:
+    """Have SQLite move what is in the write-ahead log into the database, as it does from time to time."""
+    with closing(sqlite3.connect(data / DATABASE_NAME)) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+
+
 def emptied(path: Path) -> None:
     """As `: >` does."""
     os.truncate(path, 0)
@@ -105,6 +111,9 @@ MEDDLED: dict[str, Meddle] = {
     ],
     "the write-ahead log is written over": lambda data, old: written_over(old / WAL, data / WAL),
     "the database is written over by zeros": lambda data, _: (data / DATABASE_NAME).write_bytes(bytes(200_000)),
+    "the database is written over by an older one": lambda data, old: written_over(
+        old / DATABASE_NAME, data / DATABASE_NAME
+    ),
     "an older database replaces it": lambda data, old: os.replace(old / DATABASE_NAME, data / DATABASE_NAME),
     "the database is deleted": lambda data, _: (data / DATABASE_NAME).unlink(),
     "the journal is cut": lambda data, _: emptied(data / NAME),
@@ -120,8 +129,7 @@ def test_what_is_altered_in_use_is_noticed_at_once_and_restored(tmp_path: Path, 
     data, old = tmp_path / "data", tmp_path / "old"
     with Store.open(data, SteppedClock(), CountedIds()) as store:
         run = start_run(store)
-        with closing(sqlite3.connect(data / DATABASE_NAME)) as connection:
-            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        moved_into_the_database(data)
         capture(store, run, "v1")
         checkpoint(store, run)
         old.mkdir()
@@ -129,6 +137,8 @@ def test_what_is_altered_in_use_is_noticed_at_once_and_restored(tmp_path: Path, 
             shutil.copyfile(data / name, old / name)
         for number in range(2, 6):
             capture(store, run, f"v{number}")
+            if number == 4:
+                moved_into_the_database(data)
         MEDDLED[how](data, old)
         acts: dict[str, Callable[[], object]] = {
             "capture": lambda: capture(store, run, "v9"),

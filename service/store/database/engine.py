@@ -196,7 +196,7 @@ class Database:
 
         This one reads pages of the file that other connections only remember, and each commit writes the number.
         Looked at closely, the last events that were written here must still be there, too. If the file itself has
-        changed, by SQLite or by somebody else, every chain is counted.
+        changed, by SQLite or by somebody else, all of it must fit together.
         """
         address = f"file:{quote(str(self._path.absolute()))}?mode=ro"
         status = self._path.stat()
@@ -212,7 +212,7 @@ class Database:
                 (held,) = fresh.execute("PRAGMA user_version").fetchone()
                 changed = self._looked_at != now
                 due = time.monotonic() - self._looked_s >= _LOOK_EVERY_S
-                lost = self._missing(fresh, count=changed) if closely or changed or due else []
+                lost = self._missing(fresh, changed=changed) if closely or changed or due else []
         except sqlite3.Error as error:
             if getattr(error, "sqlite_errorname", "").startswith(_ONLY_NOW):
                 raise
@@ -231,13 +231,20 @@ class Database:
         self._looked_at = now
         return int(held)
 
-    def _missing(self, fresh: sqlite3.Connection, *, count: bool) -> list[str]:
-        """Chains whose last event is gone, or with `count`, that have fewer events than their end says."""
+    def _missing(self, fresh: sqlite3.Connection, *, changed: bool) -> list[str]:
+        """Chains whose last event is gone; if the file has `changed`, also those that have lost any other event.
+
+        Raises sqlite3.DatabaseError if the changed file does not fit together, as an older one under a newer log.
+        """
         self._looked_s = time.monotonic()
         ends = [(run, *end) for run, end in self._ends.items()]
         gone = [end[0] for end in ends if fresh.execute(_EVENT, end).fetchone() is None]
-        known = self._looked_at is not None  # not of a folder that was just opened, perhaps without tables
-        return gone or ([str(row[0]) for row in fresh.execute(_SHORTER)] if count and known else [])
+        if gone or not changed or self._looked_at is None:  # None: just opened, perhaps without tables
+            return gone
+        (found,) = fresh.execute("PRAGMA quick_check(1)").fetchone()
+        if found != "ok":
+            raise sqlite3.DatabaseError(str(found).replace("\n", " "))
+        return [str(row[0]) for row in fresh.execute(_SHORTER)]
 
     def _begun(self, connection: Connection) -> RootTransaction:
         """Begin a write transaction as soon as no other process writes."""
