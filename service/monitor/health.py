@@ -46,7 +46,7 @@ def read_health(store: Store, data: Path, driven: Sequence[str], away: Away | No
     try:
         with store.database.reading() as connection:
             connection.execute(text("SELECT 1 FROM heads LIMIT 1")).all()
-        store.database.require_in_place()
+        store.database.require_record()
         database, queued = "", store.open_jobs()
     except OrthocaptureError as error:
         database, queued = error.what, 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from service.core.protocol.models import Protocol
 from service.core.records.events import Payload
@@ -15,6 +15,7 @@ from service.store.queue.leases import RunLease
 from service.store.store import Store
 
 _LEASE_S = 30.0
+_LOOK_EVERY_S = 1.0  # at what was recorded, while the run only waits or computes
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class HeldRun:
     store: Store
     follower: RunFollower
     lease: RunLease
+    _looked: list[float] = field(default_factory=lambda: [float("-inf")])  # monotonic time of the last look
 
     @property
     def state(self) -> RunState:
@@ -31,7 +33,14 @@ class HeldRun:
         return self.follower.state
 
     def refresh(self) -> RunState:
-        """Read what other processes have appended. Raises IntegrityError for an impossible event."""
+        """Read what other processes have appended, and once a second make sure that what was recorded is still there.
+
+        Raises IntegrityError for an impossible event, RecordDamagedError if database or journal was altered.
+        """
+        now_s = self.store.clock.monotonic_s()
+        if now_s - self._looked[0] >= _LOOK_EVERY_S:
+            self._looked[0] = now_s
+            self.store.database.require_record()
         return self.follower.refresh()
 
     def append(self, *payloads: Payload, actor: str = "runner") -> None:

@@ -21,6 +21,10 @@ class StoreVersionError(StoreError):
     """The database was written by another version of the software."""
 
 
+class RecordDamagedError(StoreError):
+    """Database and journal no longer agree: one of them was overwritten, cut, replaced or removed."""
+
+
 class SigningKeyError(StoreError):
     """The private key that signs checkpoints is missing, unusable or readable by others; the record is unaffected."""
 

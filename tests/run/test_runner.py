@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,8 @@ from service.core.records.events import (
     ViewpointCaptured,
 )
 from service.run_start import recorded_rig, recorded_run
-from service.store.errors import LeaseHeldError
+from service.store.errors import LeaseHeldError, RecordDamagedError
+from service.store.journal.rebuild import rebuild
 from service.store.records import Checkpoint
 from service.store.signatures import timestamps as timestamping
 from service.store.store import Store
@@ -100,3 +102,49 @@ def test_a_database_that_is_moved_away_in_the_capture_ends_the_run_loudly(tmp_pa
     report = verify(data)
     assert report.faults == ()
     assert any(note.startswith("artefacts/") for note in report.notes), report.notes
+
+
+def test_a_write_ahead_log_that_is_cut_in_the_capture_ends_the_run_and_loses_nothing(
+    tmp_path: Path,
+) -> None:
+    data = tmp_path / "data"
+    seen: list[str] = []
+
+    def cut(_seconds: float) -> None:
+        if len(bench.captured()) == 2 and not seen:
+            seen.extend(bench.captured())
+            os.truncate(data / "orthocapture.sqlite-wal", 0)
+
+    with bench_store(data) as store:
+        bench = begin_run(store, PROTOCOL, tmp_path)
+        bench.on_wait = cut
+        with pytest.raises(StoreError) as told:
+            bench.run()
+        assert "store rebuild" in told.value.remedy
+    assert len(seen) == 2
+    assert rebuild(data, actor=lambda _folder: "Ada").lost == ()
+    with bench_store(data) as store:
+        again = Bench(store, bench.run_id, data, bench.rig)
+        assert again.captured()[:2] == seen
+        assert again.run().status == "completed"
+        assert len(set(again.captured())) == len(again.captured())
+        again.must_verify()
+
+
+def test_a_paused_run_notices_within_a_second_that_the_record_was_altered(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    waited_s: list[float] = []
+
+    def cut(seconds: float) -> None:
+        if bench.state().status == "paused":
+            if not waited_s:
+                os.truncate(data / "journal.jsonl", 0)
+            waited_s.append(seconds)
+
+    with bench_store(data) as store:
+        bench = begin_run(store, PROTOCOL, tmp_path)
+        bench.act("pause")
+        bench.on_wait = cut
+        with pytest.raises(RecordDamagedError, match=r"journal\.jsonl was removed, replaced, cut or altered"):
+            bench.run()
+    assert 0 < sum(waited_s) <= 1.2

@@ -161,7 +161,9 @@ def test_tables_refuse_update_delete_and_replace(store: Store, table: str) -> No
         ):
             with pytest.raises(sqlite3.IntegrityError, match=f"{table} is append-only"):
                 outsider.execute(statement)
-    assert [str(fault) for fault in verify(store.database_path.parent).faults if "time stamp" not in fault.what] == []
+    of_stamp = "time stamp", "its row of timestamps"
+    faults = [fault.what for fault in verify(store.database_path.parent).faults]
+    assert [what for what in faults if not what.startswith(of_stamp)] == []
 
 
 def moved_away(path: Path) -> None:

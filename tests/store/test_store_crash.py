@@ -88,7 +88,10 @@ def test_crash_at_every_point_of_a_record(before: Path, tmp_path: Path, *, power
         "sync_file",
         "rename",
         "sync_directory",
+        "append",
+        "sync_file",
         "commit",
+        "append",
     ]
     committed_at: list[str] = []
     for index, point in enumerate(points):
@@ -116,7 +119,7 @@ def test_crash_at_every_point_of_a_record(before: Path, tmp_path: Path, *, power
                 "job_enqueued",
             ]
         assert verify(data).ok
-    assert committed_at == ["after commit"]
+    assert committed_at == ["after commit", "before append", "within append", "after append"]
 
 
 def test_a_commit_that_returned_survives_the_loss_of_power(before: Path, tmp_path: Path) -> None:

@@ -75,6 +75,7 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture plan next latest --data runs": succeeds,
     "orthocapture act pause --run latest --data runs": succeeds,
     'orthocapture note "a wire slipped" --run latest --data runs': succeeds,
+    "orthocapture store rebuild --data runs": succeeds,
     "orthocapture runs --search spine --data runs": succeeds,
     "orthocapture history --out history.csv --data runs": succeeds,
     "orthocapture worker --data runs": serves_until_terminated,

@@ -25,7 +25,7 @@ from service.store.durable_effects import DurableFiles
 from service.store.events import canonical
 from service.store.records import SITE, Checkpoint
 from service.store.signatures.log import NAME, LogEnd, SignatureLog, read_log
-from service.store.signatures.log_copy import bring_up_to_date
+from service.store.signatures.log_copy import LogCopy
 from service.store.signatures.seen import SeenSignatures
 from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
@@ -33,7 +33,7 @@ from service.store.verification.verify import verify
 from tests.support.record.counting import lines_of
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, capture, start_run, tamper
-from tests.support.record.tampering import WORDS_AGAIN, cut, rewrite_to_the_end, without_signatures_from
+from tests.support.record.tampering import WORDS_AGAIN, cut, journal_anew, rewrite_to_the_end, without_signatures_from
 from tests.support.runs.bench_run import PROTOCOL, begin_run
 
 
@@ -242,22 +242,23 @@ def test_a_signature_made_while_the_evidence_is_verified_is_no_fault(data: Path)
 
 def test_a_log_that_was_cut_or_changed_shows_against_its_copy(data: Path, tmp_path: Path) -> None:
     copy = tmp_path / "elsewhere.jsonl"
-    bring_up_to_date(data, copy)
+    LogCopy(data / NAME, copy).bring_up_to_date()
     assert copy.read_bytes() == (data / NAME).read_bytes()
     sign_again(data)
     report = verify(data, signatures_copy=copy)
     assert report.faults == ()
     assert f"{copy} does not have the last 2 lines of {NAME} yet" in report.notes
-    bring_up_to_date(data, copy)
+    LogCopy(data / NAME, copy).bring_up_to_date()
     # Everything is rolled back to the first run, log included: nothing within the folder shows it.
     lines = (data / NAME).read_bytes().splitlines(keepends=True)
     (data / NAME).write_bytes(b"".join(lines[:-2]))
     tamper(data, *cut(run_of(data), 5), *cut(SITE, 7))
+    journal_anew(data)
     assert faults(data) == []
     (fault,) = verify(data, signatures_copy=copy).faults
     assert f"{NAME} ends before line {len(lines) - 1} of its copy: it was cut" in str(fault)
     with pytest.raises(IntegrityError, match="is not the beginning of the log"):
-        bring_up_to_date(data, copy)
+        LogCopy(data / NAME, copy).bring_up_to_date()
     (data / NAME).write_bytes(b"".join([*lines[:1], *lines[:1]]))
     assert str(verify(data, signatures_copy=copy).faults[-1]).startswith(f"{NAME}, line 2: it is not the line that")
 
@@ -265,7 +266,7 @@ def test_a_log_that_was_cut_or_changed_shows_against_its_copy(data: Path, tmp_pa
 def test_half_a_line_in_the_copy_is_written_over(data: Path, tmp_path: Path) -> None:
     copy = tmp_path / "elsewhere.jsonl"
     copy.write_bytes((data / NAME).read_bytes()[:100])  # from a share that disappeared
-    bring_up_to_date(data, copy)
+    LogCopy(data / NAME, copy).bring_up_to_date()
     assert copy.read_bytes() == (data / NAME).read_bytes()
 
 

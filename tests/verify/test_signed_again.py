@@ -16,7 +16,7 @@ from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.store import rows, tamper
-from tests.support.record.tampering import WORDS_AGAIN, cut, rewrite_to_the_end, without_signatures_from
+from tests.support.record.tampering import WORDS_AGAIN, cut, journal_anew, rewrite_to_the_end, without_signatures_from
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
 
 UNSIGNED = PROTOCOL.replace(
@@ -66,6 +66,7 @@ def forge(data: Path, run: str) -> list[int]:
     lines = (data / NAME).read_bytes().splitlines(keepends=True)
     first = next(at for at, line in enumerate(lines) if json.loads(line)["checkpoint"]["run_id"] == run)
     (data / NAME).write_bytes(b"".join(lines[:first]))
+    journal_anew(data)
     return passed[:-1]  # the last of them is the run's end
 
 

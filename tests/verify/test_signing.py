@@ -27,7 +27,7 @@ from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.stepped_clock import SteppedClock
 from tests.support.record.store import CountedIds, capture, rows, start_run, tamper
-from tests.support.record.tampering import WORDS_AGAIN, alter_row, rewrite_to_the_end
+from tests.support.record.tampering import WORDS_AGAIN, alter_row, journal_anew, rewrite_to_the_end
 
 ROOT_DIR = Path(__file__).parents[2]
 RUN = "20261121-120000-000003"
@@ -115,6 +115,7 @@ def test_a_chain_rewritten_to_its_end_is_found(store: Store) -> None:
     checkpoint(store, RUN)
     assert faults(store) == []
     rewrite_to_the_end(folder(store), RUN, 2, actor="Eve")
+    journal_anew(folder(store))
     found = faults(store, RUN)
     assert found[0].startswith(f"run {RUN}, event 3: checkpoint: it signs an event with hash")
     assert "rewritten" in found[0]
@@ -126,6 +127,7 @@ def test_a_chain_rewritten_to_its_end_is_found(store: Store) -> None:
 def test_a_row_altered_together_with_its_hash_is_found(store: Store) -> None:
     checkpoint(store, RUN)
     alter_row(folder(store), RUN, 3, "phone")
+    journal_anew(folder(store))
     assert faults(store) == [
         f"run {RUN}, event 3: checkpoint: the rows of the artefacts up to it are not those that it signs"
     ]
@@ -145,6 +147,7 @@ def test_the_sites_chain_is_protected_by_the_runs(store: Store) -> None:
         "WHERE run_id = 'site'",
         *WORDS_AGAIN,
     )
+    journal_anew(folder(store))
     found = faults(store, RUN)
     assert found[0] == f"run {RUN}, event 3: checkpoint: event 3 of the site's chain is not the one that it names"
     assert all("signatures.jsonl" in fault for fault in found[1:]), "they were written down outside of the database"

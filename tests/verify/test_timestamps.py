@@ -22,6 +22,7 @@ from service.store.signatures.timestamps import Authority, stamp_end, timestamp
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.store import rows, tamper
+from tests.support.record.tampering import journal_anew
 from tests.support.record.time_stamp_authority import (
     TimeStampAuthority,
     make_certificates,
@@ -117,11 +118,13 @@ def test_a_stamp_of_something_else_is_a_fault(
         timestamp(store, checkpoint(store, run), ask(authority))
     ((token,),) = rows(data, f"SELECT token FROM timestamps WHERE run_id = '{other.run_id}'")
     tamper(data, f"UPDATE timestamps SET token = '{token}' WHERE run_id = '{run}'")
+    journal_anew(data)
     for certificates in (None, authority.certificates):
         (fault,) = verify(data, run, certificates=certificates).faults
         assert fault.run_id == run
         assert "time stamp" in fault.what
     tamper(data, f"UPDATE timestamps SET token = 'AAAA' WHERE run_id = '{run}'")
+    journal_anew(data)
     assert len(verify(data, run).faults) == 1
 
 

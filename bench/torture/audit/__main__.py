@@ -26,12 +26,13 @@ from typing import Any
 
 from bench.machine import REPOSITORY, commit, machine
 from bench.torture.audit.edits import Edits
-from bench.torture.audit.flips import ArtefactFlips, DatabaseFlips, LogFlips
+from bench.torture.audit.flips import ArtefactFlips, DatabaseFlips, LineFlips
 from bench.torture.audit.forger import Forgeries
 from bench.torture.audit.outcome import quickened, verdict
 from bench.torture.audit.record import Record, make_record, put_back
 from bench.torture.audit.rollback import RollBacks
 from bench.torture.audit.tally import Sweep, Tallies, Tally, add_all, in_a_process
+from service.store.signatures.log import NAME as LOG_NAME
 
 RESULTS = REPOSITORY / "bench" / "results"
 DOCUMENT = REPOSITORY / "docs" / "explanation" / "evidence.md"
@@ -40,7 +41,8 @@ SWEEPS: Mapping[str, Callable[[Record], Sweep]] = {
     "edits": Edits,
     "rollbacks": RollBacks,
     "forgeries": Forgeries,
-    "log": LogFlips,
+    "log": lambda record: LineFlips(record, record.data / LOG_NAME, "end of the log of signatures"),
+    "journal": lambda record: LineFlips(record, record.journal, "end of the journal"),
     "artefacts": ArtefactFlips,
     "wal": lambda record: DatabaseFlips(record, wal=True),
     "database": lambda record: DatabaseFlips(record, wal=False),
@@ -120,7 +122,7 @@ def sweep(
         part = json.loads(line)
         done += part["done"]
         add_all(total, {kind: Tally.of_json(tally) for kind, tally in part["tallies"].items()})
-    with quickened(files_stay=name != "artefacts", database_stays=name in ("log", "artefacts")):
+    with quickened(files_stay=name != "artefacts", database_stays=name in ("log", "journal", "artefacts")):
         put_back(record)
         verdict(record, ())  # caches what every process needs about the unaltered record
         made = SWEEPS[name](record)

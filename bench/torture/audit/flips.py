@@ -1,4 +1,4 @@
-"""Flips one bit of every byte of the record: database, write-ahead log, signature log, artefacts."""
+"""Flips one bit of every byte of the record: database, write-ahead log, signature log, journal, artefacts."""
 
 from __future__ import annotations
 
@@ -41,8 +41,9 @@ class DatabaseFlips:
         self._path = database_path(record.data)
         self._wal = wal
         if wal:
-            database, log, signatures = record.with_wal
+            database, log, signatures, journal = record.with_wal
             self._path.write_bytes(database)
+            record.journal.write_bytes(journal)
             (record.data / NAME).write_bytes(signatures)
             self._path = record.data / WAL_NAME
             self._path.write_bytes(log)
@@ -100,15 +101,15 @@ class DatabaseFlips:
         return codes
 
 
-class LogFlips:
-    """Bit flips in the signature log."""
+class LineFlips:
+    """Bit flips in a file of lines: the log of signatures, or the journal."""
 
-    name = f"flip in {NAME}"
-
-    def __init__(self, record: Record) -> None:
+    def __init__(self, record: Record, path: Path, code: str) -> None:
         put_back(record)
+        self.name = f"flip in {path.name}"
         self._record = record
-        self._path = record.data / NAME
+        self._path = path
+        self._code = code
         self.size = self._path.stat().st_size
         self._notes = outcome.audit.verify(record.data).notes
 
@@ -118,7 +119,7 @@ class LogFlips:
         for offset in offsets:
             with flipped(self._path, offset):
                 found = verdict(self._record, self._notes)
-                tally.count(found, f"byte {offset}", lambda: {"end of the log of signatures"})
+                tally.count(found, f"byte {offset}", lambda: {self._code})
         return {self.name: tally}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
@@ -21,6 +22,9 @@ from service.store.database.engine import database_path
 from service.store.durable_effects import DurableFiles
 from service.store.events import ROOT, canonical, event_sha256, parse_canonical
 from service.store.files.artefacts import record_sha256
+from service.store.journal.changes import every_row
+from service.store.journal.journal import Journal
+from service.store.journal.lines import FIRST, JournalLine, LineFields, line_bytes, read_lines
 from service.store.records import SITE, Checkpoint
 from service.store.signatures.checkpoints import RowsDigest, key_fingerprint
 from service.store.signatures.checkpoints import statement as signed_text
@@ -28,7 +32,7 @@ from service.store.signatures.keys import public_bytes
 from service.store.signatures.log import NAME, LogEnd, SignatureLog
 from tests.support.record.tampering import WORDS_AGAIN
 
-CAN_WRITE = ("database", "site's chain", "log", "second place")
+CAN_WRITE = ("database", "site's chain", "journal", "log", "second place")
 KEYS = ("no key", "a key of his own", "the key in use", "every key")
 _EVENT = ("seq", "run_id", "at_utc", "monotonic_s", "actor", "previous_sha256")
 _CHECKPOINT = tuple(Checkpoint.__dataclass_fields__)
@@ -71,7 +75,7 @@ class Forgeries:
             run_id, seq, can, keys = self.all[number]
             put_back(self._record)
             _Forger(self._record, can, keys).forge(run_id, seq)
-            tail = seq > self._last.get(run_id, 0)
+            tail = seq > self._last.get(run_id, 0) and "journal" in can
             for with_copy in (False, True):
                 compared = "second place compared" if with_copy else "second place not looked at"
                 tally = tallies.setdefault(f"forger with {keys}, {compared}", Tally())
@@ -99,8 +103,9 @@ class Forgeries:
 
     @staticmethod
     def _code(can: frozenset[str], keys: str, *, with_copy: bool) -> str:
-        places = {"log", "site's chain"} | ({"second place"} if with_copy else set())
-        return f"forger: {keys}" + (", second place too" if with_copy and places <= can else "")
+        places = {"log", "site's chain", "journal"} | ({"second place"} if with_copy else set())
+        code = f"forger: {keys}" + (", second place too" if with_copy and places <= can else "")
+        return code if "journal" in can else f"{code}, without the journal"
 
 
 class _Forger:
@@ -122,12 +127,16 @@ class _Forger:
             with closing(sqlite3.connect(database_path(self._record.data), isolation_level=None)) as connection:
                 connection.row_factory = sqlite3.Row
                 self._in_database(connection, run_id, seq)
+        if "journal" in self._can:
+            self._in_journal(run_id, seq)
         if "log" in self._can:
             self._in_log(run_id, seq)
-        if "second place" in self._can and "log" in self._can:
-            self._record.copy.write_bytes((self._record.data / NAME).read_bytes())
-        elif "second place" in self._can:
-            self._record.copy.write_bytes(b"")
+        if "second place" in self._can:
+            for name, path, copy in (
+                ("log", self._record.data / NAME, self._record.copy),
+                ("journal", self._record.journal, self._record.journal_copy),
+            ):
+                copy.write_bytes(path.read_bytes() if name in self._can else b"")
 
     # --- database ---
 
@@ -266,6 +275,30 @@ class _Forger:
             connection.execute(
                 f"UPDATE checkpoints SET {columns} WHERE run_id = ? AND seq = ?", (*values.values(), *where)
             )
+
+    # --- journal ---
+
+    def _in_journal(self, run_id: str, seq: int) -> None:
+        """Make a journal that fits the forged database; without the database, change the event in the journal."""
+        journal = self._record.journal
+        if "database" in self._can:
+            with closing(sqlite3.connect(database_path(self._record.data), isolation_level=None)) as connection:
+                tail = Journal(self._record.data, DurableFiles()).begin(every_row(connection), 0)
+                connection.execute(f"PRAGMA user_version = {tail.number}")
+            return
+        previous, content = FIRST, b""
+        for line in read_lines(journal):
+            if isinstance(line, JournalLine):
+                place = "events", run_id, seq
+                rows = [
+                    replace(row, values={**row.values, "actor": "Eve"})
+                    if (row.table, row.values.get("run_id"), row.values.get("seq")) == place
+                    else row
+                    for row in line.rows
+                ]
+                raw = line_bytes(LineFields(line.number, line.after, previous, line.continued), rows)
+                previous, content = hashlib.sha256(raw).hexdigest(), content + raw
+        journal.write_bytes(content)
 
     # --- log of signatures ---
 

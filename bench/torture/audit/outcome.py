@@ -20,6 +20,7 @@ from bench.torture.audit.record import Record
 from service.core.errors import OrthocaptureError
 from service.store.database import engine as database
 from service.store.database.engine import database_path
+from service.store.journal import lines as journal_lines
 from service.store.signatures import log as signature_log
 from service.store.signatures.log import LogLine
 from service.store.verification import chain_checks as audit_checks
@@ -110,6 +111,7 @@ def quickened(*, files_stay: bool, database_stays: bool = False) -> Generator[No
             (audit_signatures, "signed_by", functools.cache(audit_signatures.signed_by)),
             (LogLine, "signed_by", functools.cache(LogLine.signed_by)),
             (signature_log, "_line", functools.cache(vars(signature_log)["_line"])),
+            (journal_lines, "parse_line", functools.cache(journal_lines.parse_line)),
             (database, "_engine", functools.cache(vars(database)["_engine"])),
             (file_checks, "hash_file", file_hash),
         ):

@@ -20,10 +20,11 @@ from service.people.person import Person
 from service.people.sessions import People
 from service.rig import load_rig
 from service.store.database.engine import database_path
-from service.store.durable_effects import DurableFiles
+from service.store.durable_effects import DurableFiles, SystemClock
+from service.store.journal.copies import journal_copy
+from service.store.journal.lines import NAME as JOURNAL_NAME
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.signatures.log import NAME
-from service.store.signatures.log_copy import bring_up_to_date
 from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.signatures.timestamps import Authority
@@ -43,6 +44,8 @@ class State:
     database: bytes
     log: bytes | None
     copy: bytes | None
+    journal: bytes | None
+    journal_copy: bytes | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +56,15 @@ class Record:
         folder: holds data/ and the signature copy; nothing has it open.
         run_id: of the run that is complete, corrected and released.
         states: after every commit, oldest first; the last one is the current state.
-        with_wal: the database and its write-ahead log as left by a crash, some commits before the end.
+        with_wal: the database, its write-ahead log, the log of signatures and the journal as left by a crash, some
+            commits before the end.
         keys: PEM of every key that signed, oldest first; only the last one's file still exists.
     """
 
     folder: Path
     run_id: str
     states: tuple[State, ...]
-    with_wal: tuple[bytes, bytes, bytes]
+    with_wal: tuple[bytes, bytes, bytes, bytes]
     keys: tuple[bytes, ...]
 
     @property
@@ -72,6 +76,16 @@ class Record:
     def copy(self) -> Path:
         """The second copy of the signature log."""
         return self.folder / COPY
+
+    @property
+    def journal(self) -> Path:
+        """The journal."""
+        return self.data / JOURNAL_NAME
+
+    @property
+    def journal_copy(self) -> Path:
+        """The second copy of the journal."""
+        return journal_copy(self.copy)
 
 
 @dataclass
@@ -88,10 +102,11 @@ class _Keeping(DurableFiles):
 
 
 def state_of(folder: Path) -> State:
-    """Read the three files in their current state."""
+    """Read the files in their current state."""
     with closing(sqlite3.connect(database_path(folder / "data"))) as connection:
         database = connection.serialize()
-    return State(database, _content(folder / "data" / NAME), _content(folder / COPY))
+    named = folder / "data" / NAME, folder / COPY, folder / "data" / JOURNAL_NAME, journal_copy(folder / COPY)
+    return State(database, *map(_content, named))
 
 
 def _content(path: Path) -> bytes | None:
@@ -110,7 +125,7 @@ def make_record(folder: Path) -> Record:
         (first_key,) = (folder / "data" / "keys").glob("*.pem")
         first = first_key.read_bytes()
         rotate_key(store, reason="yearly", actor="ada")
-        bring_up_to_date(folder / "data", folder / COPY)
+        _keep(folder)
         _aborted_run(store, folder)
         _open_run(store, folder, people)
         with_wal = _with_wal(folder)
@@ -131,11 +146,23 @@ def put(record: Record, state: State) -> None:
     for left in record.data.glob("orthocapture.sqlite-*"):
         left.unlink()
     database_path(record.data).write_bytes(state.database)
-    for path, content in ((record.data / NAME, state.log), (record.copy, state.copy)):
+    for path, content in (
+        (record.data / NAME, state.log),
+        (record.copy, state.copy),
+        (record.journal, state.journal),
+        (record.journal_copy, state.journal_copy),
+    ):
         if content is None:
             path.unlink(missing_ok=True)
         elif not path.exists() or path.read_bytes() != content:
             path.write_bytes(content)
+
+
+def _keep(folder: Path) -> None:
+    """Bring the second place up to date."""
+    away = SecondPlace.of(folder / "data", folder / COPY, SystemClock(), DurableFiles()).update()
+    if away is not None:
+        raise DataError("the second place of the record that is to be attacked is not up to date", where=away.why)
 
 
 def _start(store: Store, folder: Path, people: People) -> None:
@@ -163,7 +190,7 @@ def _complete_run(store: Store, folder: Path, authority: Authority) -> str:
     )
     store.record(bench.run_id, [exported], actor="lise")
     checkpoint(store, bench.run_id)
-    bring_up_to_date(folder / "data", folder / COPY)
+    _keep(folder)
     return bench.run_id
 
 
@@ -209,7 +236,7 @@ def _aborted_run(store: Store, folder: Path) -> None:
     bench = begin_run(store, PROTOCOL, folder)
     store.record(bench.run_id, [RunAborted(reason="the specimen was dropped")], actor="Ada")
     checkpoint(store, bench.run_id)
-    bring_up_to_date(folder / "data", folder / COPY)
+    _keep(folder)
 
 
 def _open_run(store: Store, folder: Path, people: People) -> None:
@@ -223,10 +250,13 @@ def _open_run(store: Store, folder: Path, people: People) -> None:
     with closing(sqlite3.connect(database_path(folder / "data"))) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     checkpoint(store, bench.run_id)
-    bring_up_to_date(folder / "data", folder / COPY)
+    _keep(folder)
     store.record(bench.run_id, [OperatorAction(action="pause", reason="lunch")], actor="emmy")
 
 
-def _with_wal(folder: Path) -> tuple[bytes, bytes, bytes]:
+def _with_wal(folder: Path) -> tuple[bytes, bytes, bytes, bytes]:
     data = folder / "data"
-    return database_path(data).read_bytes(), (data / WAL_NAME).read_bytes(), (data / NAME).read_bytes()
+    database, wal, log, journal = (
+        path.read_bytes() for path in (database_path(data), data / WAL_NAME, data / NAME, data / JOURNAL_NAME)
+    )
+    return database, wal, log, journal

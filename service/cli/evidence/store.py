@@ -16,6 +16,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.evidence.store_backup import backup_command, restore_command
+from service.cli.evidence.store_rebuild import rebuild_command
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.store.files.leftovers import USUAL_AGE_S, leftovers, remove_leftovers
 from service.store.records import SITE
@@ -32,6 +33,7 @@ def store() -> None:
 
 store_app.command("backup")(backup_command)
 store_app.command("restore")(restore_command)
+store_app.command("rebuild")(rebuild_command)
 
 
 @store_app.command("gc")

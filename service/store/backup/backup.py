@@ -1,7 +1,8 @@
-"""Back up a data folder while it is in use: the database, the log of signatures, and new files.
+"""Back up a data folder while it is in use: the database, its journal, the log of signatures, and new files.
 
 The database is copied first, in one consistent state, with SQLite's backup interface; every file named in that state
-is then already on disk. What a run adds meanwhile belongs to the next backup.
+is then already on disk, and so is every line of the journal up to the one that this state holds. What a run adds
+meanwhile belongs to the next backup.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from service.store.database.engine import DATABASE_NAME, LOOK, open_read_only
 from service.store.database.tables import artefacts, event_index, heads, runs
 from service.store.durable_effects import Clock, DurableFiles, Files, RandomIds, SystemClock, utc_text
 from service.store.files.artefacts import chunks_of, hash_file, relative_path
+from service.store.journal.lines import NAME as JOURNAL_NAME
+from service.store.journal.lines import first_lines
 from service.store.signatures.checkpoints import read_every_checkpoint
 from service.store.signatures.keys import KeyFolder
 from service.store.signatures.log import NAME as LOG_NAME
@@ -116,6 +119,7 @@ class _ReferencedFiles:
     sizes: dict[str, int]  # sizes of files, by hash
     heads: dict[str, tuple[int, str]]
     root_sha256: str
+    line: int  # of the journal
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +136,7 @@ class _Backup:
         self.folder.files.make_directory(part)
         database_sha256 = self._copy_database(part)
         holds, signed = self._read_copy(part)
+        journal_sha256 = self._copy_journal(part, holds.line)
         signatures_sha256 = self._copy_signatures(part, signed)
         self._require_same_site(holds)
         missing = self._missing(holds.sizes)
@@ -146,6 +151,7 @@ class _Backup:
             data_folder=str(self.data_dir.resolve()),
             database_sha256=database_sha256,
             signatures_sha256=signatures_sha256,
+            journal_sha256=journal_sha256,
             artefacts=len(holds.sizes),
             artefact_bytes=sum(holds.sizes.values()),
             heads=holds.heads,
@@ -197,6 +203,18 @@ class _Backup:
             source.close()
         self.folder.files.sync_file(target)
         return hash_file(target)[0]
+
+    def _copy_journal(self, part: Path, line: int) -> str:
+        """Copy the journal up to the line that the database copy holds. Returns the copy's SHA-256; "" without lines.
+
+        A journal that lacks the line, or was altered, is copied as it is, for the audit to find.
+        """
+        journal = self.data_dir / JOURNAL_NAME
+        if not line or not journal.is_file():
+            return ""
+        self.folder.files.write(part / JOURNAL_NAME, first_lines(journal, line), private=True)
+        self.folder.files.sync_file(part / JOURNAL_NAME)
+        return hash_file(part / JOURNAL_NAME)[0]
 
     def _copy_signatures(self, part: Path, copied: set[tuple[str, int]]) -> str:
         """Copy the lines before the first signature newer than the database copy. SHA-256; "" without a log."""
@@ -323,6 +341,7 @@ def _holds(connection: Connection) -> _ReferencedFiles:
         sizes={row.sha256: row.size_bytes for row in connection.execute(named)},
         heads={row.run_id: (row.seq, row.sha256) for row in connection.execute(select(heads))},
         root_sha256=connection.execute(select(runs.c.root_sha256).where(runs.c.run_id == first)).scalar() or "",
+        line=connection.exec_driver_sql("PRAGMA user_version").scalar_one(),
     )
 
 

@@ -2,7 +2,8 @@
 
 BACKUP/orthocapture-backup.json   marks the folder
 BACKUP/artefacts/ab/abcd…         the files of all states by hash, each written once
-BACKUP/states/TIME/               one backup: orthocapture.sqlite, signatures.jsonl, state.json, optionally keys/
+BACKUP/states/TIME/               one backup: orthocapture.sqlite, journal.jsonl, signatures.jsonl, state.json,
+                                  optionally keys/
 BACKUP/states/TIME.part           an unfinished backup, which is never used
 
 A state gets its name by one rename, after everything in it was written and read back.
@@ -42,6 +43,7 @@ class BackupState(Record):
     data_folder: str  # its path on that host
     database_sha256: str
     signatures_sha256: str  # "" if nothing was signed yet
+    journal_sha256: str = ""  # "" if there was no journal yet
     artefacts: int
     artefact_bytes: int
     heads: dict[str, tuple[int, str]]  # chain → number and hash of its last event

@@ -17,6 +17,7 @@ from service.store.database.engine import DATABASE_NAME, open_read_only
 from service.store.database.tables import artefacts, control, leases, sessions
 from service.store.durable_effects import DurableFiles, Files, RandomIds
 from service.store.files.artefacts import ArtefactFiles, chunks_of, hash_file, relative_path
+from service.store.journal.lines import NAME as JOURNAL_NAME
 from service.store.signatures.log import NAME as LOG_NAME
 from service.store.store import Store
 from service.store.verification import verify as audit
@@ -92,7 +93,13 @@ def restore(
         report = audit.verify(work, progress=progress)
         restored = DataRestored(state=name, at_utc=state.at_utc, folder=state.data_folder, host=state.host)
         _let_go(work, restored, name_of_actor)
-        for part in (LOG_NAME, KEYS, "artefacts", DATABASE_NAME):  # the database last: it makes this a data folder
+        for part in (
+            LOG_NAME,
+            JOURNAL_NAME,
+            KEYS,
+            "artefacts",
+            DATABASE_NAME,
+        ):  # the database last: it makes this a data folder
             if (work / part).exists():
                 files.rename(work / part, destination / part)
         files.sync_directory(destination)
@@ -110,11 +117,15 @@ def _require_empty(destination: Path) -> None:
 
 
 def _copy_state(state_dir: Path, work: Path, state: BackupState, files: Files) -> None:
-    expected = {DATABASE_NAME: state.database_sha256, LOG_NAME: state.signatures_sha256}
+    expected = {
+        DATABASE_NAME: state.database_sha256,
+        JOURNAL_NAME: state.journal_sha256,
+        LOG_NAME: state.signatures_sha256,
+    }
     for part, sha256 in expected.items():
         if not sha256:
             continue
-        files.write(work / part, chunks_of(state_dir / part))
+        files.write(work / part, chunks_of(state_dir / part), private=part == JOURNAL_NAME)
         files.sync_file(work / part)
         if hash_file(work / part)[0] != sha256:
             raise IntegrityError(

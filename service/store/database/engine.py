@@ -6,8 +6,9 @@ import logging
 import os
 import sqlite3
 import time
+from collections import OrderedDict
 from collections.abc import Generator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,15 +23,26 @@ from service.core.errors import StoreError
 from service.store.access import file_mode, open_new, require_access
 from service.store.database import new_schema
 from service.store.durable_effects import Files
-from service.store.errors import StoreVersionError
+from service.store.errors import RecordDamagedError, StoreVersionError
+from service.store.journal import changes
+from service.store.journal.journal import REBUILD, Journal, Tail
+from service.store.journal.lines import RowImage
 
 DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0  # how long SQLite waits for another process that writes; then a warning is logged
 PATIENCE_S = 300.0  # for all such waits of one write: a process that is starved may hold the database for minutes
 _LOG = logging.getLogger(__name__)
 REVISIONS = ("0001", "0002", "0003", "0004", "0005")  # of migrations/versions, in order
-RESTORE = "Restore the data folder from a copy; run `orthocapture audit verify` on the copy"
+RESTORE = (
+    "`orthocapture store rebuild` restores a damaged database from its journal; or restore the folder from a copy"
+)
 LOOK = "Look at the disk of the data folder: room, cable, permissions; then resume the run. What was recorded is safe"
+_EVENT = "SELECT 1 FROM events WHERE run_id = ? AND seq = ? AND sha256 = ?"
+_SHORTER = "SELECT run_id FROM heads WHERE seq <> (SELECT count(*) FROM events WHERE events.run_id = heads.run_id)"
+_WRITING = ["journal_mode = WAL", "synchronous = FULL", "temp_store = MEMORY"]  # notes of changes stay in memory
+_LOOK_EVERY_S = 1.0
+_ENDS_KEPT = 20  # chains whose last event is looked for
+_ONLY_NOW = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_CANTOPEN", "SQLITE_NOMEM", "SQLITE_INTERRUPT")
 _MIGRATIONS = "service.store.database:migrations"  # package:folder, which Alembic reads with importlib.resources
 
 
@@ -75,12 +87,18 @@ _COMPILED = _Compiled(500)
 class Database:
     """Connections to one database. Writers use BEGIN IMMEDIATE, so no transaction must be upgraded and retried."""
 
-    def __init__(self, engine: Engine, path: Path, files: Files, patience_s: float = PATIENCE_S) -> None:
+    def __init__(
+        self, engine: Engine, path: Path, files: Files, patience_s: float = PATIENCE_S, journal: Journal | None = None
+    ) -> None:
         self._engine = engine
         self._patience_s = patience_s
         self._path = path
         self._files = files
+        self._journal = journal
         self._opened: dict[Path, tuple[int, int]] = {}  # device and inode of the files written to
+        self._ends: OrderedDict[str, tuple[int, str]] = OrderedDict()  # chain → its last event written here
+        self._looked_at: tuple[int, int] | None = None  # the file's time of change and size at the last look
+        self._looked_s = 0.0  # when it was looked at closely
 
     @contextmanager
     def reading(self) -> Generator[Connection]:
@@ -90,13 +108,145 @@ class Database:
 
     @contextmanager
     def writing(self) -> Generator[Connection]:
-        """A write transaction: commits through `Files` at the end, rolls back on any exception. Raises StoreError."""
+        """A write transaction: commits through `Files` at the end, rolls back on any exception.
+
+        What it changes is in the journal before it is committed. Nothing is committed, and so nothing is signed,
+        unless what was recorded before is still there.
+
+        Raises:
+            RecordDamagedError: database and journal do not agree any more, or what was recorded before is gone.
+            StoreError: the database refused.
+        """
         with _store_errors(self._path), self._engine.connect() as plain:
             connection = plain.execution_options(writes=True)
+            raw = self._watched(plain)
             with self._begun(connection) as transaction:
+                if raw is not None:
+                    changes.forget(raw)
                 yield connection
                 self.require_in_place()
-                self._files.commit(transaction.commit)
+                if raw is None:
+                    self._files.commit(transaction.commit)
+                else:
+                    self._commit(raw, transaction)
+
+    def _watched(self, connection: Connection) -> sqlite3.Connection | None:
+        """The driver's connection, whose changes are noted; None without a journal, or before the tables are made."""
+        raw = connection.connection.driver_connection
+        assert isinstance(raw, sqlite3.Connection)  # the engine's own driver
+        if self._journal is None:
+            return None
+        if not connection.info.get("watched"):
+            connection.info["watched"] = changes.watch(raw)
+        return raw if connection.info["watched"] else None
+
+    def _commit(self, raw: sqlite3.Connection, transaction: RootTransaction) -> None:
+        """Write the changes to the journal, then commit them, then say in the journal that this was done."""
+        rows = changes.changed_rows(raw)
+        held = self._require_record(signs=any(row.table == "checkpoints" for row in rows))
+        line = self._write_first(raw, rows, held) if rows else None
+        try:
+            self._files.commit(transaction.commit)
+        except Exception:
+            if line is not None and self._journal is not None:
+                self._journal.mark(line, "withdrawn")
+            raise
+        if line is not None and self._journal is not None:
+            self._journal.mark(line, "committed")
+        for row in rows:
+            if row.table == "events":
+                run_id, seq, sha256 = (row.values[name] for name in ("run_id", "seq", "sha256"))
+                self._ends[str(run_id)] = int(seq or 0), str(sha256)
+                self._ends.move_to_end(str(run_id))
+        while len(self._ends) > _ENDS_KEPT:
+            self._ends.popitem(last=False)
+
+    def _write_first(self, raw: sqlite3.Connection, rows: list[RowImage], held: int) -> Tail:
+        assert self._journal is not None
+        if held:
+            line = self._journal.append(rows, held)
+        else:
+            (events,) = raw.execute("SELECT count(*) FROM events").fetchone()
+            earlier = events - sum(row.table == "events" for row in rows)
+            line = self._journal.begin(changes.every_row(raw), earlier)
+        raw.execute(f"PRAGMA user_version = {line.number}")
+        return line
+
+    def require_record(self) -> None:
+        """Raise RecordDamagedError unless what was recorded is still there: for whoever does not write just now."""
+        with _store_errors(self._path):
+            self.require_in_place()
+            if self._journal is not None:
+                before = self._journal.tail()  # another process may write between the two
+                held = self._looked_up(closely=True)
+                self._journal.require_not_behind(before, held)
+                self._journal.require_not_cut(self._journal.tail(), held)
+
+    def _require_record(self, *, signs: bool) -> int:
+        """The number of the journal's line that the database holds. Raises RecordDamagedError unless both agree.
+
+        Called with the write lock held. What is signed is looked at closely, and so is a write once a second.
+        """
+        assert self._journal is not None
+        held, tail = self._looked_up(closely=signs), self._journal.tail()
+        self._journal.require_not_behind(tail, held)
+        self._journal.require_not_cut(tail, held)
+        return held
+
+    def _looked_up(self, *, closely: bool) -> int:
+        """The number of the journal's line that the database holds, as a new connection finds it.
+
+        This one reads pages of the file that other connections only remember, and each commit writes the number.
+        Looked at closely, the last events that were written here must still be there, too. If the file itself has
+        changed, by SQLite or by somebody else, all of it must fit together.
+        """
+        address = f"file:{quote(str(self._path.absolute()))}?mode=ro"
+        status = self._path.stat()
+        now = status.st_mtime_ns, status.st_size
+        if not status.st_size:  # SQLite would take it for a new database and delete the write-ahead log
+            raise RecordDamagedError(
+                "the database was cut to nothing in place; nothing is written any more",
+                where=str(self._path),
+                remedy=REBUILD,
+            )
+        try:
+            with closing(sqlite3.connect(address, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)) as fresh:
+                (held,) = fresh.execute("PRAGMA user_version").fetchone()
+                changed = self._looked_at != now
+                due = time.monotonic() - self._looked_s >= _LOOK_EVERY_S
+                lost = self._missing(fresh, changed=changed) if closely or changed or due else []
+        except sqlite3.Error as error:
+            if getattr(error, "sqlite_errorname", "").startswith(_ONLY_NOW):
+                raise
+            raise RecordDamagedError(
+                f"the database was overwritten or cut in place ({error}); nothing is written any more",
+                where=str(self._path),
+                remedy=REBUILD,
+            ) from error
+        if lost:
+            raise RecordDamagedError(
+                f"events of {lost[0]} that were recorded are no longer in the database: it was overwritten, cut or "
+                "replaced; nothing is written any more",
+                where=str(self._path),
+                remedy=REBUILD,
+            )
+        self._looked_at = now
+        return int(held)
+
+    def _missing(self, fresh: sqlite3.Connection, *, changed: bool) -> list[str]:
+        """Chains whose last event is gone; if the file has `changed`, also those that have lost any other event.
+
+        Raises sqlite3.DatabaseError if the changed file does not fit together, as an older one under a newer log.
+        """
+        self._looked_s = time.monotonic()
+        ends = [(run, *end) for run, end in self._ends.items()]
+        gone = [end[0] for end in ends if fresh.execute(_EVENT, end).fetchone() is None]
+        if gone or not changed or self._looked_at is None:  # None: just opened, perhaps without tables
+            return gone
+        (found,) = fresh.execute("PRAGMA quick_check(1)").fetchone()
+        if found != "ok":
+            raise sqlite3.DatabaseError(str(found).replace("\n", " "))
+        return [str(row[0]) for row in fresh.execute(_SHORTER)]
 
     def _begun(self, connection: Connection) -> RootTransaction:
         """Begin a write transaction as soon as no other process writes."""
@@ -128,8 +278,9 @@ class Database:
                     f"{path.name} was {'removed' if place is None else 'replaced'} while it was in use; nothing is "
                     "written any more",
                     where=str(path),
-                    remedy="Put the file back as it was, with those of the same name beside it, then resume the run; "
-                    "files that were captured lie in the data folder",
+                    remedy="Put the file back as it was, with those of the same name beside it; or stop every "
+                    "orthocapture process of this data folder and run `orthocapture store rebuild`. Then resume the "
+                    "run; nothing that was captured is lost",
                 )
 
     def close(self) -> None:
@@ -138,29 +289,45 @@ class Database:
 
 
 def open_database(data_dir: Path, files: Files, patience_s: float = PATIENCE_S) -> Database:
-    """Open for writing, creating or upgrading the database. Raises StoreVersionError if a newer version wrote it.
+    """Open for writing, creating or upgrading the database. A write waits up to about `patience_s` for others.
 
-    A write waits up to about `patience_s` for other processes that write.
+    Raises:
+        StoreVersionError: a newer version wrote the database.
+        RecordDamagedError: it is not the one that the journal describes.
     """
     path = database_path(data_dir)
+    journal = Journal(data_dir, files)
+    _require_what_the_journal_has(path, journal)
     with _store_errors(path), suppress(FileExistsError):
         # SQLite gives its other files the same mode. A database that exists must not even be opened here: closing it
         # would release the locks that SQLite holds on it in this process (POSIX).
         os.close(open_new(path, os.O_EXCL | os.O_RDONLY, file_mode(data_dir)))
     engine = _engine(f"file:{quote(str(path.absolute()))}?uri=true", writable=True)
-    database = Database(engine, path, files, patience_s)
+    database = Database(engine, path, files, patience_s, journal)
     try:
         with database.reading() as connection:
             is_current = _revision(connection) == REVISIONS[-1]
         if not is_current:
             with database.writing() as connection:
                 _upgrade(connection, path)
-        database.require_in_place()
+        database.require_record()
         files.sync_directory(data_dir)
     except BaseException:
         database.close()
         raise
     return database
+
+
+def _require_what_the_journal_has(path: Path, journal: Journal) -> None:
+    """Raise RecordDamagedError if there is a journal and an empty database, or none: a new one would replace it."""
+    there = path.stat().st_size if path.is_file() else 0
+    tail = journal.tail()
+    if there == 0 and tail is not None and (tail.after or tail.word == "committed"):
+        raise RecordDamagedError(
+            "the database is empty" if path.is_file() else "the database is gone",
+            where=str(path),
+            remedy=REBUILD,
+        )
 
 
 def open_read_only(data_dir: Path, files: Files) -> Database:
@@ -212,7 +379,7 @@ def _engine(address: str, *, writable: bool) -> Engine:
         # The driver's own BEGIN comes too late and is never IMMEDIATE, so on_begin below sends it.
         connection.isolation_level = None
         pragmas = ["foreign_keys = ON", "recursive_triggers = ON"]
-        pragmas += ["journal_mode = WAL", "synchronous = FULL"] if writable else ["query_only = ON"]
+        pragmas += _WRITING if writable else ["query_only = ON"]
         try:
             for pragma in pragmas:
                 connection.execute(f"PRAGMA {pragma}")
@@ -291,6 +458,8 @@ def _store_errors(path: Path) -> Generator[None]:
         yield
     except DBAPIError as error:
         raise StoreError(_explain(error), where=str(path), remedy=_advise(error)) from error
+    except sqlite3.Error as error:
+        raise StoreError(f"the database refused: {error}", where=str(path), remedy=LOOK) from error
     except UnicodeDecodeError as error:  # raised by the driver for damaged text
         raise StoreError(
             "the database is damaged: it holds text that is not UTF-8", where=str(path), remedy=RESTORE
@@ -314,6 +483,7 @@ def _is_busy(error: DBAPIError) -> bool:
 def _advise(error: DBAPIError) -> str:
     code: Any = getattr(error.orig, "sqlite_errorname", "")
     return {
+        "SQLITE_IOERR_SHORT_READ": RESTORE,
         "SQLITE_BUSY": "Another process has held the database for too long; look for one that hangs",
         "SQLITE_FULL": "Free space on this disk; what was recorded before is safe",
         "SQLITE_CORRUPT": RESTORE,

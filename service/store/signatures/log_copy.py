@@ -1,4 +1,4 @@
-"""The copy of the log of signatures in a second place, such as a network share: updating and comparing it."""
+"""The copies of the log of signatures and of the journal in a second place, such as a network share."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from service.core.errors import IntegrityError, StoreError
 from service.store.database.engine import LOOK
 from service.store.durable_effects import DurableFiles, Files
+from service.store.journal.copies import journal_copy, journal_copy_faults
 from service.store.signatures.log import NAME
 from service.store.verification.chain_checks import Fault
 
@@ -80,13 +81,8 @@ class LogCopy:
         self._last = ours[ours.rfind(b"\n", 0, -1) + 1 :]
 
 
-def bring_up_to_date(data_dir: Path, copy: Path, files: Files = _FILES) -> None:
-    """Append to `copy` the lines of a data folder's log that it lacks. Raises IntegrityError, StoreError."""
-    LogCopy(data_dir / NAME, copy, files).bring_up_to_date()
-
-
 def copy_faults(data_dir: Path, copy: Path) -> tuple[list[Fault], list[str]]:
-    """Faults and notes on differences between the log and its copy.
+    """Faults and notes on differences between the log and its copy, and between the journal and the copy beside it.
 
     Raises:
         StoreError: the copy is missing or cannot be read.
@@ -104,7 +100,8 @@ def copy_faults(data_dir: Path, copy: Path) -> tuple[list[Fault], list[str]]:
         if log[number - 1] != line:
             return [Fault(None, None, f"{NAME}, line {number}", f"it is not the line that {copy} holds")], []
     missing = len(log) - len(held)
-    return [], [f"{copy} does not have the last {missing} lines of {NAME} yet"] if missing else []
+    notes = [f"{copy} does not have the last {missing} lines of {NAME} yet"] if missing else []
+    return list(journal_copy_faults(data_dir, journal_copy(copy))), notes
 
 
 def _whole_lines(content: bytes) -> bytes:

@@ -15,6 +15,7 @@ from typing import Protocol, Self
 from service.core.errors import StoreError
 from service.core.text.clock_time import time_here
 from service.store.durable_effects import Clock, Files, Signal, utc_text
+from service.store.journal.copies import JournalCopy, journal_copy
 from service.store.signatures.log import NAME
 from service.store.signatures.log_copy import LogCopy
 
@@ -60,8 +61,13 @@ class SecondPlace:
     def of(
         cls, data_dir: Path, copy: Path | None, clock: Clock, files: Files, *, patience_s: float = _PATIENCE_S
     ) -> Self:
-        """That of a data folder whose log of signatures is copied to `copy`; None if it has no second place."""
-        kept = () if copy is None else (LogCopy(data_dir / NAME, copy, files),)
+        """That of a data folder whose log of signatures is copied to `copy`, and its journal to a file beside it.
+
+        `copy` is None if it has no second place.
+        """
+        if copy is None:
+            return cls((), clock, patience_s=patience_s)
+        kept = LogCopy(data_dir / NAME, copy, files), JournalCopy(data_dir, journal_copy(copy), files)
         return cls(kept, clock, patience_s=patience_s)
 
     @property

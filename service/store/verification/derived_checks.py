@@ -36,7 +36,7 @@ SELECT j.run_id AS run_id, j.enqueued_seq AS enqueued_seq, j.job_id AS job_id, j
 FROM jobs AS j CROSS JOIN event_index AS i ON i.run_id = j.run_id AND i.seq = j.enqueued_seq ORDER BY i.position
 """
 _STATISTICS = {("table", "sqlite_stat1"), ("table", "sqlite_stat4")}  # made by ANALYZE, which is harmless
-_NUMBERS = ("user_version", "application_id")  # numbers in the database's header, which this software leaves 0
+_NUMBERS = ("application_id",)  # in the database's header, which this software leaves 0
 
 
 def schema_faults(connection: Connection) -> Iterator[Fault]:

@@ -10,12 +10,13 @@ from pathlib import Path
 from sqlalchemy import Connection
 
 from service.core.errors import StoreError
-from service.store.database.engine import DATABASE_NAME, RESTORE, database_path, open_read_only
+from service.store.database.engine import DATABASE_NAME, RESTORE, Database, database_path, open_read_only
 from service.store.database.wal import wal_findings
 from service.store.durable_effects import DurableFiles
 from service.store.errors import UnknownRunError
 from service.store.events import read_events
 from service.store.files.artefacts import read_artefacts
+from service.store.journal.findings import journal_findings
 from service.store.records import SITE, Artefact, RunRow
 from service.store.run_rows import read_runs
 from service.store.signatures.log import NAME as LOG_NAME
@@ -111,13 +112,22 @@ def verify(
         lines = read_log(data_dir / LOG_NAME)
         with database.reading() as connection, _damage_named(data_dir, connection):
             report = _verify(data_dir, connection, lines, run_id, progress, certificates, with_files=files)
+            runs = None if run_id is None else [run_id]
+            of_journal, notes_of_journal = journal_findings(data_dir, connection, runs, lambda: _held_now(database))
     finally:
         database.close()
-    report = replace(report, faults=(*report.faults, *of_wal), notes=(*report.notes, *notes_of_wal))
+    faults = (*report.faults, *of_wal, *of_journal)
+    report = replace(report, faults=faults, notes=(*report.notes, *notes_of_wal, *notes_of_journal))
     if signatures_copy is None:
         return report
-    faults, notes = copy_faults(data_dir, signatures_copy)
-    return replace(report, faults=(*report.faults, *faults), notes=(*report.notes, *notes))
+    of_copy, notes = copy_faults(data_dir, signatures_copy)
+    return replace(report, faults=(*report.faults, *of_copy), notes=(*report.notes, *notes))
+
+
+def _held_now(database: Database) -> int:
+    """The number of the journal's line that the database holds by now."""
+    with database.reading() as connection:
+        return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
@@ -54,6 +55,7 @@ class CrashingFiles:
         self.dead = False
         self._real = DurableFiles()
         self._unsynced_data: set[Path] = set()
+        self._unsynced_ends: dict[Path, int] = {}  # file → how much of it is certain
         self._unsynced_names: dict[Path, Path | None] = {}  # name → its previous name
 
     def _point(self, name: str) -> None:
@@ -98,7 +100,12 @@ class CrashingFiles:
         self._call("write", act, half)
 
     def append(self, path: Path, offset: int, data: bytes) -> None:
-        raise NotImplementedError("no record of one viewpoint is signed")
+        def act(data: bytes = data) -> None:
+            self._unsynced_ends.setdefault(path, offset)
+            self._unsynced_ends[path] = min(offset, self._unsynced_ends[path])
+            self._real.append(path, offset, data)
+
+        self._call("append", act, lambda: act(data[: len(data) // 2]))
 
     def make_read_only(self, path: Path) -> None:
         self._call("make_read_only", lambda: self._real.make_read_only(path))
@@ -107,6 +114,7 @@ class CrashingFiles:
         def act() -> None:
             self._real.sync_file(path)
             self._unsynced_data.discard(path)
+            self._unsynced_ends.pop(path, None)
 
         self._call("sync_file", act)
 
@@ -135,7 +143,10 @@ class CrashingFiles:
         self._call("commit", commit)
 
     def lose_power(self) -> None:
-        """Empty the files whose data was not synced, and undo unsynced names, the deepest first."""
+        """Empty the files whose data was not synced, cut what was not, undo unsynced names, the deepest first."""
+        for path, certain in self._unsynced_ends.items():
+            if path.exists():
+                os.truncate(path, certain)
         for path in self._unsynced_data:
             if path.exists():
                 path.chmod(0o644)

@@ -1,12 +1,19 @@
-"""Rewrites evidence as somebody with full access to the database but without the signing key."""
+"""Rewrites evidence as somebody with full access to database and journal but without the signing key."""
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from service.store.database.engine import database_path
+from service.store.durable_effects import DurableFiles
 from service.store.events import event_sha256, parse_canonical
 from service.store.files.artefacts import record_sha256
+from service.store.journal.changes import every_row
+from service.store.journal.journal import Journal
+from service.store.journal.lines import NAME
 from tests.support.record.store import rows, tamper
 
 # Rebuilds the search index from the current events; tamper() has dropped the triggers before this runs.
@@ -17,6 +24,14 @@ WORDS_AGAIN = (
     "FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq ORDER BY i.position",
 )
 _EVENT: tuple[str, ...] = ("seq", "run_id", "at_utc", "monotonic_s", "actor", "previous_sha256", "payload", "sha256")
+
+
+def journal_anew(data: Path) -> None:
+    """Make the journal anew, as a forger does who can write it too, so that it fits the database as it is."""
+    (data / NAME).unlink(missing_ok=True)
+    with closing(sqlite3.connect(database_path(data), isolation_level=None)) as connection:
+        tail = Journal(data, DurableFiles()).begin(every_row(connection), 0)
+        connection.execute(f"PRAGMA user_version = {tail.number}")
 
 
 def rewrite_to_the_end(data: Path, run_id: str, seq: int, **changes: Any) -> None:

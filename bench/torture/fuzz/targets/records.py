@@ -32,7 +32,7 @@ from service.store.records import Checkpoint, Timestamp
 from service.store.signatures.checkpoints import key_fingerprint
 from service.store.signatures.keys import KeyFolder, public_bytes
 from service.store.signatures.log import NAME, log_findings, read_log
-from service.store.signatures.log_copy import bring_up_to_date
+from service.store.signatures.log_copy import LogCopy
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.signatures.timestamps import stamped_bytes, timestamp_findings
 from service.store.store import Store
@@ -191,7 +191,7 @@ def _log(data: bytes, folder: Path) -> None:
     "\n".join([*(fault.what for fault in faults), *notes]).encode()
     with contextlib.suppress(FileNotFoundError):
         (folder / "copy").write_bytes(data[: len(data) // 2])
-        bring_up_to_date(folder, folder / "copy")
+        LogCopy(folder / NAME, folder / "copy").bring_up_to_date()
 
 
 def _keys(folder: Path) -> list[bytes]:

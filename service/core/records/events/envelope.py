@@ -36,6 +36,7 @@ from service.core.records.events.site import (
     KeyChanged,
     LeftoversRemoved,
     ProtocolApproved,
+    RecordRebuilt,
     RunSigned,
     ServiceStarted,
     SignaturesWrittenAgain,
@@ -100,7 +101,8 @@ Payload = Annotated[
     | LeftoversRemoved
     | ActionAfterEnd
     | ProtocolApproved
-    | DataRestored,
+    | DataRestored
+    | RecordRebuilt,
     Field(discriminator="kind"),
 ]
 PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)

@@ -137,3 +137,15 @@ class DataRestored(Record):
     at_utc: str  # when the backup was made
     folder: str  # the data folder that was backed up
     host: str
+
+
+class RecordRebuilt(Record):
+    """Database or journal was overwritten, cut or lost, and was made again from the other; the old files are kept."""
+
+    kind: Literal["record_rebuilt"] = "record_rebuilt"
+    made: Literal["database", "journal"]  # what was made again
+    why: str  # what was found
+    events: int  # in all chains, when this was done
+    restored_events: int  # of these, which the old database did not hold any more
+    kept: tuple[str, ...]  # files of the data folder that hold what was there before
+    lost: tuple[str, ...] = ()  # what could not be restored, in words; () if nothing is known to be lost

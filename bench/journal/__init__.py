@@ -1,0 +1,1 @@
+"""The journal measured, and every file of a data folder altered at every moment."""

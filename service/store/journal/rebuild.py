@@ -1,0 +1,285 @@
+"""Make a database again from its journal, or a journal from its database; what was there before is kept beside it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+from urllib.parse import quote
+
+from service.core.errors import StoreError
+from service.core.records.events import RecordRebuilt
+from service.store.backup.folder import folder_errors
+from service.store.database.engine import DATABASE_NAME, database_path, open_database, open_read_only
+from service.store.durable_effects import Clock, DurableFiles, Files, SystemClock, utc_text
+from service.store.files.artefacts import relative_path
+from service.store.journal import changes
+from service.store.journal.findings import journal_findings
+from service.store.journal.journal import Journal
+from service.store.journal.lines import NAME, first_lines
+from service.store.journal.survey import Survey, committed_rows, survey
+from service.store.records import SITE
+from service.store.signatures.keys import FOLDER as KEYS
+from service.store.signatures.signing import checkpoint
+from service.store.store import Store
+
+_WORK = "rebuilding"  # within the data folder, until everything in it is complete
+_LATEST_HEADS = "INSERT INTO heads (run_id, seq, sha256) SELECT run_id, max(seq), sha256 FROM events GROUP BY run_id"
+_MOST_NAMED = 20
+
+
+@dataclass(frozen=True, slots=True)
+class RebuildReport:
+    """What was done.
+
+    Attributes:
+        made: what was made again; "" if database and journal agree.
+        why: what was found.
+        events: in all chains afterwards.
+        restored_events: of these, which the old database did not hold any more.
+        kept: files of the data folder that hold what was there before.
+        lost: what could not be restored, in words.
+        unsigned: why the record of this could not be signed; "" if it was.
+    """
+
+    made: Literal["", "database", "journal"]
+    why: str = ""
+    events: int = 0
+    restored_events: int = 0
+    kept: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()
+    unsigned: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """A database as it was found.
+
+    Attributes:
+        problem: why it cannot be relied upon; "" if SQLite reads all of it.
+        held: number of the journal's line that it holds.
+        events: how many events can be read.
+    """
+
+    problem: str
+    held: int = 0
+    events: int = 0
+
+
+def rebuild(
+    data_dir: Path,
+    *,
+    actor: Callable[[Path], str],
+    journal: Path | None = None,
+    files: Files | None = None,
+    clock: Clock | None = None,
+) -> RebuildReport:
+    """Make again what does not agree with the other: the database from the journal, or the journal from the database.
+
+    The journal counts, if its lines are as they were written and the database lacks one of them, has another row or
+    cannot be read; the database counts if all of it can be read and the journal lacks what it holds. This is recorded
+    in the site's chain, and signed. No process may use the data folder meanwhile; one that does is refused its next
+    write.
+
+    Args:
+        data_dir: the data folder.
+        actor: gives the name of the person for the record, or raises if that is somebody else's; called with a folder
+            that has the accounts.
+        journal: a copy of the journal kept elsewhere, from which the database is made in any case.
+        files: durable file operations.
+        clock: gives the time for the names of what is kept.
+
+    Raises:
+        StoreError: there is nothing to rebuild from, or the folder cannot be written; nothing was changed.
+        OrthocaptureError: what `actor` raises; nothing was changed.
+    """
+    files, clock = files or DurableFiles(), clock or SystemClock()
+    stamp = utc_text(clock.utc_now()).replace(":", "").replace("-", "")
+    surveyed, found = survey(journal or data_dir / NAME), _look(data_dir)
+    behind = bool(found.problem) or surveyed.is_behind(found.held)
+    with folder_errors("the record could not be rebuilt"):
+        if journal is None and not behind and (surveyed.problems or surveyed.last < max(found.held, 1)):
+            return _journal_again(data_dir, surveyed, found, stamp, actor, files, clock)
+        why = found.problem or _why(data_dir, surveyed, found)
+        if not why and journal is None:
+            return RebuildReport("")
+        if surveyed.last == 0:
+            raise StoreError(
+                "there is no journal from which the database could be made again",
+                where=str(journal or data_dir / NAME),
+                remedy="Name the copy in the second place with --journal, or restore a backup",
+            )
+        return _database_again(data_dir, journal or data_dir / NAME, surveyed, found, why, stamp, actor, files, clock)
+
+
+def _look(data_dir: Path) -> _Found:
+    path = database_path(data_dir)
+    if not path.is_file():
+        return _Found("the database is gone")
+    try:
+        address = f"file:{quote(str(path.absolute()))}?mode=ro"
+        with closing(sqlite3.connect(address, uri=True, isolation_level=None)) as connection:
+            (held,) = connection.execute("PRAGMA user_version").fetchone()
+            (events,) = connection.execute("SELECT count(*) FROM events").fetchone()
+            damage = [str(row[0]) for row in connection.execute("PRAGMA integrity_check(3)") if row[0] != "ok"]
+    except sqlite3.Error as error:
+        return _Found(f"the database cannot be read: {error}")
+    return _Found(f"the database is damaged: {damage[0]}" if damage else "", int(held), int(events))
+
+
+def _why(data_dir: Path, surveyed: Survey, found: _Found) -> str:
+    """What the database lacks, or has otherwise than its journal; "" if they agree."""
+    if surveyed.is_behind(found.held):
+        return f"the database held line {found.held} of the journal, which has {surveyed.last}"
+    database = open_read_only(data_dir, DurableFiles())
+    try:
+        with database.reading() as connection:
+            faults, _notes = journal_findings(data_dir, connection, None, lambda: found.held)
+    finally:
+        database.close()
+    return str(faults[0]) if faults else ""
+
+
+def _journal_again(
+    data_dir: Path,
+    surveyed: Survey,
+    found: _Found,
+    stamp: str,
+    actor: Callable[[Path], str],
+    files: Files,
+    clock: Clock,
+) -> RebuildReport:
+    """Begin the journal anew with what the database holds."""
+    why = (
+        f"line {surveyed.problems[0][0]} of the journal: {surveyed.problems[0][1]}"
+        if surveyed.problems
+        else f"the journal ended at line {surveyed.last}, the database held line {found.held}"
+    )
+    path, kept = data_dir / NAME, f"{NAME}.before-{stamp}"
+    with closing(sqlite3.connect(database_path(data_dir), isolation_level=None)) as connection:
+        connection.execute("PRAGMA synchronous = FULL")
+        connection.execute("BEGIN IMMEDIATE")
+        had_one = path.exists()
+        if had_one:
+            os.link(path, data_dir / kept)
+        journal = Journal(data_dir, files)
+        tail = journal.begin(changes.every_row(connection), found.events)
+        connection.execute(f"PRAGMA user_version = {tail.number}")
+        files.commit(connection.commit)
+        journal.mark(tail, "committed")
+    made = RecordRebuilt(
+        made="journal", why=why, events=found.events, restored_events=0, kept=(kept,) if had_one else ()
+    )
+    return _record(data_dir, made, actor(data_dir), files, clock)
+
+
+def _database_again(
+    data_dir: Path,
+    journal: Path,
+    surveyed: Survey,
+    found: _Found,
+    why: str,
+    stamp: str,
+    actor: Callable[[Path], str],
+    files: Files,
+    clock: Clock,
+) -> RebuildReport:
+    """Make the database again in a folder of its own, then put it in place of the old one, which is renamed."""
+    work = data_dir / _WORK
+    shutil.rmtree(work, ignore_errors=True)  # of an interrupted rebuild
+    files.make_directory(work, private=True)
+    try:
+        withdrawn = surveyed.mark is not None and surveyed.mark.word == "withdrawn"
+        until = surveyed.before_last if withdrawn else surveyed.last
+        lost = [f"line {number} of the journal: {what}" for number, what in surveyed.problems]
+        events = _replay(work, journal, surveyed, until, lost)
+        files.write(work / NAME, first_lines(journal, until), private=True)
+        files.sync_file(work / NAME)
+        lost += _missing_files(data_dir, work)
+        if (data_dir / KEYS).is_dir():
+            (work / KEYS).symlink_to(Path("..") / KEYS)
+        name = actor(work)
+        kept = _put_in_place(data_dir, work, stamp, files)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    made = RecordRebuilt(
+        made="database",
+        why=why,
+        events=events,
+        restored_events=max(0, events - (0 if found.problem else found.events)),
+        kept=kept,
+        lost=tuple(lost),
+    )
+    return _record(data_dir, made, name, files, clock)
+
+
+def _replay(work: Path, journal: Path, surveyed: Survey, until: int, lost: list[str]) -> int:
+    """Make a database of all rows up to line `until`; returns the number of events. `lost` gets what it refuses."""
+    open_database(work, DurableFiles()).close()
+    with closing(sqlite3.connect(database_path(work), isolation_level=None)) as connection:
+        connection.execute("PRAGMA foreign_keys = OFF")  # checked at the end
+        connection.execute("PRAGMA recursive_triggers = ON")
+        connection.execute("BEGIN")
+        for row in committed_rows(journal, surveyed, until):
+            try:
+                changes.apply(connection, row)
+            except sqlite3.Error as error:
+                lost.append(f"a row of {row.table}: {error}")
+        connection.execute(_LATEST_HEADS)
+        connection.execute(f"PRAGMA user_version = {until}")
+        connection.execute("COMMIT")
+        for table, row_number, parent, _key in connection.execute("PRAGMA foreign_key_check").fetchall():
+            lost.append(f"row {row_number} of {table} belongs to a row of {parent} that is not there")
+        (events,) = connection.execute("SELECT count(*) FROM events").fetchone()
+        connection.execute("PRAGMA journal_mode = DELETE")  # a single file, which can be renamed
+    return int(events)
+
+
+def _missing_files(data_dir: Path, work: Path) -> Iterator[str]:
+    with closing(sqlite3.connect(database_path(work))) as connection:
+        named = connection.execute("SELECT DISTINCT sha256, original_name FROM artefacts ORDER BY sha256").fetchall()
+    gone = [(sha, name) for sha, name in named if not (data_dir / "artefacts" / relative_path(str(sha))).is_file()]
+    for sha256, name in gone[:_MOST_NAMED]:
+        yield f"the file {name} is missing (artefacts/{relative_path(str(sha256))})"
+    if len(gone) > _MOST_NAMED:
+        yield f"{len(gone) - _MOST_NAMED} more files are missing"
+
+
+def _put_in_place(data_dir: Path, work: Path, stamp: str, files: Files) -> tuple[str, ...]:
+    """Give the old files other names, and the new ones theirs. Returns the names of the old ones.
+
+    A crash in between leaves the journal, from which this can be done again.
+    """
+    database = database_path(work)
+    files.sync_file(database)
+    files.sync_file(work / NAME)  # the actor's sign-in may have been added
+    kept: list[str] = []
+    if (data_dir / NAME).exists():
+        kept.append(f"{NAME}.before-{stamp}")
+        os.link(data_dir / NAME, data_dir / kept[-1])
+    files.rename(work / NAME, data_dir / NAME)
+    for suffix in ("-wal", "-shm", ""):
+        old = data_dir / f"{DATABASE_NAME}{suffix}"
+        if old.exists():
+            kept.append(f"{DATABASE_NAME}.before-{stamp}{suffix}")
+            files.rename(old, data_dir / kept[-1])
+    files.sync_directory(data_dir)
+    files.rename(database, database_path(data_dir))
+    files.sync_directory(data_dir)
+    return tuple(sorted(kept))
+
+
+def _record(data_dir: Path, made: RecordRebuilt, actor: str, files: Files, clock: Clock) -> RebuildReport:
+    with Store.open(data_dir, clock, files=files, create=False) as store:
+        store.record_site([made], actor=actor)
+        unsigned = ""
+        try:
+            checkpoint(store, SITE)
+        except StoreError as error:
+            unsigned = str(error)
+    return RebuildReport(made.made, made.why, made.events, made.restored_events, made.kept, made.lost, unsigned)
