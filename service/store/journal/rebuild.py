@@ -14,6 +14,7 @@ from urllib.parse import quote
 
 from service.core.errors import StoreError
 from service.core.records.events import RecordRebuilt
+from service.store.access import KEYS
 from service.store.backup.folder import folder_errors
 from service.store.database.engine import DATABASE_NAME, database_path, open_database, open_read_only
 from service.store.durable_effects import Clock, DurableFiles, Files, SystemClock, utc_text
@@ -24,7 +25,6 @@ from service.store.journal.journal import Journal
 from service.store.journal.lines import NAME, first_lines
 from service.store.journal.survey import Survey, committed_rows, survey
 from service.store.records import SITE
-from service.store.signatures.keys import FOLDER as KEYS
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 
