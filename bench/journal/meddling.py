@@ -261,8 +261,10 @@ def report(about: Mapping[str, Any], found: Sequence[Result]) -> str:
         f"# Files of a data folder altered at every moment ({about['date']})",
         "",
         f"`python -m bench.journal.meddling`; commit {about['commit']}; {cpu['processor']}, Python {cpu['python']}.",
-        f"{len(found)} cases; in {lost} of them something recorded was lost. Noticed by nobody, because nothing that",
-        "is recorded had changed: " + (", ".join(f"{file} {n}" for file, n in unnoticed.items()) or "none") + ".",
+        f"{len(found)} cases; in {lost} of them something recorded was lost. Noticed by nobody, and the record verified",
+        "all the same (SQLite or the next signature makes the file again, or it was the same file): "
+        + (", ".join(f"{file} {n}" for file, n in unnoticed.items()) or "none")
+        + ".",
         "",
         "| file | how it was altered | when | noticed by | all events there | the folder afterwards |",
         "|---|---|---|---|---|---|",
