@@ -115,11 +115,12 @@ def _figures(times: list[float], processor: list[float]) -> dict[str, float]:
 
 def _report(about: dict[str, Any]) -> str:
     cpu = about["machine"]
+    on = f"{cpu['processor']}, {cpu['cores']} cores, Python {cpu['python']}, load {about['load']}"
     lines = [
         f"# What the journal costs a write ({about['date']})",
         "",
-        f"`python -m bench.journal.cost`; commit {about['commit']}; {cpu['processor']}, {cpu['cores']} cores, Python "
-        f"{cpu['python']}, load {about['load']}; {about['writes_of_each_kind']} writes of each kind, with and without the journal in turn.",
+        f"`python -m bench.journal.cost`; commit {about['commit']}; {on}; {about['writes_of_each_kind']} writes of each",
+        "kind, with and without the journal in turn.",
         "",
         "| where | write | 10th percentile ms | median ms | 95th percentile ms | processor ms |",
         "|---|---|---|---|---|---|",
@@ -129,7 +130,7 @@ def _report(about: dict[str, Any]) -> str:
         for name, found in sorted(figures.items()):
             lines.append(f"| {place} | {name} | {' | '.join(str(found[key]) for key in _KEYS)} |")
         for kind in ("event", "photograph"):
-            more = {
+            more = " | ".join(f"{one[key] - other[key]:.3f}" for key in _KEYS)
                 key: figures[f"{kind}, with"][key] - figures[f"{kind}, without"][key]
                 for key in ("median_ms", "p95_ms")
             }
