@@ -257,12 +257,13 @@ def report(about: Mapping[str, Any], found: Sequence[Result]) -> str:
     cpu = about["machine"]
     lost = sum(not result.whole for result in found)
     unnoticed = Counter(result.file for result in found if result.noticed == "nobody")
+    same = ", ".join(f"{file} {number}" for file, number in unnoticed.items()) or "none"
     lines = [
         f"# Files of a data folder altered at every moment ({about['date']})",
         "",
         f"`python -m bench.journal.meddling`; commit {about['commit']}; {cpu['processor']}, Python {cpu['python']}.",
-        f"{len(found)} cases; in {lost} of them something recorded was lost. Noticed by nobody, because nothing that",
-        "is recorded had changed: " + (", ".join(f"{file} {n}" for file, n in unnoticed.items()) or "none") + ".",
+        f"{len(found)} cases; in {lost} of them something recorded was lost. Noticed by nobody, and verified all the",
+        f"same (SQLite or the next signature makes the file again, or it was the same file): {same}.",
         "",
         "| file | how it was altered | when | noticed by | all events there | the folder afterwards |",
         "|---|---|---|---|---|---|",

@@ -322,7 +322,7 @@ def _listen_itself() -> Iterator[Case]:
 
 
 # Calls of each kind that a capture makes after its first image is recorded: the disk fails at each of them.
-_CALLS = {"write": 6, "sync_file": 9, "rename": 5, "make_read_only": 4, "sync_directory": 8, "commit": 6, "append": 6}
+_CALLS = {"write": 6, "sync_file": 8, "rename": 5, "make_read_only": 4, "sync_directory": 8, "commit": 6, "append": 6}
 
 
 def _store() -> Iterator[Case]:
