@@ -32,8 +32,7 @@ from service.core.records.events import (
     RobotSeen,
     RunReleased,
 )
-from service.people.accounts import Accounts
-from service.people.credentials.passwords import Passwords
+from service.people.sessions import People
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
@@ -312,7 +311,7 @@ def _refuse(*_arguments: object, **_more: object) -> None:
 def test_people_are_named_in_full(tmp_path: Path) -> None:
     run_id = record_reported_run(tmp_path, person="ada")
     with Store.open(tmp_path / "data") as store:
-        accounts = Accounts(store, Passwords(QUICK_HASHES))
+        accounts = People(store, QUICK_HASHES).accounts
         token = accounts.first_link()
         assert token is not None
         accounts.set_up(token, "ada", "Ada, Countess of Lovelace", password_of("ada"), PIN)
