@@ -6,6 +6,7 @@ import ctypes
 import mmap
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,6 @@ def forget_pages(array: NDArray[np.generic]) -> None:
         return  # what was changed in memory alone would be lost
     base: object = array
     while isinstance(base, np.ndarray):
-        base = base.base
+        base = cast("object", base.base)
     if isinstance(base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
         base.madvise(mmap.MADV_DONTNEED)

@@ -11,6 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "limit_mb"), [("compared", 120), ("fused", 80), ("covered", 58), ("nearest", 39), ("extracted", 600)]
 )

@@ -208,6 +208,7 @@ def test_a_person_cancels_one_job_and_touches_no_other(
     assert [job.state for job in store.jobs(run)] == ["failed", "finished"]
     (end,) = [event for event in store.events(run) if isinstance(event.payload, JobFailed)]
     assert end.actor == "Ada"
+    assert isinstance(end.payload, JobFailed)
     assert end.payload.error == "JobCancelled"
     assert end.payload.message == "Ada cancelled it: the wrong series"
     with pytest.raises(IllegalTransitionError, match="has failed already"):

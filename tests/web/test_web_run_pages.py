@@ -308,5 +308,6 @@ def test_a_computation_is_ended_by_whoever_controls_the_run_and_by_nobody_else(w
     assert technician.send_form(where, reason="it hangs").status_code == 409
     (end,) = [event for event in web.store.events(run_id) if isinstance(event.payload, JobFailed)]
     assert end.actor == web.account("technician")
+    assert isinstance(end.payload, JobFailed)
     assert end.payload.message == f"{end.actor} cancelled it: it hangs"
     assert "ground-truth mesh of step fixation" not in technician.get(f"/runs/{run_id}").text

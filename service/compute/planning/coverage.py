@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import trimesh
@@ -19,7 +19,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from service.compute.camera_model import CameraModel
 from service.compute.ground_truth.distances.sampling import random_places
-from service.compute.ground_truth.surface import Surface
+from service.compute.ground_truth.surface import IntArray, Surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 
@@ -85,7 +85,7 @@ def coverage_surface(
     centre = spheres_m.mean(axis=0)
     low, high = spheres_m.min(axis=0) - _MARGIN_M, spheres_m.max(axis=0) + _MARGIN_M
     near = np.all((vertices_m > low) & (vertices_m < high), axis=1)
-    surface = Surface(vertices_m, np.asarray(faces)[_all_near(near, faces)])
+    surface = Surface(vertices_m, cast("IntArray", faces[_all_near(near, faces)]))  # the integers stay short
     if len(surface.faces) < 100:
         raise ComputeError("the surface does not reach the spheres", remedy="Check the frame and unit of the mesh")
     up = _up(spheres_m, surface)

@@ -8,6 +8,7 @@ distances beyond 20 mm are excluded, and the means of the two directions are ave
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 
@@ -177,7 +178,7 @@ def _nearest(
     one, own, other = queries
     found = NearestOfBlocks(one, outlier_m), NearestOfBlocks(own), NearestOfBlocks(other, outlier_m)
     first = Samples(some.points_m[::_PREVIEW], some.origin[::_PREVIEW], None)
-    for block in (first, *targets.blocks()) if targets.n > MOST_COMPARED else targets.blocks():
+    for block in chain([first] if targets.n > MOST_COMPARED else [], targets.blocks()):
         show(block.points_m, block.origin, found)
     return found
 
