@@ -8,6 +8,7 @@ import json
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import rfc8785
@@ -365,11 +366,15 @@ def test_a_line_altered_while_the_log_is_in_use_forbids_the_next_signature(data:
 def test_missing_lines_are_written_before_anything_new_is_signed(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So a disk that refuses for long leaves no more lines missing than one signature has."""
 
-    def refused(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
     with Store.open(data) as store:
         run = run_of(data)
+        append = store.files.append
+
+        def refused(path: Path, *rest: Any) -> None:
+            if path.name == NAME:
+                raise OSError(28, "No space left on device")
+            append(path, *rest)
+
         with monkeypatch.context() as patched:
             patched.setattr(store.files, "append", refused)
             for viewpoint in ("v4", "v5", "v6"):

@@ -32,6 +32,7 @@ from service.cli.common import (
 from service.cli.shipped_protocols import shipped_protocols
 from service.core.errors import ConfigurationError, StoreError
 from service.core.text.clock_time import local_time
+from service.core.text.person_names import cleaned_name
 from service.logs.file_log import file_log
 from service.people.sessions import People
 from service.rig import load_rig
@@ -171,7 +172,7 @@ def _only_server(store: Store) -> Generator[Callable[[str], None]]:
 
         def say_where(address: str) -> None:
             since_utc = utc_text(store.clock.utc_now())
-            who = _Server(address, getpass.getuser(), os.getpid(), socket.gethostname(), since_utc)
+            who = _Server(address, cleaned_name(getpass.getuser()), os.getpid(), socket.gethostname(), since_utc)
             file.write(json_module.dumps(asdict(who)).encode())
 
         try:
