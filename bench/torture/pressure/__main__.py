@@ -297,6 +297,8 @@ def _table(found: Mapping[str, Any]) -> str:
             f"{', '.join(map(str, row['statuses']))} | {sum(sum(s['failed'].values()) for s in steps)} | "
             f"{sum(s['by itself'] for s in steps)} | {sum(s['asked'] for s in steps)} |"
         )
+    remarks = [f"{name}: {row['remark']}" for name, row in found["runs"].items() if "remark" in row]
+    lines += ["", *remarks] if remarks else []
     names = list(found["runs"])
     lines += [
         "",
