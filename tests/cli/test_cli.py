@@ -26,8 +26,8 @@ from tests.support.runs.bench_run import PROTOCOL, record_runs
 ROOT = Path(__file__).parents[2]
 COMMAND = Path(sys.executable).with_name("orthocapture")
 COMMANDS = (
-    "demo", "serve", "run", "resume", "import", "act", "draw-region", "cancel", "note", "status", "runs", "compare", "history", "worker",
-    "doctor", "dicom-listen", "calibrate", "import-ros", "develop", "sfm", "register", "spheres", "layout", "fuse",
+    "demo", "serve", "run", "resume", "import", "act", "draw-region", "cancel", "note", "status", "runs",
+    "compare", "history", "worker", "doctor", "dicom-listen", "calibrate", "import-ros", "develop", "sfm", "register", "spheres", "layout", "fuse",
     "evaluate", "benchmark", "simulate", "audit", "store", "replay", "export", "accounts", "protocol", "plan",
 )  # fmt: skip
 
