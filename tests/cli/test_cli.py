@@ -27,8 +27,9 @@ ROOT = Path(__file__).parents[2]
 COMMAND = Path(sys.executable).with_name("orthocapture")
 COMMANDS = (
     "demo", "serve", "run", "resume", "import", "act", "draw-region", "cancel", "note", "status", "runs",
-    "compare", "history", "worker", "doctor", "dicom-listen", "calibrate", "import-ros", "develop", "sfm", "register", "spheres", "layout", "fuse",
-    "evaluate", "benchmark", "simulate", "audit", "store", "replay", "export", "accounts", "protocol", "plan",
+    "compare", "history", "worker", "doctor", "dicom-listen", "calibrate", "import-ros", "develop", "sfm",
+    "register", "spheres", "layout", "fuse", "evaluate", "benchmark", "simulate", "audit", "store", "replay",
+    "export", "accounts", "protocol", "plan",
 )  # fmt: skip
 
 
