@@ -218,7 +218,8 @@ def stop(arm: ArmModel, number: int, how: signal.Signals, *, own_speed: bool) ->
     """End or suspend the driver of an arm at the largest speed of the usual rig file, or at the arm's own largest."""
     limits = {"rest_within_s": _OWN_SPEED_REST_S} if own_speed else {}
     host = address(number)
-    config = UrConfig(host=host, **limits) if arm.name in URS else KukaConfig.model_validate({"host": host, **limits})
+    kind = UrConfig if arm.name in URS else KukaConfig
+    config = kind.model_validate({"host": host, **limits})
     abandoned = config.abandoned
     speed = largest_speed_rad_s(arm, abandoned)
     if isinstance(config, UrConfig):

@@ -16,6 +16,7 @@ from service.runner.sealing import Seal
 from service.steps import params_models
 from service.store.durable_effects import DurableFiles, Files
 from service.store.errors import LeaseHeldError
+from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store
 from tests.support.runs.bench_run import PROTOCOL, begin_run
@@ -55,7 +56,8 @@ class Told:
     def seal(
         self, store: Store, run_id: str, *, authority: Authority | None = None, copy: Path | None = None
     ) -> Seal:
-        return Seal(store, run_id, authority, copy, self.busy.append, self.lines.append)
+        place = SecondPlace.of(store.database_path.parent, copy, store.clock, store.files)
+        return Seal(store, run_id, authority, place, self.busy.append, self.lines.append)
 
 
 def test_a_run_is_held_by_one_process_and_let_go_at_the_end(store: Store, run_id: str, protocol: Protocol) -> None:

@@ -27,7 +27,7 @@ PAYLOAD = Payload(1.6, (0.0, 0.0, 0.08))
 
 @contextlib.contextmanager
 def opened(host: str, **config: float) -> Generator[RobotArm]:
-    section = UrConfig(host=host, **{**PATIENT_UR, **config})
+    section = UrConfig.model_validate({"host": host, **PATIENT_UR, **config})
     arm = hosted(RobotArm, "drivers.ur:DRIVER", section, call_timeout_s=60, name="robot")
     try:
         arm.open()
