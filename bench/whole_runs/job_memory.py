@@ -110,14 +110,14 @@ def arguments(folder: Path, name: str) -> dict[str, Any]:
 
 
 def score(folder: Path) -> JobAnswer:
-    """Score a mesh against the fused one as a benchmark does: the same, as rough as a reconstruction is."""
+    """Score a mesh against the fused one as a benchmark does: the same with noise."""
     from service.benchmark.scoring import score_mesh, write_scored  # noqa: PLC0415 - loads much that jobs do not need
     from service.dataset.posed.records import Mesh  # noqa: PLC0415
 
     columns, faces = read_ply(folder / "ground_truth.ply")
     vertices = 1e-3 * np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float64)
     truth = Mesh(vertices, faces)
-    found = Surface(vertices + np.random.default_rng(0).normal(0, 3e-4, vertices.shape), faces)
+    found = Surface(vertices + np.random.default_rng(0).normal(0, 3e-5, vertices.shape), faces)
     scored = score_mesh(found, truth)
     assert write_scored
     return JobAnswer({"chamfer_mm": scored.score.chamfer_mm, "faces": float(len(faces))})

@@ -11,7 +11,7 @@ import psutil
 
 from service.core.units import megabytes
 
-IMAGE_MB = 1000.0  # of a process that looks at one photograph of 60 megapixels after the other
+IMAGE_MB = 1000.0  # estimated, of a process that looks at one photograph of 60 megapixels after the other
 _UNLIMITED = 1 << 60  # what older kernels state where there is no limit is larger
 
 

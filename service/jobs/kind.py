@@ -74,7 +74,8 @@ class JobKind(Generic[A, R]):
         order: position among the kinds in lists and texts, as a run uses them.
         replayed: whether a replay recomputes it by default; not for kinds that only help during a capture.
         aside: whether the provenance drawing omits it, because no result depends on it.
-        demand: what a job with these arguments takes (measured: bench/results/job_memory-*.json).
+        demand: what a job with these arguments takes: measured for surfaces (bench/results/job_memory-*.json),
+            estimated for images.
     """
 
     name: str

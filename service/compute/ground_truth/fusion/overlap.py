@@ -170,7 +170,7 @@ def components(surface: Surface, chosen: Mask) -> IntArray:
     index[chosen] = np.arange(n)
     ends: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = [(np.zeros(0, np.int32), np.zeros(0, np.int32))]
     for begin in range(0, len(surface.faces), _FACES):
-        ends.append(_spanning(index[surface.faces[begin : begin + _FACES]]))
+        ends.append(_spanning(index[surface.faces[begin : begin + _FACES]], n))
     a, b = (np.concatenate(parts) for parts in zip(*ends, strict=True))
     graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(n, n))
     out = np.full(len(chosen), -1, dtype=np.int64)
@@ -178,17 +178,20 @@ def components(surface: Surface, chosen: Mask) -> IntArray:
     return out
 
 
-def _spanning(faces: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _spanning(faces: NDArray[np.int32], n: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Pairs of vertices (K,), (K,) that connect what these faces (N, 3) connect; there are fewer pairs than edges.
 
-    Vertices of number -1 are left out.
+    Vertices of number -1 are left out; the others have numbers below n.
     """
     a, b = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
     both = (a >= 0) & (b >= 0)
     a, b = a[both], b[both]
-    there = np.unique(np.concatenate([a, b]))
-    own = (np.searchsorted(there, a), np.searchsorted(there, b))
-    graph = coo_matrix((np.ones(len(a)), own), shape=(len(there), len(there)))
+    used = np.zeros(n, dtype=np.bool_)
+    used[a] = used[b] = True
+    there = np.flatnonzero(used).astype(np.int32)
+    number = np.empty(n, dtype=np.int32)
+    number[there] = np.arange(len(there), dtype=np.int32)
+    graph = coo_matrix((np.ones(len(a)), (number[a], number[b])), shape=(len(there), len(there)))
     label = connected_components(graph, directed=False)[1]
     first = np.full(int(label.max(initial=-1)) + 1, -1, dtype=np.int32)
     first[label[::-1]] = there[::-1]
