@@ -48,7 +48,11 @@ def _states(host: str, names: list[str], timeout_s: float) -> list[str]:
             while True:
                 head = answers.read(_HEADER.size)
                 if len(head) < _HEADER.size:
-                    raise DeviceUnavailableError("the RTDE server closed the connection", where=host)
+                    raise DeviceUnavailableError(
+                        "the RTDE server closed the connection",
+                        where=host,
+                        remedy="Look whether the controller runs and nothing between blocks port 30004",
+                    )
                 size, kind = _HEADER.unpack(head)
                 payload = answers.read(size - _HEADER.size)
                 if kind == ord("I"):

@@ -9,11 +9,11 @@ from drivers.errors import DeviceError
 from service.core.errors import IntegrityError, StoreError
 from service.runner.operator import Operator
 from service.steps.context import Devices
-from service.store.errors import LeaseHeldError, LeaseLostError
+from service.store.errors import LeaseHeldError, LeaseLostError, RecordDamagedError
 from service.store.store import Store
 
 PASSING = (StoreError, OSError, MemoryError, DeviceError)
-FINAL = (IntegrityError, LeaseHeldError, LeaseLostError)
+FINAL = (IntegrityError, LeaseHeldError, LeaseLostError, RecordDamagedError)
 _AGAIN_S = 1.0
 _TOLD_AGAIN_S = 60.0
 

@@ -18,6 +18,7 @@ from drivers import errors as device_errors
 from drivers.ur.link import probe
 from service.core import errors as core_errors
 from service.core.errors import OrthocaptureError
+from service.store.signatures.log import NAME
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
@@ -82,7 +83,7 @@ def test_a_data_folder_that_is_gone_is_told_with_what_to_do(tmp_path: Path) -> N
 
 def test_a_run_that_could_not_be_signed_says_how_it_is(tmp_path: Path) -> None:
     """The disk is full when the run ends; after resuming as told, the run is signed and verifies."""
-    disk = FaultyDisk("append", 1, errno.ENOSPC)
+    disk = FaultyDisk("append", 1, errno.ENOSPC, file=NAME)
     with Store.open(tmp_path / "data", files=disk) as store:
         bench = begin_run(store, PROTOCOL, tmp_path)
         disk.armed = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -132,6 +133,7 @@ def test_an_error_of_a_job_is_kept_and_the_worker_goes_on(
     tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[str] = []
+    monkeypatch.setattr(logging.root, "handlers", [])  # what pytest captures must be UTF-8 for pytest-xdist
 
     def fails(context: JobContext[Any]) -> JobAnswer:
         calls.append(context.arguments["of"])

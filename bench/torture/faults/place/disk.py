@@ -29,11 +29,13 @@ class FaultyDisk:
         effect: the kind of call that fails; empty: all kinds.
         nth: the first failing call, from 1, counted from when the fault is armed.
         number: errno of the system's error.
+        file: the name of the file for which alone calls fail; empty: all files.
     """
 
     effect: str
     nth: int
     number: int
+    file: str = ""
     armed: bool = False
     failed: int = 0
     mended: bool = False
@@ -104,7 +106,7 @@ class FaultyDisk:
         commit()
 
     def _check(self, effect: str, path: Path) -> None:
-        if not self.armed or self.mended or self.effect not in ("", effect):
+        if not self.armed or self.mended or self.effect not in ("", effect) or self.file not in ("", path.name):
             return
         self.calls[effect] = self.calls.get(effect, 0) + 1
         if sum(self.calls.values()) >= self.nth:

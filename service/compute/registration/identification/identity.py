@@ -21,6 +21,7 @@ from service.core.geometry import Array, Transform, apply, inverse, rotation_ang
 _HYPOTHESES_PER_IMAGE = 6
 _MOST_TRIED = 80
 _LEAST_AGREEING = 3  # images from which a scale is believed
+_LEAST_SCALE = 0.01  # relative: a station's images agree in spite of smaller ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +197,8 @@ def _in_another_scale(station: _Station, error: ComputeError) -> ComputeError:
     if agreeing < max(_LEAST_AGREEING, 0.5 * sum(bool(r) for r in station.readings)):
         return error
     scale = solved[0].scale
+    if abs(np.log(scale)) < _LEAST_SCALE:
+        return error
     return ComputeError(
         f"the camera positions and the spheres are in different units or scales: with the positions multiplied by "
         f"{scale:.4g}{words_of_unit(scale)}, {agreeing} images agree",
