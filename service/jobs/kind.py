@@ -90,12 +90,12 @@ class JobKind(Generic[A, R]):
     demand: Callable[[A], Demand] = usual_demand
 
     def other_numbers(self, recorded_version: int) -> str:
-        """That another version computed a recorded job, with other numbers; "" if this one did."""
+        """That another version computed a recorded job, with other numbers or fewer; "" if this one did."""
         if max(recorded_version, _FIRST_NUMBERS) == max(self.version, _FIRST_NUMBERS):
             return ""
         return (
             f"computed by version {recorded_version} of the {self.words}; this program has version {self.version}, "
-            "whose numbers differ"
+            "whose numbers differ or are more"
         )
 
     def read_arguments(self, recorded: Mapping[str, Any], jobs: Jobs = _NO_JOBS) -> A:

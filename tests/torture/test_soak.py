@@ -122,7 +122,7 @@ def test_what_stays_is_no_fault_and_what_creeps_is_one() -> None:
     (fault,) = judge(samples(descriptors=0.01))["faults"]
     assert "web: descriptors" in fault
     (fault,) = judge(samples(database_descriptors=0.1))["faults"]
-    assert fault == "web: descriptors of the database: 64.9, more than 31"
+    assert fault == "web: descriptors of the database: 64.9, more than 33"
     (fault,) = judge(samples(own_mb=0.2))["faults"]
     assert "web: memory of its own" in fault
     assert "200" in fault
