@@ -358,11 +358,14 @@ def main() -> None:
     chosen = [c for c in CASES if not options.cases or any(word in c.name for word in options.cases)]
     tables: dict[str, list[dict[str, Any]]] = {}
     for seed in options.scenes:
-        folder, foreign = (
-            render_scene(s, options.width, options.views, cache=options.cache, workers=options.workers)
-            for s in (seed, seed + 1)
+        folder = foreign = render_scene(
+            seed, options.width, options.views, cache=options.cache, workers=options.workers
         )
         for case in chosen:
+            if case.change is _foreign:  # which alone needs another scene
+                foreign = render_scene(
+                    seed + 1, options.width, options.views, cache=options.cache, workers=options.workers
+                )
             tables.setdefault(folder.name, []).append(measured(case, folder, foreign, options.workers))
             print(_line(tables[folder.name][-1]), flush=True)
     record: dict[str, Any] = {"date": options.date, "commit": commit(), "machine": machine(), "tables": tables}
