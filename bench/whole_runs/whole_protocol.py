@@ -39,7 +39,8 @@ def main(words: Sequence[str] | None = None) -> int:
     stem = options.results / f"{options.name}-{options.image_width}-{options.date}"
     options.results.mkdir(parents=True, exist_ok=True)
     rig = ["--image-width", str(options.image_width), "--ct-voxel-mm", str(options.ct_voxel_mm),
-           "--speed-up", str(options.speed_up), "--arm", options.arm, "--host", options.host]  # fmt: skip
+           "--speed-up", str(options.speed_up), "--arm", options.arm, "--host", options.host,
+           "--patience", str(options.patience)]  # fmt: skip
     found: list[dict[str, Any]] = []
     text = ""
     for scene in scenes:
@@ -74,6 +75,9 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--image-width", type=int, default=1920, help="width of the simulated photographs (1920)")
     parser.add_argument("--ct-voxel-mm", type=float, default=0.4, help="edge of the CT's voxels (0.4)")
     parser.add_argument("--speed-up", type=float, default=1.0, help="the arm takes 1/N of its time (1)")
+    parser.add_argument(
+        "--patience", type=float, default=1.0, help="the rig's time limits times N, on a machine that does more (1)"
+    )
     parser.add_argument("--arm", default="UR10e", help="model of the simulated arm (UR10e)")
     parser.add_argument("--host", default="127.0.0.1", help="address of its controller (127.0.0.1)")
     parser.add_argument("--protocol", type=Path, default=PROTOCOL, help="a protocol other than the paper's")

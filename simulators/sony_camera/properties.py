@@ -123,8 +123,8 @@ _SHUTTERS = tuple(shutter_code(tenths, 10) for tenths in _TENTHS) + tuple(
 _ISO = (50, 64, 80, 100, 125, 160, 200, 250, 320, 400, 500, 640, 800, 1000, 1250, 1600, 2000, 2500, 3200, 6400, 12800)
 _WHITE_BALANCE = (2, 4, 0x8011, 0x8010, 6, 0x8001, 0x8002, 0x8003, 0x8004, 7, 0x8012, 0x8020, 0x8021, 0x8022)
 # Thousandths of a stop, from +5 to -5 by thirds; with the dial on M they change no picture.
-_ABOVE_ZERO = tuple(round(third * 1000 / 3, -2) for third in range(15, 0, -1))
-_COMPENSATIONS = (*map(int, _ABOVE_ZERO), 0, *(-int(number) for number in reversed(_ABOVE_ZERO)))
+_ABOVE_ZERO = (5000, 4700, 4300, 4000, 3700, 3300, 3000, 2700, 2300, 2000, 1700, 1300, 1000, 700, 300)
+_COMPENSATIONS = (*_ABOVE_ZERO, 0, *(-number for number in reversed(_ABOVE_ZERO)))
 _U8, _I16, _U16, _U32, _I8 = 2, 3, 4, 6, 1
 
 

@@ -68,8 +68,8 @@ def test_the_arm_is_in_the_covariance_of_each_of_its_poses(run: RecordedRun, nam
             assert (whole > 1.5 * shared).all()
             own = np.array([record.pose_sigma_m**2] * 3 + [record.pose_sigma_rad**2] * 3)
             assert (whole > 0.6 * own).all()
-        else:  # the outlines leave little open of each pose; the lens counts as its calibration left it
-            assert (whole > shared).all()
+        else:  # the outlines leave little open of each pose; the lens moves scan and camera nearly alike
+            assert (whole > 0.98 * shared).all()
             assert (whole < 1.7 * shared).all()
     first, second = dataset.views[:2]
     of_pair = relative_covariance(first.T_world_camera, second.T_world_camera, joint[:12, :12])
