@@ -76,7 +76,11 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--ct-voxel-mm", type=float, default=0.4, help="edge of the CT's voxels (0.4)")
     parser.add_argument("--speed-up", type=float, default=1.0, help="the arm takes 1/N of its time (1)")
     parser.add_argument(
-        "--patience", type=float, default=1.0, help="the rig's time limits times N, on a machine that does more (1)"
+        "--patience",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="as of `simulate rig`, on a machine that does more (0)",
     )
     parser.add_argument("--arm", default="UR10e", help="model of the simulated arm (UR10e)")
     parser.add_argument("--host", default="127.0.0.1", help="address of its controller (127.0.0.1)")
