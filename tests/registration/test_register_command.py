@@ -226,7 +226,8 @@ def test_scale_of_poses_that_are_not_metric(capture: Capture, few: Path, tmp_pat
     assert record["mean_radial_error_mm"] < 0.2
     assert np.array(record["covariance"]).shape == (7, 7)
     # If assumed metric they contradict the images, and nothing is written.
-    refused(register(capture, tmp_path / "none.json", **options), tmp_path / "none.json", "different units or scales", "--estimate-scale")
+    answer = register(capture, tmp_path / "none.json", **options)
+    refused(answer, tmp_path / "none.json", "different units or scales", "--estimate-scale")
 
 
 @pytest.mark.slow
