@@ -216,7 +216,7 @@ CASES = (
     Case("focal length 0.1 % wrong", _focal(1.001, 1.001), ("focal length",)),
     Case("fx alone 0.1 % wrong", _focal(1.001, 1.0), ("focal length",)),
     Case("principal point 2 px off", _principal_point, ("principal point",)),
-    Case("sphere list 0.1 % too large", _scaled_list(1.001), ("% larger than the camera positions",)),
+    Case("sphere list 0.1 % too large", _scaled_list(1.001), ("larger than the camera positions",)),
     Case("sphere list 1 % too large", _scaled_list(1.01), ("list is wrong",)),
     Case("sphere list 5 % too small", _scaled_list(0.95), ("multiplied by about 1.05", "multiplied by about 1.06")),
     Case("sphere list in inches", _scaled_list(1 / 25.4), ("inches taken as millimetres",)),
