@@ -28,7 +28,7 @@ from service.run_record import RunFollower
 from service.run_start import recorded_run
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.pages.serving import Server, serving
+from tests.support.pages.serving import PASSWORD, Server, serving
 from tests.support.rig.rig import REPOSITORY, command, simulated_rig, without_calibration_and_ct
 
 _HOST = "127.0.0.81"
@@ -125,13 +125,16 @@ class _Soak:
     def go(self, seconds: float, every_s: float) -> None:
         """Run, read pages and sample until the time is up and there are enough samples; then end all processes."""
         words = ("run", str(self.protocol), "--rig", str(self.rig), "--data", str(self.data))
+        headers = self.server.signed_in()
         with self.log.open("wb") as log:
             runner = subprocess.Popen(
-                command(*words, "--operator", "soak", "--specimen", "soak", "--json"),
+                command(*words, "--operator", "ada", "--password-stdin", "--specimen", "soak", "--json"),
                 cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=log, stderr=log,
             )  # fmt: skip
         try:
-            headers = self.server.signed_in()
+            assert runner.stdin is not None
+            runner.stdin.write(f"{PASSWORD}\n".encode())
+            runner.stdin.flush()
             with httpx.Client(base_url=self.server.url, headers=headers, timeout=60) as client:
                 self._follow(runner, client, seconds, every_s)
         finally:

@@ -20,7 +20,7 @@ from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 from tests.support.pages.browser import DESKTOP, PASSWORD, Screen, Served, add_people, screen, served
 from tests.support.processes.waiting import until
 from tests.support.protocols.small_demo import COARSE, SLICE_MM
-from tests.support.rig.rig import REPOSITORY, orthocapture, simulated_rig
+from tests.support.rig.rig import REPOSITORY, command, simulated_rig
 
 pytestmark = [pytest.mark.slow, pytest.mark.whole(always=True), pytest.mark.timeout(1800)]
 
@@ -238,12 +238,21 @@ def refused(page: Page, path: str, fields: dict[str, str]) -> int:
 
 def test_the_bundle_verifies_on_a_machine_without_orthocapture(server: Served, run: str, tmp_path: Path) -> None:
     bundle = tmp_path / "bundle.zip"
-    done = orthocapture("audit", "export", run, str(bundle), "--data", str(server.data), timeout_s=240)
+    words = ("audit", "export", run, str(bundle), "--data", str(server.data), "--operator", "otto")
+    done = subprocess.run(
+        command(*words, "--password-stdin"),
+        cwd=REPOSITORY,
+        input=PASSWORD,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     found = next(tmp_path.glob("*.zip"))
     with zipfile.ZipFile(found) as archive:
         verifier = next(name for name in archive.namelist() if name.endswith("verify.py"))
         (tmp_path / "verify.py").write_bytes(archive.read(verifier))
-    command = [sys.executable, "-I", str(tmp_path / "verify.py"), str(found)]
-    answer = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    checked = [sys.executable, "-I", str(tmp_path / "verify.py"), str(found)]
+    answer = subprocess.run(checked, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
     assert answer.returncode == 0, answer.stdout + answer.stderr

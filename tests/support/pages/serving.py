@@ -14,7 +14,7 @@ import httpx
 from tests.support.processes.forked import Forked
 from tests.support.rig.rig import REPOSITORY, command
 
-_PASSWORD = "correct horse battery"
+PASSWORD = "correct horse battery"
 
 
 @dataclass
@@ -33,10 +33,10 @@ class Server:
 
     def signed_in(self) -> dict[str, str]:
         """Request headers of the first administrator, whose account is created by the first set-up."""
-        secret = {"password": _PASSWORD, "repeated": _PASSWORD, "pin": "2468"}
+        secret = {"password": PASSWORD, "repeated": PASSWORD, "pin": "2468"}
         made = httpx.post(self.set_up, data={"account": "ada", "full_name": "Ada Lovelace", **secret}, timeout=30)
         assert made.status_code == 303, made.text
-        form = {"account": "ada", "password": _PASSWORD}
+        form = {"account": "ada", "password": PASSWORD}
         answer = httpx.post(f"{self.url}/sign-in", data=form, timeout=30)
         assert answer.status_code == 303, answer.text
         return {"Cookie": answer.headers["set-cookie"].partition(";")[0]}
