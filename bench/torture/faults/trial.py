@@ -43,9 +43,9 @@ from bench.torture.faults.place.newer_rigs import (
     video_rig,
 )
 from bench.torture.faults.place.older_rigs import arm_rig, camera_rig, ct_rig, lightbox_rig, listen_rig, scan_rig
-from bench.torture.faults.place.person import ArmEye, LeftError, Motions, Person, PlaceEye
+from bench.torture.faults.place.person import ArmEye, EndedWaitingError, LeftError, Motions, Person, PlaceEye
 from bench.torture.faults.wire.proxy import RunningProxy, Wire, start_proxy
-from service.core.errors import OrthocaptureError
+from service.core.errors import OrthocaptureError, StoreError
 from service.core.protocol.models import parse_protocol
 from service.core.run.decide import AskOperator, initial_state
 from service.core.run.state import RunState
@@ -233,6 +233,8 @@ class Trial:
                     station.close()
         except LeftError:
             pass
+        except EndedWaitingError as waited:
+            ended.error = StoreError(str(waited))
         except OrthocaptureError as error:
             ended.error = error
         ended.open, ended.stopped, ended.told = person.open, person.stopped, person.told

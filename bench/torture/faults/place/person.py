@@ -22,8 +22,15 @@ _STILL_S = 0.25  # a motion after a longer rest is another one; positions arrive
 _MAY_MOVE = 0b11  # safety_status_bits: normal, reduced
 
 
+_READS_S = 2.0  # that a run waits for its record until the person ends the program
+
+
 class LeftError(Exception):
     """The person has left the question open and gone."""
+
+
+class EndedWaitingError(Exception):
+    """The person has read why the run waits, and ended the program to do what it says."""
 
 
 @dataclass
@@ -56,6 +63,11 @@ class Person(ScriptedOperator):
         if way.verb == "confirm":
             return answer(question, "confirm")
         return OperatorAction(action=way.verb, step=way.step, reason="as the screen says")
+
+    def stuck(self, why: str, for_s: float) -> None:
+        """Read why the run waits, and end the program. Raises EndedWaitingError."""
+        if for_s > _READS_S:
+            raise EndedWaitingError(why)
 
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
         """Observe what the runner is doing."""
