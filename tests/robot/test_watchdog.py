@@ -66,7 +66,7 @@ def test_killed(victims: tuple[str, ...]) -> None:
         comes_to_rest(arm, since, lateness)
         rested = arm.mark()
         if victims == ("driver",):  # the program reopens it and tries to continue, again and again
-            assert program.next("error")["error"] == "DeviceUnavailableError"
+            assert program.next("error")["error"] == "DriverKilledError"
             assert "since it was connected" in program.next("error")["message"]
             arm.pass_s(STAYS_S)
             assert arm.moved_for_s(rested) == 0.0
