@@ -16,6 +16,7 @@ from service.core.run.state import RunState
 from service.dataset.registrations import best_registration
 from service.run_record import RunRecord
 from service.store.signatures.signing import checkpoint
+from service.store.store import Store
 
 _T = TypeVar("_T")
 _Point = tuple[float, float, float]
@@ -63,6 +64,16 @@ def tick_item(log: RunRecord, step: str, attempt: int, item: str, *, ticked: boo
     if (item in now.ticked) != ticked:
         marked = ItemTicked(step=step, attempt=attempt, item=item, ticked=ticked)
         log.store.record(log.run_id, [marked], actor=actor)
+
+
+def cancel_computation(store: Store, run_id: str, job: str, reason: str, *, actor: str) -> Event:
+    """End one computation; the step that waits for it asks what to do, as if it had failed.
+
+    Raises IllegalTransitionError if there is no reason, or no such computation that waits or runs.
+    """
+    if not reason.strip():
+        raise IllegalTransitionError("a reason is needed", where=job, remedy="Say why the computation is ended")
+    return store.cancel_job(run_id, job, actor=actor, reason=reason.strip())
 
 
 def see_robot(log: RunRecord, device: str, lost_seq: int, *, driven: bool, actor: str) -> None:

@@ -257,7 +257,7 @@ def measured(case: Case, folder: Path, foreign: Path, workers: int) -> dict[str,
         words += ["--poses", scratch / "poses.csv", "--spheres", scratch / "spheres.json"]
         words += ["--out", scratch / "result.json", "--workers", workers, *inputs.options]
         answer = CliRunner().invoke(app, [str(word) for word in words])
-        said = " ".join(answer.output.split())
+        said = " ".join(answer.output.replace(f"{scratch}/", "").split())
         row: dict[str, Any] = {"case": case.name, "scene": folder.name, "status": answer.exit_code, "said": said}
         row["named"] = not case.named or any(word in said.lower() for word in case.named)
         if not (scratch / "result.json").is_file():

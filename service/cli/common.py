@@ -46,6 +46,10 @@ strict_option: OptionInfo = typer.Option(
     "--strict", help="Refuse unusable files (copies, other sizes, images without a pose) instead of skipping them."
 )
 
+RUN_HELP = "Name of the run, its first characters, or `latest`."
+
+RunArgument = Annotated[str, typer.Argument(help=RUN_HELP)]
+RunOption = Annotated[str, typer.Option("--run", help=RUN_HELP)]
 DataOption = Annotated[Path, data_option]
 JsonOption = Annotated[bool, json_option]
 StrictOption = Annotated[bool, strict_option]

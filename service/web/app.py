@@ -22,7 +22,7 @@ from service.web.home import checklist, compare, history, start
 from service.web.monitoring.pages import install_metrics
 from service.web.page.errors import install_errors
 from service.web.people import account, badges
-from service.web.run import actions, control, jobs, news, notes
+from service.web.run import actions, control, news, notes
 from service.web.security.seal import sealed
 from service.web.security.shield import TRIES_WINDOW_S, Limiter, Shield
 from service.web.site import Site
@@ -37,7 +37,6 @@ _ROUTERS: tuple[APIRouter, ...] = (
     service.web.run.pages.router,
     actions.router,
     control.router,
-    jobs.router,
     notes.router,
     news.router,
     service.web.capture.pages.router,

@@ -24,20 +24,8 @@ from service.store.files.artefacts import hash_file
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.record.bundled_site import Site, bundled_site, check, record, run_verifier
+from tests.support.record.bundled_site import Site, check, record, run_verifier
 from tests.support.runs.bench_run import PROTOCOL
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
-    return bundled_site(tmp_path_factory.mktemp("site"))
-
-
-@pytest.fixture
-def unpacked(site: Site, tmp_path: Path) -> Path:
-    shutil.copytree(site.folder, tmp_path / "bundle")
-    return tmp_path / "bundle"
-
 
 # --- an untouched bundle ---------------------------------------------------------------------------------
 

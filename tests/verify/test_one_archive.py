@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import shutil
 import struct
 import subprocess
 import sys
@@ -17,18 +16,7 @@ from typing import Any
 import pytest
 
 from service.audit.verify import bundle_verifier
-from tests.support.record.bundled_site import Site, bundled_site, check, run_verifier
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
-    return bundled_site(tmp_path_factory.mktemp("site"))
-
-
-@pytest.fixture
-def unpacked(site: Site, tmp_path: Path) -> Path:
-    shutil.copytree(site.folder, tmp_path / "bundle")
-    return tmp_path / "bundle"
+from tests.support.record.bundled_site import Site, check, run_verifier
 
 
 def streamed(content: bytes) -> Iterator[tuple[str, bytes]]:

@@ -22,20 +22,9 @@ from service.audit.verify import bundle_verifier
 from service.store.files.artefacts import hash_file
 from service.store.signatures.signing import public_keys, rotate_key
 from service.store.store import Store
-from tests.support.record.bundled_site import Site, bundled_site, check, record, run_verifier
+from tests.support.record.bundled_site import Site, check, record, run_verifier
 
 RECORDS = ("events.jsonl", "site_events.jsonl", "artefacts.jsonl", "jobs.jsonl", "checkpoints.jsonl", "keys.jsonl")
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
-    return bundled_site(tmp_path_factory.mktemp("site"))
-
-
-@pytest.fixture
-def unpacked(site: Site, tmp_path: Path) -> Path:
-    shutil.copytree(site.folder, tmp_path / "bundle")
-    return tmp_path / "bundle"
 
 
 # --- tampering -------------------------------------------------------------------------------------------

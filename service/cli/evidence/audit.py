@@ -18,8 +18,10 @@ from rich.table import Table
 from service.audit.verify.verifications import keep_verification, verification_of
 from service.cli.common import (
     DEFAULT_DATA,
+    RUN_HELP,
     DataOption,
     JsonOption,
+    RunArgument,
     console,
     print_json,
     print_table,
@@ -50,10 +52,6 @@ audit_app = typer.Typer(
     no_args_is_help=True,
 )
 
-_RUN_HELP = "Name of the run, its first characters, or `latest`."
-
-RunArgument = Annotated[str, typer.Argument(help=_RUN_HELP)]
-
 
 def _existing_file(text: str) -> Any:
     return typer.Option(metavar="FILE", help=text, exists=True, dir_okay=False)
@@ -71,7 +69,7 @@ SignaturesOption = Annotated[
 
 @audit_app.command("show")
 def show_command(
-    run: Annotated[str, typer.Argument(help=_RUN_HELP)] = "latest",
+    run: RunArgument = "latest",
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:
@@ -87,7 +85,7 @@ def show_command(
 
 @audit_app.command("verify")
 def verify_command(
-    run: Annotated[str, typer.Argument(help=_RUN_HELP + " `all` checks every run of the folder.")] = "latest",
+    run: Annotated[str, typer.Argument(help=RUN_HELP + " `all` checks every run of the folder.")] = "latest",
     data: DataOption = DEFAULT_DATA,
     certificates: CertificatesOption = None,
     signatures: SignaturesOption = None,

@@ -11,6 +11,7 @@ from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
     JsonOption,
+    RunArgument,
     console,
     error_console,
     print_json,
@@ -25,7 +26,7 @@ from service.store.verification import verify as audit
 
 
 def figures_command(
-    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
+    run: RunArgument = "latest",
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the files.", file_okay=False)] = Path(
         "figures"
     ),

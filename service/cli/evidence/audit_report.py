@@ -15,6 +15,7 @@ from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
     JsonOption,
+    RunArgument,
     console,
     error_console,
     print_json,
@@ -31,7 +32,7 @@ from service.store.verification import verify as audit
 
 
 def report_command(
-    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
+    run: RunArgument = "latest",
     data: DataOption = DEFAULT_DATA,
     pdf: Annotated[
         Path | None, typer.Option("--pdf", metavar="FILE", help="Write it as PDF.", dir_okay=False)

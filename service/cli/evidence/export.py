@@ -13,6 +13,7 @@ from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
     JsonOption,
+    RunArgument,
     console,
     print_json,
     progress_bar,
@@ -27,7 +28,7 @@ from service.store.store import Store
 
 
 def export_command(
-    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")],
+    run: RunArgument,
     form: Annotated[
         str,
         typer.Option(

@@ -19,6 +19,7 @@ from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
     JsonOption,
+    RunArgument,
     console,
     fail,
     print_json,
@@ -46,7 +47,7 @@ _WORDS = {
 
 
 def replay_command(
-    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
+    run: RunArgument = "latest",
     data: DataOption = DEFAULT_DATA,
     step: Annotated[str | None, typer.Option("--step", help="Only the jobs of this step.")] = None,
     jobs: Annotated[

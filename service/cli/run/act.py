@@ -10,7 +10,15 @@ from typing import Annotated, Literal
 
 import typer
 
-from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    RunOption,
+    console,
+    print_json,
+    reporting_errors,
+)
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person, typed_password
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.protocol.models import Protocol
@@ -40,7 +48,7 @@ def act_command(
             "finish; tick or untick one item of the checklist; seen: you have looked at an arm that was lost."
         ),
     ],
-    run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
+    run: RunOption = "latest",
     step: Annotated[str | None, typer.Option("--step", help="The step, if it is not the current one.")] = None,
     viewpoint: Annotated[str | None, typer.Option("--viewpoint", help="Redo only this viewpoint.")] = None,
     reason: Annotated[str, typer.Option("--reason", help="Why; required for redo, skip, accept and abort.")] = "",
@@ -162,7 +170,7 @@ def signed_by_verb(verb: str, protocol: Protocol, state: RunState) -> str:
 def note_command(
     text: Annotated[str, typer.Argument(help="The note's text; may be left out with a photograph.")] = "",
     photo: Annotated[Path | None, typer.Option("--photo", help="A photograph, JPEG or PNG.", dir_okay=False)] = None,
-    run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
+    run: RunOption = "latest",
     step: Annotated[str, typer.Option("--step", help="The step, if it is not the current one.")] = "",
     operator: OperatorOption = "",
     password_stdin: PasswordOption = False,
@@ -201,7 +209,7 @@ def draw_region_command(
     along: Annotated[
         str, typer.Option("--along", help="The direction from the surface to the viewer, as a JSON list of x, y, z.")
     ],
-    run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
+    run: RunOption = "latest",
     operator: OperatorOption = "",
     password_stdin: PasswordOption = False,
     data: DataOption = DEFAULT_DATA,

@@ -6,10 +6,19 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    RunOption,
+    console,
+    print_json,
+    reporting_errors,
+)
 from service.cli.run.person import OperatorOption, PasswordOption, acting_person
 from service.core.errors import ConfigurationError
 from service.jobs.words import term
+from service.run_acts import cancel_computation
 from service.store.records import Job
 from service.store.store import Store
 
@@ -17,7 +26,7 @@ from service.store.store import Store
 def cancel_command(
     job: Annotated[str, typer.Argument(help="The computation, as `status` names it, or its first characters.")],
     reason: Annotated[str, typer.Option("--reason", help="Why; it goes into the record.")],
-    run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
+    run: RunOption = "latest",
     operator: OperatorOption = "",
     password_stdin: PasswordOption = False,
     data: DataOption = DEFAULT_DATA,
@@ -27,12 +36,8 @@ def cancel_command(
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         chosen = _open_job(store, run_id, job)
-        if not reason.strip():
-            raise ConfigurationError(
-                "a reason is needed", where="--reason", remedy="Say why the computation is ended"
-            )
         name = acting_person(store, operator, password_stdin=password_stdin).name
-        event = store.cancel_job(run_id, chosen.job_id, actor=name, reason=reason.strip())
+        event = cancel_computation(store, run_id, chosen.job_id, reason, actor=name)
         if json:
             print_json({"run": run_id, "cancelled": chosen.job_id, "event": event.seq})
         else:

@@ -15,6 +15,7 @@ from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
     JsonOption,
+    RunArgument,
     console,
     error_console,
     print_json,
@@ -116,7 +117,7 @@ def run_command(
 
 
 def resume_command(
-    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
+    run: RunArgument = "latest",
     data: DataOption = DEFAULT_DATA,
     auto_confirm: AutoOption = False,
     worker: WorkerOption = True,

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from rich.table import Table
 
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
     JsonOption,
+    RunArgument,
     console,
     print_json,
     print_table,
@@ -36,7 +36,7 @@ from service.store.store import Store
 
 
 def status_command(
-    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
+    run: RunArgument = "latest",
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:

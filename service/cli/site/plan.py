@@ -13,6 +13,7 @@ from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
     JsonOption,
+    RunArgument,
     console,
     print_json,
     print_table,
@@ -94,7 +95,7 @@ def _coverage_text(counts: Sequence[Sequence[int]]) -> str:
 
 @plan_app.command("next")
 def next_command(
-    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
+    run: RunArgument = "latest",
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:

@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
-from service.store.access import KEYS as FOLDER
+from service.store.access import KEYS
 from service.store.durable_effects import Files
 from service.store.errors import SigningKeyError
 from service.store.signatures.checkpoints import key_fingerprint
@@ -32,7 +32,7 @@ class KeyFolder:
     """The private keys of one data folder. Callers hold the database's write lock, so no two processes interfere."""
 
     def __init__(self, data_dir: Path, files: Files) -> None:
-        self._folder = data_dir / FOLDER
+        self._folder = data_dir / KEYS
         self._files = files
 
     def make(self) -> Ed25519PrivateKey:

@@ -1,10 +1,10 @@
-"""What people do to a run: start, tick, confirm, sign, redo, skip, pause, resume, abort."""
+"""What people do to a run: start, tick, confirm, sign, redo, skip, pause, resume, abort, end a computation."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Form
+from fastapi import APIRouter, Depends, Form, Path
 from fastapi.responses import RedirectResponse
 
 from service.core.errors import ConfigurationError, IllegalTransitionError
@@ -36,7 +36,7 @@ from service.people.credentials.tries import on_screen_of
 from service.people.errors import NotAllowedError
 from service.people.sessions import NAMES, KnownBy
 from service.rig import load_rig
-from service.run_acts import DECIDE_AGAIN, out_of_date, see_robot, tick_item
+from service.run_acts import DECIDE_AGAIN, cancel_computation, out_of_date, see_robot, tick_item
 from service.run_record import RunRecord
 from service.run_start import record_refusal, require_rig_free, require_runnable, start_run
 from service.steps import params_models
@@ -186,6 +186,21 @@ def act(
     )
     _append(site, log, _action(form, log.state, who), who.name if who else person.account)
     return back_to(run_id, form.back)
+
+
+@router.post("/runs/{run_id}/jobs/{job}/cancel", name="cancel_job", dependencies=[Depends(requires("operate"))])
+def cancel(
+    site: CurrentSite,
+    person: SignedInPerson,
+    run_id: RunId,
+    job: Annotated[str, Path(max_length=64)],
+    reason: Short,
+) -> RedirectResponse:
+    """End a computation with a reason; nothing else of the run is touched."""
+    site.run(run_id)
+    Control(site.store).require(run_id, person)
+    cancel_computation(site.store, run_id, job, reason, actor=person.account)
+    return back_to(run_id)
 
 
 def _action(form: ActionForm, state: RunState, who: Identity | None) -> OperatorAction:

@@ -143,7 +143,7 @@ def _require_any(
     if most < 4:
         raise ComputeError(
             f"too few spheres are visible: one image must show four, at most {most} were found ({counts})",
-            remedy="Look whether the images are sharp and bright: in blurred or dark ones no sphere is found. If so, "
+            remedy="Look at the images: in blurred or dark ones no sphere is found. If they are sharp and bright, "
             "capture images that show more of the registration spheres, or check the detector's options",
         )
     centres_m = np.asarray(spheres.centres_m, dtype=np.float64)
