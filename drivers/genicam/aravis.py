@@ -20,6 +20,7 @@ _SUCCESS = 0  # of ArvBufferStatus
 # one that sees all traffic of the machine until its filter is set; a foreign packet ends the wait for the image.
 _NOTHING_IN_IT = (1, 8)
 _TRIES = 5  # exposures
+_MOST_REQUESTS = 2.0  # for packets again, as a multiple of the packets of an image; Aravis takes no more
 _SINGLE_FRAME = 1  # of ArvAcquisitionMode
 _DENIED = "access-denied"  # GigE Vision's answer to who is not in control; what it lacks it calls otherwise
 _NO_CONTROL = "the camera takes no settings from here: another program controls it, or the connection was lost"
@@ -153,12 +154,14 @@ class AravisCamera:
     def _wait_for_packets(self, stream: int, longest_s: float) -> None:
         """Let an image be whole that much later than its last packet, after which it counts as incomplete.
 
-        By itself Aravis gives up after 0.1 s, measured when its own thread is run: on a busy machine an image was
-        called incomplete whose packets lay in the socket.
+        By itself Aravis gives up after 0.1 s, measured when its own thread is run, and asks for no more than a
+        quarter of an image's packets again, repeated requests included: on a busy machine an image was called
+        incomplete whose packets lay in the socket, or had found it full, or were asked for again too often.
         """
         set_property = self._gobject.g_object_set
         set_property.restype, set_property.argtypes = None, (_POINTER, _TEXT)  # and what a property takes, and NULL
         set_property(stream, b"frame-retention", ctypes.c_uint(round(us(longest_s))), ctypes.c_void_p(None))
+        set_property(stream, b"packet-request-ratio", ctypes.c_double(_MOST_REQUESTS), ctypes.c_void_p(None))
 
     def _give_buffer(self, stream: int) -> None:
         """Give the stream, which then owns it, a buffer for one image."""

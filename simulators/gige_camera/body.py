@@ -95,11 +95,12 @@ class IndustrialBody:
         if stop.wait(max(0.0, left_s)) or kind == "no_image":
             return
         self._write_log(moment, settings)
+        lost_share = float(fault.value or 0.0) if fault is not None and kind == "lost_packets" else 0.0
         lost = 3 if kind in ("lost_packets", "truncate") else 0
         block = (counter - 1) % _LAST_BLOCK + 1
         stall_s = float(fault.value or 0.5) if fault is not None and kind == "stall" else 0.0
         self._stream.send(
-            block, code, pixels, nanoseconds(began_s), lost, for_good=kind == "truncate", stall_s=stall_s
+            block, code, pixels, nanoseconds(began_s), lost, lost_share, for_good=kind == "truncate", stall_s=stall_s
         )
 
     def _settings(self) -> ExposureSettings:

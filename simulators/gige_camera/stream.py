@@ -42,16 +42,20 @@ class Stream:
         self._lost_for_good: frozenset[int] = frozenset()
 
     def send(
-        self, block: int, code: int, pixels: bytes, exposed_ns: int, lost: int = 0, *, for_good: bool = False,
-        stall_s: float = 0.0,
+        self, block: int, code: int, pixels: bytes, exposed_ns: int, lost: int = 0, lost_share: float = 0.0, *,
+        for_good: bool = False, stall_s: float = 0.0,
     ) -> None:  # fmt: skip
         """Send an image with this pixel format.
 
-        `lost` packets in its middle are lost, perhaps for good; `stall_s` is a pause in its middle.
+        `lost` packets in its middle are lost, perhaps for good, or the last ones, trailer included, as a share of all
+        (so a receiver loses them whose socket is full); `stall_s` is a pause in its middle.
         """
         packets = self._packed(block, code, pixels, exposed_ns)
         middle = len(packets) // 2
-        missing = frozenset(range(middle, middle + lost))
+        first_lost, last_lost = middle, middle + lost
+        if lost_share:
+            first_lost, last_lost = round(len(packets) * (1.0 - lost_share)), len(packets)
+        missing = frozenset(range(first_lost, last_lost))
         with self._lock:
             self._block, self._packets, self._sent = block, packets, 0
             address = socket.inet_ntoa(self._registers.read(STREAM_ADDRESS, 4))

@@ -139,6 +139,15 @@ def test_packets_that_come_late_make_a_whole_image(way: dict[str, str], tmp_path
         assert camera.capture(tmp_path).counter == 1
 
 
+def test_half_of_the_packets_are_asked_for_again(way: dict[str, str], tmp_path: Path) -> None:
+    """So a busy machine loses them, whose socket is full; Aravis itself asks for no more than a quarter."""
+    with (
+        industrial_camera(FAULTY, faults=({"kind": "lost_packets", "nth": 1, "value": 0.5},)),
+        opened(way, FAULTY) as camera,
+    ):
+        assert camera.capture(tmp_path).counter == 1
+
+
 def test_a_camera_that_dies_and_one_that_comes_back(producer: Path, tmp_path: Path) -> None:
     """With harvesters; with Aravis, tests/industrial/test_genicam_driver.py does so."""
     with ExitStack() as until_the_end:

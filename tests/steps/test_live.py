@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from itertools import pairwise
@@ -29,7 +30,7 @@ from service.jobs.capture import live_view
 from service.store.store import Store
 from service.worker.calibration.records import arm_correction_record
 from service.worker.job import JobAnswer, JobContext, RecordedContext
-from service.worker.loop import HANDLERS
+from service.worker.loop import HANDLERS, work
 from service.worker.poses.robot_poses import robot_camera_poses
 from tests.support.rig.bench_rig import answer, other_settings
 from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run, bench_store
@@ -223,20 +224,26 @@ def test_a_capture_goes_on_without_numbers_where_what_they_need_was_skipped(begi
     assert [note.note for note in bench.payloads(StepNote) if note.step == "capture"] == ["no_live_numbers"]
 
 
-LIVE = "      live: {calibration: camera, hand_eye: camera, spheres_of: ct}\n"
+WAIT_S = 3.0  # for the last images
+LIVE = f"      live: {{calibration: camera, hand_eye: camera, spheres_of: ct, wait_s: {WAIT_S}}}\n"
 ENOUGH = """\
       - {measure: predicted_target_error_mm, max: 0.14, unit: mm, unless_skipped: ct}
     recovery: {retries: 2, wait_s: 0}"""
 
 
+def compute_one(store: Store) -> None:
+    """Compute one of the jobs that are due."""
+    ends = iter((False, True))
+    work(store, until_idle=True, stop=lambda: next(ends), progress=lambda _what, _done, _all: None)
+
+
 def measured_run(
-    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, folder: Path, *, held_out_mm: float
-) -> Bench:
+    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, folder: Path, *, held_out_mm: float,
+    gates: str = ENOUGH,
+) -> Bench:  # fmt: skip
     """A run whose images show the spheres exactly, with a worker beside it."""
     head, tail = PROTOCOL.split("  - id: capture\n")
-    tail = tail.replace("    recovery: {retries: 2, wait_s: 0}", ENOUGH).replace(
-        "distance_m: 0.6", "distance_m: 0.85"
-    )
+    tail = tail.replace("    recovery: {retries: 2, wait_s: 0}", gates).replace("distance_m: 0.6", "distance_m: 0.85")
     tail = tail.replace("      purpose: dataset\n", f"      purpose: dataset\n{LIVE}")
     bench = begin(head + MEASURED + "  - id: capture\n" + tail)
     rig = MeasuringRig()
@@ -317,6 +324,59 @@ def test_confirming_takes_the_suggested_views_and_the_gate_is_judged_again(
     assert errors[0] > 0.14 >= errors[-1] > 0
     assert all(later < earlier for earlier, later in pairwise(errors))
     bench.must_verify()
+
+
+UNEXAMINED = """\
+      - {measure: images_unexamined, max: 0, unit: images, unless_skipped: ct}
+    recovery: {retries: 2, wait_s: 0}"""
+
+
+@pytest.mark.slow
+def test_a_machine_that_is_slow_is_waited_for_while_it_goes_on_and_every_image_is_judged(
+    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    bench = measured_run(begin, monkeypatch, tmp_path, held_out_mm=0.5, gates=UNEXAMINED)
+    compute, at_s = bench.operator.on_show, [0.0]
+
+    def one_job_in_two_seconds(what: str) -> None:
+        now_s = bench.clock.monotonic_s()
+        if now_s >= at_s[-1] + 2.0:
+            compute(what)
+            at_s.append(now_s)
+
+    monkeypatch.setattr(sys.modules[__name__], "compute_jobs", compute_one)
+    bench.operator.on_show = one_job_in_two_seconds
+    state = bench.run()
+    assert state.status == "completed"
+    assert state.steps["capture"].measures["images_unexamined"] == 0
+    assert bench.clock.monotonic_s() - bench.rig.shutter.arrivals_s[-1] > 2 * WAIT_S
+    assert "live_numbers_late" not in [note.note for note in bench.payloads(StepNote)]
+
+
+@pytest.mark.slow
+def test_images_that_nobody_looked_at_are_counted_and_judged_when_the_worker_is_back(
+    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    bench = measured_run(begin, monkeypatch, tmp_path, held_out_mm=0.5, gates=UNEXAMINED)
+    compute = bench.operator.on_show
+
+    def not_before_they_are_late(what: str) -> None:
+        late = "live_numbers_late" in [note.note for note in bench.payloads(StepNote)]
+        if len(bench.captured()) < 3 or late:
+            compute(what)
+
+    def back(question: Any, _state: Any) -> Any:
+        assert "images_unexamined 3 images, allowed ≤ 0" in question.text
+        assert "is a worker running?" in question.text
+        bench.operator.on_show = compute
+        return answer(question, "confirm")
+
+    bench.operator.on_show = not_before_they_are_late
+    bench.script("capture", "recovery", back)
+    state = bench.run()
+    assert state.status == "completed"
+    assert state.steps["capture"].measures["images_unexamined"] == 0
+    assert len(bench.captured()) == 5, "no image is taken again"
 
 
 @pytest.mark.slow

@@ -56,7 +56,8 @@ class LiveParams(Record):
     arm_sigma_mm: Annotated[float, Field(gt=0)] | None = None
     arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None  # likewise, the scatter of the camera's rotations
     coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
-    wait_s: Annotated[float, Field(ge=0)] = 60.0  # at the end of the step, for jobs that have not finished
+    # At the end of the step, for jobs that have not finished: the longest wait without any of them finishing.
+    wait_s: Annotated[float, Field(ge=0)] = 60.0
 
 
 @dataclass
@@ -116,7 +117,7 @@ class LiveAnalysis:
     def summary(
         self, station: str, candidates: Sequence[tuple[Viewpoint, float]], retakes: str = "", again: int = 0
     ) -> dict[str, float]:
-        """Wait for the last images, at most `wait_s`; the measures. If a gate fails, suggest further views.
+        """Wait for the last images while their jobs go on; the measures. If a gate fails, suggest further views.
 
         Args:
             station: of the robot.
@@ -161,7 +162,7 @@ class LiveAnalysis:
         return row_to_stop_for(self.context, mine, self._looked_at(*self.params.images_of))
 
     def spoilt(self) -> dict[str, str]:
-        """Wait for the last images, but not longer than `wait_s`; the reason of each spoilt image, by its SHA-256.
+        """Wait for the last images while their jobs go on; the reason of each spoilt image, by its SHA-256.
 
         Raises ImagesSpoiltError after several in a row.
         """
@@ -170,6 +171,12 @@ class LiveAnalysis:
         if row:
             stop_for_lens(self.context, row)
         return why_spoilt(self._looked_at(self.context.step.id), self._looked_at(*self.params.images_of))
+
+    def unexamined(self) -> list[str]:
+        """The viewpoints whose image no finished job has looked at: nobody knows whether it is spoilt."""
+        captures = [c for c in self.context.evidence.captures(self.context.step.id) if all(c.verdicts.values())]
+        seen = {image_of(job).sha256 for job in self._jobs("live_view") if job.status == "finished"}
+        return [capture.viewpoint for capture in captures if capture.artefacts[0].sha256 not in seen]
 
     def note_spoilt(self, reasons: Mapping[str, str]) -> None:
         """Note images that are spoilt even after they were taken again, so that a retry of the step repeats them."""
@@ -254,7 +261,7 @@ class LiveAnalysis:
         return done[-1].artefacts[0].sha256 if done else None
 
     def _wait(self) -> None:
-        deadline_s = self.context.monotonic_s() + self.params.wait_s
+        before, since_s = 0, self.context.monotonic_s()
         while True:
             self.context.checkpoint()
             self.look()
@@ -262,7 +269,9 @@ class LiveAnalysis:
             left = sum(job.status == "enqueued" for job in waiting)
             if not left:
                 return
-            if self.context.monotonic_s() > deadline_s:
+            if left != before:
+                before, since_s = left, self.context.monotonic_s()
+            if self.context.monotonic_s() - since_s > self.params.wait_s:
                 self.context.note("live_numbers_late", images=left)
                 return
             images = [job for job in waiting if job.kind in _DESCRIBED]

@@ -15,6 +15,7 @@ TAKEN_AGAIN: Mapping[str, str] = {
     "settings_departures": "set the camera as the protocol has it",
     "moved_during_exposure": "find out what shook the arm or its mount",
     "images_spoilt": "clean the lens, and check that nothing blocks its view or the light",
+    "images_unexamined": "see why the analysis of images does not go on (is a worker running?)",
     "optics_departures": "set zoom, focus and lens as they were for the calibration, or redo the calibration",
 }
 

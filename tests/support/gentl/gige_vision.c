@@ -169,7 +169,7 @@ void *receive(void *nothing) {
         int complete = last != 0;
         for (uint32_t i = 0; complete && i < last; i++) complete = got[i];
         if (complete || (count < 0 && tries == TRIES)) deliver(buffer, !complete || lost), buffer = NULL;
-        else if (count < 0) tries++, ask_for_missing(block, last ? last : 1);
+        else if (count < 0) tries++, ask_for_missing(block, last ? last : (uint32_t)((buffer->size + room - 1) / room + 1));
     }
     return nothing;
 }

@@ -47,6 +47,9 @@ class Measures(PredictedMeasures, CaptureMeasures):
     images_spoilt: Annotated[
         Count, "images that are black, blurred or overexposed, and were so again when they were repeated"
     ] = None
+    images_unexamined: Annotated[
+        Count, "images whose analysis had not finished or failed, so that nobody knows whether they are spoilt"
+    ] = None
     live_images: Annotated[Count, "images that the prediction takes into account"] = None
     outline_limited_error_mm: Annotated[
         ErrorMm, "`predicted_target_error_mm` if the camera poses were exact: only the outlines limit it"
@@ -69,6 +72,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     if capture.live is not None:
         totals, spoilt = capture.repeat_spoilt(capture.live, totals)
         measures["images_spoilt"] = float(len(spoilt))
+        measures["images_unexamined"] = float(len(capture.live.unexamined()))
     measures |= totals.measures()
     departures = optics_departures(context)
     if departures is not None:
