@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -94,17 +94,33 @@ def find_places(
     return ImportFolders(folder.resolve(), **found)
 
 
+@dataclass(frozen=True, slots=True)
+class CtReading:
+    """What a rig.yaml would say of the CT series.
+
+    Attributes:
+        first_number: of the first slice of a whole series.
+        series: a part of the description of the series to use, where there are several.
+        unspecified_is_hounsfield: values of a series that states no unit are Hounsfield units.
+    """
+
+    first_number: int = 1
+    series: str = ""
+    unspecified_is_hounsfield: bool = False
+
+    def device(self, folder: Path) -> dict[str, Any]:
+        """The section of the device that reads a folder so."""
+        given = {name: value for name, value in asdict(self).items() if value != getattr(CtReading(), name)}
+        return {"driver": "dicom_folder", "folder": str(folder), "stable_s": 0, **given}
+
+
 def list_import(
     places: ImportFolders,
     progress: Progress = lambda _what, _done, _total: None,
     *,
-    ct_first_number: int = 1,
-    ct_unspecified_is_hounsfield: bool = False,
+    ct: CtReading | None = None,
 ) -> ImportList:
     """Every file to be imported, with its hash, and the files left out, with the reasons.
-
-    `ct_first_number` is the number of the first slice of a whole series, and `ct_unspecified_is_hounsfield` says that
-    values of a series that states no unit are Hounsfield units.
 
     Raises:
         DataError: photographs are damaged or missing, or there is not exactly one complete scan or CT series.
@@ -120,7 +136,7 @@ def list_import(
             left_out += others
     if places.ct is not None:
         progress("CT", 0, 1)
-        series, others = _ct(places.ct, ct_first_number, unspecified_is_hounsfield=ct_unspecified_is_hounsfield)
+        series, others = _ct(places.ct, ct or CtReading())
         files["ct"] = tuple(_file(listed(path), places, "application/dicom") for path in series)
         left_out += others
     left_out += _elsewhere(places)
@@ -132,9 +148,7 @@ def list_import(
     )
 
 
-def import_rig(
-    listing: ImportList, *, simulated: bool, ct_first_number: int = 1, ct_unspecified_is_hounsfield: bool = False
-) -> Rig:
+def import_rig(listing: ImportList, *, simulated: bool, ct: CtReading | None = None) -> Rig:
     """The rig of an import's run: the list, with the folders of scan and CT as devices."""
     devices: dict[str, dict[str, Any]] = {}
     for role in _SCANS:
@@ -144,7 +158,7 @@ def import_rig(
     if listing.holds("ct"):
         folders = {Path(listing.absolute(file)).parent for file in listing.files["ct"]}
         common = min(folders, key=lambda folder: len(folder.parts))
-        devices["ct"] = _ct_device(common, ct_first_number, unspecified_is_hounsfield=ct_unspecified_is_hounsfield)
+        devices["ct"] = (ct or CtReading()).device(common)
     section = RigSection(
         name=f"import of {Path(listing.folder).name}", simulated=simulated, devices=devices, imported=listing
     )
@@ -292,31 +306,25 @@ def _scan(place: Path, role: str) -> tuple[tuple[Path, ...], list[LeftOut]]:
     return export, left_out
 
 
-def _ct_device(folder: Path, first_number: int, *, unspecified_is_hounsfield: bool) -> dict[str, Any]:
-    device: dict[str, Any] = {"driver": "dicom_folder", "folder": str(folder), "stable_s": 0}
-    if first_number != 1:
-        device["first_number"] = first_number
-    return {**device, "unspecified_is_hounsfield": True} if unspecified_is_hounsfield else device
-
-
-def _ct(
-    folder: Path, first_number: int, *, unspecified_is_hounsfield: bool
-) -> tuple[tuple[Path, ...], list[LeftOut]]:
+def _ct(folder: Path, reading: CtReading) -> tuple[tuple[Path, ...], list[LeftOut]]:
     """The slices of the only complete series in a folder, and the other files there."""
-    device = _ct_device(folder, first_number, unspecified_is_hounsfield=unspecified_is_hounsfield)
-    section = RigSection(name="CT", devices={"ct": device})
+    section = RigSection(name="CT", devices={"ct": reading.device(folder)})
     station = Station(Rig(section, folder / "import-list.json", b""))
     try:
-        found = station.ct().series()
+        ct = station.ct()
+        found = ct.series()
+        problems = ct.report().problems
     finally:
         station.close()
     sound = [series for series in found if not series.problems and series.slices > 1]
     if len(sound) != 1:
-        problems = "; ".join(f"{one.description or one.uid}: {', '.join(one.problems)}" for one in found)
-        what = f"{len(sound)} CT series" if sound else f"no complete CT series ({problems or 'no DICOM file'})"
+        what = f"no complete CT series ({'; '.join(problems) or 'no DICOM file'})"
+        if sound:
+            names = "; ".join(one.description or one.uid for one in sound)
+            what = f"{len(sound)} CT series: {names}"
         remedy = (
-            "Name the folder of one complete series with --ct. What a rig.yaml would say of it, say with "
-            "--ct-first-number and --ct-unspecified-is-hounsfield"
+            "Name the folder of one complete series with --ct, or a part of its description with --ct-series. What a "
+            "rig.yaml would say of it, say with --ct-first-number and --ct-unspecified-is-hounsfield"
         )
         raise DataError(what, where=str(folder), remedy=remedy)
     chosen = set(sound[0].files)

@@ -32,6 +32,11 @@ class DicomFolderConfig(DriverConfig):
         description="values whose unit the files state as unspecified are Hounsfield units (rescale type US, as some "
         "programs write it when they copy a series)",
     )
+    series: str = Field(
+        default="",
+        description="part of the SeriesDescription of the series to use, such as MonoEnergeticPlus 70 keV, where the "
+        "suite delivers several products of one acquisition; empty: any, and of several a person is asked",
+    )
     deidentify: bool = Field(
         default=True,
         description="keep copies of series and segmentations that name no person, instead of the files themselves",

@@ -34,6 +34,7 @@ from drivers.interfaces import (
 from drivers.meshes.export_watch import ExportWatch
 from drivers.meshes.mesh_file import read_mesh_file
 from drivers.scan_folder import free_bytes, require_folder
+from service.core.units import seconds_of_ns
 
 _ARRIVING = "still arriving"
 _Headers = tuple[SliceHeader, ...] | str  # of one file; or why it cannot be read
@@ -44,10 +45,11 @@ _FileKey = tuple[Path, int, int]  # path, size, mtime in ns
 
 @dataclass(frozen=True, slots=True)
 class _Arrival:
-    """The files of a series, and since when this host has seen them unchanged."""
+    """The files of a series, since when this host has seen them unchanged, and when the newest was written."""
 
     files: frozenset[_FileKey]
     since_s: float
+    newest_ns: int
 
 
 class DicomFolder:
@@ -68,7 +70,7 @@ class DicomFolder:
         require_folder(self._config.folder)
         self._watch.poll()
         self._niftis.poll()
-        self.series()
+        self._groups()
         return self._identity()
 
     def close(self) -> None:
@@ -76,7 +78,7 @@ class DicomFolder:
 
     def report(self) -> DeviceReport:
         """Return the number of series, their problems, and the files that are not DICOM."""
-        series = self.series()
+        series = self._all_series()
         arriving = [one for one in series if any(text.startswith(_ARRIVING) for text in one.problems)]
         # A series in transfer is not a fault, and its other problems may only be due to missing files.
         problems = [
@@ -86,7 +88,8 @@ class DicomFolder:
             for text in one.problems
         ]
         problems += [text for text in self._headers.values() if isinstance(text, str)]
-        usable = [str(one.slices) for one in series if not one.problems]
+        problems += self._without_the_wanted(series)
+        usable = [str(one.slices) for one in series if not one.problems and self._is_wanted(one)]
         return DeviceReport(
             identity=self._identity(),
             free_bytes=free_bytes(self._config.folder),
@@ -94,23 +97,22 @@ class DicomFolder:
                 "series": str(len(series)),
                 "usable": f"{len(usable)}, of {', '.join(usable)} slices" if usable else "0",
                 "arriving": str(len(arriving)),
+                **self._asked_for(series),
                 "stable_s": f"{self._config.stable_s:g}",
             },
             problems=tuple(problems) + self._watch.poll()[1] + self._niftis.poll()[1],
         )
 
     def series(self) -> tuple[CtSeries, ...]:
-        """Return all series with images, including those with problems, sorted by UID.
+        """Return all series with images, including those with problems, oldest first.
+
+        If rig.yaml says which product of an acquisition to use, only those of that description.
 
         A series that this driver saw change less than `stable_s` ago has the problem "still arriving", because a
         series in transfer looks like a complete, shorter one. The age of the files is not used, since copying may
         preserve it and the clock of a share may differ.
         """
-        return tuple(
-            self._series(uid, headers, self._arriving(uid))
-            for uid, headers in sorted(self._groups().items())
-            if headers[0].modality != SEGMENTATION
-        )
+        return tuple(one for one in self._all_series() if self._is_wanted(one))
 
     def read(self, series: CtSeries) -> CtVolume:
         """Read one series into Hounsfield units.
@@ -185,6 +187,29 @@ class DicomFolder:
         """Read one segmented mesh, in metres; raises as drivers.meshes.mesh_file.read_mesh_file does."""
         return read_mesh_file(export.files[0], self._config.mesh_unit, export=export)
 
+    def _all_series(self) -> tuple[CtSeries, ...]:
+        found = [
+            self._series(uid, headers, self._arriving(uid))
+            for uid, headers in self._groups().items()
+            if headers[0].modality != SEGMENTATION
+        ]
+        return tuple(sorted(found, key=lambda one: (one.modified_utc, one.uid)))
+
+    def _is_wanted(self, series: CtSeries) -> bool:
+        return self._config.series.casefold() in series.description.casefold()
+
+    def _asked_for(self, series: Sequence[CtSeries]) -> dict[str, str]:
+        if not self._config.series:
+            return {}
+        others = [one.description or one.uid for one in series if not self._is_wanted(one)]
+        return {"series to use": self._config.series, "not used": ", ".join(others) or "none"}
+
+    def _without_the_wanted(self, series: Sequence[CtSeries]) -> list[str]:
+        if not series or any(self._is_wanted(one) for one in series):
+            return []
+        there = ", ".join(repr(one.description) for one in series)
+        return [f"no series has a description with {self._config.series!r}, as rig.yaml wants; there are {there}"]
+
     def _groups(self) -> dict[str, list[SliceHeader]]:
         """The readable slices by the UID of their series, and since when each series has not changed."""
         require_folder(self._config.folder)
@@ -202,7 +227,8 @@ class DicomFolder:
         arrivals: dict[str, _Arrival] = {}
         for uid, own in keys.items():
             files, old = frozenset(own | unread), self._arrivals.get(uid)
-            arrivals[uid] = old if old is not None and old.files == files else _Arrival(files, now)
+            newest_ns = max(modified_ns for _, _, modified_ns in own)
+            arrivals[uid] = old if old is not None and old.files == files else _Arrival(files, now, newest_ns)
         self._arrivals = arrivals
         return groups
 
@@ -248,7 +274,12 @@ class DicomFolder:
             problems=arriving + self._problems(headers),
             frame_of_reference=headers[0].frame_of_reference,
             acquired_images=acquired_images(headers),
+            modified_utc=self._modified_utc(uid),
         )
+
+    def _modified_utc(self, uid: str) -> str:
+        arrival = self._arrivals.get(uid)
+        return "" if arrival is None else _utc(arrival.newest_ns)
 
     def _identity(self) -> DeviceIdentity:
         return DeviceIdentity(
@@ -268,5 +299,9 @@ def _key(path: Path) -> _FileKey:
 
 
 def _segmentation(path: Path) -> ScanExport:
-    modified = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat().replace("+00:00", "Z")
-    return ScanExport(path.name, (path,), modified)
+    return ScanExport(path.name, (path,), _utc(path.stat().st_mtime_ns))
+
+
+def _utc(modified_ns: int) -> str:
+    moment = datetime.fromtimestamp(seconds_of_ns(modified_ns), UTC)
+    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")

@@ -70,6 +70,7 @@ class CtSeries:
     acquired_images: int | None = (
         None  # of its acquisition, as the files state: more than slices if it has other series
     )
+    modified_utc: str = ""  # when the newest of its files was written, by the clock of the folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +105,7 @@ class CtSource(Device, Protocol):
     """A CT suite, accessed through the DICOM folder that it delivers."""
 
     def series(self) -> tuple[CtSeries, ...]:
-        """Return all series found, including those with problems."""
+        """Return the series found, including those with problems, oldest first."""
         ...
 
     def read(self, series: CtSeries) -> CtVolume:

@@ -13,13 +13,17 @@ from drivers.meshes.foreign_text import alike, logical_lines, readings
 _HEAD_BYTES = 64 * 1024
 _TEXTURE = re.compile(rb"^\s*(?:map_\w+|bump|disp|decal|norm|refl)\s+(.+?)\s*$", re.MULTILINE | re.IGNORECASE)
 _MTLLIB = re.compile(rb"^\s*mtllib\s+(.+?)\s*$", re.MULTILINE)
+# What Artec Studio writes in a PLY with textures: it does not name them, they are NAME_0.jpg, NAME_1.jpg, …
+_NUMBERED = re.compile(rb"^element\s+multi_texture_vertex\s+0*[1-9]", re.MULTILINE)
+TEXTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".tga")
 _TEXTURE_FILE = re.compile(rb"^comment\s+TextureFile\s+(.+?)\s*$", re.MULTILINE | re.IGNORECASE)
 
 
 def companions(path: Path) -> tuple[Path, ...]:
-    """Find the MTL files of an OBJ and the textures they name, or those that a PLY names, in the same folder.
+    """Find the MTL files of an OBJ and the textures they name, or those of a PLY, in the same folder.
 
-    A name is compared in every encoding that it may be in, ignoring case and how accents are composed.
+    A PLY of Artec Studio has textures without naming them. A name is compared in every encoding that it may be in,
+    ignoring case and how accents are composed.
 
     Raises:
         IncompleteExportError: a companion is missing, perhaps only for now.
@@ -34,12 +38,36 @@ def companions(path: Path) -> tuple[Path, ...]:
     if suffix == ".ply":
         header = head.split(b"end_header", maxsplit=1)[0].replace(b"\r", b"\n")
         found = [_beside(path, name[1]) for name in _TEXTURE_FILE.finditer(header)]
+        if _NUMBERED.search(header):
+            found += numbered_textures(path, 1)
         return tuple(dict.fromkeys(found))
     for library in _libraries(path, next(logical_lines(path), b"")[:_HEAD_BYTES]):
         found.append(library)
         for texture in _TEXTURE.finditer(b"".join(logical_lines(library))):
             found.append(_beside(path, _texture_name(texture[1]), named_in=library))
     return tuple(dict.fromkeys(found))
+
+
+def numbered_textures(path: Path, at_least: int) -> list[Path]:
+    """The textures of a PLY that counts them: NAME_0, NAME_1, … beside it, of any kind of image.
+
+    Raises IncompleteExportError if there are fewer than `at_least`, perhaps only for now.
+    """
+    found: list[Path] = []
+    while here := _numbered(path, len(found)):
+        found.append(here)
+    if len(found) < at_least:
+        raise IncompleteExportError(
+            f"its texture {path.stem}_{len(found)} (.jpg or another image) is missing",
+            where=str(path),
+            remedy="Wait until the export has finished; if it has, export again, with its textures beside the mesh",
+        )
+    return found
+
+
+def _numbered(path: Path, number: int) -> Path | None:
+    names = (f"{path.stem}_{number}{suffix}" for suffix in TEXTURE_SUFFIXES)
+    return next((here for name in names if (here := _found(path.parent, name, os.fsencode(name))) is not None), None)
 
 
 def companion_names(content: bytes) -> Iterator[str]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.foreign_code import reading
 from drivers.interfaces import Array, Mesh, ScanExport, ScannedMesh
-from drivers.meshes.companions import companions
+from drivers.meshes.companions import TEXTURE_SUFFIXES, companions
 from drivers.meshes.foreign_text import name_of
 from drivers.meshes.mesh_format import check_complete
 from drivers.meshes.obj import read_obj
@@ -32,7 +32,6 @@ METRES_PER_UNIT = {"mm": 1e-3, "m": 1.0}
 SCENE_DIAGONAL_M = (0.1, 3.0)
 OBJECT_DIAGONAL_M = (0.02, 20.0)
 MESH_SUFFIXES = (".obj", ".ply", ".stl")
-TEXTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".tga")
 
 
 def export_of(path: Path) -> ScanExport:

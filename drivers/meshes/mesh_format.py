@@ -9,7 +9,7 @@ from pathlib import Path
 from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.foreign_code import reading
 from drivers.meshes.foreign_text import logical_lines, readings
-from drivers.meshes.ply import Element, read_header
+from drivers.meshes.ply import TEXTURE_FACE, Element, read_header
 from drivers.meshes.stl import announced_bytes
 
 _NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -114,9 +114,11 @@ def _check_ply(path: Path, size: int, *, points: bool) -> None:
 
 
 def _least_bytes(element: Element) -> int:
-    """The least size of a row: a face has at least three corners."""
-    corners = next((one.kind for one in element.properties if one.count_kind), "") if element.name == "face" else ""
-    return element.least_bytes + 3 * struct.calcsize(corners)
+    """The least size of a row: a face has at least three corners, and so have its texture's corners."""
+    corners = [one.kind for one in element.properties if one.count_kind and "ind" in one.name]
+    if element.name not in ("face", TEXTURE_FACE):
+        corners = []
+    return element.least_bytes + 3 * sum(struct.calcsize(kind) for kind in corners)
 
 
 def _last_row_short(path: Path, element: Element) -> bool:

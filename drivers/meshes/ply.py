@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import IncompleteExportError, UnreadableFileError
 from drivers.interfaces import Array
+from drivers.meshes.companions import numbered_textures
 from drivers.meshes.foreign_text import numbers, readings
 from drivers.meshes.raw_mesh import IntArray, Polygons, RawMesh, raw_mesh
 
@@ -37,6 +39,8 @@ _KINDS = {
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _TEXTURES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
+# Artec Studio writes the places on textures, and which image each is of, as elements of their own.
+TEXTURE_VERTEX, TEXTURE_FACE = "multi_texture_vertex", "multi_texture_face"
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,16 +151,25 @@ def _property(name: bytes, kind: bytes, count_kind: bytes = b"") -> Property:
 def read_rows(path: Path) -> dict[str, Rows]:
     """Read all elements of a PLY, by name.
 
-    Raises ValueError if the file does not hold what its header announces; IncompleteExportError and
-    UnreadableFileError as read_header does; OSError.
+    Raises:
+        IncompleteExportError: the file is cut short.
+        ValueError: it does not hold what its header announces.
+        UnreadableFileError: as read_header does.
+        OSError: it cannot be read.
     """
-    header = read_header(path)
+    try:
+        return _all_rows(path, read_header(path))
+    except _CutShortError as error:
+        raise IncompleteExportError(f"the file is cut short: {error}", where=str(path), remedy=_AGAIN) from error
+
+
+def _all_rows(path: Path, header: PlyHeader) -> dict[str, Rows]:
     cells = _Cells.of(path, header)
     at, found = 0, dict[str, Rows]()
     for element in header.elements:
         least = sum(cells.width(one.count_kind or one.kind) for one in element.properties)
         if least * element.count > len(cells.data) - at:
-            raise ValueError(_SHORT)
+            raise _CutShortError
         found[element.name], at = _rows(cells, element, at)
     if cells.data[at:].tobytes().strip(b"\r\n \0"):
         raise ValueError("it is longer than its header announces")
@@ -164,7 +177,7 @@ def read_rows(path: Path) -> dict[str, Rows]:
 
 
 def read_ply(path: Path) -> RawMesh:
-    """Read the polygons of a PLY. Raises as read_rows does."""
+    """Read the polygons of a PLY. Raises as read_rows does, and IncompleteExportError if a texture is missing."""
     found = read_rows(path)
     if "vertex" not in found or (vertices := found["vertex"].table("x", "y", "z")) is None:
         raise ValueError("it has no vertices with x, y and z")
@@ -172,6 +185,8 @@ def read_ply(path: Path) -> RawMesh:
     corners, counts = _indices(face)
     uv = next((table for names in _TEXTURES if (table := vertex.table(*names)) is not None), None)
     corner_uv = None if uv is None or not _within(corners, len(uv)) else uv[corners]
+    numbered_textures(path, _texture_count(found))
+    corner_uv = _wedges(found, corners, counts) if TEXTURE_FACE in found else corner_uv
     wedges, each = face.lists.get("texcoord", (None, None))
     if wedges is not None and np.array_equal(np.asarray(each), 2 * counts):
         corner_uv = wedges.astype(np.float64).reshape(-1, 2)
@@ -181,6 +196,22 @@ def read_ply(path: Path) -> RawMesh:
         normals=vertex.table("nx", "ny", "nz"),
         colours=_colours(vertex),
     )
+
+
+def _texture_count(rows: Mapping[str, Rows]) -> int:
+    """The number of texture images to which a PLY of Artec Studio refers; 0 for others."""
+    texture = rows.get(TEXTURE_VERTEX, Rows({}, {})).columns.get("tx", np.empty(0))
+    return int(texture.max()) + 1 if len(texture) else 0
+
+
+def _wedges(found: Mapping[str, Rows], corners: IntArray, counts: IntArray) -> Array | None:
+    """The places (C, 2) of the faces' corners on textures, as Artec Studio writes them; None if not all have."""
+    vertex = found.get(TEXTURE_VERTEX, Rows({}, {}))
+    places = next((table for names in _TEXTURES if (table := vertex.table(*names)) is not None), None)
+    index, each = _indices(found[TEXTURE_FACE])
+    if places is None or not np.array_equal(each, counts) or not _within(index, len(places)):
+        return None
+    return places[index]
 
 
 def _within(index: IntArray, count: int) -> bool:
@@ -208,7 +239,12 @@ def _colours(vertex: Rows) -> Array | None:
 
 # --- rows ----------------------------------------------------------------------------------------------
 
-_SHORT = "it is shorter than its header announces"
+
+class _CutShortError(ValueError):
+    """The data end before the last row."""
+
+    def __init__(self) -> None:
+        super().__init__("it is shorter than its header announces")
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,7 +322,7 @@ def _row_counts(cells: _Cells, element: Element, at: int) -> list[int]:
         count = 0
         if one.count_kind:
             if at + cells.width(one.count_kind) > len(cells.data):
-                raise ValueError(_SHORT)
+                raise _CutShortError
             count = cells.one(at, one.count_kind)
             at += cells.width(one.count_kind) + count * cells.width(one.kind)
         else:
@@ -336,9 +372,9 @@ def _each(cells: _Cells, element: Element, at: int) -> tuple[Rows, int]:
             begins[-1].append(at)
             at += gap
     except (struct.error, IndexError):
-        raise ValueError(_SHORT) from None
+        raise _CutShortError from None
     if at > len(cells.data):
-        raise ValueError(_SHORT)
+        raise _CutShortError
     rows = Rows({}, {})
     k, offset = 0, 0
     for one in element.properties:

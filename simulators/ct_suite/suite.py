@@ -6,6 +6,8 @@ import argparse
 import logging
 import tempfile
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +26,32 @@ from simulators.units import metres, mm
 log = logging.getLogger(__name__)
 
 RESCALE_INTERCEPT = -1024
+
+
+@dataclass(frozen=True, slots=True)
+class Product:
+    """What a photon-counting suite computes from an acquisition, besides the others, into the same folder.
+
+    Attributes:
+        description: as a NAEOTOM Alpha writes it.
+        image_type: its fourth value.
+        above_water: factor of the Hounsfield units above 0, as these depend on the energy.
+        suffix: of its files.
+    """
+
+    description: str
+    image_type: str
+    above_water: float
+    suffix: str = ".dcm"
+
+
+# Of a NAEOTOM Alpha, as programs tell that read its exports: slices that overlap, other grey values, one geometry.
+PRODUCTS = (
+    Product("MonoEnergeticPlus 70 keV", "VMI", 1.0),
+    Product("ProtocolModel WFBP_T1 Qr40f(3) 0.4 (0.4) [A,1]_0", "NONE", 1.12, ".ima"),
+    Product("VNC", "MAT_REMOVED", 0.6, ".ima"),
+)
+_THICKNESS = 1.5  # of a slice, as a multiple of the distance between slices, where there are several products
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,6 +81,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=network_address,
         metavar="HOST:PORT",
         help="send the series there (C-STORE, by dcmtk) instead",
+    )
+    parser.add_argument(
+        "--products",
+        action="store_true",
+        help="deliver the products of one acquisition of a photon-counting suite, with overlapping slices, together",
     )
     parser.add_argument("--implicit-vr", action="store_true", help="write implicit VR little endian")
 
@@ -98,7 +131,10 @@ def _scan(scene: Scene, args: argparse.Namespace, *, announce_it: bool) -> None:
             number = 1 + len([entry for entry in folder.glob("series_*") if entry.is_dir()])
             target = folder / f"series_{number:02d}"
             target.mkdir()
-        write_series(target, volume, grid, T_ct_grid, series, implicit=args.implicit_vr, faults=args.faults)
+        if args.products:
+            write_products(target, volume, grid, T_ct_grid, series, faults=args.faults)
+        else:
+            write_series(target, volume, grid, T_ct_grid, series, implicit=args.implicit_vr, faults=args.faults)
         if args.send_to is not None:
             send_series(target, *args.send_to)
     if announce_it:
@@ -119,13 +155,18 @@ def write_series(
     *,
     implicit: bool = False,
     faults: FaultPlan,
+    product: Product | None = None,
 ) -> None:
-    """Write volume (K, J, I) as one DICOM file per slice.
+    """Write volume (K, J, I) as one DICOM file per slice; as a product of an acquisition, if one is given.
 
     `T_ct_grid` is rigid, with its origin at the centre of voxel (0, 0, 0). Faults of the device `ct`: on `slice` drop
     (a gap), truncate, corrupt, duplicate, tilt, disk_full; on `series` localiser.
     """
     common = _common(volume.shape, grid, T_ct_grid, series)
+    prefix, suffix = "CT", ".dcm"
+    if product is not None:
+        _of_product(common, product, series)
+        prefix, suffix = f"P{PRODUCTS.index(product)}_", product.suffix
     syntax = ImplicitVRLittleEndian if implicit else ExplicitVRLittleEndian
     number = 0
     for k in range(len(volume)):
@@ -140,7 +181,7 @@ def write_series(
         path = folder
         for _ in range(2 if kind == "duplicate" else 1):
             number += 1
-            path = folder / f"CT{number:05d}.dcm"
+            path = folder / f"{prefix}{number:05d}{suffix}"
             _write_slice(path, common, volume[k], position, number, syntax, tilted=kind == "tilt")
         if kind in ("truncate", "corrupt"):
             data = path.read_bytes()
@@ -149,7 +190,44 @@ def write_series(
         number += 1
         common.ImageType = ["ORIGINAL", "PRIMARY", "LOCALIZER"]
         position = mm(T_ct_grid[:3, 3])
-        _write_slice(folder / f"CT{number:05d}.dcm", common, volume[0], position, number, syntax, tilted=True)
+        _write_slice(
+            folder / f"{prefix}{number:05d}{suffix}", common, volume[0], position, number, syntax, tilted=True
+        )
+
+
+def write_products(
+    folder: Path,
+    volume: NDArray[np.int16],
+    grid: Grid,
+    T_ct_grid: Array,
+    series: str,
+    *,
+    products: Sequence[Product] = PRODUCTS,
+    faults: FaultPlan,
+) -> None:
+    """Write volume (K, J, I) as the products of one acquisition, as `write_series` does, all into one folder.
+
+    Each slice is as thick as `_THICKNESS` steps, so it overlaps its neighbours and mixes their values.
+    """
+    beside = (_THICKNESS - 1.0) / 2.0
+    above, below = (np.concatenate(pair) for pair in ((volume[:1], volume[:-1]), (volume[1:], volume[-1:])))
+    thick = (volume + beside * (above.astype(np.float32) + below)) / _THICKNESS
+    for product in products:
+        values = np.where(thick > 0, thick * product.above_water, thick)
+        write_series(
+            folder, np.round(values).astype(np.int16), grid, T_ct_grid, series, faults=faults, product=product
+        )
+
+
+def _of_product(common: Dataset, product: Product, series: str) -> None:
+    """Change the elements of a slice to those of a product of the acquisition."""
+    common.SeriesInstanceUID = generate_uid(entropy_srcs=[series, product.description])
+    common.SeriesDescription = product.description
+    common.SeriesNumber = 2 + PRODUCTS.index(product)
+    common.ImageType = [*common.ImageType, product.image_type]
+    common.SliceThickness = _decimal(_THICKNESS * float(common.SliceThickness))
+    common.ConvolutionKernel, common.KVP = "Qr40f", 140
+    common.ImagesInAcquisition = len(PRODUCTS) * common.ImagesInAcquisition
 
 
 def _common(shape: tuple[int, ...], grid: Grid, T_ct_grid: Array, series: str) -> Dataset:

@@ -1,4 +1,9 @@
-"""Encodes scans as a scanner's software writes them: binary PLY and STL, OBJ with material and texture."""
+"""Encodes scans as a scanner's software writes them: binary PLY and STL, OBJ with material and texture.
+
+Artec Studio's PLY is as in openscenegraph/OpenSceneGraph#908: without normals, with the places on textures as
+elements of their own, and with textures that lie beside it and are not named in it. Its MTL has two comments, white
+materials, and a second material without a map.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +14,52 @@ import numpy as np
 
 from simulators.geometry import Array, Ints
 
+_ARTEC_PLY = "comment File exported by Artec Group 3D Scanning Solutions\ncomment www.artec-group.com\n"
+_ARTEC_MTL = """\
+#File exported by Artec 3D Scanning Solutions
+#www.artec3d.com
+newmtl material_0
+Ka 1 1 1
+Kd 1 1 1
+Ks 1 1 1
+Ns 1000
+map_Kd {stem}_0.png
+newmtl material_1
+Ka 1 1 1
+Kd 1 1 1
+Ks 1 1 1
+Ns 1000
+"""
 
-def encode(kind: str, name: str, vertices: Array, faces: Ints, normals: Array | None) -> list[tuple[str, bytes]]:
-    """Return the names and contents of an export's files, the mesh first; vertices (V, 3) are in the file's unit."""
+
+def encode(
+    kind: str, name: str, vertices: Array, faces: Ints, normals: Array | None, *, artec: bool = False
+) -> list[tuple[str, bytes]]:
+    """Return the names and contents of an export's files, the mesh first.
+
+    Args:
+        kind: ply, obj or stl.
+        name: of the mesh file.
+        vertices: (V, 3), in the file's unit.
+        faces: (F, 3).
+        normals: of the vertices (V, 3); None if the scanner exports none.
+        artec: as Artec Studio writes it.
+    """
+    stem = name.rsplit(".", 1)[0]
+    if kind == "ply" and artec:
+        return [(name, _artec_ply(vertices, faces)), (f"{stem}_0.jpg", _texture(".jpg"))]
     if kind == "ply":
         return [(name, _ply(vertices, faces, normals))]
     if kind == "stl":
         return [(name, _stl(vertices, faces))]
-    stem = name.rsplit(".", 1)[0]
     material = f"newmtl surface\nKd 0.8 0.8 0.8\nmap_Kd {stem}_0.png\n".encode()
+    if artec:
+        material = _ARTEC_MTL.format(stem=stem).encode()
     return [
-        (name, _obj(stem, vertices, faces, normals)),
+        (name, _obj(stem, "material_0" if artec else "surface", vertices, faces, normals)),
         # Upper and lower case differ from what the OBJ and MTL files say, as on case-insensitive file systems.
         (f"{stem}.MTL", material),
-        (f"{stem}_0.PNG", _texture()),
+        (f"{stem}_0.PNG", _texture(".png")),
     ]
 
 
@@ -48,12 +85,34 @@ def _stl(vertices: Array, faces: Ints) -> bytes:
     return b"scan".ljust(80, b"\0") + struct.pack("<I", len(faces)) + rows.tobytes()
 
 
-def _obj(stem: str, vertices: Array, faces: Ints, normals: Array | None) -> bytes:
+def _artec_ply(vertices: Array, faces: Ints) -> bytes:
+    head = ["ply", "format binary_little_endian 1.0", _ARTEC_PLY.rstrip(), f"element vertex {len(vertices)}"]
+    head += [f"property float {axis}" for axis in ("x", "y", "z")]
+    head += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    head += [f"element multi_texture_vertex {len(vertices)}", "property uchar tx"]
+    head += [f"property float {name}" for name in ("u", "v")]
+    head += [f"element multi_texture_face {len(faces)}", "property uchar tx", "property uint tn"]
+    head += ["property list uchar int texture_vertex_indices", "end_header", ""]
+    corners = np.empty(len(faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
+    corners["n"], corners["v"] = 3, faces
+    places = np.zeros(len(vertices), dtype=[("tx", "u1"), ("uv", "<f4", 2)])
+    places["uv"] = _places(vertices)
+    wedges = np.zeros(len(faces), dtype=[("tx", "u1"), ("tn", "<u4"), ("n", "u1"), ("v", "<i4", 3)])
+    wedges["n"], wedges["v"] = 3, faces
+    rows = (vertices.astype("<f4"), corners, places, wedges)
+    return "\n".join(head).encode() + b"".join(part.tobytes() for part in rows)
+
+
+def _places(vertices: Array) -> Array:
+    """Places (V, 2) on the texture, from 0 to 1."""
     low, span = vertices.min(axis=0), np.ptp(vertices, axis=0)
-    uv = ((vertices - low) / span)[:, :2]
-    text = [f"# {len(vertices)} vertices\n# {len(faces)} faces\nmtllib {stem}.mtl\nusemtl surface\n"]
+    return ((vertices - low) / span)[:, :2]
+
+
+def _obj(stem: str, material: str, vertices: Array, faces: Ints, normals: Array | None) -> bytes:
+    text = [f"# {len(vertices)} vertices\n# {len(faces)} faces\nmtllib {stem}.mtl\nusemtl {material}\n"]
     text.append(_rows("v %.5f %.5f %.5f\n", vertices))
-    text.append(_rows("vt %.5f %.5f\n", uv))
+    text.append(_rows("vt %.5f %.5f\n", _places(vertices)))
     index = faces + 1
     if normals is not None:
         text.append(_rows("vn %.4f %.4f %.4f\n", normals))
@@ -70,8 +129,8 @@ def _rows(form: str, rows: Array | Ints) -> str:
     )
 
 
-def _texture() -> bytes:
+def _texture(kind: str) -> bytes:
     image = np.random.default_rng(1).integers(150, 220, (64, 64, 3)).astype(np.uint8)
-    ok, data = cv2.imencode(".png", image)
+    ok, data = cv2.imencode(kind, image)
     assert ok
     return data.tobytes()

@@ -276,7 +276,9 @@ def _mesh(scene: Scene, args: argparse.Namespace, kind: str, nth: int) -> _Expor
         nth=nth,
     )
     vertices = in_unit(scan.vertices_m, args.unit)
-    files = encode(kind, f"scan_{nth:02d}.{kind}", vertices, scan.faces, scan.normals if args.normals else None)
+    artec = args.scanner.startswith("artec")
+    normals = scan.normals if args.normals else None
+    files = encode(kind, f"scan_{nth:02d}.{kind}", vertices, scan.faces, normals, artec=artec)
     return _Export(files, scan.T_world_scan, len(scan.faces))
 
 

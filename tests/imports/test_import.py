@@ -23,7 +23,7 @@ from service.core.records.import_list import FileRole, PhotographRole
 from service.dataset.posed.exporter import exporter, write_data_set
 from service.dataset.posed.of_run.data_set import data_set_of
 from service.dataset.summary import summarise
-from service.import_folder import find_places, import_rig, list_import
+from service.import_folder import CtReading, find_places, import_rig, list_import
 from service.run_start import recorded_rig, recorded_run, start_run
 from service.steps import params_models
 from service.steps.kinds.imports.image_import import StatedSettings, stated_settings_agree
@@ -62,7 +62,7 @@ def folder(small: Path, tmp_path: Path) -> Path:
 
 
 def listed(folder: Path, first_number: int = 1) -> Any:
-    return list_import(find_places(folder, {}, PARTS), ct_first_number=first_number)
+    return list_import(find_places(folder, {}, PARTS), ct=CtReading(first_number))
 
 
 def left_out(folder: Path) -> dict[str, str]:
@@ -154,7 +154,7 @@ def test_a_series_whose_first_slices_are_missing_is_taken_only_on_purpose(folder
     words = ["import", str(folder), "--dry-run", "--ct-first-number", "3", "--json"]
     shown = CliRunner().invoke(app, words, catch_exceptions=False)
     assert len(json.loads(shown.output)["files"]["ct"]) == len(rest)
-    rig = import_rig(listed(folder, 3), simulated=True, ct_first_number=3)
+    rig = import_rig(listed(folder, 3), simulated=True, ct=CtReading(3))
     assert rig.section.devices["ct"]["first_number"] == 3
 
 

@@ -31,6 +31,7 @@ from service.core.geometry import Array
 from service.store.store import Store
 from service.worker.job import JobContext, RecordedContext
 from service.worker.loop import HANDLERS
+from simulators.scan_station.formats import encode
 
 RADIUS_MM = 15.0
 CENTRES_MM = np.array([[-120.0, -60, 560], [110, -70, 590], [10, 80, 540], [-20, -10, 610]])
@@ -117,6 +118,20 @@ def test_every_profile_has_its_entry_point_and_advice() -> None:
 def test_a_profile_that_is_not_installed_is_refused_with_those_that_are(tmp_path: Path) -> None:
     with pytest.raises(ValidationError, match=r"no scan profile 'artek'.*artec_leo"):
         ScanFolderConfig(folder=tmp_path, profile="artek")
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj"])
+@pytest.mark.parametrize("profile", ["artec_leo", "artec_space_spider"])
+def test_what_the_simulated_artec_studio_exports_is_read_with_its_texture(
+    tmp_path: Path, profile: str, kind: str
+) -> None:
+    mesh = bodies()
+    for name, data in encode(kind, f"scan 1.{kind}", np.array(mesh.vertices), np.array(mesh.faces), None, artec=True):
+        (tmp_path / name).write_bytes(data)
+    scan = scanned(tmp_path, profile)
+    assert scan.findings["textures"] == 1
+    assert len(scan.source.files) == (2 if kind == "ply" else 3)
+    spheres_are_found(scan, 0.02)
 
 
 @pytest.mark.parametrize("profile", MESHES)

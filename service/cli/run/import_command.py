@@ -34,7 +34,7 @@ from service.core.records.import_list import FileRole, ImportedView, ImportList,
 from service.core.units import megabytes
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import summarise
-from service.import_folder import find_places, import_rig, list_import
+from service.import_folder import CtReading, find_places, import_rig, list_import
 from service.jobs.registration.evaluate import Row
 from service.rig import Rig
 from service.run_record import recorded_root
@@ -69,11 +69,15 @@ def import_command(
     control_scan: Annotated[
         Path | None, typer.Option("--control-scan", help="The mesh that also shows the control spheres.")
     ] = None,
-    ct: Annotated[Path | None, typer.Option("--ct", metavar="DIR", help="Folder of one DICOM series.")] = None,
+    ct: Annotated[Path | None, typer.Option("--ct", metavar="DIR", help="Folder of a DICOM series.")] = None,
     ct_first_number: Annotated[
         int,
         typer.Option("--ct-first-number", min=0, help="Number of the series' first slice, if it is not 1."),
     ] = 1,
+    ct_series: Annotated[
+        str,
+        typer.Option("--ct-series", metavar="TEXT", help="A part of the series' description, if there are several."),
+    ] = "",
     ct_unspecified_is_hounsfield: Annotated[
         bool,
         typer.Option(
@@ -110,18 +114,14 @@ def import_command(
         "control_scan": control_scan,
         "ct": ct,
     }
+    reading = CtReading(ct_first_number, ct_series, ct_unspecified_is_hounsfield)
     with reporting_errors(json):
         about = RunAbout() if dry_run else described(specimen, purpose=purpose, site=site, remarks=remarks)
         loaded = load_protocol(protocol_file(protocol), params_models())
         require_plausible(loaded, str(protocol))
         with progress_bar(quiet=json) as progress:
             places = find_places(folder, given, _parts_of(loaded.protocol))
-            listing = list_import(
-                places,
-                progress,
-                ct_first_number=ct_first_number,
-                ct_unspecified_is_hounsfield=ct_unspecified_is_hounsfield,
-            )
+            listing = list_import(places, progress, ct=reading)
         _require_wanted(loaded.protocol, listing)
         if not json:
             _show(listing)
@@ -129,12 +129,7 @@ def import_command(
             if json:
                 print_json(listing_record(listing))
             return
-        rig = import_rig(
-            listing,
-            simulated=simulated,
-            ct_first_number=ct_first_number,
-            ct_unspecified_is_hounsfield=ct_unspecified_is_hounsfield,
-        )
+        rig = import_rig(listing, simulated=simulated, ct=reading)
         with Store.open(data) as store:
             who = acting_person(store, operator, password_stdin=password_stdin)
             run_id = _run_of(store, loaded, rig, operator=who.name, again=again, about=about)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
-from drivers.interfaces import CtSource, CtVolume
+from drivers.interfaces import CtSeries, CtSource, CtVolume
+from service.core.errors import DataError
 from service.core.protocol.step_params import NeededDevice, RepeatedStep, StepParams
 from service.core.records.events import ArtefactRef, Record
 from service.core.units import metres, mm
@@ -133,8 +134,25 @@ def _labels(
     return (*kept, array), {"label_voxels": float(np.count_nonzero(labels.inside))}
 
 
-def _sound(ct: CtSource) -> tuple[Any, ...]:
-    return tuple(series for series in ct.series() if not series.problems and series.slices > 1)
+def _sound(ct: CtSource) -> Sequence[CtSeries]:
+    """The series without faults, oldest first.
+
+    Raises DataError if the newest is one of several in the same frame of reference, such as the products of one
+    acquisition of a photon-counting suite: all show the specimen, with other values.
+    """
+    found = [series for series in ct.series() if not series.problems and series.slices > 1]
+    frame = found[-1].frame_of_reference if found else ""
+    alike = [series for series in found if frame and series.frame_of_reference == frame]
+    if len(alike) > 1:
+        names = "; ".join(f"{series.description or series.uid} ({series.slices} slices)" for series in alike)
+        raise DataError(
+            f"{len(alike)} series show the specimen in the same frame of reference, and nothing says which to use: "
+            f"{names}",
+            where="the CT folder",
+            remedy="Take the others out of the CT folder, then confirm; for the next run, name the one to use in "
+            "rig.yaml (series: a part of its description)",
+        )
+    return found
 
 
 KIND = StepKind(
