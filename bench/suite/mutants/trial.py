@@ -16,13 +16,15 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
 from bench.machine import REPOSITORY
-from bench.suite.mutants.places import Mutation
 from bench.suite.mutants.reach import Selected
+
+if TYPE_CHECKING:
+    from bench.suite.mutants.places import Mutation
 
 # What most tests import and no mutation changes.
 LIBRARIES = (
