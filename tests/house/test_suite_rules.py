@@ -87,6 +87,7 @@ def test_not_set_up(broken): pass
     assert "first failure of test_it.py::test_late" in answer.stdout
 
 
+@pytest.mark.slow
 def test_one_worker_compiles_a_file_and_the_others_read_what_it_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,13 +5,15 @@ The order of files is chosen here, too: the dearest first.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import gc
 import json
 import os
 import sys
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -44,17 +46,36 @@ def pytest_make_collect_report(
     collector: pytest.Collector,
 ) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
     """Let one worker compile a file while the others wait for it: in a fresh clone all of them begin at once."""
-    shared = hasattr(collector.config, "workerinput") and not (sys.dont_write_bytecode or sys.pycache_prefix)
+    config = collector.config
+    shared = _is_worker(config) and not (sys.dont_write_bytecode or sys.pycache_prefix)
     if not (shared and isinstance(collector, pytest.Module)) or is_compiled(collector.path):
         return (yield)
-    folder = os.open(collector.config.rootpath, os.O_RDONLY)
-    try:
-        fcntl.flock(folder, fcntl.LOCK_EX)
+    with _alone(config):
         if not is_compiled(collector.path):
             return (yield)
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config) -> Generator[None, object, object]:
+    """Let one worker read the constants of the program for Hypothesis, which keeps them for the others."""
+    with _alone(config) if _is_worker(config) else contextlib.nullcontext():
+        return (yield)
+
+
+def _is_worker(config: pytest.Config) -> bool:
+    return hasattr(config, "workerinput")
+
+
+@contextmanager
+def _alone(config: pytest.Config) -> Generator[None]:
+    """Do something while no other process of these tests does."""
+    folder = os.open(config.rootpath, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
     finally:
         os.close(folder)
-    return (yield)
 
 
 def listed_costs() -> Costs:
@@ -70,7 +91,7 @@ def dearest_first(tests: Sequence[str], costs: Costs) -> list[int]:
     [2, 0, 1]
     """
     places: list[str] = []
-    cost_s: Counter[str] = Counter()
+    cost_s: dict[str, float] = defaultdict(float)
     for test in tests:
         file, _, name = test.partition("[")[0].partition("::")
         places.append(_BROWSER if file.startswith(_BROWSER) else file)

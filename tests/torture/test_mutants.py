@@ -5,6 +5,10 @@ from __future__ import annotations
 import ast
 import json
 import os
+import py_compile
+import re
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -14,7 +18,7 @@ from bench.machine import REPOSITORY
 from bench.suite.mutants.reach import RECORD, Reach, digest, files_of_tests
 from bench.suite.mutants.recorder import functions
 from bench.suite.mutants.subjects import SUBJECTS, TESTS
-from bench.suite.mutants.trial import Trial
+from bench.suite.mutants.trial import Trial, copied_tree
 
 MODULE = '''"""Words."""
 
@@ -159,6 +163,17 @@ def test_a_mutation_is_killed_by_a_test_that_fails_and_the_tree_is_as_before(
         assert verdict.outcome == outcome, verdict.by
         assert verdict.by == ("tests/core/test_gate.py::test_limit" if outcome == "killed" else "")
         assert (folder / GATES).read_text() == MODULE
+
+
+def test_a_copied_tree_need_not_be_compiled_again(tmp_path: Path) -> None:
+    module = "bench/suite/mutants/subjects.py"
+    py_compile.compile(str(REPOSITORY / module))
+    copied = copied_tree(tmp_path / "tree", None)
+    shown = subprocess.run(
+        [sys.executable, "-v", "-c", "import bench.suite.mutants.subjects"],
+        cwd=copied, env={**os.environ, "PYTHONPATH": str(copied)}, capture_output=True, text=True, check=True,
+    ).stderr  # fmt: skip
+    assert re.search(rf"subjects\S*\.pyc matches {re.escape(str(copied / module))}", shown)
 
 
 def test_the_record_is_of_tests_and_functions_that_exist() -> None:
