@@ -1,4 +1,4 @@
-"""Settings for all tests: repeatable examples, one thread of linear algebra, files in memory, long files first."""
+"""Settings for all tests: repeatable examples, one thread of linear algebra, files in memory, dear files first."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.plugins import collecting
 from tests.plugins.cpu_record import CpuRecord
 from tests.plugins.draw import Draw
 
@@ -50,6 +51,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Register the plug-ins of this suite."""
+    config.pluginmanager.register(collecting)
     directory: Path | None = config.getoption("--cpu-record")
     if directory is not None:
         config.pluginmanager.register(CpuRecord(directory / f"{os.environ.get('PYTEST_XDIST_WORKER', 'main')}.jsonl"))
@@ -64,16 +66,14 @@ def pytest_xdist_auto_num_workers() -> int:
     return min(2 * (os.cpu_count() or 1), MOST_WORKERS)
 
 
+@pytest.hookimpl(trylast=True)  # once those that do not run have been left out
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Put the files with slow tests first, so that none keeps one process busy while all others have ended.
-
-    A test that meets the clock may run once more if it failed.
-    """
+    """Put the dearest files first. A test that meets the clock may run once more if it failed."""
     for item in items:
         if item.get_closest_marker("realtime") is not None:
             item.add_marker(pytest.mark.flaky(reruns=1))
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    order = collecting.dearest_first([item.nodeid for item in items], collecting.listed_costs())
+    items[:] = [items[k] for k in order]
     items *= int(config.getoption("--repeat") or 1)
 
 

@@ -16,7 +16,7 @@ from service.compute.pixels.ray_mesh import RayMesh
 from service.core.errors import ComputeError
 from service.core.geometry import Array, transform
 from service.dataset.posed.exporter import exporter, write_data_set
-from tests.support.scenes.slab_data_set import SLABS, slab_data_set, slab_mesh
+from tests.support.scenes.slab_data_set import slab_data_set, slab_mesh, slab_scene
 
 
 def write_map(path: Path, values: Array) -> None:
@@ -68,7 +68,7 @@ def test_the_depth_maps_are_fused_and_meshed_in_the_frame_of_the_poses(
     options = pycolmap.PoissonMeshingOptions()
     options.depth, options.trim = 8, 5.0  # there are 16,000 points
     reconstruct(dense, tmp_path / "fused.ply", tmp_path / "mesh.ply", options)
-    heights = np.array(sorted({slab.z for slab in SLABS}))
+    heights = np.array(sorted({slab.z for slab in slab_scene()}))
     for name, most_m in (("fused.ply", 0.2e-3), ("mesh.ply", 1e-3)):
         vertices = read_surface_file(tmp_path / name, "m").vertices_m
         assert len(vertices) > 2000

@@ -22,7 +22,7 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, look_at
 from service.dataset.posed.records import DataSet
 from tests.support.scenes.depth_of_sphere import depth_of_sphere
-from tests.support.scenes.slab_data_set import SLABS, slab_data_set, slab_mesh
+from tests.support.scenes.slab_data_set import slab_data_set, slab_mesh, slab_scene
 from tests.support.scenes.textured_scene import render
 
 PINHOLE = CameraModel(320, 240, 450.0, 450.0, 159.5, 119.5)
@@ -32,7 +32,7 @@ UP = np.array([0.0, 1.0, 0.1])
 def height_m(places: Array) -> Array:
     """Height of the uppermost slab at places (N, 2)."""
     out = np.zeros(len(places))
-    for slab in SLABS:
+    for slab in slab_scene():
         inside = ((places > slab.low) & (places < slab.high)).all(axis=1)
         out[inside] = np.maximum(out[inside], slab.z)
     return out
@@ -45,7 +45,7 @@ def eye_at(angle_deg: float, tilt_deg: float = 25.0) -> Transform:
 
 
 def seen_from(T_world_camera: Transform) -> StereoView:
-    return StereoView(render(SLABS, PINHOLE, T_world_camera, 1), PINHOLE, T_world_camera)
+    return StereoView(render(slab_scene(), PINHOLE, T_world_camera, 1), PINHOLE, T_world_camera)
 
 
 def blank(T_world_camera: Transform) -> StereoView:

@@ -7,10 +7,9 @@ import dataclasses
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
-import mlcroissant
 import numpy as np
 import pytest
 from PIL import Image
@@ -22,7 +21,11 @@ from service.dataset.posed.exporter import exporter, exporters, write_data_set
 from service.dataset.posed.pixels import undistorted_data_set
 from service.dataset.posed.records import DataSet
 from service.jobs.registration.evaluate import Contribution, ErrorBudget, Row
+from tests.support.scenes.croissant import read_croissant
 from tests.support.scenes.posed import posed_data_set
+
+if TYPE_CHECKING:
+    from mlcroissant import Dataset
 
 # rdflib, which mlcroissant reads JSON-LD with, calls its own deprecated class.
 pytestmark = pytest.mark.filterwarnings("ignore:ConjunctiveGraph is deprecated:DeprecationWarning")
@@ -73,7 +76,7 @@ def listed(folder: Path) -> dict[str, str]:
 
 
 def test_croissant_is_valid_and_its_record_sets_load(exported: Path, dataset: DataSet) -> None:
-    loaded = mlcroissant.Dataset(jsonld=exported / "croissant.json")  # raises where it is not valid
+    loaded = read_croissant(exported)  # raises where it is not valid
     issues = loaded.metadata.ctx.issues
     assert not issues.errors
     assert not issues.warnings
@@ -95,7 +98,7 @@ def test_croissant_is_valid_and_its_record_sets_load(exported: Path, dataset: Da
         check_depth(exported, expected, [record["views/depth"].decode() for record in views])
 
 
-def check_pictures(loaded: mlcroissant.Dataset, folder: Path, role: str, files: list[str]) -> None:
+def check_pictures(loaded: Dataset, folder: Path, role: str, files: list[str]) -> None:
     name = f"{role}_pixels"
     records = {record[f"{name}/file"].decode(): record[f"{name}/pixels"] for record in loaded.records(name)}
     assert set(records) == set(files)
@@ -118,7 +121,7 @@ def test_croissant_refuses_a_file_that_was_altered(dataset: DataSet, tmp_path: P
     table = tmp_path / "out" / "views.csv"
     table.write_bytes(table.read_bytes().replace(b"true", b"false", 1))
     with pytest.raises(Exception, match=r"Download\(views.csv\)"):
-        list(mlcroissant.Dataset(jsonld=tmp_path / "out" / "croissant.json").records("views"))
+        list(read_croissant(tmp_path / "out").records("views"))
 
 
 def test_ro_crate_lists_every_file_with_its_hash(exported: Path) -> None:
@@ -174,7 +177,7 @@ def test_what_nobody_stated_is_said_to_be_missing(dataset: DataSet, tmp_path: Pa
     assert "No licence was stated" in text
     assert "No ethics statement was given" in text
     assert "Not evaluated" in text
-    assert not mlcroissant.Dataset(jsonld=tmp_path / "out" / "croissant.json").metadata.ctx.issues.errors
+    assert not read_croissant(tmp_path / "out").metadata.ctx.issues.errors
 
 
 def test_a_captured_data_set_is_not_called_simulated(tmp_path: Path) -> None:

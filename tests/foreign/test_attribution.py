@@ -10,7 +10,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import mlcroissant
 import pytest
 
 from service.core.errors import DataError
@@ -23,6 +22,7 @@ from service.dataset.posed.records import DataSet
 from service.steps import params_models
 from service.steps.protocol_check import implausible
 from tests.support.rig.rig import REPOSITORY
+from tests.support.scenes.croissant import read_croissant
 
 # rdflib, which mlcroissant reads JSON-LD with, calls its own deprecated class.
 pytestmark = pytest.mark.filterwarnings("ignore:ConjunctiveGraph is deprecated:DeprecationWarning")
@@ -141,7 +141,7 @@ def test_the_crate_names_people_bodies_and_licence_by_their_addresses(exported: 
 
 
 def test_mlcroissant_reads_them_too(exported: Path) -> None:
-    read = mlcroissant.Dataset(jsonld=exported / "croissant.json").metadata
+    read = read_croissant(exported).metadata
     assert not read.ctx.issues.errors
     assert not read.ctx.issues.warnings
     assert read.license == [f"{SPDX}CC-BY-4.0"]

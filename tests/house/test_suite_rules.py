@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from bench.suite.marks import costs_of, disagreements, remarked, settled
+from tests.plugins.collecting import dearest_first, is_compiled
 from tests.plugins.cpu_record import cpu_s_of_tree
 from tests.plugins.draw import drawn
 
@@ -28,10 +29,10 @@ def test_marks_stand_in_the_test_files_in_which_the_makefile_looks_for_them() ->
     ]
 
 
-def pytest_in(folder: Path, source: str, *words: str) -> subprocess.CompletedProcess[str]:
+def pytest_in(folder: Path, source: str, *words: str, conftest: str = "") -> subprocess.CompletedProcess[str]:
     """Run the tests of `source` in a process of their own, with this suite's settings and plug-ins."""
     (folder / "pytest.ini").write_text(SETTINGS)
-    (folder / "conftest.py").write_text((ROOT / "tests/conftest.py").read_text())
+    (folder / "conftest.py").write_text((ROOT / "tests/conftest.py").read_text() + conftest)
     (folder / "test_it.py").write_text(source)
     return subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-rA", *words],
@@ -84,6 +85,49 @@ def test_not_set_up(broken): pass
     assert "1 failed, 1 passed, 1 error, 1 rerun" in answer.stdout
     assert "1 realtime tests ran again" in answer.stdout
     assert "first failure of test_it.py::test_late" in answer.stdout
+
+
+@pytest.mark.slow
+def test_one_worker_compiles_a_file_and_the_others_read_what_it_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")
+    files = [tmp_path / f"test_{number}.py" for number in range(12)]
+    for file in files:
+        file.write_text("def test_it():\n" + "    assert 1 + 1 == 2\n" * 200)
+    notes_who_compiles = """
+import sys
+def note(event, words):
+    if event == "compile" and "test_" in str(words[1]):
+        with open("compiled", "a") as file:
+            print(words[1], os.getpid(), file=file)
+sys.addaudithook(note)
+"""
+    answer = pytest_in(tmp_path, "def test_it(): pass", "-n", "2", conftest=notes_who_compiles)
+    assert "13 passed" in answer.stdout, answer.stdout
+    assert all(map(is_compiled, files))
+    compiled = set((tmp_path / "compiled").read_text().splitlines())
+    assert len({line for line in compiled if Path(line.split()[0]) in files}) == len(files), "one process a file"
+    files[0].write_text("def test_it(): pass\n")
+    os.utime(files[0], (2e9, 2e9))
+    assert not is_compiled(files[0])
+
+
+def test_the_dearest_files_come_first_and_those_of_the_browser_stay_together(tmp_path: Path) -> None:
+    cheap, dear, pages = "tests/test_a.py", "tests/test_b.py", "tests/browser/test_"
+    costs = {cheap: {"test": 0.1}, dear: {"test": 5.0}, f"{pages}1.py": {"test": 0.0}, f"{pages}2.py": {"test": 9.0}}
+    tests = [f"{pages}1.py::test", f"{cheap}::test[1]", f"{pages}2.py::test", f"{cheap}::test[2]", f"{dear}::test"]
+    assert [tests[k] for k in dearest_first(tests, costs)] == [tests[k] for k in (0, 2, 4, 1, 3)]
+    assert dearest_first([f"{dear}::test", "tests/test_whole_run.py::test"], costs) == [1, 0]
+
+    dearer = "\n".join(f"def test_{n}(): pass" for n in range(3))
+    (tmp_path / "test_other.py").write_text(dearer)
+    (tmp_path / "test_third.py").write_text(
+        dearer.replace("def test_0", "import pytest\n@pytest.mark.slow\ndef test_0")
+    )
+    answer = pytest_in(tmp_path, "def test(): pass", "--collect-only", "-m", "not slow")
+    files = list(dict.fromkeys(re.findall(r"(?m)^(test_\w+\.py)::", answer.stdout)))
+    assert files == ["test_other.py", "test_third.py", "test_it.py"], "what does not run does not count"
 
 
 @pytest.mark.slow

@@ -54,6 +54,13 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return told
 
 
+@pytest.fixture(scope="module")
+def events(demo: dict[str, Any]) -> list[dict[str, Any]]:
+    """The events of the run, as the command shows them."""
+    answer = orthocapture("audit", "show", demo["run"], "--data", demo["data_dir"], "--json")
+    return json.loads(answer.stdout)["events"]
+
+
 def test_table_has_the_papers_rows_and_its_reason(demo: dict[str, Any]) -> None:
     rows = {row["poses"]: row for row in demo["table"]}
     assert set(rows) == {"robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid"}
@@ -86,9 +93,9 @@ def test_one_altered_byte_is_found(demo: dict[str, Any], tmp_path: Path) -> None
     assert photograph.name in json.dumps(json.loads(answer.stdout)["first_fault"])
 
 
-def test_views_come_from_both_stations_at_the_promised_size(demo: dict[str, Any]) -> None:
-    answer = orthocapture("audit", "show", demo["run"], "--data", demo["data_dir"], "--json")
-    events = json.loads(answer.stdout)["events"]
+def test_views_come_from_both_stations_at_the_promised_size(
+    demo: dict[str, Any], events: list[dict[str, Any]]
+) -> None:
     captured = [e for e in events if e["kind"] == "viewpoint_captured"]
     views = [e for e in captured if any(a["kind"] == "image" for a in e["artefacts"])]
     assert len(views) >= 16
@@ -113,7 +120,7 @@ def test_data_set_is_in_one_frame(demo: dict[str, Any]) -> None:
     assert json.loads((folder / "dataset.json").read_text())["simulated"] is True
 
 
-def test_the_data_set_is_packaged_verified_and_recorded(demo: dict[str, Any]) -> None:
+def test_the_data_set_is_packaged_verified_and_recorded(demo: dict[str, Any], events: list[dict[str, Any]]) -> None:
     folder = Path(demo["dataset"])
     done = subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=folder, check=False)
     assert done.returncode == 0
@@ -123,8 +130,7 @@ def test_the_data_set_is_packaged_verified_and_recorded(demo: dict[str, Any]) ->
     assert "No ethics statement was given" in card
     for name in ("croissant.json", "ro-crate-metadata.json", "views.csv"):
         assert (folder / name).is_file()
-    answer = orthocapture("audit", "show", demo["run"], "--data", demo["data_dir"], "--json")
-    exported = [event for event in json.loads(answer.stdout)["events"] if event["kind"] == "evidence_exported"]
+    exported = [event for event in events if event["kind"] == "evidence_exported"]
     assert len(exported) == 1
     # CT and scan agree where both show the specimen; the means hold what only one of them shows.
     floor_mm = demo["chamfer_floor_mm"]
@@ -139,7 +145,9 @@ def test_report_stands_alone(demo: dict[str, Any]) -> None:
     assert 'src="http' not in html
 
 
-def test_every_image_was_looked_at_while_the_specimen_was_there(demo: dict[str, Any]) -> None:
+def test_every_image_was_looked_at_while_the_specimen_was_there(
+    demo: dict[str, Any], events: list[dict[str, Any]]
+) -> None:
     answer = orthocapture("status", demo["run"], "--data", demo["data_dir"], "--json")
     steps = json.loads(answer.stdout)["steps"]
     looked_at: list[float] = []
@@ -150,8 +158,7 @@ def test_every_image_was_looked_at_while_the_specimen_was_there(demo: dict[str, 
     last = steps["control_capture_2"]["measures"]
     assert 0 < last["predicted_target_error_mm"] <= max(looked_at)
     assert 0.6 <= last["specimen_coverage"] <= 1
-    events = json.loads(orthocapture("audit", "show", demo["run"], "--data", demo["data_dir"], "--json").stdout)
-    plans = [e for e in events["events"] if "note=motion_plan" in e["summary"]]
+    plans = [event for event in events if "note=motion_plan" in event["summary"]]
     assert len(plans) == 4, "recorded before the first motion of each capture"
 
 

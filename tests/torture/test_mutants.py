@@ -5,17 +5,20 @@ from __future__ import annotations
 import ast
 import json
 import os
+import py_compile
+import re
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from bench.machine import REPOSITORY
-from bench.suite.mutants.places import Place, drawn, mutated, places
 from bench.suite.mutants.reach import RECORD, Reach, digest, files_of_tests
 from bench.suite.mutants.recorder import functions
 from bench.suite.mutants.subjects import SUBJECTS, TESTS
-from bench.suite.mutants.trial import Trial
+from bench.suite.mutants.trial import Trial, copied_tree
 
 MODULE = '''"""Words."""
 
@@ -63,6 +66,8 @@ GATES = "service/core/gates/made_up.py"
 
 def changes(folder: Path) -> dict[str, set[tuple[str, str]]]:
     """What the lines of the module become, by kind."""
+    from bench.suite.mutants.places import mutated, places  # noqa: PLC0415 - loads libcst: a second in every worker
+
     made = [mutated(folder, place) for place in places(folder, "gates", GATES)]
     found: dict[str, set[tuple[str, str]]] = {}
     for mutation in made:
@@ -94,6 +99,8 @@ def test_what_no_result_depends_on_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_the_seed_alone_decides_and_no_subject_comes_short(tmp_path: Path) -> None:
+    from bench.suite.mutants.places import drawn  # noqa: PLC0415 - loads libcst
+
     folder = tree(tmp_path)
     first, again, other = (drawn(folder, seed, 24) for seed in ("1", "1", "2"))
     assert first == again
@@ -140,6 +147,8 @@ def test_a_mutation_is_killed_by_a_test_that_fails_and_the_tree_is_as_before(
     tmp_path: Path, after: str, outcome: str
 ) -> None:
     """The file is longer or not, and of the same second: byte code of either text is never taken for the other."""
+    from bench.suite.mutants.places import Place, mutated  # noqa: PLC0415 - loads libcst
+
     folder = tree(tmp_path)
     selected = recorded(folder, TEST).selected("gates", GATES, 18)
     (folder / "pyproject.toml").write_text("[tool.pytest.ini_options]\nmarkers = ['slow', 'realtime']\n")
@@ -154,6 +163,17 @@ def test_a_mutation_is_killed_by_a_test_that_fails_and_the_tree_is_as_before(
         assert verdict.outcome == outcome, verdict.by
         assert verdict.by == ("tests/core/test_gate.py::test_limit" if outcome == "killed" else "")
         assert (folder / GATES).read_text() == MODULE
+
+
+def test_a_copied_tree_need_not_be_compiled_again(tmp_path: Path) -> None:
+    module = "bench/suite/mutants/subjects.py"
+    py_compile.compile(str(REPOSITORY / module))
+    copied = copied_tree(tmp_path / "tree", None)
+    shown = subprocess.run(
+        [sys.executable, "-v", "-c", "import bench.suite.mutants.subjects"],
+        cwd=copied, env={**os.environ, "PYTHONPATH": str(copied)}, capture_output=True, text=True, check=True,
+    ).stderr  # fmt: skip
+    assert re.search(rf"subjects\S*\.pyc matches {re.escape(str(copied / module))}", shown)
 
 
 def test_the_record_is_of_tests_and_functions_that_exist() -> None:

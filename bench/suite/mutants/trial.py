@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import importlib
 import json
 import os
@@ -16,13 +17,15 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
 from bench.machine import REPOSITORY
-from bench.suite.mutants.places import Mutation
 from bench.suite.mutants.reach import Selected
+
+if TYPE_CHECKING:
+    from bench.suite.mutants.places import Mutation
 
 # What most tests import and no mutation changes.
 LIBRARIES = (
@@ -49,14 +52,22 @@ class Verdict:
 
 
 def copied_tree(target: Path, tests_of: str | None) -> Path:
-    """Copy what git would commit; with the tests of another revision, if one is given."""
+    """Copy what git would commit, with its byte code; with the tests of another revision, if one is given.
+
+    Files keep their times, by which Python knows that byte code is of them: no trial compiles what did not change.
+    """
     listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     names = subprocess.run(listed, cwd=REPOSITORY, capture_output=True, check=True).stdout.decode().split("\0")
     for name in filter(None, names):
         source = REPOSITORY / name
         if source.is_file() and not source.is_symlink():
             (target / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, target / name)
+            shutil.copy2(source, target / name)
+    for folder in {Path(name).parent for name in names if name.endswith(".py")}:
+        (target / folder / "__pycache__").mkdir()
+        for compiled in (REPOSITORY / folder / "__pycache__").glob("*.pyc"):
+            with contextlib.suppress(FileNotFoundError):  # other tests may run meanwhile, and compile it anew
+                shutil.copy2(compiled, target / folder / "__pycache__")
     if tests_of is not None:
         shutil.rmtree(target / "tests")
         packed = subprocess.run(
@@ -67,10 +78,11 @@ def copied_tree(target: Path, tests_of: str | None) -> Path:
 
 
 def import_libraries() -> None:
-    """Import them, before the first fork."""
+    """Import them, before the first fork; no trial looks for garbage among them."""
     for name in LIBRARIES:
         with contextlib.suppress(ImportError):
             importlib.import_module(name)
+    gc.freeze()
 
 
 _OURS = ("bench", "drivers", "service", "simulators", "tests")  # packages that are read anew, from the tree

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -81,7 +82,7 @@ def _camera_rays(camera: CameraModel) -> Array:
 
 
 def render(
-    scene: list[Slab], camera: CameraModel, T_world_camera: Transform, noise_seed: int | None = None
+    scene: Sequence[Slab], camera: CameraModel, T_world_camera: Transform, noise_seed: int | None = None
 ) -> NDArray[np.uint8]:
     """Grey image (height, width), 2 × 2 supersampled, with a little noise."""
     fine = camera.scaled(2 * camera.width, 2 * camera.height)

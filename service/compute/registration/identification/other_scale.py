@@ -46,6 +46,8 @@ def words_of_other_scale(
     for i in sorted(range(len(outlines)), key=lambda i: -len(outlines[i]))[:_COMPARED]:
         seen_m = sightings(outlines[i], radius_m, camera).positions_m
         for factor in factors:
+            if len(outlines[i]) <= max(best[0], _LEAST - 1):
+                break  # no scale shows more spheres than there are outlines, and a search costs a second
             for reading in image_hypotheses(outlines[i], factor * centres_m, radius_m, camera)[:1]:
                 if reading.count > max(best[0], _LEAST - 1):
                     shown, listed = (np.array(side) for side in zip(*reading.markers.items(), strict=True))
