@@ -13,6 +13,7 @@ from service.core.records.events import Event, ItemTicked, RegionDrawn, RobotSee
 from service.core.run.actions import needs_leave
 from service.core.run.connections import connected_arms, lost_arms
 from service.core.run.state import RunState
+from service.core.text.reasons import reason_of
 from service.dataset.registrations import best_registration
 from service.run_record import RunRecord
 from service.store.signatures.signing import checkpoint
@@ -71,9 +72,7 @@ def cancel_computation(store: Store, run_id: str, job: str, reason: str, *, acto
 
     Raises IllegalTransitionError if there is no reason, or no such computation that waits or runs.
     """
-    if not reason.strip():
-        raise IllegalTransitionError("a reason is needed", where=job, remedy="Say why the computation is ended")
-    return store.cancel_job(run_id, job, actor=actor, reason=reason.strip())
+    return store.cancel_job(run_id, job, actor=actor, reason=reason_of(reason, IllegalTransitionError))
 
 
 def see_robot(log: RunRecord, device: str, lost_seq: int, *, driven: bool, actor: str) -> None:

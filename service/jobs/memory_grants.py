@@ -1,6 +1,8 @@
 """What memory the jobs on a machine have been granted, in small files that all its workers of a data folder share.
 
-A job begins when it fits beside what runs. What was granted and is not used yet counts as used.
+A job begins when it fits beside what runs. What was granted and is not used yet counts as used. One that waits for
+others of these jobs to end is overtaken by none that came later, so that many small jobs cannot keep a large one
+waiting for ever. One that waits for other programs to give memory back holds up nobody.
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ import contextlib
 import fcntl
 import logging
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +41,7 @@ class Grant(Record):
     job: str
     memory_mb: float
     waits: str = ""  # why, in words; "" for one that has been granted
+    place: int = 0  # in the order in which those that wait came
 
     @property
     def lives(self) -> bool:
@@ -82,20 +85,6 @@ class MemoryGrants:
                 "this one or its container more; then try again",
             )
         own = _folder(self.data) / f"{_here().host}-{os.getpid()}.json"
-        told = ""
-        try:
-            while (why := self._take(own, job, memory_mb)) != "":
-                if why != told:
-                    tell(why)
-                    told = why
-                self.clock.sleep(_POLL_S)
-            yield
-        finally:
-            with contextlib.suppress(OSError):
-                own.unlink(missing_ok=True)
-
-    def _take(self, own: Path, job: str, memory_mb: float) -> str:
-        """Write down the grant, or what is waited for and why; returns why, or "" once it is granted."""
         grant = Grant(
             host=_here().host,
             boot=_here().boot,
@@ -104,22 +93,50 @@ class MemoryGrants:
             job=job,
             memory_mb=memory_mb,
         )
+        told = ""
+        try:
+            while (grant := self._take(own, grant)).waits:
+                if grant.waits != told:
+                    tell(grant.waits)
+                    told = grant.waits
+                self.clock.sleep(_POLL_S)
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                own.unlink(missing_ok=True)
+
+    def _take(self, own: Path, wanted: Grant) -> Grant:
+        """Write down the grant, or what it waits for and at which place; returns it as it was written."""
+        grant = wanted
         try:
             with _alone(own.parent):
-                others = [found for found in _grants(self.data) if found.pid != os.getpid() and not found.waits]
-                free_mb = self.memory().available_mb - _RESERVE_MB
-                free_mb -= sum(max(0.0, other.memory_mb - _used_mb(other.pid)) for other in others)
-                needed_mb = max(0.0, memory_mb - _used_mb(os.getpid()))
-                if needed_mb > free_mb:
-                    why = f"waits for memory: it needs {_rounded(needed_mb)} MB, {_rounded(free_mb)} MB are free"
-                    grant = grant.model_copy(update={"waits": why})
+                others = [found for found in _grants(self.data) if found.pid != wanted.pid]
+                why = self._why_not(wanted, others)
+                place = wanted.place or 1 + max((other.place for other in others if other.waits), default=0)
+                grant = wanted.model_copy(update={"waits": why, "place": place if why else 0})
                 part = own.with_suffix(".part")
                 part.write_text(grant.model_dump_json(), encoding="utf-8")
                 part.replace(own)
         except OSError as error:  # a disk that is full must not keep a job from being computed
             _log.warning("the memory of jobs on this machine cannot be written down: %s", error)
-            return ""
-        return grant.waits
+            return wanted.model_copy(update={"waits": ""})
+        return grant
+
+    def _why_not(self, wanted: Grant, others: Sequence[Grant]) -> str:
+        """Why a job cannot begin beside the others, in words; "" if it can."""
+        used_mb = {grant.pid: _used_mb(grant.pid) for grant in (wanted, *others)}
+        granted = [other for other in others if not other.waits]
+        free_mb = self.memory().available_mb - _RESERVE_MB
+        free_after_them_mb = free_mb + sum(used_mb[other.pid] for other in granted)
+        free_mb -= sum(max(0.0, other.memory_mb - used_mb[other.pid]) for other in granted)
+        needed_mb = max(0.0, wanted.memory_mb - used_mb[wanted.pid])
+        if needed_mb > free_mb:
+            return f"waits for memory: it needs {_rounded(needed_mb)} MB, {_rounded(free_mb)} MB are free"
+        for other in others:
+            earlier = bool(other.waits) and (not wanted.place or other.place < wanted.place)
+            if earlier and other.memory_mb - used_mb[other.pid] <= free_after_them_mb:
+                return f"waits for memory: one that needs {_rounded(other.memory_mb)} MB has waited longer"
+        return ""
 
 
 def waiting_for_memory(data: Path) -> dict[str, str]:

@@ -8,6 +8,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, func, insert, select, update
 
 from service.core.records.events import AccountChanged
+from service.core.text.reasons import reason_of
 from service.people.credentials.passwords import (
     Passwords,
     ShortSecrets,
@@ -26,7 +27,6 @@ from service.people.rows import (
     end_sessions,
     get_account,
     record_change,
-    require_reason,
     to_account,
 )
 from service.store.database.tables import accounts, invitations
@@ -127,7 +127,7 @@ class Accounts:
 
     def reset(self, by: Person, account: str, reason: str) -> str:
         """Remove password, PIN and badge, end all sign-ins, and return a new link's token. Raises AccountError."""
-        why = require_reason(reason)
+        why = reason_of(reason, AccountError)
         with self._store.database.writing() as connection:
             row = get_account(connection, account)
             if row.state == "active":
@@ -144,7 +144,7 @@ class Accounts:
 
     def change_role(self, by: Person, account: str, role: Role, reason: str) -> None:
         """Give an account another role and end its sign-ins. Raises AccountError."""
-        why = require_reason(reason)
+        why = reason_of(reason, AccountError)
         _require_role(role)
         with self._store.database.writing() as connection:
             row = get_account(connection, account)
@@ -159,7 +159,7 @@ class Accounts:
 
     def disable(self, by: Person, account: str, reason: str) -> None:
         """Disable an account and end its sign-ins and links. Raises AccountError, also for the last administrator."""
-        why = require_reason(reason)
+        why = reason_of(reason, AccountError)
         with self._store.database.writing() as connection:
             row = get_account(connection, account)
             if row.state == "disabled":
@@ -174,7 +174,7 @@ class Accounts:
 
     def enable(self, by: Person, account: str, reason: str) -> None:
         """Enable a disabled account again with its old password. Raises AccountError."""
-        why = require_reason(reason)
+        why = reason_of(reason, AccountError)
         with self._store.database.writing() as connection:
             row = get_account(connection, account)
             if row.state != "disabled" or not row.password_hash:

@@ -10,6 +10,7 @@ from sqlalchemy import select
 from service.core.errors import ConfigurationError
 from service.core.protocol.models import LoadedProtocol
 from service.core.records.events import Event, Identified, ProtocolApproved
+from service.core.text.reasons import reason_of
 from service.store.database.tables import event_index, events
 from service.store.events import to_event
 from service.store.records import SITE
@@ -103,7 +104,7 @@ def approve(
         sha256=loaded.sha256,
         source=loaded.source,
         instead_of=standing.other.payload.sha256 if standing.other is not None else "",
-        reason=reason.strip(),
+        reason=reason.strip() and reason_of(reason, ConfigurationError),
         identified=identified,
     )
     store.record_site([record], actor=by)

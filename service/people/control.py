@@ -12,9 +12,10 @@ from sqlalchemy.dialects.sqlite import insert
 
 from service.core.records.events import ControlTaken
 from service.core.records.moments import age_s
-from service.people.errors import ControlError, NotAllowedError
+from service.core.text.reasons import reason_of
+from service.people.errors import AccountError, ControlError, NotAllowedError
 from service.people.person import Person
-from service.people.rows import SESSION_S, require_reason
+from service.people.rows import SESSION_S
 from service.store.database.tables import accounts, control, runs, sessions
 from service.store.store import Store
 
@@ -105,7 +106,7 @@ class Control:
                 where=run_id,
                 remedy="Ask for control, or call a supervisor",
             )
-        why = require_reason(reason)
+        why = reason_of(reason, AccountError)
         with self._store.database.writing() as connection:
             holder = self._holder(connection, run_id)
             if holder.screen != person.screen:

@@ -20,16 +20,6 @@ SERVICE = "web"  # actor of events that no signed-in person caused
 SESSION_S = 12 * 3600.0
 
 
-def require_reason(reason: str) -> str:
-    """The reason without outer blanks. Raises AccountError unless it has 3 to 500 characters."""
-    plain = reason.strip()
-    if not 3 <= len(plain) <= 500:
-        raise AccountError(
-            "a reason is needed", where="reason", remedy="Say why in a few words, up to 500 characters"
-        )
-    return plain
-
-
 def find_account(connection: Connection, account: str) -> Row[Any] | None:
     """The row of an account, or None."""
     return connection.execute(select(accounts).where(accounts.c.account == account)).one_or_none()

@@ -16,7 +16,7 @@ from service.core.errors import OrthocaptureError, UnforeseenError
 from service.core.protocol.models import Protocol, Step
 from service.core.records.base import recorded
 from service.core.records.events import DeviceTrouble, Payload, StepFailed, StepMeasured, StepNote
-from service.core.recovery.policy import PASSING, recovery_policy
+from service.core.recovery.policy import TRIED_AGAIN, recovery_policy
 from service.core.run.state import JobState
 from service.core.text.counts import counted
 from service.logs.where import at
@@ -191,7 +191,7 @@ class StepExecution:
         self.note_connections()
         state = self.run.refresh().steps[step_id]
         name = type(error).__name__
-        short = name in PASSING and starvation is not None and _short(starvation)
+        short = name in TRIED_AGAIN and starvation is not None and _short(starvation)
         policy = recovery_policy(self.protocol.step(step_id).recovery, name, state.failures + 1, starved=short)
         payloads: list[Payload] = []
         message = str(error)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-import json
+import shutil
 import zipfile
 from pathlib import Path
 
@@ -13,76 +13,46 @@ from typer.testing import CliRunner
 from service.audit.verify import bundle_verifier
 from service.cli.main import app
 from service.cli.terminal_output import Terminal
-from service.core.records.events import DeviceTrouble, OperatorAction, StepNote
 from service.core.shown_text import shown
 from service.store.durable_effects import DurableFiles, SystemClock
-from service.store.records import NewArtefact
 from service.store.signatures.second_place import SecondPlace, away_words
-from service.store.signatures.signing import checkpoint, rotate_key
-from tests.support.hostile_text import HOSTILE, obeyed
-from tests.support.runs.bench_run import PROTOCOL, begin_run, bench_store
-
-COMMANDS = {
-    "show": ["audit", "show", "{run}"],
-    "verify": ["audit", "verify", "{run}"],
-    "verify all": ["audit", "verify", "all"],
-    "keys": ["audit", "keys"],
-    "status": ["status", "{run}"],
-    "runs": ["runs"],
-    "compare": ["compare", "{run}", "{other}"],
-    "history": ["history"],
-    "replay": ["replay", "{run}"],
-    "leftovers": ["store", "gc"],
-    "release": ["audit", "release", "{run}"],
-    "plan": ["plan", "suggested", "{run}"],
-}
+from tests.support.hostile_places import PAGES, READING, elements_made, read_by, record_of_hostile_texts, settled
+from tests.support.hostile_text import obeyed
+from tests.support.pages.web import web_site
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
-    """A completed run and an open one, with each text in the place of names, notes, reasons, messages and devices."""
-    folder = tmp_path_factory.mktemp("hostile")
-    with bench_store(folder / "data") as store:
-        completed, waiting = begin_run(store, PROTOCOL, folder), begin_run(store, PROTOCOL, folder)
-        for text in HOSTILE.values():
-            ref = store.put_bytes(text.encode("utf-8", "replace"), kind="log", media_type="x", original_name=text)
-            said = [
-                StepNote(step="capture", attempt=1, note=text, data={text: text, "file": ref.model_dump()}),
-                DeviceTrouble(device=text, error=text, message=text),
-                OperatorAction(action="redo", step=text, viewpoint=text, reason=text, meaning=text),
-                OperatorAction(action="skip", step="fixation", reason=text),
-            ]
-            store.record(waiting.run_id, said, actor=text, artefacts=[NewArtefact(ref, text, step=text, who=text)])
-        for text in HOSTILE.values():
-            said = [DeviceTrouble(device=text, error=text, message=text)]
-            store.record(completed.run_id, said, actor=text)
-        assert completed.run().status == "completed"
-        checkpoint(store, completed.run_id)
-        checkpoint(store, waiting.run_id)
-        for text in (HOSTILE["rows above erased"], HOSTILE["NUL"]):
-            rotate_key(store, reason=text, actor=text)
-    return folder / "data", completed.run_id, waiting.run_id
+    return record_of_hostile_texts(tmp_path_factory.mktemp("hostile"))
 
 
 @pytest.mark.parametrize("which", ["completed", "open"])
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", READING)
 def test_every_command_that_reads_it_prints_escapes(recorded: tuple[Path, str, str], name: str, which: str) -> None:
     data, *runs = recorded
     run, other = runs if which == "completed" else reversed(runs)
-    words = [word.format(run=run, other=other) for word in COMMANDS[name]] + ["--data", str(data)]
-    done = CliRunner().invoke(app, words, env={"COLUMNS": "250"})
-    assert isinstance(done.exception, SystemExit | None), done.exception
-    assert done.exit_code in (0, 1, 2), done.output
-    assert obeyed(done.output) == []
-    verdicts = [line for line in done.output.splitlines() if line.startswith("Verified")]
+    as_words, *as_json = read_by(name, data, run, other)
+    for status, printed, fault in (as_words, *as_json):
+        assert fault is None
+        assert status in (0, 1, 2), printed
+        assert obeyed(printed) == []
+    verdicts = [line for line in as_words[1].splitlines() if line.startswith("Verified")]
     assert len(verdicts) == (1 if name.startswith("verify") else 0), verdicts
     if name == "show" and which == "open":
-        assert "[bold red]x[/]" in done.output
-        assert "\\x1b[3A" in done.output
-    if name not in ("history", "plan"):
-        told = CliRunner().invoke(app, [*words, "--json"])
-        assert obeyed(told.stdout) == []
-        json.loads(told.stdout)
+        assert "[bold red]x[/]" in as_words[1]
+        assert "\\x1b[3A" in as_words[1]
+
+
+@pytest.mark.parametrize("which", ["completed", "open"])
+def test_no_page_makes_elements_of_it(recorded: tuple[Path, str, str], tmp_path: Path, which: str) -> None:
+    data, *runs = recorded
+    shutil.copytree(data, tmp_path / "data")
+    with web_site(tmp_path) as site:
+        browser = site.browser("administrator")
+        for page in PAGES:
+            status, text = settled(browser, page.format(run=runs[which == "open"]))
+            assert status in (200, 404), page
+            assert elements_made(text) == [], page
 
 
 def test_it_is_reported_exported_and_verified_elsewhere(recorded: tuple[Path, str, str], tmp_path: Path) -> None:

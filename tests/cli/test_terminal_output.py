@@ -3,73 +3,33 @@
 from __future__ import annotations
 
 import ast
-import io
 import json
 import logging
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import typer
 from rich.markup import escape  # noqa: TID251 - what Typer would take for markup
-from rich.table import Table
-from typer.core import TyperGroup
-from typer.testing import CliRunner
 
 from service.audit.verify import bundle_verifier
 from service.cli import main as command_line
-from service.cli.common import print_document, print_json, print_table, reporting_errors
-from service.cli.main import app
-from service.cli.run.terminal.operators import Display
-from service.cli.terminal_output import Terminal, bar_of_counts, bar_of_shares, listed, styled
+from service.cli.common import print_document, print_json, reporting_errors
 from service.core.errors import ConfigurationError
 from service.core.shown_text import shown, shown_json, shown_lines
 from service.logs.terminal import EscapingFormatter
+from tests.support.every_command import every_command
+from tests.support.hostile_places import ON_A_TERMINAL, TYPED_IN, printed_at, typed_in
 from tests.support.hostile_text import HOSTILE, TYPED, obeyed
 from tests.support.rig.rig import REPOSITORY
 
 texts = pytest.mark.parametrize("text", HOSTILE.values(), ids=list(HOSTILE))
 
 
-def in_a_table(terminal: Terminal, text: str) -> None:
-    table = Table(text, title=text)
-    table.add_row(text)
-    table.add_row(styled((text, "bold")))
-    table.add_row(listed(text, text))
-    print_table(table, terminal)
-
-
-def in_a_bar(terminal: Terminal, text: str) -> None:
-    for bar in (bar_of_shares(terminal), bar_of_counts(terminal)):
-        bar.add_task(shown(text), total=2)
-        terminal.print(bar.get_renderable())
-
-
-PLACES: dict[str, Callable[[Terminal, str], None]] = {
-    "a line": lambda terminal, text: terminal.print(f"name: {text}"),
-    "a line with styles": lambda terminal, text: terminal.tell(("name:", "bold"), f" {text}", (text, "red")),
-    "a box": lambda terminal, text: terminal.boxed(text, title=text),
-    "a table": in_a_table,
-    "a bar": in_a_bar,
-    "a line of a run": lambda terminal, text: Display(terminal, Silent()).tell(text),  # type: ignore[arg-type]
-}
-
-
-class Silent:
-    """A reporter without screens."""
-
-    def tell(self, message: str) -> None:
-        """Nobody is told."""
-
-
 @texts
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("place", ON_A_TERMINAL)
 def test_a_text_is_shown_as_it_is_with_escapes(place: str, text: str) -> None:
-    stream = io.StringIO()
-    PLACES[place](Terminal(file=stream, width=300), text)
-    printed = stream.getvalue()
+    printed = printed_at(place, text)
     assert obeyed(printed) == []
     assert printed.encode()
     for line in text.split("\n"):
@@ -156,56 +116,22 @@ def test_a_message_of_the_log_is_escaped(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", [HOSTILE["brackets that close nothing"], TYPED], ids=["brackets", "all"])
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["{}"],
-        ["status", "--{}"],
-        ["status", "{}", "--data", "nowhere"],
-        ["status", "--data", "{}"],
-        ["protocol", "check", "{}"],
-        ["protocol", "check", "{}", "--json"],
-        ["doctor", "--rig", "{}"],
-        ["run", "{}", "--rig", "{}", "--json"],
-        ["audit", "show", "{}", "--data", "{}"],
-        ["audit", "verify", "{}", "--certificates", "{}"],
-        ["audit", "report", "--pdf", "{}", "--data", "nowhere"],
-        ["simulate", "rig", "--help", "{}"],
-        ["serve", "--rig", "{}", "--json"],
-        ["plan", "show", "{}"],
-        ["replay", "{}", "--data", "nowhere", "--json"],
-        ["export", "{}", "{}", "--data", "nowhere"],
-        ["act", "{}"],
-        ["act", "confirm", "--data", "{}"],
-        ["store", "check", "--data", "{}"],
-        ["import", "{}", "--json"],
-    ],
-    ids=" ".join,
-)
+@pytest.mark.parametrize("words", TYPED_IN, ids=" ".join)
 def test_what_was_typed_is_repeated_with_escapes(
-    words: list[str], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: tuple[str, ...], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(app, [word.format(text) for word in words], env={"COLUMNS": "300"})
-    assert done.exit_code in (0, 1, 2), done.exception
-    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-    assert obeyed(done.output) == []
-    assert not any(line.startswith("Verified") for line in done.output.splitlines())
+    status, printed, fault = typed_in(words, text)
+    assert fault is None
+    assert status in (0, 1, 2)
+    assert obeyed(printed) == []
+    assert not any(line.startswith("Verified") for line in printed.splitlines())
     assert sorted(tmp_path.iterdir()) == []
-
-
-def of_all(command: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """A command and all below it, with their names."""
-    yield name, command
-    if isinstance(command, TyperGroup):
-        context = typer.Context(command)
-        for each in command.list_commands(context):
-            yield from of_all(command.resolve_command(context, [each])[1], f"{name} {each}")
 
 
 def test_no_help_has_what_typer_takes_for_markup() -> None:
     seen: list[str] = []
-    for name, command in of_all(typer.main.get_command(app), "orthocapture"):
+    for name, command in every_command():
         for text in (command.help, *(getattr(one, "help", None) for one in command.params)):
             assert escape(text or "") == (text or ""), f"{name}: square brackets vanish from its help"
         seen.append(name)

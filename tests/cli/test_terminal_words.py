@@ -25,6 +25,7 @@ from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.run.terminal.operators import Display, TerminalOperator
 from service.cli.terminal_output import Terminal
 from service.compute.matching.methods.method import matchers
+from service.core.protocol.irreversible import irreversible_warning
 from service.core.protocol.models import load_protocol
 from service.core.run.decide import AskOperator
 from service.dataset.posed.exporter import exporters
@@ -79,7 +80,8 @@ def test_no_word_of_an_instruction_is_lost(columns: int) -> None:
         operator.print_question(question)  # as shown by the poll, but without a terminal
         assert max(map(len, shown.getvalue().splitlines())) <= columns
         words = _plain(shown.getvalue())
-        for text in (step.title, step.why, question.text, *step.checklist):
+        warning = [irreversible_warning(protocol, step)] if step.irreversible else []
+        for text in (step.title, step.why, question.text, *step.checklist, *warning):
             assert " ".join(text.split()) in words
 
 

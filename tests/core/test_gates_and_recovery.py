@@ -16,7 +16,7 @@ from service.core.records.events import (
     Uncertainty,
     ViewpointFailed,
 )
-from service.core.recovery.policy import NEEDS_A_PERSON, PASSING, recovery_policy
+from service.core.recovery.policy import NEEDS_A_PERSON, TRIED_AGAIN, recovery_policy
 from service.core.recovery.ways_on import ways_on
 from service.core.run.decide import (
     Halt,
@@ -261,5 +261,5 @@ def test_the_recovery_policy(error: str, failures: int, on_failure: str, expecte
 
 
 def test_the_policy_names_errors_that_exist() -> None:
-    for name in PASSING | NEEDS_A_PERSON:
+    for name in TRIED_AGAIN | NEEDS_A_PERSON:
         assert hasattr(device_errors, name) or hasattr(core_errors, name)

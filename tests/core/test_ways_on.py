@@ -18,6 +18,7 @@ from drivers.errors import DeviceFaultError
 from service.cli.main import app
 from service.core import errors as core_errors
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
+from service.core.protocol.irreversible import irreversible_warning
 from service.core.protocol.models import parse_protocol
 from service.core.protocol.step_params import StepParams
 from service.core.records.events import OperatorAction, OperatorVerb, StepNote
@@ -218,6 +219,44 @@ def test_a_step_whose_requirement_cannot_be_done_again_may_be_left_out() -> None
     assert set(ways) == {"skip", "abort"}  # a redo would cross the irreversible step
     log.act("skip", reason="it cannot be released any more")
     assert log.state.current == "scan"
+
+
+# The end of the paper's protocol: the specimen is released, and then the ground truth is judged.
+JUDGED_AFTERWARDS = """\
+  - id: freed
+    kind: checklist
+    title: Free the specimen
+    irreversible: true
+    cannot_be_undone: Once it is free, nothing can be measured again.
+    sign: true
+    requires: [scan, register]
+  - id: fuse
+    kind: registration
+    title: Fuse
+    confirm: false
+    gates: [{measure: m, max: 1, accept_by: supervisor}]
+"""
+
+
+def test_a_step_that_fails_after_the_release_has_ways_on_that_are_possible() -> None:
+    log = Log(toy_protocol(TOY_TEXT + JUDGED_AFTERWARDS))
+    for measures in ({}, GOOD, {}, {"rms_mm": 0.05}, {}, {}):
+        log.do(**measures)
+    assert log.state.current == "fuse"
+    log.begin()
+    log.measure(m=2.0)
+    assert log.question.for_ == "recovery"
+    possible = {(way.verb, way.step) for way in log.question.ways if way.available}
+    assert possible == {("confirm", "fuse"), ("accept", "fuse"), ("abort", "fuse")}
+
+
+def test_before_the_release_a_person_reads_what_it_ends() -> None:
+    protocol = toy_protocol(TOY_TEXT + JUDGED_AFTERWARDS)
+    assert irreversible_warning(protocol, protocol.step("freed")) == (
+        "Once it is free, nothing can be measured again. None of these can be done again: Scan, Register. What is "
+        "judged only afterwards can then be computed again, accepted where the protocol allows it, or left as it is, "
+        "but no longer be mended by new measurements: Fuse. Read the figures before you go on."
+    )
 
 
 def test_a_checklist_that_was_left_open_is_ticked_when_it_is_tried_again() -> None:

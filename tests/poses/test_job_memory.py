@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
+import psutil
 import pytest
 
 from service.compute.machine_memory import MachineMemory, machine_memory, processes_for
@@ -97,26 +98,15 @@ def test_a_job_waits_until_it_fits_beside_those_of_all_workers_and_says_so(store
     grants = MemoryGrants(data, clock, lambda: MachineMemory(8000, free["mb"]))
     folder = data / "monitor" / "memory"
     folder.mkdir(parents=True)
-    here = ProcessIdentity.of_this_process()
     # Another worker's process: this one's parent, which lives, and a dead one, which does not count.
-    for pid, job in ((os.getppid(), "theirs"), (4_000_000, "a dead one's")):
-        other = ProcessIdentity(here.host, here.boot, pid, here.process_started_s)
-        alive = _started_as(other) if pid == os.getppid() else other
-        grant = Grant(
-            host=alive.host,
-            boot=alive.boot,
-            pid=pid,
-            process_started_s=alive.process_started_s,
-            job=job,
-            memory_mb=900_000 if pid != os.getppid() else 50_000,
-        )
-        (folder / f"{here.host}-{pid}.json").write_text(grant.model_dump_json(), encoding="utf-8")
+    theirs = write_grant(folder, os.getppid(), "theirs", 900_000)
+    write_grant(folder, 4_000_000, "a dead one's", 50_000)
     told: list[str] = []
 
     def tell(why: str) -> None:
         told.append(why)
         assert waiting_for_memory(data) == {"mine": why}
-        (folder / f"{here.host}-{os.getppid()}.json").unlink()  # it has ended its job
+        theirs.unlink()  # it has ended its job
 
     with grants.granted("mine", 1500, tell):
         assert waiting_for_memory(data) == {}
@@ -125,12 +115,69 @@ def test_a_job_waits_until_it_fits_beside_those_of_all_workers_and_says_so(store
     assert not list(folder.glob("*.json"))
 
 
-def _started_as(identity: ProcessIdentity) -> ProcessIdentity:
-    import psutil  # noqa: PLC0415 - only here
+def write_grant(folder: Path, pid: int, job: str, memory_mb: float, *, waits: str = "", place: int = 0) -> Path:
+    """What another process was granted, or waits for."""
+    here = ProcessIdentity.of_this_process()
+    started_s = here.process_started_s
+    if psutil.pid_exists(pid):
+        started_s = psutil.Process(pid).create_time() - psutil.boot_time()
+    grant = Grant(
+        host=here.host,
+        boot=here.boot,
+        pid=pid,
+        process_started_s=started_s,
+        job=job,
+        memory_mb=memory_mb,
+        waits=waits,
+        place=place,
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{here.host}-{pid}.json"
+    path.write_text(grant.model_dump_json(), encoding="utf-8")
+    return path
 
-    process = psutil.Process(identity.pid)
-    started_s = process.create_time() - psutil.boot_time()
-    return ProcessIdentity(identity.host, identity.boot, identity.pid, started_s)
+
+def test_a_small_job_does_not_overtake_a_large_one_that_has_waited_longer(store: Store, clock: SteppedClock) -> None:
+    data = store.database_path.parent
+    folder = data / "monitor" / "memory"
+    grants = MemoryGrants(data, clock, lambda: MachineMemory(8000, 6000))
+    large = write_grant(folder, os.getppid(), "large", 5000, waits="waits for memory", place=1)
+    told: list[str] = []
+
+    def tell(why: str) -> None:
+        told.append(why)
+        assert waiting_for_memory(data) == {"large": "waits for memory", "small": why}
+        large.unlink()  # it has begun and ended meanwhile
+
+    with grants.granted("small", 200, tell):
+        pass
+    assert told == ["waits for memory: one that needs 5000 MB has waited longer"]
+
+
+def test_a_job_that_waits_for_other_programs_holds_up_no_other(store: Store, clock: SteppedClock) -> None:
+    data = store.database_path.parent
+    write_grant(data / "monitor" / "memory", os.getppid(), "large", 7500, waits="waits for memory", place=1)
+    grants = MemoryGrants(data, clock, lambda: MachineMemory(8000, 2000))  # of no job of ours is the rest
+    with grants.granted("small", 200, pytest.fail):
+        assert waiting_for_memory(data) == {"large": "waits for memory"}
+
+
+def test_those_that_wait_keep_the_order_in_which_they_came(store: Store, clock: SteppedClock) -> None:
+    data = store.database_path.parent
+    folder = data / "monitor" / "memory"
+    grants = MemoryGrants(data, clock, lambda: MachineMemory(8000, 6000))
+    first = write_grant(folder, os.getppid(), "first", 900_000)  # fills the machine
+    places: list[int] = []
+
+    def tell(_why: str) -> None:
+        (mine,) = [path for path in folder.glob("*.json") if path != first]
+        places.append(Grant.model_validate_json(mine.read_bytes()).place)
+        # One that came later waits as well, and is not waited for.
+        write_grant(folder, os.getppid(), "later", 300, waits="waits for memory", place=places[-1] + 1)
+
+    with grants.granted("mine", 1500, tell):
+        pass
+    assert places == [1]
 
 
 def test_a_job_that_can_never_fit_is_refused_in_words_and_not_tried_again(

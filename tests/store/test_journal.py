@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
@@ -21,10 +22,12 @@ from service.store.database.tables import metadata
 from service.store.durable_effects import DurableFiles, SystemClock
 from service.store.errors import RecordDamagedError
 from service.store.journal import changes
-from service.store.journal.copies import journal_copy
+from service.store.journal.copies import JournalCopy, journal_copy
+from service.store.journal.journal import read_tail
 from service.store.journal.lines import NAME, Ending, JournalLine, read_lines
 from service.store.journal.rebuild import RebuildReport, rebuild
 from service.store.records import SITE, NewJob
+from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
@@ -391,6 +394,46 @@ def test_the_second_place_has_the_journal_too_and_a_lost_folder_comes_back_from_
     assert verify(data).faults == ()
     with Store.open(data) as store:
         assert store.head(run) == 3
+
+
+class Interrupting(DurableFiles):
+    """Lets another program act whenever something is about to be appended, if no lock keeps that program waiting."""
+
+    def __init__(self, locked: Path, act: Callable[[], object]) -> None:
+        self.locked = locked
+        self.act = act
+
+    def append(self, path: Path, offset: int, data: bytes) -> None:
+        with self.locked.open("rb") as stream:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                free = False
+            else:
+                fcntl.flock(stream, fcntl.LOCK_UN)
+                free = True
+        if free:
+            self.act()
+        super().append(path, offset, data)
+
+
+def test_two_programs_that_copy_the_journal_at_once_do_not_spoil_the_copy(tmp_path: Path) -> None:
+    data, copy = tmp_path / "data", tmp_path / "copy.jsonl"
+    with Store.open(data, SteppedClock(), CountedIds()) as store:
+        run = start_run(store)
+        checkpoint(store, run)
+        ends: list[int] = []
+
+        def another_program() -> None:
+            capture(store, run, f"v{len(ends)}")
+            JournalCopy(data, copy, DurableFiles()).bring_up_to_date()
+            ends.append(copy.stat().st_size)
+
+        JournalCopy(data, copy, Interrupting(data / LOG_NAME, another_program)).bring_up_to_date()
+        assert copy.stat().st_size >= max(ends, default=0), "what one program had copied another took away"
+        another_program()
+    assert read_tail(copy) is not None
+    assert (data / NAME).read_bytes().startswith(copy.read_bytes())
 
 
 def test_two_stores_of_one_folder_write_one_journal(tmp_path: Path) -> None:

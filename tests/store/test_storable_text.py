@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-import os
-import sqlite3
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +16,12 @@ from service.cli.main import app
 from service.core.records.events import JobFailed, StepNote
 from service.core.shown_text import storable, storable_data
 from service.store import events as event_module
-from service.store.records import NewArtefact, NewJob
+from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.worker.job import JobAnswer, JobContext
 from service.worker.loop import HANDLERS, work
+from tests.support.hostile_places import STORED_AS, can_be_stored_as, refused_by_other_databases
 from tests.support.hostile_text import UNSTORABLE, obeyed
 from tests.support.record.bundled_site import check
 from tests.support.record.store import CountedIds, start_run
@@ -39,87 +37,21 @@ def store(tmp_path: Path) -> Iterator[Store]:
         assert verify(tmp_path / "data").ok
 
 
-def dumped(data: Path) -> str:
-    """Every row of the database as text. A copy to PostgreSQL takes it unless it holds NUL or a surrogate."""
-    with closing(sqlite3.connect(data / "orthocapture.sqlite")) as database:
-        # The index of words keeps no text that could be read back.
-        listed = "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'event_words%'"
-        tables = [name for (name,) in database.execute(listed)]
-        return "\n".join(repr(row) for name in tables for row in database.execute(f'SELECT * FROM "{name}"'))
-
-
-def as_a_note(store: Store, run: str, text: str) -> None:
-    store.record(run, [StepNote(step=text, attempt=1, note=text, data={"x": [text], text: {text: text}})], actor=text)
-
-
-def as_a_file(store: Store, run: str, text: str) -> None:
-    ref = store.put_bytes(b"{}", kind="result", media_type="application/json", original_name=text)
-    note = StepNote(step="s", attempt=1, note="n", data={"file": ref.model_dump()})
-    store.record(run, [note], actor="Ada", artefacts=[NewArtefact(ref, text, step=text, viewpoint=text, who=text)])
-
-
-def can_name_a_file(text: str) -> bool:
-    """Whether a file system has such names; a surrogate stands for a byte that is not text."""
-    try:
-        return b"\0" not in os.fsencode(text) and "/" not in text
-    except UnicodeEncodeError:
-        return False
-
-
-def as_a_name_of_a_file(store: Store, run: str, text: str) -> None:
-    path = store.database_path.parent.parent / text
-    path.write_bytes(b"x")
-    ref = store.put_file(path, kind="image", media_type="image/jpeg")
-    note = StepNote(step="s", attempt=1, note="n", data={"file": ref.model_dump()})
-    store.record(run, [note], actor="Ada", artefacts=[NewArtefact(ref, "camera")])
-
-
-def as_a_job(store: Store, run: str, text: str) -> None:
-    job = NewJob("detect", text, 1, text, {"of": text})
-    store.record(run, [], actor=text, jobs=[job])
-    store.record(run, [], actor=text, jobs=[job])
-    assert len(store.jobs(run)) == 1
-
-
-def as_a_result(store: Store, run: str, text: str) -> None:
-    store.record(run, [], actor="runner", jobs=[NewJob("detect", "s", 1, "k", {})])
-    job = store.claim_job(text.replace("\x00", "").encode("utf-8", "ignore").decode(), 10)
-    assert job is not None
-    store.finish_job(job, measures={}, duration_s=1.0, result={"words": [text]})
-
-
-def in_the_sites_chain(store: Store, run: str, text: str) -> None:
-    note = StepNote(step=run, attempt=1, note=text)
-    store.record_site([note], actor=text, software={"orthocapture": text})
-
-
-PLACES: dict[str, Callable[[Store, str, str], None]] = {
-    "note": as_a_note,
-    "file": as_a_file,
-    "file's own name": as_a_name_of_a_file,
-    "job": as_a_job,
-    "result": as_a_result,
-    "site": in_the_sites_chain,
-}
-
-
 @pytest.mark.parametrize(
     ("place", "text"),
     [
         pytest.param(place, text, id=f"{place}-{name}")
-        for place in PLACES
+        for place in STORED_AS
         for name, text in UNSTORABLE.items()
-        if place != "file's own name" or can_name_a_file(text)
+        if can_be_stored_as(place, text)
     ],
 )
 def test_every_text_can_be_recorded_verified_and_copied(store: Store, place: str, text: str) -> None:
     run = start_run(store)
-    PLACES[place](store, run, text)
+    STORED_AS[place](store, run, text)
     data = store.database_path.parent
     assert verify(data).ok
-    stored = dumped(data)
-    assert "\\x00" not in stored.replace("\\\\x00", "")
-    assert "\\\\u0000" not in stored.replace("\\\\\\\\u0000", "")
+    assert not refused_by_other_databases(data)
     assert all(event == again for event, again in zip(store.events(run), store.events(run), strict=True))
     done = CliRunner().invoke(app, ["audit", "show", run, "--data", str(data)], env={"COLUMNS": "200"})
     assert done.exit_code == 0, done.exception

@@ -1,4 +1,4 @@
-"""Texts from outside that mean harm to a terminal, to markup, or to a database."""
+"""Texts from outside that mean harm to a terminal, to markup, to a page, or to a database."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ HOSTILE = {
     "tags": "x\U000e0041\U000e0042",
     "tabs": "a\tb",
     "deleted": "a\x7fb",
+    "element of a page": "<img src=x onerror=alert(1)>",
+    "end of an attribute": "x\"' onmouseover=alert(1) '\"",
 }
 
 # All of them that a shell can give to a command, in one line; and those that a database may refuse.

@@ -1,8 +1,8 @@
 """What a machine under pressure does to each step of a run: `python -m bench.torture.pressure [--only starved …]`.
 
-The demonstration with few views (every kind of its steps but the sphere layout's check and the ground truth's) is run
-with `--auto-confirm` on a simulated rig: as it is, with a fraction of a processor for all its processes, with little
-memory, and with a driver killed in each step that takes views. Where the command ends because a person must decide,
+The demonstration with few views and all its steps is run with `--auto-confirm` on a simulated rig: as it is, with a
+fraction of a processor for all its processes, with little memory, and with a driver killed in each step that takes
+views. Where the command ends because a person must decide,
 one is played from then on: the run is resumed with `--screens`, and what it asks is confirmed by `orthocapture act`.
 Nothing else may end it. It needs root.
 
@@ -113,7 +113,7 @@ def run(name: str, pressure: Pressure, folder: Path, host: str, longest_s: float
     """One whole run; its figures."""
     data = folder / "data"
     (folder / "rig").mkdir(parents=True)
-    protocol = small_demo(folder / "small.yaml")
+    protocol = small_demo(folder / "small.yaml", every_step=True)
     killer = Killer(pressure.kills)
     statuses: list[int] = []
     began_s = time.monotonic()
@@ -305,9 +305,10 @@ def _table(found: Mapping[str, Any]) -> str:
         f"| step | kind | {' | '.join(f'{name}: s, failures' for name in names)} |",
         "|---|---|" + "---|" * len(names),
     ]
-    first = next(iter(found["runs"].values()))
-    for step, figures in first["steps"].items():
-        cells = [_cell(found["runs"][name]["steps"][step]) for name in names]
+    most = max((row["steps"] for row in found["runs"].values()), key=len)
+    for step, figures in most.items():
+        rows = [row["steps"].get(step) for row in found["runs"].values()]
+        cells = ["" if row is None else _cell(row) for row in rows]
         lines.append(f"| {step} | {figures['kind']} | {' | '.join(cells)} |")
     return "\n".join([*lines, "", f"Machine: {found['machine']}; revision {found['commit']}.", ""])
 

@@ -11,6 +11,7 @@ from service.audit.record.event_rows import one_event
 from service.core.errors import DataError
 from service.core.records.events import Event, RecordCorrected
 from service.core.text.json_text import parse_json
+from service.core.text.reasons import reason_of
 from service.store.store import Store
 
 _UNCORRECTABLE = frozenset({"sha256", "size_bytes", "kind", "signed_sha256", "protocol_sha256"})
@@ -26,10 +27,8 @@ def correct(store: Store, run_id: str, *, of_seq: int, field: str, new: str, rea
         DataError: the field does not exist or cannot be corrected, the value has another type or is the same, or no
             reason is given.
     """
-    field, reason = field.strip(), reason.strip()
+    field, reason = field.strip(), reason_of(reason, DataError)
     where = f"event {of_seq}, {field}"
-    if not reason:
-        raise DataError("a correction needs a reason", where=where, remedy="Say why; it goes into the record")
     with store.database.reading() as connection:
         event = one_event(connection, run_id, of_seq)
     if event.kind == "record_corrected":

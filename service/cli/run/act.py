@@ -27,6 +27,7 @@ from service.core.run.actions import VERBS, capture_refusal, record_to_sign, ref
 from service.core.run.connections import connected_arms, lost_arms
 from service.core.run.fold import fold
 from service.core.run.state import RunState
+from service.core.text.reasons import reason_of
 from service.notes import NotePhotograph, require_size, take_note
 from service.people.authorisation import Identity, identity_for, who_acts, who_pauses
 from service.people.sessions import People
@@ -89,7 +90,7 @@ def act_command(
             action=verb,
             step=step or state.current,
             viewpoint=viewpoint,
-            reason=reason,
+            reason=reason.strip() and reason_of(reason, ConfigurationError),
             checklist=protocol.step(state.current).checklist if verb == "confirm" else (),
             meaning=meaning,
             signed_sha256=signed_by_verb(verb, protocol, state),

@@ -12,7 +12,7 @@ MOST_WAITED_OUT = 5  # further tries of a step whose failures the computer's own
 
 # Names instead of classes, because core does not know the drivers and the events hold names.
 # Transient errors: the same call may succeed in a moment. (The driver has already waited for a busy camera.)
-PASSING = frozenset({"DeviceUnavailableError", "DeviceTimeoutError", "MachineBusyError", "StaleImageError"})
+TRIED_AGAIN = frozenset({"DeviceUnavailableError", "DeviceTimeoutError", "MachineBusyError", "StaleImageError"})
 # Only a person can put these right, whatever the protocol says. (A damaged file of the evidence is restored from a
 # copy; it is checked against its hash when it is read again.)
 NEEDS_A_PERSON = frozenset(
@@ -43,6 +43,6 @@ def recovery_policy(recovery: Recovery, error: str, failures: int, *, starved: b
     """
     if error in NEEDS_A_PERSON:
         return "ask"
-    if error in PASSING and failures <= recovery.retries + (MOST_WAITED_OUT if starved else 0):
+    if error in TRIED_AGAIN and failures <= recovery.retries + (MOST_WAITED_OUT if starved else 0):
         return "retry"
     return recovery.on_failure

@@ -7,11 +7,12 @@ from collections.abc import Callable
 from sqlalchemy import select, update
 
 from service.core.records.events import AccountChanged
+from service.core.text.reasons import reason_of
 from service.people.credentials.passwords import ShortSecrets, plain_badge
 from service.people.credentials.tries import SecretOrigin, on_screen_of
 from service.people.errors import AccountError
 from service.people.person import Person
-from service.people.rows import get_account, record_change, require_reason
+from service.people.rows import get_account, record_change
 from service.store.database.tables import accounts
 from service.store.store import Store
 
@@ -45,7 +46,7 @@ class Badges:
 
     def revoke(self, by: Person, account: str, reason: str) -> None:
         """Revoke an account's badge, so that it can no longer sign. Raises AccountError."""
-        self._set(by, account, "", "revoked", require_reason(reason))
+        self._set(by, account, "", "revoked", reason_of(reason, AccountError))
 
     def _others(self, account: str) -> list[str]:
         with self._store.database.reading() as connection:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +12,7 @@ from service.core.errors import IntegrityError, StoreError
 from service.store.durable_effects import Files
 from service.store.journal.journal import Tail, read_tail
 from service.store.journal.lines import NAME
+from service.store.signatures.log import NAME as LOG_NAME
 from service.store.verification.chain_checks import Fault
 
 _BLOCK_BYTES = 1 << 22
@@ -29,41 +32,52 @@ class JournalCopy:
         self._files = files
 
     def bring_up_to_date(self) -> None:
-        """Append to the copy the lines that it lacks.
+        """Append to the copy the lines that it lacks, once something was signed.
 
-        Only its owner can read it, as it holds what the database holds.
+        Only its owner can read it, as it holds what the database holds. One process writes to it at a time: the lock
+        is that of the log of signatures, as for its copy, because the journal's own would keep its writers waiting.
 
         Raises:
             IntegrityError: the copy is not a beginning of the journal: one of them was changed.
             StoreError: the copy cannot be written; the next call adds what is missing.
         """
         try:
-            end, held = read_tail(self._journal), read_tail(self.copy)
-            if end is None:
-                return
-            if held is not None and not _has(self._journal, held):
-                raise IntegrityError(
-                    "the copy of the journal is not the beginning of the journal: one of the two was changed",
-                    where=str(self.copy),
-                    remedy="Keep both. If `orthocapture store rebuild` made the journal anew, rename this copy",
-                )
-            if not self.copy.exists():
-                self._files.write(self.copy, (), private=True)
-                self._files.sync_directory(self.copy.parent)
-            begin = 0 if held is None else held.end
-            with self._journal.open("rb") as stream:
-                stream.seek(begin)
-                while begin < end.end:
-                    block = stream.read(min(_BLOCK_BYTES, end.end - begin))
-                    self._files.append(self.copy, begin, block)  # overwrites a partly written line
-                    begin += len(block)
-            self._files.sync_file(self.copy)
+            descriptor = os.open(self._journal.with_name(LOG_NAME), os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError:
+            return  # nothing was signed yet
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            self._append()
         except OSError as error:
             raise StoreError(
                 f"the copy of the journal cannot be written: {error.strerror or error}",
                 where=str(self.copy),
                 remedy="Check that the share or the medium is there and that it has space",
             ) from error
+        finally:
+            os.close(descriptor)
+
+    def _append(self) -> None:
+        end, held = read_tail(self._journal), read_tail(self.copy)
+        if end is None:
+            return
+        if held is not None and not _has(self._journal, held):
+            raise IntegrityError(
+                "the copy of the journal is not the beginning of the journal: one of the two was changed",
+                where=str(self.copy),
+                remedy="Keep both. If `orthocapture store rebuild` made the journal anew, rename this copy",
+            )
+        if not self.copy.exists():
+            self._files.write(self.copy, (), private=True)
+            self._files.sync_directory(self.copy.parent)
+        begin = 0 if held is None else held.end
+        with self._journal.open("rb") as stream:
+            stream.seek(begin)
+            while begin < end.end:
+                block = stream.read(min(_BLOCK_BYTES, end.end - begin))
+                self._files.append(self.copy, begin, block)  # overwrites a partly written line
+                begin += len(block)
+        self._files.sync_file(self.copy)
 
 
 def journal_copy_faults(data_dir: Path, copy: Path) -> Iterator[Fault]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -160,6 +160,7 @@ def _journal_again(
         if surveyed.problems
         else f"the journal ended at line {surveyed.last}, the database held line {found.held}"
     )
+    name = _named_with_a_copy(data_dir, actor, files)
     path, kept = data_dir / NAME, f"{NAME}.before-{stamp}"
     with closing(sqlite3.connect(database_path(data_dir), isolation_level=None)) as connection:
         connection.execute("PRAGMA synchronous = FULL")
@@ -175,7 +176,33 @@ def _journal_again(
     made = RecordRebuilt(
         made="journal", why=why, events=found.events, restored_events=0, kept=(kept,) if had_one else ()
     )
-    return _record(data_dir, made, actor(data_dir), files, clock)
+    return _record(data_dir, made, name, files, clock)
+
+
+def _named_with_a_copy(data_dir: Path, actor: Callable[[Path], str], files: Files) -> str:
+    """The person's name, by the accounts in a copy of the database: the folder itself does not open as it is."""
+    with _work_folder(data_dir, files) as work:
+        with (
+            closing(sqlite3.connect(database_path(data_dir))) as original,
+            closing(sqlite3.connect(database_path(work))) as copy,
+        ):
+            original.backup(copy)
+            copy.execute("PRAGMA user_version = 0")  # as of a folder without a journal
+        return actor(work)
+
+
+@contextmanager
+def _work_folder(data_dir: Path, files: Files) -> Generator[Path]:
+    """A folder within the data folder that has its keys, and is gone afterwards."""
+    work = data_dir / _WORK
+    shutil.rmtree(work, ignore_errors=True)  # of an interrupted rebuild
+    files.make_directory(work, private=True)
+    try:
+        if (data_dir / KEYS).is_dir():
+            (work / KEYS).symlink_to(Path("..") / KEYS)
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
 
 
 def _database_again(
@@ -190,10 +217,7 @@ def _database_again(
     clock: Clock,
 ) -> RebuildReport:
     """Make the database again in a folder of its own, then put it in place of the old one, which is renamed."""
-    work = data_dir / _WORK
-    shutil.rmtree(work, ignore_errors=True)  # of an interrupted rebuild
-    files.make_directory(work, private=True)
-    try:
+    with _work_folder(data_dir, files) as work:
         withdrawn = surveyed.mark is not None and surveyed.mark.word == "withdrawn"
         until = surveyed.before_last if withdrawn else surveyed.last
         lost = [f"line {number} of the journal: {what}" for number, what in surveyed.problems]
@@ -201,12 +225,8 @@ def _database_again(
         files.write(work / NAME, first_lines(journal, until), private=True)
         files.sync_file(work / NAME)
         lost += _missing_files(data_dir, work)
-        if (data_dir / KEYS).is_dir():
-            (work / KEYS).symlink_to(Path("..") / KEYS)
         name = actor(work)
         kept = _put_in_place(data_dir, work, stamp, files)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
     made = RecordRebuilt(
         made="database",
         why=why,

@@ -13,6 +13,7 @@ from service.audit.overview.corrections import correct
 from service.audit.record import artefact_queries, event_rows, run_rows
 from service.web.audit.frame import CurrentAudit, audit_frame, link
 from service.web.page.rendering import render
+from service.web.run.forms import Reason
 from service.web.security.guards import SignedInPerson, requires
 
 router = APIRouter(tags=["audit"])
@@ -66,7 +67,7 @@ def correct_value(
     of_seq: Annotated[int, Form(ge=1, le=2**53)],
     field: Annotated[str, Form(min_length=1, max_length=400)],
     new: Annotated[str, Form(max_length=4000)],
-    reason: Annotated[str, Form(min_length=1, max_length=2000)],
+    reason: Reason,
 ) -> Response:
     """Record a correction; the original stays."""
     audit_frame(audit, run_id, "/corrections")

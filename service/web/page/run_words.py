@@ -67,14 +67,6 @@ def will_happen(step: Step, now: StepState) -> tuple[str, str]:
     return f"Confirm: {said.does}", said.below
 
 
-def irreversible_warning(protocol: Protocol, step: Step) -> str:
-    """Say in plain words what cannot be undone after this step."""
-    before = [s.title for s in protocol.steps[: protocol.index(step.id)] if s.photographs_specimen]
-    words = step.cannot_be_undone or "This step changes the scene for good."
-    tail = f" None of these can be done again: {', '.join(before)}." if before else ""
-    return f"{words}{tail} Read the figures before you go on."
-
-
 def figure_line(verdict: GateVerdict) -> str:
     """One figure of what is signed or did not pass."""
     allowed = limit(verdict.minimum, verdict.maximum, verdict.unit)

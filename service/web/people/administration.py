@@ -16,13 +16,13 @@ from service.people.roles import ROLES, Role
 from service.store.durable_effects import utc_text
 from service.web.page.errors import status_of, wants_json
 from service.web.page.rendering import render
+from service.web.run.forms import Reason
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["administration"])
 
 Name = Annotated[str, Form(max_length=80)]
-Reason = Annotated[str, Form(max_length=500)]
 AccountName = Annotated[str, Path(max_length=40)]
 _ADMINISTER = [Depends(requires("administer"))]
 

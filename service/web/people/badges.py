@@ -11,6 +11,7 @@ from service.core.errors import OrthocaptureError
 from service.people.errors import AccountError, SignInRefusedError
 from service.web.page.errors import status_of, wants_json
 from service.web.page.rendering import render
+from service.web.run.forms import Reason
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
@@ -18,7 +19,6 @@ router = APIRouter(tags=["people"])
 
 AccountName = Annotated[str, Path(max_length=40)]
 Secret = Annotated[str, Form(max_length=256)]
-Reason = Annotated[str, Form(max_length=500)]
 _ENROL = [Depends(requires("enrol"))]
 
 

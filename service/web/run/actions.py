@@ -29,6 +29,7 @@ from service.core.recovery.reasons import full_reason
 from service.core.run.actions import redo_moves, refuse
 from service.core.run.connections import lost_arms
 from service.core.run.state import RunState
+from service.core.text.reasons import reason_of
 from service.people.approvals import approve, standing_of
 from service.people.authorisation import Identity, identity_for
 from service.people.control import Control
@@ -40,7 +41,7 @@ from service.run_acts import DECIDE_AGAIN, cancel_computation, out_of_date, see_
 from service.run_record import RunRecord
 from service.run_start import record_refusal, require_rig_free, require_runnable, start_run
 from service.steps import params_models
-from service.web.run.forms import ActionForm, RunId, StartForm, back_to
+from service.web.run.forms import ActionForm, Reason, RunId, StartForm, back_to
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
@@ -194,7 +195,7 @@ def cancel(
     person: SignedInPerson,
     run_id: RunId,
     job: Annotated[str, Path(max_length=64)],
-    reason: Short,
+    reason: Reason,
 ) -> RedirectResponse:
     """End a computation with a reason; nothing else of the run is touched."""
     site.run(run_id)
@@ -205,11 +206,12 @@ def cancel(
 
 def _action(form: ActionForm, state: RunState, who: Identity | None) -> OperatorAction:
     """The event of a form; `who` is the person who identified themselves for this action, if anybody had to."""
+    reason = full_reason(form.preset, form.reason)
     return OperatorAction(
         action=form.verb,
         step=form.step or state.current,
         viewpoint=form.viewpoint or None,
-        reason=full_reason(form.preset, form.reason),
+        reason=reason and reason_of(reason, IllegalTransitionError),
         checklist=state.step.ticked if form.verb == "confirm" else (),
         meaning=form.meaning.strip(),
         signed_sha256=form.signed_sha256,

@@ -9,19 +9,18 @@ from fastapi.responses import RedirectResponse
 
 from service.core.errors import IllegalTransitionError
 from service.people.control import Control
-from service.web.run.forms import RunId, back_to
+from service.web.run.forms import Reason, RunId, back_to
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["control"])
 
-Words = Annotated[str, Form(max_length=2000)]
 Shown = Annotated[str, Form(max_length=64)]  # the screen of which the page spoke; "" for none
 
 
 @router.post("/runs/{run_id}/control/take", name="take_control", dependencies=[Depends(requires("operate"))])
 def take_control(
-    site: CurrentSite, person: SignedInPerson, run_id: RunId, reason: Words = "", holder: Shown = ""
+    site: CurrentSite, person: SignedInPerson, run_id: RunId, reason: Reason = "", holder: Shown = ""
 ) -> RedirectResponse:
     """Take control of a run that nobody controls; a supervisor takes it from somebody with a reason."""
     _require_open(site, run_id)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import Path
+from fastapi import Form, Path
 from fastapi.responses import RedirectResponse
 from pydantic import BaseModel, Field
 
 from service.core.records.events import OperatorVerb
+from service.core.text.reasons import REASON_CHARACTERS
 from service.people.sessions import KnownBy
 
 RunId = Annotated[str, Path(max_length=64)]
+Reason = Annotated[str, Form(max_length=REASON_CHARACTERS)]
 
 
 class StartForm(BaseModel):
@@ -21,7 +23,7 @@ class StartForm(BaseModel):
     """
 
     protocol: str = Field(max_length=200)
-    reason: str = Field("", max_length=2000)
+    reason: str = Field("", max_length=REASON_CHARACTERS)
     password: str = Field("", max_length=1000)
     specimen: str = Field("", max_length=2000)
     purpose: str = Field("", max_length=2000)
@@ -60,7 +62,7 @@ class ActionForm(BaseModel):
     replaces: int = Field(0, ge=0, le=2**31)
     moves: bool = False
     preset: str = Field("", max_length=2000)
-    reason: str = Field("", max_length=2000)
+    reason: str = Field("", max_length=REASON_CHARACTERS)
     meaning: str = Field("", max_length=2000)
     known_by: KnownBy = "password"
     password: str = Field("", max_length=1000)

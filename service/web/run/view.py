@@ -9,6 +9,7 @@ from service.core.equipment.clocks import clock_readings
 from service.core.equipment.disk_space import Forecast
 from service.core.gates.acceptance import acceptors, demanded_role, failed_gates
 from service.core.gates.dependence import dependent_steps, depends_on
+from service.core.protocol.irreversible import irreversible_warning
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import Event, FilesKept, ItemTicked, OperatorAction, OperatorVerb, RecordedView
 from service.core.recovery.ways_on import WayOn, takes_words
@@ -27,7 +28,6 @@ from service.web.page.run_words import (
     count,
     drawing_of,
     figure_line,
-    irreversible_warning,
     needs,
     phase_words,
     planned_views,

@@ -13,6 +13,7 @@ from service.cli.run.terminal.hands import SimulatedHands
 from service.cli.terminal_output import Terminal, bar_of_counts, styled
 from service.core.errors import PersonNeededError
 from service.core.gates.acceptance import demanded_role
+from service.core.protocol.irreversible import irreversible_warning
 from service.core.protocol.models import Protocol
 from service.core.records.events import OperatorAction
 from service.core.recovery.ways_on import takes_words
@@ -192,6 +193,8 @@ class TerminalOperator(_Operator):
         plan = self.preview(question.step) if question.for_ == "confirm" else ""
         if plan:
             lines.append(f"\nThe plan: {plan}")
+        if step.irreversible and question.for_ in ("confirm", "sign"):
+            lines.append(f"\nThis cannot be undone. {irreversible_warning(self.protocol, step)}")
         lines += _ways_lines(question)
         lines.append(f"\nType one of: {', '.join(question.options)} (with a reason where one is needed).")
         if "confirm" in question.options and question.checklist:
