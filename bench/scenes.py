@@ -77,7 +77,7 @@ def render_scene(seed: int, width: int, views: int, *, cache: Path = CACHE, work
     (folder / "images").mkdir(parents=True, exist_ok=True)
     scene = Scene.generate(seed)
     shots = plan_shots(scene, views)
-    tasks = [(seed, width, folder / "images" / shot.name, shot, i) for i, shot in enumerate(shots)]
+    tasks = _tasks(folder, seed, width, shots)
     if workers > 1:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
             list(pool.map(_render, tasks))
@@ -111,6 +111,15 @@ def render_scene(seed: int, width: int, views: int, *, cache: Path = CACHE, work
     return folder
 
 
+def render_image(seed: int, width: int, views: int, name: str, *, cache: Path = CACHE) -> Path:
+    """Render one image of a capture, unless it is cached, and return its file."""
+    folder = cache / f"scene{seed:02d}_{width}_{views}"
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    task = next(t for t in _tasks(folder, seed, width, plan_shots(Scene.generate(seed), views)) if t[2].name == name)
+    _render(task)
+    return task[2]
+
+
 def rendered(name: str, cache: Path = CACHE) -> Path:
     """Render a capture named like scene01_1920_20 (seed, width, number of views), unless cached.
 
@@ -120,7 +129,14 @@ def rendered(name: str, cache: Path = CACHE) -> Path:
     return render_scene(int(seed), int(width), int(views), cache=cache)
 
 
-def _render(task: tuple[int, int, Path, Shot, int]) -> None:
+_Task = tuple[int, int, Path, Shot, int]
+
+
+def _tasks(folder: Path, seed: int, width: int, shots: list[Shot]) -> list[_Task]:
+    return [(seed, width, folder / "images" / shot.name, shot, i) for i, shot in enumerate(shots)]
+
+
+def _render(task: _Task) -> None:
     seed, width, path, shot, number = task
     if path.is_file():
         return

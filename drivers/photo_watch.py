@@ -25,6 +25,7 @@ from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, Devi
 from drivers.photos.photo_file import ExifRecord, check_jpeg_complete, read_exif, sha256_of, taken_utc_s
 from drivers.photos.photo_folder import JPEG_SUFFIXES, RAW_MEDIA_TYPES, odd, paired
 from drivers.plugin import DriverConfig, DriverSpec
+from service.core.jpeg_damage import damaged_jpegs
 
 _LOOK_S = 0.2  # interval between two polls of the folder
 _COUNTER = re.compile(r"(\d+)$")
@@ -200,6 +201,12 @@ class PhotoWatch:
                 return
             check_jpeg_complete(path)
             seen.whole = True
+            damage = damaged_jpegs([path]).get(path)
+            if damage is not None:
+                seen.trouble = UnreadableFileError(
+                    damage, where=str(path), remedy="Copy it from the card again, or take it again"
+                )
+                return
             seen.exif.settings(focus_mode="", image_quality="")
             if taken_s is None:
                 seen.trouble = UnreadableFileError(

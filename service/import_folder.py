@@ -228,6 +228,7 @@ def camera_record(exif: ExifRecord) -> dict[str, Any]:
         "exif_time": exif.taken,
         "width": exif.width,
         "height": exif.height,
+        "unread": exif.unread,
     }
     return {name: value for name, value in stated.items() if value not in (None, "")}
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import csv
 import datetime
+import functools
 import json
 import shutil
 import statistics
@@ -21,12 +22,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from bench.machine import RESULTS, commit, machine
-from bench.scenes import CACHE, render_scene
+from bench.scenes import CACHE, render_image, render_scene
 from service.cli.main import app
-from service.core.geometry import Array, apply
+from service.core.geometry import apply
 
 _ASIDE = np.array([0.6, 0.7, -0.39]) / np.linalg.norm([0.6, 0.7, -0.39])
 _WIDTH = 1920  # for which lengths in pixels below are meant
@@ -41,7 +43,7 @@ class Inputs:
     poses: dict[str, list[float]]
     spheres: dict[str, Any]
     scratch: Path
-    foreign: Path  # images of another scene
+    foreign: Callable[[str], Path]  # the image of this name of another scene
     options: list[str] = field(default_factory=list[str])
 
     @property
@@ -139,7 +141,7 @@ def _copied(before: Path, after: Path) -> None:
 def _foreign(inputs: Inputs) -> None:
     inputs.own_images(_copied)
     names = sorted(file.name for file in inputs.images.iterdir())
-    shutil.copy(inputs.foreign / names[5], inputs.images / names[5])
+    shutil.copy(inputs.foreign(names[5]), inputs.images / names[5])
 
 
 def _swapped(inputs: Inputs) -> None:
@@ -152,18 +154,21 @@ def _pose_off(inputs: Inputs) -> None:
     pose[:3] = (np.array(pose[:3]) + 5e-3 * _ASIDE).tolist()
 
 
-def _pictures(change: Callable[[Array, float], Array], quality: int = 94) -> Callable[[Inputs], None]:
+_Picture = NDArray[np.uint8]
+
+
+def _pictures(change: Callable[[_Picture, float], _Picture], quality: int = 94) -> Callable[[Inputs], None]:
     def rewrite(inputs: Inputs) -> None:
         def one(before: Path, after: Path) -> None:
-            picture = change(np.asarray(cv2.imread(str(before)), dtype=np.float64), inputs.pixels)
-            cv2.imwrite(str(after), np.rint(picture).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])
+            picture = change(np.asarray(cv2.imread(str(before)), dtype=np.uint8), inputs.pixels)
+            cv2.imwrite(str(after), picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
 
         inputs.own_images(one)
 
     return rewrite
 
 
-def _motion_blur(picture: Array, pixels: float) -> Array:
+def _motion_blur(picture: _Picture, pixels: float) -> _Picture:
     """A shift by 5 px along a diagonal during the exposure."""
     length, size = 5.0 * pixels, 2 * int(np.ceil(5 * pixels)) + 1
     kernel = np.zeros((size, size))
@@ -180,22 +185,27 @@ def _motion_blur(picture: Array, pixels: float) -> Array:
     return _in_light(picture, lambda light: cv2.filter2D(light, -1, kernel / kernel.sum()))
 
 
-def _motion_blur_of_codes(picture: Array, pixels: float) -> Array:
+def _motion_blur_of_codes(picture: _Picture, pixels: float) -> _Picture:
     """The same along a row, of the coded values, as a program that processes images makes it: edges move outward."""
     length = max(2, round(5 * pixels))
-    return np.asarray(cv2.blur(picture, (length, 1)), dtype=np.float64)
+    return np.asarray(cv2.blur(picture, (length, 1)), dtype=np.uint8)
 
 
-def _in_light(picture: Array, change: Callable[[Array], Any]) -> Array:
-    """A picture whose light is changed, not its codes."""
-    return 255 * np.clip(np.asarray(change((picture / 255) ** 2.2), dtype=np.float64), 0, 1) ** (1 / 2.2)
+def _in_light(picture: _Picture, change: Callable[[NDArray[np.float32]], Any]) -> _Picture:
+    """A picture whose light is changed, not its codes; one colour at a time, which 60 MP have room for."""
+    light_of_code = ((np.arange(256) / 255) ** 2.2).astype(np.float32)
+    colours: list[_Picture] = []
+    for codes in cv2.split(picture):
+        light = np.clip(np.asarray(change(light_of_code[codes]), dtype=np.float32), 0, 1)
+        colours.append(np.rint(255 * light ** np.float32(1 / 2.2)).astype(np.uint8))
+    return np.dstack(colours)
 
 
-def _defocus(picture: Array, pixels: float) -> Array:
+def _defocus(picture: _Picture, pixels: float) -> _Picture:
     return _in_light(picture, lambda light: cv2.GaussianBlur(light, (0, 0), 2.5 * pixels))
 
 
-def _same(picture: Array, _pixels: float) -> Array:
+def _same(picture: _Picture, _pixels: float) -> _Picture:
     return picture
 
 
@@ -231,16 +241,16 @@ CASES = (
 
 
 @contextmanager
-def _inputs(folder: Path, foreign: Path) -> Generator[Inputs]:
+def _inputs(folder: Path, foreign: Callable[[str], Path]) -> Generator[Inputs]:
     with tempfile.TemporaryDirectory(prefix="orthocapture-faults-") as scratch, (folder / "poses.csv").open() as file:
         poses = {row[0]: [float(v) for v in row[1:]] for row in list(csv.reader(file))[1:]}
         yield Inputs(
             folder / "images", json.loads((folder / "camera.json").read_text()), poses,
-            json.loads((folder / "spheres.json").read_text()), Path(scratch), foreign / "images",
+            json.loads((folder / "spheres.json").read_text()), Path(scratch), foreign,
         )  # fmt: skip
 
 
-def measured(case: Case, folder: Path, foreign: Path, workers: int) -> dict[str, Any]:
+def measured(case: Case, folder: Path, foreign: Callable[[str], Path], workers: int) -> dict[str, Any]:
     """One row: the fault on a scene, and what the command makes of it."""
     truth = np.array(json.loads((folder / "truth.json").read_text())["T_world_scan"])
     true_m = 1e-3 * np.array(json.loads((folder / "spheres.json").read_text())["registration_mm"])
@@ -282,7 +292,7 @@ def measured(case: Case, folder: Path, foreign: Path, workers: int) -> dict[str,
 
 def clean_scenes(folders: Iterable[Path], workers: int) -> dict[str, Any]:
     """Clean scenes: how many are refused, or have a finding, and the median stated sigma."""
-    rows = [measured(CASES[0], folder, folder, workers) for folder in folders]
+    rows = [measured(CASES[0], folder, folder.joinpath, workers) for folder in folders]
     for row in rows:
         print(_line(row), flush=True)
     return {
@@ -320,6 +330,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         "sphere's radial error (mm).",
     ]
     for scene, rows in record["tables"].items():
+        missing = [case.name for case in CASES if all(row["case"] != case.name for row in rows)]
         lines += [
             "",
             f"## {scene}",
@@ -328,6 +339,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
             "|---|---:|---:|---:|---:|---|---|",
             *map(_line, rows),
         ]
+        if missing:
+            lines += ["", f"Not measured here: {'; '.join(missing)}."]
     clean = record.get("clean")
     if clean:
         lines += [
@@ -339,6 +352,11 @@ def as_markdown(record: Mapping[str, Any]) -> str:
             f"at most {clean['worst_errors_in_sigma']:.1f} sigmas.",
         ]
     return "\n".join(lines) + "\n"
+
+
+def _write(record: Mapping[str, Any], stem: Path) -> None:
+    stem.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    stem.with_suffix(".md").write_text(as_markdown(record), encoding="utf-8")
 
 
 def main() -> None:
@@ -354,21 +372,25 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=CACHE)
     parser.add_argument("--record", action="store_true")
     parser.add_argument("--date", default=datetime.datetime.now(tz=datetime.UTC).date().isoformat(), help="today")
+    parser.add_argument("--resume", action="store_true", help="keep the rows that --record wrote for this date")
     options = parser.parse_args()
     chosen = [c for c in CASES if not options.cases or any(word in c.name for word in options.cases)]
-    tables: dict[str, list[dict[str, Any]]] = {}
+    stem = RESULTS / f"faults_table-{options.date}"
+    record: dict[str, Any] = {"date": options.date, "commit": commit(), "machine": machine(), "tables": {}}
+    if options.resume and stem.with_suffix(".json").is_file():
+        record["tables"] = json.loads(stem.with_suffix(".json").read_text(encoding="utf-8"))["tables"]
     for seed in options.scenes:
-        folder = foreign = render_scene(
-            seed, options.width, options.views, cache=options.cache, workers=options.workers
-        )
+        folder = render_scene(seed, options.width, options.views, cache=options.cache, workers=options.workers)
+        other = functools.partial(render_image, seed + 1, options.width, options.views, cache=options.cache)
+        rows = record["tables"].setdefault(folder.name, [])
         for case in chosen:
-            if case.change is _foreign:  # which alone needs another scene
-                foreign = render_scene(
-                    seed + 1, options.width, options.views, cache=options.cache, workers=options.workers
-                )
-            tables.setdefault(folder.name, []).append(measured(case, folder, foreign, options.workers))
-            print(_line(tables[folder.name][-1]), flush=True)
-    record: dict[str, Any] = {"date": options.date, "commit": commit(), "machine": machine(), "tables": tables}
+            if any(row["case"] == case.name for row in rows):
+                continue
+            rows.append({**measured(case, folder, other, options.workers), "commit": record["commit"]})
+            rows.sort(key=lambda row: [c.name for c in CASES].index(row["case"]))
+            print(_line(next(row for row in rows if row["case"] == case.name)), flush=True)
+            if options.record:  # a table of large images takes an hour
+                _write(record, stem)
     if options.clean:
         folders = (
             render_scene(s, options.clean_width, options.views, cache=options.cache, workers=options.workers)
@@ -376,9 +398,7 @@ def main() -> None:
         )
         record["clean"] = clean_scenes(folders, options.workers)
     if options.record:
-        stem = RESULTS / f"faults_table-{options.date}"
-        stem.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-        stem.with_suffix(".md").write_text(as_markdown(record), encoding="utf-8")
+        _write(record, stem)
     print(as_markdown(record))
 
 

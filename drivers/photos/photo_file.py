@@ -13,10 +13,11 @@ from drivers.errors import UnreadableFileError
 from drivers.foreign_code import check_name, reading
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage
 from service.core.errors import DataError
-from service.core.picture_files import ForeignKindError, TruncatedPictureError, check_jpeg, kind_of
+from service.core.picture_files import ForeignKindError, TruncatedPictureError, check_jpeg, kind_of, picture_size
 
 # The library has no types; see docs/decisions/0002-strict-typing.md.
 exiv2: Any = importlib.import_module("exiv2")
+_TEXTS = (exiv2.TypeId.asciiString, exiv2.TypeId.undefined)  # kinds of values that are no numbers
 _LONGEST_TEXT = 500  # limit for a name or a time; cameras write less than a tenth of it
 
 
@@ -41,6 +42,7 @@ class ExifRecord:
     focus_distance_m: float | None = None  # many lenses do not report it
     focus_mode: str = ""  # in the manufacturer's words
     focus_position: int | None = None  # of the lens's focus motor, in its own steps, if the camera reports it
+    unread: str = ""  # why the file's EXIF, which is broken, could not be read
 
     def settings(self, *, focus_mode: str, image_quality: str) -> CameraSettings:
         """Combine aperture, exposure time and ISO of the file with two settings that have no standard EXIF tag.
@@ -49,7 +51,7 @@ class ExifRecord:
         """
         if self.aperture_f is None or self.exposure_s is None or self.iso is None:
             raise UnreadableFileError(
-                "the photograph does not state aperture, exposure time and ISO",
+                self.unread or "the photograph does not state aperture, exposure time and ISO",
                 where=str(self.path),
                 remedy="Use files as they left the camera; editing programs often remove EXIF",
             )
@@ -116,31 +118,62 @@ _KEYS = {
 
 
 def read_exif(path: Path) -> ExifRecord:
-    """Read the EXIF of a photograph (JPEG, TIFF, PNG, raw). Raises UnreadableFileError if it is not an image."""
+    """Read the EXIF of a photograph (JPEG, TIFF, PNG, raw).
+
+    A JPEG whose EXIF is broken states nothing but its size, and `unread` says why.
+
+    Raises UnreadableFileError if the file is not an image.
+    """
     check_name(path)
-    with reading(path, "a photograph", "Copy it again from the camera"):
-        image = exiv2.ImageFactory.open(str(path))
-        image.readMetadata()
-        exif = image.exifData()
+    size = _jpeg_size(path)
+    try:
+        with reading(path, "a photograph", "Copy it again from the camera"):
+            return _stated(path, size)
+    except UnreadableFileError as error:
+        if size is None:
+            raise
+        width, height = size
         return ExifRecord(
-            path=path,
-            make=_text(exif, "make"),
-            model=_text(exif, "model"),
-            body_serial=_text(exif, "serial"),
-            lens=_text(exif, "lens"),
-            aperture_f=_number(exif, "aperture"),
-            exposure_s=_number(exif, "exposure"),
-            iso=_integer(exif, "iso"),
-            focal_length_mm=_number(exif, "focal_length"),
-            taken=_taken(exif),
-            orientation=_integer(exif, "orientation") or 1,
-            width=int(image.pixelWidth()),
-            height=int(image.pixelHeight()),
-            lens_serial=_text(exif, "lens_serial"),
-            focus_distance_m=_number(exif, "focus_distance"),
-            focus_mode=_text(exif, "focus_mode", in_words=True),
-            focus_position=_integer(exif, "focus_position"),
-        )
+            path, "", "", "", "", None, None, None, None, "", 1, width, height,
+            unread=f"the photograph's EXIF is broken: {error.__cause__}",
+        )  # fmt: skip
+
+
+def _stated(path: Path, size: tuple[int, int] | None) -> ExifRecord:
+    image = exiv2.ImageFactory.open(str(path))
+    image.readMetadata()
+    exif = image.exifData()
+    # The library takes the size from what it has read of a JPEG, which a broken colour profile cuts short.
+    width, height = size or (int(image.pixelWidth()), int(image.pixelHeight()))
+    return ExifRecord(
+        path=path,
+        make=_text(exif, "make"),
+        model=_text(exif, "model"),
+        body_serial=_text(exif, "serial"),
+        lens=_text(exif, "lens"),
+        aperture_f=_number(exif, "aperture"),
+        exposure_s=_number(exif, "exposure"),
+        iso=_integer(exif, "iso"),
+        focal_length_mm=_number(exif, "focal_length"),
+        taken=_taken(exif),
+        orientation=_integer(exif, "orientation") or 1,
+        width=width,
+        height=height,
+        lens_serial=_text(exif, "lens_serial"),
+        focus_distance_m=_number(exif, "focus_distance"),
+        focus_mode=_text(exif, "focus_mode", in_words=True),
+        focus_position=_integer(exif, "focus_position"),
+    )
+
+
+def _jpeg_size(path: Path) -> tuple[int, int] | None:
+    """Width and height by a JPEG's own header; None for other files."""
+    if kind_of_file(path) != "JPEG":
+        return None
+    try:
+        return picture_size(path.read_bytes(), str(path))
+    except DataError:
+        return None
 
 
 def _find(exif: Any, name: str) -> Any:
@@ -167,6 +200,8 @@ def _number(exif: Any, name: str) -> float | None:
     found = _find(exif, name)
     if found is None:
         return None
+    if found.typeId() in _TEXTS:
+        return None  # the library would give the code of its first letter
     numerator, denominator = found.toRational()
     # Cameras write 0/0 if the lens reports no value.
     return numerator / denominator if denominator and numerator > 0 else None
@@ -174,7 +209,7 @@ def _number(exif: Any, name: str) -> float | None:
 
 def _integer(exif: Any, name: str) -> int | None:
     found = _find(exif, name)
-    return None if found is None else int(found.toInt64())
+    return None if found is None or found.typeId() in _TEXTS else int(found.toInt64())
 
 
 def _taken(exif: Any) -> str:

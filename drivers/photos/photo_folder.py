@@ -10,6 +10,7 @@ from pathlib import Path
 from drivers.errors import UnreadableFileError
 from drivers.folder_files import files_below
 from drivers.photos.photo_file import ExifRecord, check_jpeg_complete, kind_of_file, read_exif, sha256_of
+from service.core.jpeg_damage import damaged_jpegs
 from service.core.picture_files import ForeignKindError
 
 JPEG_SUFFIXES = (".jpg", ".jpeg")
@@ -92,15 +93,21 @@ def list_photographs(folder: Path) -> Photographs:
             left_out.append(LeftOut(path, "not a photograph: only JPEG files, with raw files beside them, are read"))
     of_jpeg, alone = paired(jpegs, raws)
     left_out += [LeftOut(path, "a raw file without the JPEG of the same name; develop it first") for path in alone]
-    photographs: list[Photograph] = []
+    whole: dict[Path, ExifRecord] = {}
     damaged: list[LeftOut] = []
     for path in jpegs:
         try:
             check_jpeg_complete(path)
-            exif = read_exif(path)
-            photographs.append(Photograph(listed(path), exif, tuple(map(listed, of_jpeg.get(path, ())))))
+            whole[path] = read_exif(path)
         except UnreadableFileError as error:
             (left_out if isinstance(error.__cause__, ForeignKindError) else damaged).append(LeftOut(path, error.what))
+    within = damaged_jpegs(tuple(whole))
+    damaged += [LeftOut(path, what) for path, what in within.items()]
+    photographs = [
+        Photograph(listed(path), exif, tuple(map(listed, of_jpeg.get(path, ()))))
+        for path, exif in whole.items()
+        if path not in within
+    ]
     return Photographs(tuple(photographs), tuple(left_out), tuple(damaged))
 
 

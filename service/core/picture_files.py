@@ -17,6 +17,7 @@ MOST_PIXELS = 400_000_000  # three times the largest cameras; a damaged header m
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _FILL, _START_OF_SCAN, _END_OF_IMAGE = 0xFF, 0xDA, 0xD9
 _STANDALONE = {0x01, *range(0xD0, 0xD8)}  # markers without a length
+_METADATA = {0xE1, 0xED, 0xFE}  # EXIF and XMP, IPTC, comments
 _FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # headers with the size
 
 
@@ -123,6 +124,20 @@ def end_of_jpeg(data: bytes, where: str) -> int:
     """
     check_jpeg(data, where)
     return next(at + 2 for marker, at in _segments(data, where) if marker == _END_OF_IMAGE)
+
+
+def without_metadata(data: bytes, where: str) -> bytes:
+    """A JPEG without EXIF, XMP, IPTC and comments, broken or not. Its colour profile stays, and each of its pixels.
+
+    Raises:
+        DataError: as `check_jpeg`.
+    """
+    end = end_of_jpeg(data, where)
+    kept, begin = bytearray(), 0
+    for at in (at for marker, at in _segments(data, where) if marker in _METADATA):
+        kept += data[begin:at]
+        begin = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return bytes(kept + data[begin:end])
 
 
 def check_png(data: bytes, where: str) -> None:

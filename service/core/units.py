@@ -3,11 +3,27 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, overload
+from collections.abc import Mapping
+from itertools import permutations
+from typing import TYPE_CHECKING, Literal, overload
 
 if TYPE_CHECKING:  # numpy is not imported for this: the pages' start does not wait for it
     import numpy as np
     from numpy.typing import NDArray
+
+LengthUnit = Literal["m", "cm", "mm", "in"]
+METRES_PER: Mapping[LengthUnit, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
+LENGTH_WORDS: Mapping[LengthUnit, str] = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
+#: What lengths have to be multiplied by if one unit was taken as another, by the mistake in words.
+MISTAKEN_LENGTHS: Mapping[str, float] = {
+    f"{LENGTH_WORDS[true]} taken as {LENGTH_WORDS[taken]}": METRES_PER[true] / METRES_PER[taken]
+    for true, taken in permutations(METRES_PER, 2)
+}
+
+
+def mistaken_length(factor: float, relative: float) -> str:
+    """The mistaken unit by which lengths have to be multiplied by `factor`, in words; "" if none is as near."""
+    return next((words for words, known in MISTAKEN_LENGTHS.items() if abs(factor / known - 1) < relative), "")
 
 
 @overload

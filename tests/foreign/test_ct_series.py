@@ -230,3 +230,31 @@ def test_padding_counts_as_air(
     assert (found[outside] <= -1000).all()
     expected = np.concatenate([body[None], pixels()[1:]]) * 2 - 1000
     np.testing.assert_array_equal(found[~outside], np.clip(expected, -32768, 32767)[~outside])
+
+
+def _with_pixel(stored: int) -> Change:
+    def change(ds: Dataset, k: int) -> None:
+        body = pixels()[k].copy()
+        if k == 1:
+            body[0, 0] = stored
+        ds.PixelData, ds.PixelRepresentation = body.astype("<i2" if stored < 0 else "<u2").tobytes(), int(stored < 0)
+
+    return change
+
+
+def test_values_higher_than_a_volume_can_hold_are_refused_with_slice_and_scale(tmp_path: Path) -> None:
+    """They were kept as 32,767 HU, without a word."""
+    write_series(tmp_path, change=_with_pixel(40000))
+    source = _source(tmp_path)
+    with pytest.raises(UnreadableFileError, match=r"values up to 79000 HU.*slope 2 and intercept -1000") as caught:
+        source.read(source.series()[0])
+    assert Path(caught.value.where).name in {path.name for path in tmp_path.iterdir()}
+
+
+def test_values_lower_than_a_volume_can_hold_count_as_air(tmp_path: Path) -> None:
+    write_series(tmp_path, change=_with_pixel(-20000))  # -41,000 HU: outside the reconstructed circle
+    source = _source(tmp_path)
+    found = source.read(source.series()[0]).hounsfield
+    expected = pixels() * 2 - 1000
+    expected[1, 0, 0] = -1000
+    np.testing.assert_array_equal(found, expected)

@@ -1,11 +1,12 @@
 """Pictures under the name of another kind: their content decides, and one that cannot be read does not stop the rest.
 
-Pixels are those that Pillow 13 reads from the same bytes.
+Pixels are those that Pillow 13 reads from the same bytes. What is damaged in the middle of a JPEG, libjpeg says.
 """
 
 from __future__ import annotations
 
 import io
+import os
 import shutil
 from pathlib import Path
 
@@ -18,7 +19,9 @@ from drivers.photos.photo_folder import list_photographs
 from service.compute.images.files import image_size, read_grey, read_image
 from service.compute.images.folder import image_folder
 from service.core.errors import DataError
+from service.core.jpeg_damage import damaged_jpegs
 from service.core.picture_files import kind_of
+from tests.support.rig.rig import REPOSITORY
 
 HEIC = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(200)
 AVIF = b"\0\0\0\x1cftypavif\0\0\0\0avifmif1miaf"
@@ -125,3 +128,59 @@ def test_a_thumbnail_beside_a_film_is_no_photograph(tmp_path: Path) -> None:
 )
 def test_kinds_by_their_first_bytes(data: bytes, kind: str) -> None:
     assert kind_of(data) == kind
+
+
+def _textured(**options: object) -> bytes:
+    out = io.BytesIO()
+    picture = np.random.default_rng(5).integers(60, 190, (24, 32, 3), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
+    Image.fromarray(picture).save(out, "JPEG", quality=92, **options)
+    return out.getvalue()
+
+
+def _spoilt(data: bytes, count: int) -> bytes:
+    """Other bytes in the middle of the picture, none of which is a marker."""
+    middle = len(data) // 2
+    return (
+        data[:middle]
+        + bytes(np.random.default_rng(6).integers(1, 255, count, dtype=np.uint8))
+        + data[middle + count :]
+    )
+
+
+@pytest.mark.parametrize("options", [{}, {"progressive": True}, {"restart_marker_rows": 2}], ids=str)
+def test_a_jpeg_that_is_spoilt_in_the_middle_is_named(options: dict[str, object], tmp_path: Path) -> None:
+    """A decoder goes on after the damage: the picture was taken, displaced and of another brightness below it."""
+    whole = _textured(**options)
+    (tmp_path / "DSC1.JPG").write_bytes(whole)
+    (tmp_path / "DSC2.JPG").write_bytes(_spoilt(whole, 64))
+    found = list_photographs(tmp_path)
+    assert [one.file.path.name for one in found.photographs] == ["DSC1.JPG"]
+    (damaged,) = found.damaged
+    assert damaged.path.name == "DSC2.JPG"
+    assert "its picture is damaged within" in damaged.reason
+    with pytest.raises(DataError, match=r"1 of 2 images are damaged: DSC2\.JPG: its picture is damaged within"):
+        image_folder(tmp_path)
+
+
+@pytest.mark.parametrize("filling", [b"\0", b"\xff"])
+def test_bytes_with_which_a_camera_fills_up_the_end_are_no_damage(filling: bytes, tmp_path: Path) -> None:
+    (tmp_path / "DSC1.JPG").write_bytes(_textured()[:-2] + 16 * filling + b"\xff\xd9")
+    assert list_photographs(tmp_path).damaged == ()
+
+
+def test_a_file_with_which_the_decoder_ends_is_named_and_the_others_are_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ending = tmp_path / "ending"
+    ending.mkdir()
+    (ending / "cv2.py").write_text(  # a decoder that a file brings down
+        "import os\nIMREAD_REDUCED_GRAYSCALE_8 = 0\n"
+        "def imdecode(data, how):\n    if b'ending' in data.tobytes():\n        os._exit(7)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ending), os.environ.get("PYTHONPATH", str(REPOSITORY))]))
+    files = [tmp_path / name for name in ("a.jpg", "b.jpg", "c.jpg", "gone.jpg")]
+    for file, content in zip(files, (b"\xff\xd8", b"\xff\xd8 ending", b"\xff\xd8 ending"), strict=False):
+        file.write_bytes(content)
+    assert damaged_jpegs(files) == dict.fromkeys(
+        files[1:3], "its picture cannot be decoded (the decoder ended with status 7)"
+    )

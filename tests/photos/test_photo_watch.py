@@ -96,6 +96,19 @@ def test_a_file_that_stays_cut_off_is_told_once_and_holds_nothing_up(card: Path,
     assert names(camera, tmp_path, 5.0) == ["DSC00001.JPG"]
 
 
+def test_a_file_that_is_spoilt_in_the_middle_is_told_once(card: Path, tmp_path: Path) -> None:
+    camera = watching(card)
+    data = photograph(1, after(1))
+    end = len(data) - 2
+    put(card, "DSC00001.JPG", data[: end - 40] + bytes(range(1, 33)) + data[end - 8 :])
+    put(card, "DSC00002.JPG", photograph(2, after(2)))
+    assert names(camera, tmp_path, 5.0) == ["DSC00002.JPG"]
+    with pytest.raises(UnreadableFileError, match="its picture is damaged within") as told:
+        camera.released_images(tmp_path, 1.0, SINCE_S)
+    assert told.value.where.endswith("DSC00001.JPG")
+    assert names(camera, tmp_path) == []
+
+
 def test_what_was_taken_before_is_left_out(card: Path, tmp_path: Path) -> None:
     put(card, "DSC00001.JPG", photograph(1, after(-9000)))
     camera = watching(card)

@@ -158,7 +158,7 @@ def test_metres_are_refused_where_millimetres_are_exported(tmp_path: Path, profi
     refused(tmp_path, profile, "unit mm contradicts the size")
 
 
-@pytest.mark.parametrize(("factor", "words"), [(25.4, "inches read as mill"), (10.0, "centimetres read as mill")])
+@pytest.mark.parametrize(("factor", "words"), [(25.4, "inches taken as mill"), (10.0, "centimetres taken as mill")])
 def test_the_spheres_tell_a_wrong_unit_that_the_size_does_not(tmp_path: Path, factor: float, words: str) -> None:
     bodies(1 / factor).export(tmp_path / "scan.ply")
     scan = scanned(tmp_path, "shining3d", "mm")
@@ -325,7 +325,7 @@ def test_the_search_for_spheres_says_that_the_unit_is_wrong(tmp_path: Path, part
         files: dict[str, Any] = {"mesh": kept.sha256} if parts == 1 else {"meshes": [kept.sha256] * parts}
         arguments = {**files, "radius_m": RADIUS_MM / 1000, "expected": len(CENTRES_MM)}
         context: RecordedContext = JobContext(arguments, store, tmp_path, lambda *_: None)
-        with pytest.raises(ComputeError, match=r"inches read as millimetres") as caught:
+        with pytest.raises(ComputeError, match=r"inches taken as millimetres") as caught:
             HANDLERS["locate_spheres" if parts == 1 else "merge_scans"](context)
     assert "multiplied by 25.4 it has 4 spheres of 15 mm radius" in caught.value.what
     assert "rig.yaml" in caught.value.remedy

@@ -51,7 +51,6 @@ from service.compute.images.folder import ImageFolder, image_folder
 from service.compute.poses.files.camera_files import read_camera_json
 from service.compute.poses.files.pose_files import only_posed, posed_images
 from service.compute.poses.files.robot_poses import (
-    LengthUnit,
     RobotPoseTable,
     RotationForm,
     matched_rows,
@@ -65,7 +64,7 @@ from service.core.geometry import Array, Transform
 from service.core.text.counts import counted
 from service.core.text.file_text import file_text
 from service.core.text.json_text import parse_json
-from service.core.units import mm
+from service.core.units import LengthUnit, mm
 from service.jobs.calibration.records import BoardSeen
 from service.jobs.records import matrix
 from service.worker.calibration.records import hand_eye_record, seen_board

@@ -207,7 +207,13 @@ def listing_record(listing: ImportList) -> dict[str, object]:
         "photographs": {role: asdict(_photographs(listing, role)) for role in _PARTS if listing.holds(role)},
         "files": {role: [file.model_dump() for file in files] for role, files in listing.files.items()},
         "left_out": [one.model_dump() for one in listing.left_out],
+        "unread": _unread(listing),
     }
+
+
+def _unread(listing: ImportList) -> dict[str, str]:
+    """What could not be read of photographs that are imported all the same, by file."""
+    return {v.photograph.path: str(v.camera["unread"]) for v in listing.views if "unread" in v.camera}
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,6 +271,11 @@ def _show(listing: ImportList) -> None:
         written = f"written {files[0].modified_utc[:16].replace('T', ' ')}"
         table.add_row(role.replace("_", " "), str(len(files)), name, "", written, size)
     print_table(table)
+    unread = _unread(listing)
+    for path, what in list(unread.items())[:_SHOWN]:
+        console.print(f"imported without what it states of camera and settings: {path}: {what}")
+    if len(unread) > _SHOWN:
+        console.print(f"imported in the same way: {len(unread) - _SHOWN} more files; --json lists them all")
     for one in listing.left_out[:_SHOWN]:
         console.print(f"left out: {one.path}: {one.reason}")
     if len(listing.left_out) > _SHOWN:

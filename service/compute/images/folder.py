@@ -14,6 +14,7 @@ from pathlib import Path
 
 from service.compute.images.files import image_size
 from service.core.errors import DataError
+from service.core.jpeg_damage import damaged_jpegs
 from service.core.picture_files import ForeignKindError
 from service.core.text.counts import counted
 
@@ -102,6 +103,8 @@ def _sizes(files: Sequence[Path], folder: Path) -> tuple[dict[str, tuple[int, in
             foreign[file.name] = f"{error.what}. {error.remedy}"
         except DataError as error:
             damaged.append(f"{file.name}: {error.what}")
+    within = damaged_jpegs([file for file in files if file.name in sizes])
+    damaged += [f"{file.name}: {what}" for file, what in within.items()]
     if damaged:
         rest = f"; and {len(damaged) - _NAMED} more" if len(damaged) > _NAMED else ""
         raise DataError(

@@ -6,10 +6,11 @@ The camera's serial numbers are personal data where one person owns the camera.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from typing import Any
 
 from service.core.errors import DataError
-from service.core.picture_files import JPEG_BEGINS, end_of_jpeg, picture_size
+from service.core.picture_files import JPEG_BEGINS, end_of_jpeg, picture_size, without_metadata
 
 exiv2: Any = importlib.import_module("exiv2")  # the library has no types
 
@@ -23,21 +24,24 @@ _SHORTEST_SOUGHT = 5  # a shorter value may stand anywhere by chance
 def without_personal_data(picture: bytes, where: str = "") -> bytes:
     """Remove GPS, owner, author, serial numbers, makers' notes and previews from a JPEG or PNG, but change no pixel.
 
-    XMP, IPTC and comments are removed as a whole, and whatever follows the picture in the file.
+    XMP, IPTC and comments are removed as a whole, and whatever follows the picture in the file; EXIF too, if it is
+    broken.
 
     Raises:
         DataError: the file is not a picture, or a removed value still stands in it elsewhere.
     """
     if picture.startswith(JPEG_BEGINS):
         picture = picture[: end_of_jpeg(picture, where)]
-    image = _opened(picture, where)
-    exif = image.exifData()
-    removed = _remove_personal(exif)
-    image.clearXmpPacket()
-    image.clearXmpData()
-    image.clearIptcData()
-    image.clearComment()
-    cleaned = _written(image)
+    removed: list[bytes] = []
+
+    def clean(image: Any) -> None:
+        removed.extend(_remove_personal(image.exifData()))
+        image.clearXmpPacket()
+        image.clearXmpData()
+        image.clearIptcData()
+        image.clearComment()
+
+    cleaned = _changed(picture, clean, where)
     if any(value in cleaned for value in removed):
         raise DataError(
             "the photograph repeats a serial number or a name outside its metadata",
@@ -52,14 +56,17 @@ def with_metadata_of(original: bytes, resampled: bytes, *, personal: bool, where
 
     Args:
         original: JPEG or PNG as the camera wrote it.
-        resampled: JPEG or PNG without metadata.
+        resampled: JPEG or PNG without metadata, which it stays if those of the original are broken.
         personal: whether GPS, owner and serial numbers are carried over too.
         where: the file, for messages.
 
     Raises:
         DataError: one of them is not a picture.
     """
-    source = _opened(original, where).exifData()
+    try:
+        source = _opened(original, where).exifData()
+    except _BrokenMetadataError:
+        source = exiv2.ExifData()
     if not personal:
         _remove_personal(source)
     _remove_previews(source)
@@ -72,21 +79,46 @@ def with_metadata_of(original: bytes, resampled: bytes, *, personal: bool, where
             source[key] = exiv2.UShortValue(height) if height < 1 << 16 else exiv2.ULongValue(height)
     if "Exif.Image.Orientation" in source:
         source["Exif.Image.Orientation"] = exiv2.UShortValue(1)  # the pixels stand as the camera model has them
-    image = _opened(resampled, where)
-    image.setExifData(source)
-    return _written(image)
+    return _changed(resampled, lambda image: image.setExifData(source), where)
 
 
 def described(picture: bytes, words: str, where: str = "") -> bytes:
     """Write a description that every viewer shows into the EXIF of a JPEG or PNG, but change no pixel.
 
+    Broken EXIF is replaced.
+
     Raises:
         DataError: it is not a picture.
     """
+
+    def describe(image: Any) -> None:
+        image.exifData()["Exif.Image.ImageDescription"] = exiv2.AsciiValue(words)
+
+    return _changed(picture, describe, where)
+
+
+class _BrokenMetadataError(DataError):
+    """A picture is whole, as far as can be seen, but its metadata are not."""
+
+
+def _changed(picture: bytes, change: Callable[[Any], object], where: str) -> bytes:
+    """The picture with its metadata changed; broken metadata of a JPEG are dropped before."""
+    try:
+        return _written(picture, change, where)
+    except _BrokenMetadataError:
+        if not picture.startswith(JPEG_BEGINS):
+            raise
+        return _written(without_metadata(picture, where), change, where)
+
+
+def _written(picture: bytes, change: Callable[[Any], object], where: str) -> bytes:
     image = _opened(picture, where)
-    exif = image.exifData()
-    exif["Exif.Image.ImageDescription"] = exiv2.AsciiValue(words)
-    return _written(image)
+    change(image)
+    try:
+        image.writeMetadata()  # reads the file once more, with other demands
+    except exiv2.Exiv2Error as error:
+        raise _broken(error, where) from error
+    return bytes(image.io().mmap())
 
 
 def _opened(picture: bytes, where: str) -> Any:
@@ -94,15 +126,14 @@ def _opened(picture: bytes, where: str) -> Any:
         image = exiv2.ImageFactory.open(picture)
         image.readMetadata()
     except exiv2.Exiv2Error as error:
-        raise DataError(
-            f"the photograph's metadata cannot be read: {error}", where=where, remedy="Copy the file again"
-        ) from error
+        raise _broken(error, where) from error
     return image
 
 
-def _written(image: Any) -> bytes:
-    image.writeMetadata()
-    return bytes(image.io().mmap())
+def _broken(error: Exception, where: str) -> _BrokenMetadataError:
+    return _BrokenMetadataError(
+        f"the photograph's metadata cannot be read: {error}", where=where, remedy="Copy the file again"
+    )
 
 
 def _remove_previews(exif: Any) -> None:

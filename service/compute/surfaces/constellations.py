@@ -9,11 +9,12 @@ from scipy.optimize import linear_sum_assignment
 
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, align_points, apply
-from service.core.units import mm
+from service.core.units import MISTAKEN_LENGTHS, mistaken_length, mm
 
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 # A match finds scales that are off by 0.7 %, in a scene of 300 mm; the spheres' known radius excludes others.
-_FACTORS = tuple(1.01**k for k in range(-12, 13) if k)
+_NEAR_A_UNIT = 0.01  # relative
+_FACTORS = (*(1.01**k for k in range(-12, 13) if k), *MISTAKEN_LENGTHS.values())
 _LEAST = 4  # spheres that agree: three lie in a plane, and agree with a mirror image too
 
 
@@ -105,7 +106,11 @@ def _words_of_other_scale(a: Array, b: Array, tolerance_m: float) -> str:
         return ""
     rows, columns = (np.array(side) for side in zip(*best, strict=True))
     _, scale = align_points(a[rows], b[columns], with_scale=True)
-    return f"; with the second multiplied by {scale:.4f}, {len(best)} do: one of them has a wrong scale or unit"
+    unit = mistaken_length(scale, _NEAR_A_UNIT)
+    return (
+        f"; with the second multiplied by {scale:.4f}{f' ({unit})' if unit else ''}, {len(best)} do: one of them has "
+        "a wrong scale or unit"
+    )
 
 
 def _count(solutions: list[Pairs]) -> int:

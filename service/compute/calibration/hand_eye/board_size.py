@@ -16,18 +16,15 @@ from service.compute.calibration.hand_eye.fit import HandEyeMeasurements, HandEy
 from service.compute.calibration.hand_eye.weighted import resample
 from service.core.errors import ComputeError
 from service.core.geometry import Array
-from service.core.units import deg, mm
+from service.core.units import deg, mistaken_length, mm
 
 _RULER = 3e-4  # relative error of the lengths of an arm that was not measured
 _SURE = 3.0  # standard deviations
 _UNEXPLAINED = 4.0  # times as much scatter in position as the rotations explain
 _USUAL_M = 1.5e-3  # along each axis; joints of which one errs more than the others reach this in position alone
 _LIKE = 0.05  # relative difference up to which a ratio counts as a known one
-#: Ratios of true to stated size that mistakes lead to.
+#: Ratios of true to stated size that mistakes other than of the unit lead to.
 _KNOWN: tuple[tuple[float, str], ...] = (
-    (10.0, "a length in centimetres given as millimetres has this ratio"),
-    (25.4, "a length in inches given as millimetres has this ratio"),
-    (0.1, "a length in tenths of millimetres has this ratio"),
     (2.0, "the distance of two rows of circles, or half a square, given for the whole has this ratio"),
     (0.5, "the distance of two circles in a row, or two squares, given for one has this ratio"),
     (4 / 3, "the side of a marker given for that of its square has this ratio"),
@@ -82,6 +79,9 @@ class BoardSizeFound:
 
 
 def _likely(ratio: float) -> str:
+    unit = mistaken_length(ratio, _LIKE)
+    if unit:
+        return f": {unit} have this ratio"
     for known, words in _KNOWN:
         if abs(ratio / known - 1) < _LIKE:
             return f": {words}"

@@ -27,6 +27,7 @@ from service.compute.calibration.hand_eye.closed_form import (
 from service.core.errors import ComputeError
 from service.core.geometry import Array, inverse
 from service.core.text.counts import counted
+from service.core.units import LENGTH_WORDS, METRES_PER
 
 Setup = Literal["eye-in-hand", "eye-to-hand"]
 
@@ -34,8 +35,6 @@ Setup = Literal["eye-in-hand", "eye-to-hand"]
 _MOST_MM, _MOST_DEG = 25.0, 3.0
 _CLEARLY = 3.0  # the true reading's errors are this many times smaller, in position and rotation
 _LIKE = 0.12  # relative difference up to which a ratio of lengths counts as that of two units
-#: Ratio of a board's size by the robot to its true size, if the robot's positions are not in metres.
-_UNITS = ((1000.0, "millimetres", "mm"), (100.0, "centimetres", "cm"), (39.37, "inches", "in"))
 _LOST_FEWEST = 2  # views that a lost row must explain: an outlier, or two poses that were swapped, explain one
 _LOST_SHARE = 0.9  # of the views that fit if a row was lost
 
@@ -100,9 +99,9 @@ class SetupFit:
     @property
     def unit(self) -> tuple[str, str] | None:
         """The unit of the positions, and its option, if it is not the metre."""
-        for ratio, words, option in _UNITS:
-            if abs(np.log(max(self.scale, 1e-9) / ratio)) < _LIKE:
-                return words, option
+        for unit, metres in METRES_PER.items():
+            if metres != 1 and abs(np.log(max(self.scale, 1e-9) * metres)) < _LIKE:
+                return LENGTH_WORDS[unit], unit
         return None
 
     def __str__(self) -> str:

@@ -21,6 +21,7 @@ from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.text.counts import counted
 from service.core.text.file_text import csv_rows
+from service.core.units import METRES_PER, LengthUnit
 
 RotationForm = Literal[
     "quaternion",
@@ -36,9 +37,6 @@ RotationForm = Literal[
     "zyz",
     "zyz-deg",
 ]
-LengthUnit = Literal["m", "mm", "cm", "in"]
-
-METRES: dict[LengthUnit, float] = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 _UNIT = 1e-3  # tolerance of a quaternion's length from 1, so that files with four decimals pass
 _TURN = 2 * np.pi + 0.1  # no component of a rotation vector in radians is larger
 _WORDS: dict[RotationForm, str] = {
@@ -93,7 +91,7 @@ class RobotPoseTable:
         """(M, 4, 4) poses with positions in metres, with the rotations in this form or the file's."""
         out = np.tile(np.eye(4), (len(self.position), 1, 1))
         out[:, :3, :3] = _matrices(self.rotation, form or self.form)
-        out[:, :3, 3] = METRES[self.unit] * self.position
+        out[:, :3, 3] = METRES_PER[self.unit] * self.position
         return out
 
     def other_readings(self) -> Iterator[tuple[Array, str, str]]:

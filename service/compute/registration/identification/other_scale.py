@@ -11,23 +11,14 @@ from service.compute.markers.records import SphereOutline
 from service.compute.registration.identification.hypotheses import image_hypotheses
 from service.compute.registration.identification.pairing import sightings
 from service.core.geometry import Array, align_points
-from service.core.units import mm
+from service.core.units import MISTAKEN_LENGTHS, mistaken_length, mm
 
 # A search in one scale finds a list that is off by up to 2 %.
 _STEP, _STEPS = 1.03, 12
-_UNITS = {
-    25.4: "inches taken as millimetres",
-    1 / 25.4: "millimetres taken as inches",
-    10.0: "centimetres taken as millimetres",
-    0.1: "millimetres taken as centimetres",
-    1000.0: "metres taken as millimetres",
-    0.001: "millimetres taken as metres",
-    2.0: "a diameter taken as the radius",
-    0.5: "half the diameter taken as the diameter",
-}
+_OTHER_MISTAKES = {"a diameter taken as the radius": 2.0, "half the diameter taken as the diameter": 0.5}
 _COMPARED = 3  # images
 _LEAST = 5  # spheres that one image must show: four agree by chance in one of so many scales
-_NEAR = 0.03  # relative, to one of the units
+_NEAR = 0.03  # relative, to one of the mistakes
 
 
 def words_of_other_scale(
@@ -42,7 +33,11 @@ def words_of_other_scale(
     An image alone cannot tell a list in another scale from another radius of the spheres.
     """
     best: tuple[int, float, int] = (0, 1.0, 0)
-    factors = (*(_STEP**k for k in range(-_STEPS, _STEPS + 1) if k), *_UNITS)
+    factors = (
+        *(_STEP**k for k in range(-_STEPS, _STEPS + 1) if k),
+        *MISTAKEN_LENGTHS.values(),
+        *_OTHER_MISTAKES.values(),
+    )
     for i in sorted(range(len(outlines)), key=lambda i: -len(outlines[i]))[:_COMPARED]:
         seen_m = sightings(outlines[i], radius_m, camera).positions_m
         for factor in factors:
@@ -63,4 +58,6 @@ def words_of_other_scale(
 
 def words_of_unit(scale: float) -> str:
     """The mistake by which lengths have to be multiplied by `scale`, in words within brackets, or nothing."""
-    return next((f" ({words})" for factor, words in _UNITS.items() if abs(scale / factor - 1) < _NEAR), "")
+    others = (words for words, factor in _OTHER_MISTAKES.items() if abs(scale / factor - 1) < _NEAR)
+    words = mistaken_length(scale, _NEAR) or next(others, "")
+    return f" ({words})" if words else ""

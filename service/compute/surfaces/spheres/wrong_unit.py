@@ -10,16 +10,8 @@ from numpy.typing import NDArray
 from service.compute.surfaces.spheres.mesh_spheres import locate_spheres
 from service.core.errors import ComputeError
 from service.core.geometry import Array
+from service.core.units import MISTAKEN_LENGTHS
 
-# What the coordinates would have to be multiplied by.
-_MISTAKES = {
-    1000.0: "metres read as millimetres",
-    25.4: "inches read as millimetres",
-    10.0: "centimetres read as millimetres",
-    0.0254: "inches read as metres",
-    0.01: "centimetres read as metres",
-    0.001: "millimetres read as metres",
-}
 _SCENE_M = (0.1, 3.0)  # diagonal of a scene with its spheres
 _LEAST_SPHERES = 3
 _LEAST_COVERAGE = 0.15  # of a sphere; smaller caps of any radius occur everywhere
@@ -27,7 +19,7 @@ _LEAST_COVERAGE = 0.15  # of a sphere; smaller caps of any radius occur everywhe
 
 @dataclass(frozen=True, slots=True)
 class WrongUnit:
-    """A mistaken unit that makes the spheres have their radius."""
+    """A mistaken unit that makes the spheres have their radius, with the coordinates multiplied by `factor`."""
 
     factor: float
     words: str
@@ -52,7 +44,7 @@ def wrong_unit(vertices_m: Array, faces: NDArray[np.integer], radius_m: float) -
     if low <= diagonal_m <= high:
         return None
     best: WrongUnit | None = None
-    for factor, words in _MISTAKES.items():
+    for words, factor in MISTAKEN_LENGTHS.items():
         if not low <= factor * diagonal_m <= high:
             continue
         try:
