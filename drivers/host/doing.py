@@ -1,4 +1,4 @@
-"""What a hosted driver is doing, in memory that its parent can still read when a native library has ended the process.
+"""What a hosted driver is doing, in memory that its parent can still read when a library has ended the process.
 
 What ended the process twice is left out from then on, if the device can do without it: reading one of its values.
 """

@@ -48,7 +48,6 @@ _WORTH_WAITING_S = 0.02
 _BUSY_SHARE = 0.25  # of a call's time limit; held up for longer, the driver is not to blame
 
 
-
 def hosted(
     interface: type[T],
     spec_path: str,

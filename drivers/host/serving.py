@@ -1,4 +1,4 @@
-"""The child's side of a hosted driver: it serves one driver over a file descriptor (`python -m drivers.host FD NOTE`)."""
+"""The child's side of a hosted driver: it serves one driver over a descriptor (`python -m drivers.host FD NOTE`)."""
 
 from __future__ import annotations
 
