@@ -23,7 +23,7 @@ from drivers.gphoto.link import AddedFile, Link, gp, library_version
 from drivers.gphoto.profile import Profile, battery_fraction
 from drivers.gphoto.profiles import profile_for
 from drivers.gphoto.room import Room
-from drivers.gphoto.shutter import release_shutter
+from drivers.gphoto.shutter import release_again, release_shutter
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
 from drivers.photos.photo_file import check_jpeg_complete, read_exif, sha256_of
 from drivers.plugin import DriverConfig
@@ -72,6 +72,7 @@ class GphotoCamera:
         self._clock_offset_s: float | None = None
         self._profile_name = ""
         self._target = ""
+        self._has_released = False  # since it was opened
         self._opened: tuple[Profile, Dials] | None = None
 
     @property
@@ -96,6 +97,7 @@ class GphotoCamera:
         self._profile_name, profile = profile_for(maker, model, self._config.profile, self._link.where)
         self._opened = profile, Dials(self._link, profile, self._config.white_balance)
         self._target = self._choose_target()
+        self._has_released = False
         self._identity = DeviceIdentity(
             kind="camera",
             model=model,
@@ -233,7 +235,10 @@ class GphotoCamera:
         room = self._room()
         room.check()
         trigger_s, *first = release_shutter(self._link, dials, room.check)
+        if self._profile.may_miss_first and not (first or self._has_released):
+            trigger_s, *first = release_again(self._link, dials, trigger_s, self._config.capture_timeout_s)
         added = self._collect(2 if quality == "RAW+JPEG" else 1, trigger_s, *first)
+        self._has_released = True
         return self._image(added, folder, trigger_s, quality, focus)
 
     def released_images(self, folder: Path, timeout_s: float, since_utc_s: float = 0.0) -> tuple[CapturedImage, ...]:
@@ -349,8 +354,7 @@ class GphotoCamera:
             return
         if image.counter == last.counter:
             raise self._stale(f"The file counter stayed at {name}")
-        # The counter in file names restarts after 9999.
-        if image.counter < last.counter and (image.counter - last.counter) % 10000 > 100:
+        if image.counter < last.counter and (image.counter - last.counter) % 10000 > 100:  # 0001 follows 9999
             raise self._stale(f"The file counter went back from {last.files[0].camera_name} to {name}")
         if image.exif_time <= last.exif_time:
             raise self._stale(f"The EXIF time of {name} ({image.exif_time}) is not after {last.exif_time}")

@@ -92,9 +92,12 @@ class Dials:
                 yield fixed, now
 
     def _can_be_set(self, fixed: Fixed) -> bool:
-        if fixed.name in self._refused or self._link.is_fixed(fixed.name):
+        try:
+            if fixed.name in self._refused or self._link.is_fixed(fixed.name):
+                return False
+            return fixed.words[0] in self._link.choices(fixed.name)
+        except DeviceRefusedError:  # the body lists it and does not tell it
             return False
-        return fixed.words[0] in self._link.choices(fixed.name)
 
     def wrong_by_hand(self) -> tuple[str, ...]:
         """What the body has otherwise than the profile fixes it and software cannot set, as sentences."""

@@ -75,6 +75,7 @@ class Profile:
     targets: Mapping[str, str]  # computer, card, both: the camera's word; the first is the default
     serial: str = "serialnumber"
     fixed: tuple[Fixed, ...] = ()
+    may_miss_first: bool = False  # whether a body may release and take nothing for some seconds after it was opened
     files_missing: str = ""  # what to look at where fewer files arrive than the quality promises
     # Properties of the card slots, by libgphoto2's hexadecimal names: (state, shots left). A body without storage in
     # remote control tells its space only there.

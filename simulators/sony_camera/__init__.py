@@ -6,6 +6,8 @@ import argparse
 
 from simulators import still_camera
 from simulators.serve import Termination
+from simulators.sony_camera.alpha_7r_v import alpha_7r_v
+from simulators.sony_camera.answers import with_answers
 from simulators.sony_camera.body import SonyBody, SonyOptions
 from simulators.sony_camera.properties import Code
 from simulators.sony_camera.recorded import names, recorded_table
@@ -29,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="releases give no photograph so long after opening",
     )
     parser.add_argument("--old-file", action="store_true", help="its memory still holds a file of another day")
+    parser.add_argument("--answers", metavar="JSON", help="properties that answer otherwise (sony_camera/answers.py)")
     parser.add_argument("--bare-event", action="store_true", help="announce a file as C206 instead of C201")
 
 
@@ -36,9 +39,11 @@ def serve(args: argparse.Namespace) -> None:
     """Print the ready line and serve until SIGTERM."""
     termination = Termination()
     sony = SonyOptions("" if args.no_lens else args.lens_switch, args.not_ready_s, args.bare_event)
-    table = recorded_table(args.recorded) if args.recorded else None
+    table = recorded_table(args.recorded) if args.recorded else alpha_7r_v()
+    if args.answers:
+        table = with_answers(table, args.answers)
     body = SonyBody(image_source(args), args.faults, body_options(args), table, sony)
-    if not args.recorded:
+    if not (args.recorded or args.answers):
         body.properties.put(Code.BATTERY, args.battery)
     if args.old_file:
         body.shoot()

@@ -69,7 +69,7 @@ def alpha_7r_v() -> BodyTable:
             CameraProperty(Code.F_NUMBER, U16, 800, F_NUMBERS),
             CameraProperty(Code.FOCUS_MODE, U16, 2, (2, 0x8005, 0x8004, DIRECT_MANUAL_FOCUS, MANUAL_FOCUS)),
             CameraProperty(Code.EXPOSURE_PROGRAM, U32, 1, _PROGRAMS, enabled=_SHOWN),
-            CameraProperty(Code.EXPOSURE_COMPENSATION, I16, 0, _COMPENSATIONS, enabled=_SHOWN),
+            CameraProperty(Code.EXPOSURE_COMPENSATION, I16, 0, _COMPENSATIONS),
             CameraProperty(Code.DRIVE_MODE, U32, 1, _DRIVES),
             CameraProperty(Code.SHUTTER_SPEED, U32, shutter_code(1, 60), (_BULB, *SHUTTERS)),
             CameraProperty(Code.ASPECT_RATIO, U8, 1, (1, 3, 2, 4)),

@@ -82,7 +82,6 @@ class SonyBody(CameraBody):
         if not self.sony.lens:
             self.properties.fix(Code.F_NUMBER, NO_F_NUMBER, ())
             self.properties.fix(Code.FOCUS_CAN_BE_DRIVEN, 0)
-        self._count_shots()
         if options.send_to is not None:
             # Nobody can set this camera remotely: a technician has dialled in what a protocol asks for.
             for code, value in DIALLED.items():
@@ -97,7 +96,8 @@ class SonyBody(CameraBody):
         """A client has connected: from now on the body is not ready for a while."""
         self._ready_s = time.monotonic() + self.sony.not_ready_s
 
-    def _count_shots(self) -> None:
+    def count_shots(self) -> None:
+        """Say how many photographs the card still holds."""
         self.properties.put(Code.SLOT_1_SHOTS, self.free_bytes // _PICTURE_BYTES)
 
     def exposure_settings(self) -> ExposureSettings:
@@ -119,7 +119,6 @@ class SonyBody(CameraBody):
         elif code == Code.FULL_PRESS and state == _PRESSED:
             if time.monotonic() >= self._ready_s:
                 self.shoot()
-            self._count_shots()
         elif code == Code.FOCUS_STEP:
             self._step_focus(state - 0x10000 if state & 0x8000 else state)
         elif code in _LADDERS:
@@ -141,7 +140,6 @@ class SonyBody(CameraBody):
         with self._lock:
             self._waiting.extend(files)
             self._count()
-        self._count_shots()
         if self.options.announce != "property":
             for _ in files:
                 self.on_object()

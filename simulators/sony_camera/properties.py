@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import threading
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -89,6 +90,8 @@ class CameraProperty:
     limits: tuple[int, int, int] | None = None
     enabled: Enabled = Enabled.ON
     get_set: bool | None = None  # the fifth byte, where it does not follow from the sixth
+    late_s: float = 0.0  # how long it takes until a value that was set is stated
+    coming: tuple[float, int | str] | None = None  # a value, and the time.monotonic() from which it is stated
 
     def pack(self, value: int | str) -> bytes:
         """Encode a value in the property's type."""
@@ -126,7 +129,15 @@ class CameraProperty:
             raise RefusedValueError(f"{self.code:04X} does not offer {value}")
         if self.limits is not None and not self.limits[0] <= int(value) <= self.limits[1]:
             raise RefusedValueError(f"{self.code:04X} {value} is out of range")
-        self.value = value
+        if self.late_s:
+            self.coming = time.monotonic() + self.late_s, value
+        else:
+            self.value = value
+
+    def settle(self) -> None:
+        """State a value that was set long enough ago."""
+        if self.coming is not None and time.monotonic() >= self.coming[0]:
+            self.value, self.coming = self.coming[1], None
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +167,8 @@ class PropertyTable:
     def encode_all(self) -> bytes:
         """Encode the answer to 9209: 8-byte count, then all entries."""
         with self._lock:
+            for entry in self._entries.values():
+                entry.settle()
             entries = [entry.encode(twice=self._protocol >= 300) for entry in self._entries.values()]
         return struct.pack("<Q", len(entries)) + b"".join(entries)
 

@@ -142,4 +142,5 @@ class SonyResponder(Operations):
         del request, data
         if self._body.exposing:
             time.sleep(_POLL_WHILE_EXPOSING_S)
+        self._body.count_shots()
         return Reply(data=self._body.properties.encode_all())

@@ -72,6 +72,7 @@ PROFILE = Profile(
         Fixed("imagesize", ("Large",), "the JPEGs have another size: set the JPEG image size to L"),
         Fixed("aspectratio", ("3:2",), "the JPEGs have another size: set the aspect ratio to 3:2"),
     ),
+    may_miss_first=True,
     files_missing="PC Save Image Size must be Original and RAW+J PC Save Image must be RAW & JPEG (menu PC Remote)",
     slots=(("d248", "d249"), ("d256", "d257")),
     no_card="2",
