@@ -9,7 +9,7 @@ import mmap
 import os
 import weakref
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 
 from drivers.errors import DeviceRefusedError
@@ -81,7 +81,7 @@ def leave_out(what: frozenset[str]) -> None:
 
 
 @contextmanager
-def doing(what: str, *, where: str = "", optional: bool = False) -> Iterator[None]:
+def doing(what: str, *, where: str = "", optional: bool = False) -> Generator[None]:
     """Say what the driver does inside, such as "Reading the setting iso".
 
     Raises DeviceRefusedError if it is optional and has ended the driver's process twice.

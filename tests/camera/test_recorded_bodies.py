@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -54,7 +54,7 @@ TOLD = {
 
 
 @contextmanager
-def outcome(refusal: str) -> Iterator[None]:
+def outcome(refusal: str) -> Generator[None]:
     """What is inside succeeds, or is refused with words that match."""
     if not refusal:
         yield
@@ -171,7 +171,7 @@ def test_what_goes_to_the_computer_and_what_changes_a_photograph_is_set() -> Non
 def test_what_only_a_person_can_set_is_a_problem() -> None:
     values = {"d268": 2, "d269": 2, "d0d9": 2, "d0df": 3}
     answers: list[dict[str, object]] = [{"code": c, "how": "value", "value": v} for c, v in values.items()]
-    answers += [{"code": code, "how": "read_only"} for code in values]
+    answers.extend({"code": code, "how": "read_only"} for code in values)
     with rig([], "--fast", "--answers", json.dumps(answers)) as (camera, _):
         assert camera.apply(PAPER) == PAPER
         problems = "; ".join(camera.report().problems)
