@@ -239,6 +239,7 @@ class PropertyTable:
         has_lens = 0 < f_number < NO_F_NUMBER
         iso = self.value(Code.ISO) & 0xFFFFFF
         jpeg, raw = self._files()
+        level = self.value(Code.JPEG_QUALITY)
         return ExposureSettings(
             aperture_f=f_number / 100.0 if has_lens else 8.0,
             exposure_s=numerator / denominator,
@@ -246,7 +247,7 @@ class PropertyTable:
             iso=min(iso, _MOST_IN_EXIF) if 0 < iso < 0xFFFFFF else _AUTO_ISO,
             jpeg=jpeg,
             raw=raw,
-            jpeg_level=self.value(Code.JPEG_QUALITY, _STANDARD_QUALITY) or _STANDARD_QUALITY,
+            jpeg_level=level if level in _LEVELS else _STANDARD_QUALITY,
             on_card=self.value(Code.CAPTURE_TARGET, TARGET_COMPUTER) != TARGET_COMPUTER,
             states_aperture=has_lens,
         )
@@ -260,7 +261,7 @@ class PropertyTable:
         return compression not in _COMPRESSIONS_RAW, raw
 
 
-_STANDARD_QUALITY = 2
+_STANDARD_QUALITY, _LEVELS = 2, range(1, 5)
 _BULB = 1 << 16 | 2  # somebody holds the button for half a second
 _AUTO_ISO, _MOST_IN_EXIF = 400, 65535
 
