@@ -186,8 +186,12 @@ class Dials:
 
         Raises DeviceRefusedError if it has another one.
         """
-        if not self._link.is_fixed(widget.name):
-            return False
+        try:
+            if not self._link.is_fixed(widget.name):
+                return False
+        except DeviceRefusedError:
+            self.word(widget)  # says what is missing
+            raise
         self.refresh()  # the camera may have changed its mind since it was last asked
         now = self.word(widget)
         if not self._link.is_fixed(widget.name):

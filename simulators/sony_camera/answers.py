@@ -35,7 +35,7 @@ def _changed(entry: CameraProperty, answer: dict[str, Any]) -> CameraProperty | 
     changes: dict[str, Callable[[], dict[str, Any]]] = {
         "read_only": lambda: {"enabled": Enabled.DISPLAY_ONLY},
         "empty_list": lambda: {"choices": (), "limits": None},
-        "value": lambda: {"value": answer["value"]},
+        "value": lambda: {"value": str(answer["value"]) if entry.datatype == TEXT else int(answer["value"])},
         "late": lambda: {"late_s": float(answer["value"])},
         "wrong_type": lambda: _other_type(entry),
     }

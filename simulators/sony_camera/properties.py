@@ -215,7 +215,8 @@ class PropertyTable:
     def put(self, code: int, value: int) -> None:
         """Change a value from inside the camera (focus status, objects in memory, battery), if it has it."""
         with self._lock:
-            if entry := self._entries.get(code):
+            entry = self._entries.get(code)
+            if entry is not None and entry.datatype != TEXT:
                 entry.value = value
 
     def fix(self, code: int, value: int, choices: tuple[int, ...] | None = None) -> None:
