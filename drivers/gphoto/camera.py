@@ -13,25 +13,24 @@ from typing import Literal
 from drivers.errors import (
     DeviceBusyError,
     DeviceRefusedError,
-    DeviceStorageFullError,
     DeviceTimeoutError,
     DeviceUnavailableError,
     StaleImageError,
     UnreadableFileError,
 )
-from drivers.gphoto.dials import Dials
+from drivers.gphoto.dials import NOT_TOLD, Dials
 from drivers.gphoto.link import AddedFile, Link, gp, library_version
 from drivers.gphoto.profile import Profile, battery_fraction
 from drivers.gphoto.profiles import profile_for
-from drivers.gphoto.shutter import release_shutter
+from drivers.gphoto.room import Room
+from drivers.gphoto.shutter import release_again, release_shutter
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
 from drivers.photos.photo_file import check_jpeg_complete, read_exif, sha256_of
 from drivers.plugin import DriverConfig
-from service.core.units import megabytes, ms
+from service.core.units import ms
 
 _LOG = logging.getLogger(__name__)
 PREVIEW_PATIENCE_S = 15.0
-LEAST_FREE_BYTES = 200_000_000  # room for one RAW+JPEG exposure of 61 megapixels
 MEDIA_TYPES = {
     ".JPG": "image/jpeg",
     ".JPEG": "image/jpeg",
@@ -72,6 +71,8 @@ class GphotoCamera:
         self._hashes: set[str] = set()
         self._clock_offset_s: float | None = None
         self._profile_name = ""
+        self._target = ""
+        self._has_released = False  # since it was opened
         self._opened: tuple[Profile, Dials] | None = None
 
     @property
@@ -95,7 +96,8 @@ class GphotoCamera:
         maker, model = self._link.value("manufacturer"), self._link.value("cameramodel")
         self._profile_name, profile = profile_for(maker, model, self._config.profile, self._link.where)
         self._opened = profile, Dials(self._link, profile, self._config.white_balance)
-        self._dials.set(profile.target.name, self._target_word())
+        self._target = self._choose_target()
+        self._has_released = False
         self._identity = DeviceIdentity(
             kind="camera",
             model=model,
@@ -107,20 +109,28 @@ class GphotoCamera:
         )
         return self._identity
 
-    @property
-    def _target(self) -> str:
-        """What the camera keeps the image on: as configured, else what the profile prefers."""
-        return self._config.capture_target or next(iter(self._profile.targets))
+    def _room(self) -> Room:
+        return Room(self._link, self._profile, self._target)
 
-    def _target_word(self) -> str:
-        wanted, profile = self._target, self._profile
-        if wanted not in profile.targets:
+    def _choose_target(self) -> str:
+        """Set what the camera keeps the image on, and return it: as configured, else what the profile prefers."""
+        wanted, profile, name = self._config.capture_target, self._profile, self._profile.target.name
+        if wanted is not None and wanted not in profile.targets:
             raise DeviceRefusedError(
                 f"capture_target {wanted} is not possible with the profile {self._profile_name}",
                 where=self._link.where,
                 remedy=f"Possible: {', '.join(profile.targets)}",
             )
-        return profile.targets[wanted]
+        preferred = next(iter(profile.targets))
+        if wanted is None:
+            try:
+                offered = self._link.choices(name)
+            except DeviceRefusedError as error:  # bodies from before 2018 hand every photograph over
+                _LOG.warning("the camera keeps photographs where its menu says: %s", error)
+                return preferred
+            wanted = next((ours for ours, word in profile.targets.items() if word in offered), preferred)
+        self._dials.set(name, profile.targets[wanted])
+        return wanted
 
     def close(self) -> None:
         """Disconnect from the camera; does not raise if the link is dead."""
@@ -132,8 +142,8 @@ class GphotoCamera:
             raise DeviceUnavailableError("the camera is not open", where=self._link.where, remedy="Open it first")
         profile = self._profile
         self._dials.refresh()
-        free = self._link.free_bytes()
-        battery = battery_fraction(self._link.value("batterylevel"))
+        free = self._room().free_bytes()
+        battery = self._battery()
         names = (
             profile.f_number,
             profile.shutter,
@@ -142,6 +152,14 @@ class GphotoCamera:
             profile.quality,
             profile.white_balance,
         )
+        told: dict[str, str] = {}
+        silent: list[str] = []
+        for one in names:
+            try:
+                told[one.name] = self._dials.word(one)
+            except DeviceRefusedError as error:
+                told[one.name] = NOT_TOLD
+                silent.append(f"{error.what}: {error.remedy}")
         return DeviceReport(
             identity=self._identity,
             clock_offset_s=self._clock_offset_s,
@@ -149,21 +167,32 @@ class GphotoCamera:
             battery_fraction=battery,
             details={
                 "profile": self._profile_name,
-                **{one.name: self._link.value(one.name) for one in names},
+                **told,
                 "serial number": "its photographs may state only the last digits",
             },
-            problems=self._problems(battery, free),
+            problems=(*silent, *self._problems(battery, free)),
         )
+
+    def _battery(self) -> float | None:
+        try:
+            return battery_fraction(self._link.value("batterylevel"))
+        except DeviceRefusedError as error:
+            _LOG.info("the charge of the battery is unknown: %s", error)
+            return None
 
     def _problems(self, battery: float | None, free: int | None) -> tuple[str, ...]:
         problems: list[str] = []
         if battery is not None and battery < 0.2:
             problems.append(f"Battery at {100 * battery:g} %: change it, or use mains power")
-        program = self._link.value(self._profile.program.name)
-        if program != self._profile.manual_program:
-            problems.append(f"Exposure program is {program}: turn the mode dial to M")
-        if free is not None and free < LEAST_FREE_BYTES:
-            problems.append(f"{megabytes(free):.0f} MB free in the camera: empty or change the card")
+        try:
+            program = self._link.value(self._profile.program.name)
+            if program != self._profile.manual_program:
+                problems.append(f"Exposure program is {program}: turn the mode dial to M")
+        except DeviceRefusedError as error:
+            problems.append(f"{error.what}: see that the mode dial is on M")
+        problems += self._dials.wrong_by_hand()
+        if full := self._room().problem(free):
+            problems.append(f"{full}: empty, change or insert the card")
         return tuple(problems)
 
     # --- settings -----------------------------------------------------------------------------------------
@@ -200,9 +229,16 @@ class GphotoCamera:
             _LOG.warning("%s is left over from before and does not belong to this exposure", left.name)
         dials.announced.clear()
         quality, focus = dials.quality(), dials.focus()
-        self._check_space()
-        trigger_s, *first = release_shutter(self._link, dials, self._check_space)
+        dials.word(
+            self._profile.f_number
+        )  # without a lens, or with one that states none, no photograph could be used
+        room = self._room()
+        room.check()
+        trigger_s, *first = release_shutter(self._link, dials, room.check)
+        if self._profile.may_miss_first and not (first or self._has_released):
+            trigger_s, *first = release_again(self._link, dials, trigger_s, self._config.capture_timeout_s)
         added = self._collect(2 if quality == "RAW+JPEG" else 1, trigger_s, *first)
+        self._has_released = True
         return self._image(added, folder, trigger_s, quality, focus)
 
     def released_images(self, folder: Path, timeout_s: float, since_utc_s: float = 0.0) -> tuple[CapturedImage, ...]:
@@ -270,15 +306,6 @@ class GphotoCamera:
                 remedy="Insert a card, and open the camera again",
             )
 
-    def _check_space(self) -> None:
-        free = self._link.free_bytes()
-        if free is not None and (free == 0 or (self._target != "computer" and free < LEAST_FREE_BYTES)):
-            raise DeviceStorageFullError(
-                f"{megabytes(free):.0f} MB free in the camera",
-                where=self._link.where,
-                remedy="Empty or change the card",
-            )
-
     def _collect(self, expected: int, trigger_s: float, *first: AddedFile) -> list[AddedFile]:
         added = list(first)
         while len(added) < expected:
@@ -288,7 +315,8 @@ class GphotoCamera:
                 raise DeviceTimeoutError(
                     f"expected {expected} file(s) within {waited_s:g} s of the release, received: {names}",
                     where=self._link.where,
-                    remedy="Check the save destination and the display of the camera, then take the exposure again",
+                    remedy="Check the save destination and the display of the camera, then take the exposure again"
+                    + (f". {self._profile.files_missing}" if self._profile.files_missing else ""),
                 )
             added += self._link.next_event(200)[1]
         return added
@@ -326,8 +354,7 @@ class GphotoCamera:
             return
         if image.counter == last.counter:
             raise self._stale(f"The file counter stayed at {name}")
-        # The counter in file names restarts after 9999.
-        if image.counter < last.counter and (image.counter - last.counter) % 10000 > 100:
+        if image.counter < last.counter and (image.counter - last.counter) % 10000 > 100:  # 0001 follows 9999
             raise self._stale(f"The file counter went back from {last.files[0].camera_name} to {name}")
         if image.exif_time <= last.exif_time:
             raise self._stale(f"The EXIF time of {name} ({image.exif_time}) is not after {last.exif_time}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import logging
 import os
@@ -22,13 +23,14 @@ from drivers.errors import (
     DeviceTimeoutError,
     DeviceUnavailableError,
 )
+from drivers.host.doing import doing as said
 
 gp: Any = importlib.import_module("gphoto2")  # no types; see docs/decisions/0002-strict-typing.md
 Gphoto = Any  # a gphoto2.Camera
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
 BROKEN_VERSIONS = ("2.5.31",)
-LEAST_VERSION = (2, 5, 30)
+LEAST_VERSION = (2, 5, 32)  # an older one gives the Alpha 7R V no list of ISO values
 OPEN_ATTEMPTS = 3
 PTPIP_MODEL = "PTP/IP Camera"
 _TO_CARD = "ptp2=capturetarget=card"  # as libgphoto2 writes it
@@ -46,6 +48,7 @@ _ERRORS: dict[int, tuple[type[DeviceError], str]] = {
     ),
     gp.GP_ERROR_MODEL_NOT_FOUND: (DeviceUnavailableError, "Switch the camera on and check the cable"),
 }
+NOT_STATED = "Turn the mode dial to M and look at the camera's display and menu; not every body has every setting"
 _UNAVAILABLE = "Check cable and power, then open the camera again; re-plug it if that does not help"
 
 
@@ -111,6 +114,26 @@ def keep_own_settings() -> None:
         _LOG.warning("libgphoto2 uses the settings of the user: %s", error)
         return
     os.environ["XDG_CONFIG_HOME"] = str(own)
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    """libgphoto2 itself, through the part of python-gphoto2 that was linked with it."""
+    return ctypes.CDLL(str(importlib.import_module("gphoto2._widget").__file__))
+
+
+def text_of(widget: Gphoto) -> str | None:
+    """The value of a widget; None if the camera states none for it.
+
+    python-gphoto2 ends the process with SIGSEGV where a widget of words has no value: a f-number without a lens.
+    """
+    if widget.get_type() not in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU, gp.GP_WIDGET_TEXT):
+        return str(widget.get_value())
+    value = ctypes.c_char_p()
+    code = _library().gp_widget_get_value(ctypes.c_void_p(int(widget.this)), ctypes.byref(value))
+    if code != gp.GP_OK:
+        raise gp.GPhoto2Error(code)
+    return None if value.value is None else value.value.decode(errors="replace")
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,12 +214,16 @@ class Link:
         del camera
         keep_descriptor_zero()
 
-    def call(self, doing: str, function: Callable[[Gphoto], T]) -> T:
-        """Run a function on the camera and translate its errors; `doing` says what it does, for messages."""
+    def call(self, doing: str, function: Callable[[Gphoto], T], *, optional: bool = False) -> T:
+        """Run a function on the camera and translate its errors; `doing` says what it does, for messages.
+
+        Raises DeviceRefusedError for what is optional and has crashed or stopped this driver twice.
+        """
         if self._camera is None:
             raise DeviceUnavailableError("the camera is not open", where=self.where, remedy="Open it first")
         try:
-            return function(self._camera)
+            with said(doing, where=self.where, optional=optional):
+                return function(self._camera)
         except gp.GPhoto2Error as error:
             raise translate(error, doing, self.where) from error
 
@@ -220,30 +247,46 @@ class Link:
         """The names of all widgets that the camera has."""
         return self.call("Listing the settings", lambda camera: frozenset(str(n) for n, _ in camera.list_config()))
 
+    def _widget(self, camera: Gphoto, name: str) -> Gphoto:
+        try:
+            return camera.get_single_config(name)
+        except gp.GPhoto2Error as error:
+            if int(error.code) != gp.GP_ERROR_BAD_PARAMETERS:
+                raise
+            raise DeviceRefusedError(
+                f"the camera has no setting {name}", where=self.where, remedy=NOT_STATED
+            ) from error
+
     def value(self, name: str) -> str:
-        """Return the value of one widget. Raises DeviceRefusedError if the camera has no such setting."""
+        """Return the value of one widget. Raises DeviceRefusedError if the camera has or states none."""
+        word = self.call(
+            f"Reading the setting {name}", lambda camera: text_of(self._widget(camera, name)), optional=True
+        )
+        if word is None:
+            raise DeviceRefusedError(f"the camera states no {name}", where=self.where, remedy=NOT_STATED)
+        return word
 
-        def read(camera: Gphoto) -> str:
-            return str(camera.get_single_config(name).get_value())
-
-        return self.call(f"Reading the setting {name}", read)
+    def is_fixed(self, name: str) -> bool:
+        """Whether the camera says that this setting cannot be changed now."""
+        doing = f"Reading whether {name} can be set"
+        return self.call(doing, lambda camera: bool(self._widget(camera, name).get_readonly()), optional=True)
 
     def choices(self, name: str) -> tuple[str, ...]:
         """Return the values that the camera currently offers for a widget; empty for free text and ranges."""
 
         def read(camera: Gphoto) -> tuple[str, ...]:
-            widget = camera.get_single_config(name)
+            widget = self._widget(camera, name)
             if widget.get_type() not in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU):
                 return ()
             return tuple(str(choice) for choice in widget.get_choices())
 
-        return self.call(f"Reading the choices of {name}", read)
+        return self.call(f"Reading the choices of {name}", read, optional=True)
 
     def put(self, name: str, value: str) -> None:
         """Set a single widget, because libgphoto2 reports no refusal when the whole tree is sent."""
 
         def write(camera: Gphoto) -> None:
-            widget = camera.get_single_config(name)
+            widget = self._widget(camera, name)
             widget.set_value(value)
             camera.set_single_config(name, widget)
 
@@ -251,6 +294,6 @@ class Link:
 
     def free_bytes(self) -> int | None:
         """Free space of the camera's storage in bytes; None if the camera lists none (usual in PC Remote mode)."""
-        stores = self.call("Reading the free space", lambda camera: list(camera.get_storageinfo()))
+        stores = self.call("Reading the free space", lambda camera: list(camera.get_storageinfo()), optional=True)
         known = [int(store.freekbytes) * 1024 for store in stores if store.fields & gp.GP_STORAGEINFO_FREESPACEKBYTES]
         return sum(known) if known else None

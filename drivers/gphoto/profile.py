@@ -24,7 +24,9 @@ class Widget:
 
     name: str
     words: Mapping[str, tuple[str, ...]] = field(default_factory=_no_words)  # ours: the camera's, best first
-    by_hand: str = ""  # what a person does where software cannot set it; "" if it can
+    by_hand: str = ""  # what a person does where software can never set it; "" if it can
+    unknown: tuple[str, ...] = ()  # the camera's words for no value at all
+    if_fixed: str = ""  # what a person does where the camera states no value, or keeps it from being set
 
     def candidates(self, wanted: str) -> tuple[str, ...]:
         """The camera's words that mean `wanted`, best first."""
@@ -33,6 +35,22 @@ class Widget:
     def ours(self, word: str) -> str:
         """The protocol's word for one of the camera's; the camera's own if it has none."""
         return next((ours for ours, theirs in self.words.items() if word in theirs), word)
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed:
+    """A setting that stays the same during a run, and is set where the body has it and lets it be set."""
+
+    name: str  # of libgphoto2's widget
+    words: tuple[str, ...]  # the camera's, best first
+    otherwise: str  # what goes wrong, and what a person does where software cannot set it
+    # Whether it applies at all: not while the camera states one of these, which it does while it is not in question.
+    not_in_question: tuple[str, ...] = ()
+    needed: bool = False  # whether nothing may be captured without it
+
+    def suits(self, word: str) -> bool:
+        """Whether nothing has to be changed."""
+        return word in self.words or word in self.not_in_question
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +74,13 @@ class Profile:
     target: Widget
     targets: Mapping[str, str]  # computer, card, both: the camera's word; the first is the default
     serial: str = "serialnumber"
-    fixed: tuple[tuple[str, str], ...] = ()  # widgets and their words, which are set where the body has them
+    fixed: tuple[Fixed, ...] = ()
+    may_miss_first: bool = False  # whether a body may release and take nothing for some seconds after it was opened
+    files_missing: str = ""  # what to look at where fewer files arrive than the quality promises
+    # Properties of the card slots, by libgphoto2's hexadecimal names: (state, shots left). A body without storage in
+    # remote control tells its space only there.
+    slots: tuple[tuple[str, str], ...] = ()
+    no_card: str = ""  # the state of a slot without a card
     # Whether libgphoto2 answers with the value that it sent until the camera reports another one. What such a body
     # was sent counts as set only when its report has come, or a new connection has read it.
     echoes: bool = False
@@ -78,11 +102,20 @@ def number_of(word: str) -> float | None:
         return None
 
 
+def is_number(word: str, wanted: float) -> bool:
+    """Whether a camera's word means this number."""
+    number = number_of(word)
+    return number is not None and abs(number - wanted) <= RELATIVE_TOLERANCE * wanted
+
+
 def battery_fraction(word: str) -> float | None:
-    """The charge of the battery from "87%" or "Low"; None if the camera does not say it."""
+    """The charge of the battery from "87%" or "Low"; None if the camera does not say it.
+
+    A Sony says -1 where it does not know, perhaps on mains power, which libgphoto2 writes as 253%.
+    """
     number = number_of(word.rstrip("%"))
     if number is not None:
-        return number / 100.0
+        return number / 100.0 if 0.0 <= number <= 100.0 else None
     return _LOW_BATTERY if word == "Low" else None
 
 
@@ -94,7 +127,7 @@ def choose_number(widget: Widget, wanted: float, offered: Sequence[str], where: 
         raise DeviceRefusedError(
             f"the camera offers no values for {name}",
             where=where,
-            remedy="Turn the mode dial to M and check the lens",
+            remedy=widget.if_fixed or "Turn the mode dial to M and check the lens",
         )
     numbers.sort(key=lambda pair: abs(pair[1] - wanted))
     word, number = numbers[0]

@@ -1,4 +1,4 @@
-"""`python -m drivers.host FD`: the child's side of a hosted driver (drivers/host/serving.py)."""
+"""`python -m drivers.host FD NOTE`: the child's side of a hosted driver (drivers/host/serving.py)."""
 
 from __future__ import annotations
 

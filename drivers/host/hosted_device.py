@@ -5,7 +5,6 @@ It contains native crashes of vendor libraries.
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import socket
@@ -27,6 +26,8 @@ from drivers.errors import (
     DriverKilledError,
     MachineBusyError,
 )
+from drivers.host.child_log import LOG, pass_on
+from drivers.host.doing import MOST_ENDS, Note
 from drivers.host.heartbeat import CLOSE_TIMEOUT_S, MOST_STRETCHED, START_TIMEOUT_S, Line
 from drivers.interfaces import DeviceIdentity
 from drivers.machine_pressure import HeldUp, killed_for_memory
@@ -45,11 +46,6 @@ _FROM_OUTSIDE = frozenset({signal.SIGKILL, signal.SIGALRM, signal.SIGTERM, signa
 _PROMPT_S = 0.1
 _WORTH_WAITING_S = 0.02
 _BUSY_SHARE = 0.25  # of a call's time limit; held up for longer, the driver is not to blame
-
-_LOG = logging.getLogger("drivers.host")
-_LEVELS = logging.getLevelNamesMapping()
-# What other libraries than the driver's own package log in a child is for the log file, not for people.
-_OURS = frozenset({"drivers", "service", "root"})
 
 
 def hosted(
@@ -151,6 +147,9 @@ class HostedDevice:
         self._child: _Child | None = None
         self._sequence = 0
         self._obituary = "not opened yet"
+        self._note = Note()
+        self._method = ""  # the call in progress
+        self._crashed = False  # the last child died of a fault of its own
         self._killed = False  # the last child died of a signal from outside
         self._memory_kills = 0  # of the kernel, when the child began
         self._suspect = False  # the driver reported a lost link
@@ -176,17 +175,23 @@ class HostedDevice:
             fresh = self._child is None
             if fresh:
                 self._start()
-            try:
-                identity = cast("DeviceIdentity", self.call("open"))
-            except DeviceError as error:
-                if fresh or self._child is not None or isinstance(error, DriverKilledError):
-                    raise
-                # The rest of the old connection crashed the child; a new child starts clean.
-                _LOG.warning("%s: %s; trying once more", self._name, error)
-                self._start()
-                identity = cast("DeviceIdentity", self.call("open"))
-            self._opened = True
-            return identity
+            # The rest of an old connection may crash the child, and so may a value that the device states; a new
+            # child starts clean, and leaves out what has crashed twice.
+            for attempt in range(MOST_ENDS + 1):
+                try:
+                    identity = cast("DeviceIdentity", self.call("open"))
+                except DeviceError as error:
+                    if self._child is not None or isinstance(error, DriverKilledError):
+                        raise
+                    again = (attempt == 0 and not fresh) or (self._crashed and bool(self._note.read()))
+                    if attempt == MOST_ENDS or not again:
+                        raise
+                    LOG.warning("%s: %s; trying once more", self._name, error)
+                    self._start()
+                else:
+                    self._opened = True
+                    return identity
+            raise AssertionError
 
     def close(self) -> None:
         """Close the device and end the child; does not raise if either is already gone."""
@@ -196,7 +201,7 @@ class HostedDevice:
             try:
                 self._exchange("close", (), {}, CLOSE_TIMEOUT_S)
             except DeviceError as error:
-                _LOG.warning("%s: closing: %s", self._name, error)
+                LOG.warning("%s: closing: %s", self._name, error)
             self._bury()
             self._obituary, self._killed = "closed", False
         self._watch_stop.set()
@@ -223,6 +228,7 @@ class HostedDevice:
         if child is None:
             raise self._unavailable()
         self._sequence += 1
+        self._method = method
         try:
             child.line.send((self._sequence, method, args, kwargs))
             ok, value = self._receive(child, timeout_s)
@@ -230,8 +236,10 @@ class HostedDevice:
             child.process.kill()
             opened = self._bury()
             self._killed = False
-            self._obituary = f"killed after {method or 'ping'} did not return within {timeout_s:g} s"
-            stalled = _stalled(method or "ping", timeout_s, silence.held_up_s, self._name)
+            stalled = _stalled(method or "ping", timeout_s, silence.held_up_s, self._name, self._doing())
+            self._obituary = f"killed after {method or 'ping'} did not return within {timeout_s:g} s{self._doing()}"
+            if isinstance(stalled, DeviceTimeoutError):
+                self._note.count_end()
             if opened:
                 self._on_end("stalled", stalled)
             raise stalled from None
@@ -269,6 +277,10 @@ class HostedDevice:
                 raise _NoAnswerError(held_up.seconds)
             deadline_s = began_s + longest_s
 
+    def _doing(self) -> str:
+        what = self._note.read()
+        return f", while {what[0].lower()}{what[1:]}" if what else ""
+
     def _unavailable(self) -> DeviceUnavailableError:
         if self._killed:
             short = killed_for_memory() > self._memory_kills
@@ -278,8 +290,11 @@ class HostedDevice:
                 where=self._name,
                 remedy="End programs that are not needed on this computer, look at the device, then try again",
             )
+        remedy = "Open the device again"
+        if (what := self._note.read()) in self._note.left_out:
+            remedy += f"; {what[0].lower()}{what[1:]} is then left out if the device can do without it"
         return DeviceUnavailableError(
-            f"driver process is not running: {self._obituary}", where=self._name, remedy="Open the device again"
+            f"driver process is not running: {self._obituary}", where=self._name, remedy=remedy
         )
 
     # --- birth and death -----------------------------------------------------------------------------
@@ -288,13 +303,14 @@ class HostedDevice:
         ours, theirs = socket.socketpair()
         path = os.pathsep.join(p for p in sys.path if p)
         self._killed, self._memory_kills = False, killed_for_memory()
+        self._note.clear()
         try:
             process = Popen(
-                [sys.executable, "-m", "drivers.host", str(theirs.fileno())],
+                [sys.executable, "-m", "drivers.host", str(theirs.fileno()), str(self._note.descriptor)],
                 stdin=DEVNULL,  # libgphoto2 closes descriptor 0
                 stdout=PIPE,
                 stderr=STDOUT,
-                pass_fds=[theirs.fileno()],
+                pass_fds=[theirs.fileno(), self._note.descriptor],
                 env={**os.environ, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"},
                 start_new_session=True,  # Ctrl-C must reach only the parent, which then closes the device properly
                 text=True,
@@ -310,11 +326,11 @@ class HostedDevice:
         finally:
             theirs.close()
         package = self._spec_path.partition(".")[0].partition(":")[0]
-        reader = threading.Thread(target=_log_output, args=(process, self._name, package), daemon=True)
+        reader = threading.Thread(target=pass_on, args=(process, self._name, package), daemon=True)
         reader.start()
         self._child = _Child(process, Line(Connection(ours.detach())), reader)
         self._suspect = False
-        start = (self._spec_path, self._config_json, self._call_timeout_s)
+        start = (self._spec_path, self._config_json, self._call_timeout_s, self._note.left_out)
         try:
             if self._exchange("start", start, {}, START_TIMEOUT_S):
                 self._child.line.begin()
@@ -342,8 +358,12 @@ class HostedDevice:
             child.process.stdout.close()
         self._killed = status < 0 and -status in _FROM_OUTSIDE
         self._obituary = f"died of {signal.Signals(-status).name}" if status < 0 else f"exited with status {status}"
+        self._crashed = status < 0 and not self._killed
+        if self._crashed:
+            self._obituary += f" in {self._method}{self._doing()}" if self._method else ""
+            self._note.count_end()
         if status != 0:
-            _LOG.error("%s: driver process %d %s", self._name, child.process.pid, self._obituary)
+            LOG.error("%s: driver process %d %s", self._name, child.process.pid, self._obituary)
         self._watch_stop.set()
         return opened
 
@@ -356,15 +376,15 @@ class HostedDevice:
                 if not stop.is_set():
                     self._exchange("", (), {}, PING_TIMEOUT_S)
             except DeviceError as error:
-                _LOG.error("%s: heartbeat: %s", self._name, error)
+                LOG.error("%s: heartbeat: %s", self._name, error)
                 return
             finally:
                 self._lock.release()
 
 
-def _stalled(method: str, timeout_s: float, lost_s: float, name: str) -> DeviceError:
+def _stalled(method: str, timeout_s: float, lost_s: float, name: str, doing: str) -> DeviceError:
     """Why a call was given up, after the machine had held the driver up for `lost_s`."""
-    said = f"driver call {method} did not return within {timeout_s:g} s"
+    said = f"driver call {method} did not return within {timeout_s:g} s{doing}"
     if lost_s > _BUSY_SHARE * timeout_s:
         return MachineBusyError(
             f"{said}, nor in the {lost_s:.0f} s more in which it had waited for a processor or for memory; its "
@@ -375,15 +395,3 @@ def _stalled(method: str, timeout_s: float, lost_s: float, name: str) -> DeviceE
     return DeviceTimeoutError(
         f"{said}; its process was ended", where=name, remedy="Check the device and its cable, then open it again"
     )
-
-
-def _log_output(process: Popen[str], name: str, package: str) -> None:
-    log = logging.getLogger(f"{_LOG.name}.{name}")
-    assert process.stdout is not None
-    for line in process.stdout:
-        level, separator, message = line.rstrip().partition("|")
-        if separator and level in _LEVELS:
-            ours = message.partition(":")[0].partition(".")[0] in _OURS | {package}
-            log.log(_LEVELS[level] if ours else min(_LEVELS[level], logging.INFO), "%s", message)
-        elif line.strip():
-            log.info("%s", line.rstrip())

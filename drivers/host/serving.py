@@ -1,4 +1,4 @@
-"""The child's side of a hosted driver: it serves one driver over a file descriptor (`python -m drivers.host FD`)."""
+"""The child's side of a hosted driver: it serves one driver over a descriptor (`python -m drivers.host FD NOTE`)."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from multiprocessing.connection import Connection
 from typing import Any, cast
 
 from drivers.errors import DeviceFaultError
+from drivers.host.doing import leave_out, take_note
 from drivers.host.heartbeat import BEAT, CLOSE_TIMEOUT_S, MOST_STRETCHED, START_TIMEOUT_S
 from drivers.interfaces import Device
 from drivers.plugin import DriverSpec, NeedsHeartbeat
@@ -85,7 +86,8 @@ class _Server:
         if method == "":
             return None
         if method == "start":
-            spec_path, config_json, self._call_timeout_s = cast("tuple[str, str, float]", args)
+            spec_path, config_json, self._call_timeout_s, ended = cast("tuple[str, str, float, frozenset[str]]", args)
+            leave_out(ended)
             with loading():
                 spec = load_spec(spec_path)
                 self._device = spec.build(spec.config.model_validate_json(config_json))
@@ -108,8 +110,9 @@ def load_spec(spec_path: str) -> DriverSpec:
 
 
 def main() -> None:
-    """Entry point of the child; its only argument is the connection's file descriptor."""
+    """Entry point of the child; its arguments are the file descriptors of the connection and of the note."""
     faulthandler.enable()
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s|%(name)s: %(message)s")
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    take_note(int(sys.argv[2]))
     _Server(Connection(int(sys.argv[1]))).serve()

@@ -26,6 +26,7 @@ FOLDERS = {FOLDER_DCIM: ("DCIM", 0), FOLDER_PICTURES: ("100EOSR5", FOLDER_DCIM)}
 PICTURE_BYTES = 30_000_000  # by which the remaining pictures are counted
 _IN_MEMORY = 0x40000000
 _PROTOCOL_ISO = 100
+_STEP_WIDTHS = {1: 1, 2: 8, 3: 64}  # of our own choice: how far a lens goes differs
 DIALLED = {Code.APERTURE: 0x50, Code.SHUTTER: 0x58, Code.ISO: 0x48}
 
 
@@ -37,6 +38,7 @@ class CanonBody(CameraBody):
         self.properties = Properties(SERIAL, LENS)
         self.count_shots()
         self.has_card = True
+        self.focus_steps = 0  # by which the lens was driven; away from the camera counts up
         self._files: dict[int, CameraFile] = {}
         self._lock = threading.Lock()
         if options.send_to is not None:
@@ -50,6 +52,11 @@ class CanonBody(CameraBody):
             self.properties.put(Code.FOCUS, ONE_SHOT)
         if aperture_priority:
             self.properties.put(Code.EXPOSURE_MODE, APERTURE_PRIORITY)
+
+    def drive_lens(self, amount: int) -> None:
+        """Move the focus by 1, 2 or 3 widths of step towards the camera, or away from it (from 8001 on)."""
+        width = _STEP_WIDTHS[amount & 0x7FFF]
+        self.focus_steps += width if amount & 0x8000 else -width
 
     def take_card_out(self) -> None:
         """From now on, files go to the memory only."""

@@ -19,6 +19,7 @@ class Code(IntEnum):
     APERTURE = 0xD101
     SHUTTER = 0xD102
     ISO = 0xD103
+    EXPOSURE_COMPENSATION = 0xD104
     EXPOSURE_MODE = 0xD105
     DRIVE = 0xD106
     FOCUS = 0xD108
@@ -67,6 +68,11 @@ SHUTTER = dict(
 )
 
 
+# From +3 to -3 by thirds of a stop, in signed bytes; with the dial on M they change no picture.
+_ABOVE_ZERO = thirds(0, 10)[:0:-1]
+COMPENSATIONS = (*_ABOVE_ZERO, 0, *((-code) & 0xFF for code in reversed(_ABOVE_ZERO)))
+
+
 @dataclass(frozen=True, slots=True)
 class ImageFormat:
     """The files of an exposure: (type, size, compression) of one or two of them."""
@@ -96,6 +102,7 @@ def _initial() -> dict[Code, _Number]:
         Code.APERTURE: _Number(0x38, tuple(APERTURE_F)),
         Code.SHUTTER: _Number(0x68, tuple(SHUTTER)),
         Code.ISO: _Number(0x58, (0, *ISO)),
+        Code.EXPOSURE_COMPENSATION: _Number(0, COMPENSATIONS),
         Code.EXPOSURE_MODE: _Number(MANUAL_EXPOSURE, writable=False),
         Code.DRIVE: _Number(0, (0, 0x12, 0x04, 0x05, 0x10, 0x11)),
         Code.FOCUS: _Number(MANUAL_FOCUS, (0, 1), writable=False),

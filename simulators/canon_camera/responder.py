@@ -68,6 +68,7 @@ class CanonResponder(Operations):
             0x9128: ("press", self._press),
             0x9129: ("let_go", self._let_go),
             0x9153: ("preview", self._preview),
+            0x9155: ("drive_lens", self._drive_lens),
         }
         super().__init__(body, faults, operations)
 
@@ -214,6 +215,17 @@ class CanonResponder(Operations):
     def _let_go(self, request: codec.Request, data: bytes) -> Reply:
         del data
         return Reply() if request.parameters[:1] in ((_HALF,), (_FULL,)) else Reply(INVALID_PARAMETER)
+
+    def _drive_lens(self, request: codec.Request, data: bytes) -> Reply:
+        # A body drives its lens only while live view goes to the computer.
+        del data
+        if not self._body.properties.value(Code.VIEWFINDER_OUTPUT) & _VIEWFINDER_TO_COMPUTER:
+            return Reply(_NOT_READY)
+        amount = request.parameters[0] if request.parameters else 0
+        if amount & 0x7FFF not in (1, 2, 3):
+            return Reply(INVALID_PARAMETER)
+        self._body.drive_lens(amount)
+        return Reply()
 
     def _preview(self, request: codec.Request, data: bytes) -> Reply:
         del request, data

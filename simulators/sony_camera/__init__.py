@@ -1,21 +1,50 @@
-"""A simulated Sony ILCE-7RM5 over PTP/IP: command-line options and main loop."""
+"""A simulated Sony camera over PTP/IP, an ILCE-7RM5 or one that was recorded: options and main loop."""
 
 from __future__ import annotations
 
 import argparse
 
+from simulators import still_camera
 from simulators.serve import Termination
-from simulators.sony_camera.body import SonyBody
+from simulators.sony_camera.alpha_7r_v import alpha_7r_v
+from simulators.sony_camera.answers import with_answers
+from simulators.sony_camera.body import SonyBody, SonyOptions
 from simulators.sony_camera.properties import Code
+from simulators.sony_camera.recorded import names, recorded_table
 from simulators.sony_camera.server import SonyServer
-from simulators.still_camera import add_arguments, body_options, image_source, serve_until_stopped
+from simulators.still_camera import body_options, image_source, serve_until_stopped
 
-__all__ = ["add_arguments", "serve"]
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the camera's options."""
+    still_camera.add_arguments(parser)
+    parser.add_argument(
+        "--recorded", choices=names(), metavar="BODY", help="serve what this body was recorded to state"
+    )
+    parser.add_argument("--lens-switch", choices=("MF", "AF"), default="AF", help="focus switch on the lens")
+    parser.add_argument("--no-lens", action="store_true", help="there is no lens, or one without contacts")
+    parser.add_argument(
+        "--not-ready-s",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="releases give no photograph so long after opening",
+    )
+    parser.add_argument("--old-file", action="store_true", help="its memory still holds a file of another day")
+    parser.add_argument("--answers", metavar="JSON", help="properties that answer otherwise (sony_camera/answers.py)")
+    parser.add_argument("--bare-event", action="store_true", help="announce a file as C206 instead of C201")
 
 
 def serve(args: argparse.Namespace) -> None:
     """Print the ready line and serve until SIGTERM."""
     termination = Termination()
-    body = SonyBody(image_source(args), args.faults, body_options(args))
-    body.properties.put(Code.BATTERY, args.battery)
+    sony = SonyOptions("" if args.no_lens else args.lens_switch, args.not_ready_s, args.bare_event)
+    table = recorded_table(args.recorded) if args.recorded else alpha_7r_v()
+    if args.answers:
+        table = with_answers(table, args.answers)
+    body = SonyBody(image_source(args), args.faults, body_options(args), table, sony)
+    if not (args.recorded or args.answers):
+        body.properties.put(Code.BATTERY, args.battery)
+    if args.old_file:
+        body.shoot()
     serve_until_stopped(SonyServer(args.host, args.port, body, args.faults), body, termination)

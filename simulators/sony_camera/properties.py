@@ -1,21 +1,25 @@
-"""The property table of an ILCE-7RM5 (protocol 3.00): codes, types, choices and current values."""
+"""The properties of a Sony body: how they are encoded, which can be set, and how some follow others."""
 
 from __future__ import annotations
 
 import struct
 import threading
-from dataclasses import dataclass, field
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import IntEnum
 
+from simulators.ptpip import codec
 from simulators.still_camera.exif import ExposureSettings
 from simulators.still_camera.operations import NotWritableError, RefusedValueError
 
-PROTOCOL_VERSION = 300
-_FORMATS = {1: "<b", 2: "<B", 3: "<h", 4: "<H", 5: "<i", 6: "<I"}
+_FORMATS = {1: "<b", 2: "<B", 3: "<h", 4: "<H", 5: "<i", 6: "<I", 7: "<q", 8: "<Q"}
+I8, U8, I16, U16, U32 = 1, 2, 3, 4, 6
+TEXT = 0xFFFF
 
 
 class Code(IntEnum):
-    """Property codes; those from D2C1 on are controls, which cannot be read."""
+    """Property codes that the camera itself uses; those from D2C1 on are controls, which cannot be read."""
 
     COMPRESSION = 0x5004
     WHITE_BALANCE = 0x5005
@@ -24,18 +28,31 @@ class Code(IntEnum):
     EXPOSURE_PROGRAM = 0x500E
     EXPOSURE_COMPENSATION = 0x5010
     DRIVE_MODE = 0x5013
+    LENS_NAME = 0xD07B
+    STABILIZATION = 0xD0D9
+    SILENT_MODE = 0xD0DB
+    SHUTTER_TYPE = 0xD0DF
+    NAME_PREFIX = 0xD1CA
     IMAGE_SIZE = 0xD203
     SHUTTER_SPEED = 0xD20D
+    ASPECT_RATIO = 0xD211
     FOCUS_STATUS = 0xD213
     OBJECTS_IN_MEMORY = 0xD215
     BATTERY = 0xD218
+    SENSOR_CROP = 0xD219
     ISO = 0xD21E
     CAPTURE_TARGET = 0xD222
     FOCUS_CAN_BE_DRIVEN = 0xD235
+    SLOT_1_STATE = 0xD248
+    SLOT_1_SHOTS = 0xD249
     FOCAL_POSITION = 0xD24C
     JPEG_QUALITY = 0xD252
     FILE_FORMAT = 0xD253
+    SLOT_2_STATE = 0xD256
+    SLOT_2_SHOTS = 0xD257
     PRIORITY_MODE = 0xD25A
+    COMPUTER_IMAGE_SIZE = 0xD268
+    COMPUTER_FILES = 0xD269
     HALF_PRESS = 0xD2C1
     FULL_PRESS = 0xD2C2
     FOCUS_STEP = 0xD2D1
@@ -46,6 +63,9 @@ CONTROLS = (Code.HALF_PRESS, Code.FULL_PRESS, Code.FOCUS_STEP, Code.FOCUS_REST)
 MANUAL_FOCUS, DIRECT_MANUAL_FOCUS = 1, 0x8006
 FILE_RAW, FILE_RAW_JPEG, FILE_JPEG = 1, 2, 3
 TARGET_COMPUTER, TARGET_CARD, TARGET_BOTH = 1, 16, 17
+CARD, NO_CARD = 1, 2
+NO_F_NUMBER = 0xFFFE  # without a lens, or with one that has no contacts
+_COMPRESSIONS_RAW, _COMPRESSIONS_BOTH = (16,), (17, 18, 19, 20)  # of protocol 2.00
 
 
 class Enabled(IntEnum):
@@ -58,105 +78,86 @@ class Enabled(IntEnum):
 
 @dataclass(slots=True)
 class CameraProperty:
-    """One entry of the table; empty `choices` means no form, `limits` is (minimum, maximum, step)."""
+    """One entry of the table.
 
-    code: Code
+    `choices` is None without a form, and may be empty; `limits` is (minimum, maximum, step).
+    """
+
+    code: int
     datatype: int
-    value: int
-    choices: tuple[int, ...] = ()
+    value: int | str
+    choices: tuple[int, ...] | None = None
     limits: tuple[int, int, int] | None = None
     enabled: Enabled = Enabled.ON
-    default: int = field(init=False)
+    get_set: bool | None = None  # the fifth byte, where it does not follow from the sixth
+    late_s: float = 0.0  # how long it takes until a value that was set is stated
+    coming: tuple[float, int | str] | None = None  # a value, and the time.monotonic() from which it is stated
 
-    def __post_init__(self) -> None:
-        self.default = self.value
-
-    def pack(self, value: int) -> bytes:
+    def pack(self, value: int | str) -> bytes:
         """Encode a value in the property's type."""
-        return struct.pack(_FORMATS[self.datatype], value)
+        return codec.string(value) if isinstance(value, str) else struct.pack(_FORMATS[self.datatype], value)
 
-    def unpack(self, data: bytes) -> int:
+    def unpack(self, data: bytes) -> int | str:
         """Decode a value from the client, which sends 4 bytes for some 2-byte types; only the first ones count."""
+        if self.datatype == TEXT:
+            return data[1:].decode("utf-16-le", errors="replace").rstrip("\0")
         layout = _FORMATS[self.datatype]
         if len(data) < struct.calcsize(layout):
-            raise RefusedValueError(f"{self.code.name}: {len(data)} bytes are not a valid value")
+            raise RefusedValueError(f"{self.code:04X}: {len(data)} bytes are not a valid value")
         return int(struct.unpack_from(layout, data)[0])
 
-    def encode(self) -> bytes:
+    def encode(self, *, twice: bool) -> bytes:
         """Encode the entry: code, type, get/set, enabled, default, current, form.
 
-        In protocol 3.00 the list of an enumeration is repeated.
+        In protocol 3.00 an enumeration is written `twice`: what can be set now, and what exists.
         """
-        settable = self.enabled is Enabled.ON
+        settable = self.enabled is Enabled.ON if self.get_set is None else self.get_set
         head = struct.pack("<HHBB", self.code, self.datatype, settable, self.enabled)
-        head += self.pack(self.default) + self.pack(self.value)
+        head += self.pack("" if self.datatype == TEXT else 0) + self.pack(self.value)
         if self.limits is not None:
             return head + b"\x01" + b"".join(self.pack(number) for number in self.limits)
-        if not self.choices:
+        if self.choices is None:
             return head + b"\x00"
         listing = struct.pack("<H", len(self.choices)) + b"".join(self.pack(choice) for choice in self.choices)
-        return head + b"\x02" + listing + listing
+        return head + b"\x02" + listing * (2 if twice else 1)
 
-    def accept(self, value: int) -> None:
+    def accept(self, value: int | str) -> None:
         """Set a value if the camera offers it. Raises NotWritableError or RefusedValueError."""
         if self.enabled is not Enabled.ON:
-            raise NotWritableError(self.code.name)
+            raise NotWritableError(f"{self.code:04X}")
         if self.choices and value not in self.choices:
-            raise RefusedValueError(f"{self.code.name} does not offer {value}")
-        if self.limits is not None and not self.limits[0] <= value <= self.limits[1]:
-            raise RefusedValueError(f"{self.code.name} {value} is out of range")
-        self.value = value
+            raise RefusedValueError(f"{self.code:04X} does not offer {value}")
+        if self.limits is not None and not self.limits[0] <= int(value) <= self.limits[1]:
+            raise RefusedValueError(f"{self.code:04X} {value} is out of range")
+        if self.late_s:
+            self.coming = time.monotonic() + self.late_s, value
+        else:
+            self.value = value
+
+    def settle(self) -> None:
+        """State a value that was set long enough ago."""
+        if self.coming is not None and time.monotonic() >= self.coming[0]:
+            self.value, self.coming = self.coming[1], None
 
 
-def shutter_code(numerator: int, denominator: int) -> int:
-    """Encode an exposure time as the camera does: numerator in the high word, denominator in the low word."""
-    return numerator << 16 | denominator
+@dataclass(frozen=True, slots=True)
+class BodyTable:
+    """What a body states about itself after power-on."""
 
-
-_APERTURES = (280, 320, 350, 400, 450, 500, 560, 630, 710, 800, 900, 1000, 1100, 1300, 1400, 1600, 1800, 2000, 2200)
-_TENTHS = (300, 250, 200, 150, 130, 100, 80, 60, 50, 40, 32, 25, 20, 16, 13, 10, 8, 6, 5, 4)
-_FRACTIONS = (3, 4, 5, 6, 8, 10, 13, 15, 20, 25, 30, 40, 50, 60, 80, 100, 125, 160, 200, 250, 320, 400, 500, 640, 800)
-_FAST = (1000, 1250, 1600, 2000, 2500, 3200, 4000, 5000, 6400, 8000)
-_SHUTTERS = tuple(shutter_code(tenths, 10) for tenths in _TENTHS) + tuple(
-    shutter_code(1, denominator) for denominator in _FRACTIONS + _FAST
-)
-_ISO = (50, 64, 80, 100, 125, 160, 200, 250, 320, 400, 500, 640, 800, 1000, 1250, 1600, 2000, 2500, 3200, 6400, 12800)
-_WHITE_BALANCE = (2, 4, 0x8011, 0x8010, 6, 0x8001, 0x8002, 0x8003, 0x8004, 7, 0x8012, 0x8020, 0x8021, 0x8022)
-# Thousandths of a stop, from +5 to -5 by thirds; with the dial on M they change no picture.
-_ABOVE_ZERO = (5000, 4700, 4300, 4000, 3700, 3300, 3000, 2700, 2300, 2000, 1700, 1300, 1000, 700, 300)
-_COMPENSATIONS = (*_ABOVE_ZERO, 0, *(-number for number in reversed(_ABOVE_ZERO)))
-_U8, _I16, _U16, _U32, _I8 = 2, 3, 4, 6, 1
-
-
-def initial_properties() -> list[CameraProperty]:
-    """The table after power-on: dial on M, autofocus, JPEG Fine, files to the computer."""
-    return [
-        CameraProperty(Code.WHITE_BALANCE, _U16, 4, _WHITE_BALANCE),
-        CameraProperty(Code.F_NUMBER, _U16, 800, _APERTURES),
-        CameraProperty(Code.FOCUS_MODE, _U16, 2, (2, 0x8005, 0x8004, DIRECT_MANUAL_FOCUS, MANUAL_FOCUS)),
-        CameraProperty(Code.EXPOSURE_PROGRAM, _U32, 1, (), enabled=Enabled.DISPLAY_ONLY),
-        CameraProperty(Code.EXPOSURE_COMPENSATION, _I16, 0, _COMPENSATIONS),
-        CameraProperty(Code.DRIVE_MODE, _U32, 1, (1, 0x8010, 2, 0x8012, 0x8003, 0x8004, 0x8005)),
-        CameraProperty(Code.IMAGE_SIZE, _U8, 1, (1, 2, 3)),
-        CameraProperty(Code.SHUTTER_SPEED, _U32, shutter_code(1, 60), _SHUTTERS),
-        CameraProperty(Code.FOCUS_STATUS, _U8, 1, (), enabled=Enabled.DISPLAY_ONLY),
-        CameraProperty(Code.OBJECTS_IN_MEMORY, _U16, 0, (), enabled=Enabled.DISPLAY_ONLY),
-        CameraProperty(Code.BATTERY, _I8, 87, limits=(-1, 100, 1), enabled=Enabled.DISPLAY_ONLY),
-        CameraProperty(Code.ISO, _U32, 400, _ISO),
-        CameraProperty(Code.CAPTURE_TARGET, _U16, TARGET_COMPUTER, (TARGET_COMPUTER, TARGET_BOTH, TARGET_CARD)),
-        CameraProperty(Code.FOCUS_CAN_BE_DRIVEN, _U8, 1, (), enabled=Enabled.DISPLAY_ONLY),
-        CameraProperty(Code.FOCAL_POSITION, _U8, 50, limits=(0, 100, 1), enabled=Enabled.DISPLAY_ONLY),
-        CameraProperty(Code.JPEG_QUALITY, _U8, 2, (1, 2, 3, 4)),
-        CameraProperty(Code.FILE_FORMAT, _U8, FILE_JPEG, (FILE_RAW, FILE_RAW_JPEG, FILE_JPEG)),
-        CameraProperty(Code.PRIORITY_MODE, _U8, 0, (0, 1)),
-    ]
+    model: str
+    firmware: str
+    protocol: int  # 200 or 300
+    properties: tuple[CameraProperty, ...]
+    controls: tuple[int, ...] = CONTROLS
+    lens: str = "FE 24-70mm F2.8 GM"
 
 
 class PropertyTable:
     """All properties behind one lock; used by the command thread and the exposure thread."""
 
-    def __init__(self) -> None:
-        self._entries = {entry.code: entry for entry in initial_properties()}
+    def __init__(self, table: BodyTable) -> None:
+        self._protocol, self._controls = table.protocol, table.controls
+        self._entries = {entry.code: entry for entry in table.properties}
         self._lock = threading.Lock()
 
     def codes(self) -> tuple[int, ...]:
@@ -166,45 +167,106 @@ class PropertyTable:
     def encode_all(self) -> bytes:
         """Encode the answer to 9209: 8-byte count, then all entries."""
         with self._lock:
-            entries = [entry.encode() for entry in self._entries.values()]
+            for entry in self._entries.values():
+                entry.settle()
+            entries = [entry.encode(twice=self._protocol >= 300) for entry in self._entries.values()]
         return struct.pack("<Q", len(entries)) + b"".join(entries)
 
     def extension_info(self) -> bytes:
         """Encode the answer to 9202: version, codes of the properties, codes of the controls."""
         codes = self.codes()
-        listing = struct.pack(f"<HI{len(codes)}H", PROTOCOL_VERSION, len(codes), *codes)
-        return listing + struct.pack(f"<I{len(CONTROLS)}H", len(CONTROLS), *CONTROLS)
+        listing = struct.pack(f"<HI{len(codes)}H", self._protocol, len(codes), *codes)
+        return listing + struct.pack(f"<I{len(self._controls)}H", len(self._controls), *self._controls)
 
     def set_from_client(self, code: int, data: bytes) -> None:
         """Set a value as operation 9205 does. Raises NotWritableError or RefusedValueError."""
         with self._lock:
-            try:
-                entry = self._entries[Code(code)]
-            except (ValueError, KeyError) as error:
-                raise NotWritableError(f"{code:04X}") from error
+            entry = self._entries.get(code)
+            if entry is None:
+                raise NotWritableError(f"{code:04X}")
             entry.accept(entry.unpack(data))
+            if code == Code.FILE_FORMAT:
+                self._follow_file_format(raw_only=entry.value == FILE_RAW)
 
-    def put(self, code: Code, value: int) -> None:
-        """Change a value from inside the camera (focus status, objects in memory, battery)."""
-        with self._lock:
-            self._entries[code].value = value
+    def _follow_file_format(self, *, raw_only: bool) -> None:
+        """While only RAW is set, nothing about a JPEG can be, and its quality is none."""
+        for code in (Code.JPEG_QUALITY, Code.IMAGE_SIZE):
+            if entry := self._entries.get(code):
+                entry.enabled, entry.get_set = Enabled.DISPLAY_ONLY if raw_only else Enabled.ON, None
+        if entry := self._entries.get(Code.JPEG_QUALITY):
+            entry.value = 0 if raw_only else entry.value or _STANDARD_QUALITY
 
-    def value(self, code: Code) -> int:
-        """The current raw value."""
+    def step(self, code: int, steps: int, ladder: Sequence[int]) -> None:
+        """Go so many steps along a ladder of values, as bodies of protocol 2.00 are set."""
         with self._lock:
-            return self._entries[code].value
+            entry = self._entries.get(code)
+            if entry is None or not isinstance(entry.value, int):
+                raise NotWritableError(f"{code:04X}")
+            allowed = [
+                one
+                for one in ladder
+                if entry.limits is None or code != Code.F_NUMBER or entry.limits[0] <= one <= entry.limits[1]
+            ]
+            if not allowed:
+                raise NotWritableError(f"{code:04X}")
+            nearest = min(range(len(allowed)), key=lambda i: abs(allowed[i] - int(entry.value)))
+            entry.value = allowed[min(len(allowed) - 1, max(0, nearest + steps))]
+
+    def put(self, code: int, value: int) -> None:
+        """Change a value from inside the camera (focus status, objects in memory, battery), if it has it."""
+        with self._lock:
+            entry = self._entries.get(code)
+            if entry is not None and entry.datatype != TEXT:
+                entry.value = value
+
+    def fix(self, code: int, value: int, choices: tuple[int, ...] | None = None) -> None:
+        """Keep a property at this value, with these choices if they change: a switch of the lens, or no lens."""
+        with self._lock:
+            if entry := self._entries.get(code):
+                entry.value, entry.enabled, entry.get_set = value, Enabled.GREY, None
+                entry.choices = entry.choices if choices is None else choices
+
+    def value(self, code: int, otherwise: int = 0) -> int:
+        """The current raw number; `otherwise` if the body does not have the property."""
+        with self._lock:
+            entry = self._entries.get(code)
+            return entry.value if entry is not None and isinstance(entry.value, int) else otherwise
 
     def exposure_settings(self) -> ExposureSettings:
         """The settings with which the next exposure will be taken."""
-        shutter = self.value(Code.SHUTTER_SPEED)
+        shutter = self.value(Code.SHUTTER_SPEED) or _BULB
         numerator, denominator = shutter >> 16, shutter & 0xFFFF
+        f_number = self.value(Code.F_NUMBER)
+        has_lens = 0 < f_number < NO_F_NUMBER
+        iso = self.value(Code.ISO) & 0xFFFFFF
+        jpeg, raw = self._files()
+        level = self.value(Code.JPEG_QUALITY)
         return ExposureSettings(
-            aperture_f=self.value(Code.F_NUMBER) / 100.0,
+            aperture_f=f_number / 100.0 if has_lens else 8.0,
             exposure_s=numerator / denominator,
             exposure_fraction=(numerator, denominator),
-            iso=self.value(Code.ISO) & 0xFFFFFF,
-            jpeg=self.value(Code.FILE_FORMAT) != FILE_RAW,
-            raw=self.value(Code.FILE_FORMAT) != FILE_JPEG,
-            jpeg_level=self.value(Code.JPEG_QUALITY),
-            on_card=self.value(Code.CAPTURE_TARGET) != TARGET_COMPUTER,
+            iso=min(iso, _MOST_IN_EXIF) if 0 < iso < 0xFFFFFF else _AUTO_ISO,
+            jpeg=jpeg,
+            raw=raw,
+            jpeg_level=level if level in _LEVELS else _STANDARD_QUALITY,
+            on_card=self.value(Code.CAPTURE_TARGET, TARGET_COMPUTER) != TARGET_COMPUTER,
+            states_aperture=has_lens,
         )
+
+    def _files(self) -> tuple[bool, bool]:
+        """Whether an exposure gives a JPEG, and whether a raw file."""
+        if kind := self.value(Code.FILE_FORMAT):
+            return kind != FILE_RAW, kind != FILE_JPEG
+        compression = self.value(Code.COMPRESSION)
+        raw = compression in (*_COMPRESSIONS_RAW, *_COMPRESSIONS_BOTH)
+        return compression not in _COMPRESSIONS_RAW, raw
+
+
+_STANDARD_QUALITY, _LEVELS = 2, range(1, 5)
+_BULB = 1 << 16 | 2  # somebody holds the button for half a second
+_AUTO_ISO, _MOST_IN_EXIF = 400, 65535
+
+
+def shutter_code(numerator: int, denominator: int) -> int:
+    """Encode an exposure time as the camera does: numerator in the high word, denominator in the low word."""
+    return numerator << 16 | denominator

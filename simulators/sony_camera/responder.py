@@ -10,16 +10,19 @@ from simulators.ptpip.reply import (
     INVALID_HANDLE,
     INVALID_STORAGE,
     INVALID_VALUE,
+    STORE_NOT_AVAILABLE,
     Reply,
 )
 from simulators.sony_camera.body import FORMAT_ARW, SonyBody
-from simulators.sony_camera.properties import CONTROLS, Code
-from simulators.still_camera.body import CARD_BYTES, FORMAT_JPEG
+from simulators.sony_camera.properties import Code
+from simulators.still_camera.body import FORMAT_JPEG
 from simulators.still_camera.operations import Operation, Operations, accept
 
-STORAGE = 0x00010001
+STORAGE = 0x00010000  # what objects in the memory state; it is not listed
+_ALL_STORES = 0xFFFFFFFF
 SHOT_HANDLE, LIVE_VIEW_HANDLE = 0xFFFFC001, 0xFFFFC002
-OBJECT_ADDED = 0xC201
+OBJECT_ADDED, SOMETHING_ADDED = 0xC201, 0xC206
+_STEPPED = 200  # the protocol in which aperture, shutter time and ISO go by steps
 # A real camera takes milliseconds to answer a poll during an exposure; the client polls as fast as it is answered.
 _POLL_WHILE_EXPOSING_S = 0.005
 
@@ -31,7 +34,7 @@ class SonyResponder(Operations):
         self._body = body
         operations: dict[int, tuple[str, Operation]] = {
             0x1001: ("get_device_info", self._device_info),
-            0x1002: ("open_session", accept),
+            0x1002: ("open_session", self._open_session),
             0x1003: ("close_session", accept),
             0x1004: ("get_storage_ids", self._storage_ids),
             0x1005: ("get_storage_info", self._storage_info),
@@ -60,11 +63,11 @@ class SonyResponder(Operations):
         del request, data
         info = codec.DeviceInfo(
             manufacturer="Sony Corporation",
-            model="ILCE-7RM5",
-            firmware="3.00",
+            model=self._body.table.model,
+            firmware=self._body.table.firmware,
             serial="00000000000000003282933005318008",
             operations=tuple(self.operations),
-            events=(OBJECT_ADDED, 0xC202, 0xC203),
+            events=(0x4004, 0x4005, OBJECT_ADDED, *range(0xC202, 0xC20A)),
             properties=(),
             image_formats=(0x3001, FORMAT_JPEG, FORMAT_ARW),
             vendor_extension=0x11,
@@ -72,16 +75,19 @@ class SonyResponder(Operations):
         )
         return Reply(data=info.encode())
 
-    def _storage_ids(self, request: codec.Request, data: bytes) -> Reply:
+    def _open_session(self, request: codec.Request, data: bytes) -> Reply:
         del request, data
-        return Reply(data=codec.array_u32((STORAGE,)))
+        self._body.session_opened()
+        return Reply()
+
+    def _storage_ids(self, request: codec.Request, data: bytes) -> Reply:
+        # In PC Remote mode no body lists its cards: it tells of them by properties.
+        del request, data
+        return Reply(data=codec.array_u32(()))
 
     def _storage_info(self, request: codec.Request, data: bytes) -> Reply:
-        del data
-        if request.parameters[:1] != (STORAGE,):
-            return Reply(INVALID_STORAGE)
-        free = self._body.free_bytes
-        return Reply(data=codec.StorageInfo(CARD_BYTES, free, free // 60_000_000, "CFexpress Type A").encode())
+        del request, data
+        return Reply(INVALID_STORAGE)
 
     def _object_count(self, request: codec.Request, data: bytes) -> Reply:
         del request, data
@@ -89,7 +95,9 @@ class SonyResponder(Operations):
 
     def _object_handles(self, request: codec.Request, data: bytes) -> Reply:
         # In PC Remote mode the card's files are not listed; only the pseudo handles exist.
-        del request, data
+        del data
+        if request.parameters[:1] == (_ALL_STORES,):
+            return Reply(STORE_NOT_AVAILABLE)
         return Reply(data=codec.array_u32(()))
 
     def _object_info(self, request: codec.Request, data: bytes) -> Reply:
@@ -100,12 +108,7 @@ class SonyResponder(Operations):
         file = self._body.next_file() if handle == SHOT_HANDLE else None
         if file is None:
             return Reply(INVALID_HANDLE)
-        size = len(file.data)
-        return Reply(
-            data=codec.ObjectInfo(
-                STORAGE, file.format, size, file.width, file.height, file.name, file.captured
-            ).encode()
-        )
+        return Reply(data=codec.ObjectInfo(STORAGE, file.format, len(file.data), 0, 0, file.name, "").encode())
 
     def _object(self, request: codec.Request, data: bytes) -> Reply:
         del data
@@ -129,7 +132,8 @@ class SonyResponder(Operations):
 
     def _button(self, request: codec.Request, data: bytes) -> Reply:
         code = request.parameters[0] if request.parameters else 0
-        if code not in CONTROLS or len(data) < 2:
+        least = 1 if self._body.table.protocol == _STEPPED else 2  # a step is one byte
+        if code not in self._body.controls or len(data) < least:
             return Reply(INVALID_VALUE)
         self._body.button(code, int.from_bytes(data[:2], "little"))
         return Reply()
@@ -138,4 +142,5 @@ class SonyResponder(Operations):
         del request, data
         if self._body.exposing:
             time.sleep(_POLL_WHILE_EXPOSING_S)
+        self._body.count_shots()
         return Reply(data=self._body.properties.encode_all())

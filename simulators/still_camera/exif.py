@@ -36,6 +36,7 @@ class ExposureSettings:
     raw: bool = False
     jpeg_level: int = 2  # 1 is the finest, 4 the coarsest
     on_card: bool = False  # the files stay on the card
+    states_aperture: bool = True  # not without a lens, or with one that has no contacts
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +94,8 @@ def with_exif(file: bytes, width: int, height: int, shot: Shot) -> bytes:
     }
     for key, value in text.items():
         exif[key] = exiv2.AsciiValue(value)
-    exif["Exif.Photo.FNumber"] = exiv2.URationalValue((round(settings.aperture_f * 10), 10))
+    if settings.states_aperture:
+        exif["Exif.Photo.FNumber"] = exiv2.URationalValue((round(settings.aperture_f * 10), 10))
     exif["Exif.Photo.ExposureTime"] = exiv2.URationalValue(settings.exposure_fraction)
     exif["Exif.Photo.FocalLength"] = exiv2.URationalValue((FOCAL_LENGTH_MM * 10, 10))
     numbers = {

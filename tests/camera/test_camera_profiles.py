@@ -83,7 +83,10 @@ def test_a_body_that_was_listed_is_driven_by_its_profile(body: Listed) -> None:
     if profile.quality.name in offered:
         for wanted in ("JPEG", "RAW", "RAW+JPEG"):
             assert quality_of(choose_word(profile.quality, wanted, offered[profile.quality.name], "here")) == wanted
-    fixed = ((profile.white_balance.name, profile.fixed_white_balance), *profile.fixed)
+    fixed = (
+        (profile.white_balance.name, profile.fixed_white_balance),
+        *((one.name, one.words[0]) for one in profile.fixed),
+    )
     for name, word in (*fixed, (profile.target.name, next(iter(profile.targets.values())))):
         assert word in offered.get(name, (word,))
     assert body.now[profile.program.name] == profile.manual_program
@@ -104,7 +107,7 @@ def words_of(profile: Profile) -> set[str]:
         profile.fixed_white_balance,
     }
     parts |= {*profile.floating_white_balance, *profile.targets.values()}
-    parts |= {text for pair in profile.fixed for text in pair}
+    parts |= {text for one in profile.fixed for text in (one.name, *one.words, *one.not_in_question)}
     for best in (words[0] for widget in widgets for words in widget.words.values()):
         parts |= set(best.split(" + "))
     return {part for part in parts if not re.fullmatch(r"d[0-9a-f]{3}|\d+", part)}

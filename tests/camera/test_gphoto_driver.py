@@ -39,8 +39,7 @@ def test_identity_and_report(camera: Camera) -> None:
     assert (report.identity.model, report.identity.serial) == ("ILCE-7RM5", "3282933005318008")
     assert "libgphoto2 2." in report.identity.driver_version
     assert report.battery_fraction == pytest.approx(0.87)
-    assert report.free_bytes is not None
-    assert report.free_bytes > 1e9
+    assert report.free_bytes is None, "no body lists a storage in PC Remote mode"
     assert report.problems == ()
 
 
@@ -158,13 +157,13 @@ def test_nobody_listens() -> None:
     camera.close()
 
 
-@pytest.mark.parametrize("version", ["2.5.31", "2.5.27", "2.4.0", "banana"])
+@pytest.mark.parametrize("version", ["2.5.30", "2.5.31", "2.5.27", "2.4.0", "banana"])
 def test_unfit_library_versions_are_refused(version: str) -> None:
     with pytest.raises(DeviceFaultError, match="libgphoto2"):
         check_library_version(version)
 
 
-@pytest.mark.parametrize("version", ["2.5.30", "2.5.32", "2.5.34", "2.6.0"])
+@pytest.mark.parametrize("version", ["2.5.32", "2.5.33", "2.5.34", "2.6.0"])
 def test_fit_library_versions(version: str) -> None:
     check_library_version(version)
 

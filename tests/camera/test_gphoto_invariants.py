@@ -59,10 +59,11 @@ def test_camera_that_stays_busy(tmp_path: Path, body: str) -> None:
 
 
 def test_full_store(tmp_path: Path, body: str) -> None:
-    with rig(body, [{"on": "shutter", "kind": "disk_full"}]) as (camera, _):
+    """A Canon lists its storage; a Sony says how many photographs fit on its cards."""
+    with rig(body, [{"on": "shutter", "kind": "disk_full"}], capture_target="card") as (camera, _):
         with pytest.raises(DeviceStorageFullError):
             camera.capture(tmp_path)
-        assert any("free" in problem for problem in camera.report().problems)
+        assert any("change or insert the card" in problem for problem in camera.report().problems)
 
 
 def test_shutter_without_an_image(tmp_path: Path, body: str) -> None:

@@ -11,6 +11,7 @@ from simulators.faults import FaultPlan
 from simulators.ptpip import codec
 from simulators.ptpip.codec import PacketType
 from simulators.serve import SimulatorError
+from simulators.sony_camera.alpha_7r_v import alpha_7r_v
 from simulators.sony_camera.body import SonyBody
 from simulators.sony_camera.properties import Code, PropertyTable
 from simulators.sony_camera.responder import SonyResponder
@@ -83,16 +84,16 @@ def test_golden_strings_and_object_info() -> None:
 
 
 def test_golden_property_entry_has_its_choices_twice() -> None:
-    table = PropertyTable()
+    table = PropertyTable(alpha_7r_v())
     table.set_from_client(Code.FILE_FORMAT, b"\x02\x00\x00\x00")
     blob = table.encode_all()
-    entry = bytes.fromhex("53d2" + "0200" + "0101" + "03" + "02" + "02" + "0300010203" + "0300010203")
+    entry = bytes.fromhex("53d2" + "0200" + "0101" + "00" + "02" + "02" + "0300010203" + "0300010203")
     assert entry in blob
     assert struct.unpack_from("<Q", blob)[0] == len(table.codes())
 
 
 def test_f_number_comes_in_four_bytes_and_strange_values_are_refused() -> None:
-    table = PropertyTable()
+    table = PropertyTable(alpha_7r_v())
     table.set_from_client(Code.F_NUMBER, struct.pack("<I", 2200))
     table.set_from_client(Code.SHUTTER_SPEED, struct.pack("<I", 1 << 16 | 15))
     settings = table.exposure_settings()
@@ -145,7 +146,7 @@ def test_refusals(body: SonyBody, operation: int, parameters: tuple[int, ...], d
 
 
 def test_brightness_follows_aperture_time_and_iso() -> None:
-    table = PropertyTable()
+    table = PropertyTable(alpha_7r_v())
     source = StillLife(240)
 
     def brightness(f_number: int, denominator: int, iso: int) -> tuple[float, float]:

@@ -10,7 +10,9 @@ import pytest
 from simulators.canon_camera import events
 from simulators.canon_camera.body import CanonBody
 from simulators.canon_camera.properties import APERTURE_F, FORMATS, ISO, SHUTTER, Code, Properties
+from simulators.canon_camera.responder import CanonResponder
 from simulators.faults import FaultPlan
+from simulators.ptpip import codec
 from simulators.still_camera.body import BodyOptions, CameraFile
 from simulators.still_camera.operations import NotWritableError, RefusedValueError
 from simulators.still_camera.scene import StillLife
@@ -89,3 +91,16 @@ def test_the_mode_dial_locks_aperture_and_time() -> None:
     table.put(Code.EXPOSURE_MODE, 2)
     with pytest.raises(NotWritableError, match="mode dial"):
         table.set_from_client(written(Code.APERTURE, 0x50))
+
+
+def test_the_lens_is_driven_while_live_view_goes_to_the_computer() -> None:
+    body = CanonBody(StillLife(96), FaultPlan(), BodyOptions(fast=True))
+    responder = CanonResponder(body, FaultPlan())
+
+    def drive(amount: int) -> int:
+        return responder.handle(codec.Request(0x9155, 1, (amount,), False), b"").code
+
+    assert drive(1) == 0xA102
+    body.properties.put(Code.VIEWFINDER_OUTPUT, 2)
+    assert [drive(amount) for amount in (3, 0x8001, 4)] == [0x2001, 0x2001, 0x201D]
+    assert body.focus_steps == -64 + 1

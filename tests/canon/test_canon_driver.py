@@ -199,3 +199,21 @@ def test_what_rig_yaml_names_must_exist() -> None:
         camera = driver(simulator.gphoto_port, profile="canon_eos")
         assert camera.open().model == "Canon EOS R5"
         camera.close()
+
+
+def test_the_focus_is_driven_and_the_exposure_compensated() -> None:
+    """The seven steps of focus are those of a listed EOS R5."""
+    with camera_simulator(name="canon") as simulator:
+        focus, compensation, _, _, driven = vendor_session(
+            simulator.gphoto_port,
+            ["choices", "manualfocusdrive"],
+            ["choices", "exposurecompensation"],
+            ["set", "exposurecompensation", "-1.3"],
+            ["preview"],
+            ["set", "manualfocusdrive", "Far 1"],
+        )
+        assert focus == ["Near 1", "Near 2", "Near 3", "None", "Far 1", "Far 2", "Far 3"]
+        assert len(compensation) == 19
+        assert (compensation[0], compensation[-1]) == ("3", "-3")
+        assert isinstance(driven, float)
+        assert vendor_session(simulator.gphoto_port, ["value", "exposurecompensation"]) == ["-1.3"]

@@ -15,6 +15,7 @@ from typing import Any
 import psutil
 import pytest
 
+from drivers.host.doing import Note
 from tests.support.processes.forked import INSTALLED, ROOT, SET_BY_IMPORTS, Forked
 from tests.support.processes.waiting import until
 from tests.support.rig.rig import command
@@ -182,12 +183,14 @@ def test_the_devices_of_a_forked_rig_are_forks_too_and_end_with_it(tmp_path: Pat
 @pytest.mark.parametrize("kind", [Forked, subprocess.Popen])
 def test_a_driver_has_the_connection_that_it_is_passed_and_ends_with_it(kind: type[subprocess.Popen[str]]) -> None:
     ours, theirs = socket.socketpair()
+    note = Note()
     given: dict[str, Any] = {
-        "pass_fds": [theirs.fileno()],
+        "pass_fds": [theirs.fileno(), note.descriptor],
         "env": {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
         "start_new_session": True,
     }
-    with kind([sys.executable, "-m", "drivers.host", str(theirs.fileno())], cwd=ROOT, text=True, **given) as driver:
+    words = [sys.executable, "-m", "drivers.host", str(theirs.fileno()), str(note.descriptor)]
+    with kind(words, cwd=ROOT, text=True, **given) as driver:
         assert not isinstance(driver, Forked) or driver.is_fork
         theirs.close()
         with pytest.raises(subprocess.TimeoutExpired):

@@ -105,6 +105,35 @@ def test_call_timeout_kills_the_child(tmp_path: Path) -> None:
     device.close()
 
 
+def test_a_process_that_crashed_says_at_what_and_a_value_that_crashes_it_twice_is_left_out(fake: Fake) -> None:
+    """Before, the words were "died of SIGSEGV | Open the device again", again and again."""
+    for _ in range(2):
+        with pytest.raises(DeviceUnavailableError, match="SIGSEGV in read_value, while reading the setting iso"):
+            fake.read_value("crash")
+        with pytest.raises(DeviceUnavailableError, match="while reading the setting iso"):
+            fake.double(np.ones(1))
+        fake.open()
+    assert "Reading the setting iso has ended the driver's process 2 times" in fake.read_value("crash")
+    np.testing.assert_array_equal(fake.double(np.ones(1)), [2])
+
+
+def test_a_device_opens_without_the_value_that_crashes_its_driver() -> None:
+    device = hosted(Fake, SPEC, FakeConfig(bad_value="crash"), call_timeout_s=20.0, name="bad")
+    assert device.open().model == "hello"
+    device.close()
+
+
+def test_a_value_that_hangs_twice_is_left_out() -> None:
+    device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=0.5, name="slow")
+    for _ in range(2):
+        device.open()
+        with pytest.raises(DeviceTimeoutError, match=r"within 0\.5 s, while reading the setting iso"):
+            device.read_value("hang")
+    device.open()
+    assert "left out" in device.read_value("hang")
+    device.close()
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGALRM, signal.SIGTERM])
 def test_a_driver_that_is_ended_from_outside_says_so_until_it_is_opened_again(fake: Fake, number: int) -> None:
     for _ in range(2):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
-from drivers.gphoto.profile import Profile, Widget
+from drivers.gphoto.profile import Fixed, Profile, Widget
 
 PROFILE = Profile(
     bodies="Canon EOS",
@@ -40,6 +40,6 @@ PROFILE = Profile(
     target=Widget("capturetarget"),
     targets=MappingProxyType({"card": "Memory card"}),
     serial="eosserialnumber",
-    fixed=(("drivemode", "Single"),),
+    fixed=(Fixed("drivemode", ("Single",), "one exposure may give several files", needed=True),),
     echoes=True,
 )

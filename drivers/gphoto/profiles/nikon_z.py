@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
-from drivers.gphoto.profile import Profile, Widget
+from drivers.gphoto.profile import Fixed, Profile, Widget
 
 PROFILE = Profile(
     bodies="Nikon Z",
@@ -38,5 +38,8 @@ PROFILE = Profile(
     # Only files on the card have the camera's own names and numbers.
     target=Widget("capturetarget"),
     targets=MappingProxyType({"card": "Memory card"}),
-    fixed=(("isoauto", "Off"), ("capturemode", "Single Shot")),
+    fixed=(
+        Fixed("isoauto", ("Off",), "the camera chooses the ISO value of each photograph", needed=True),
+        Fixed("capturemode", ("Single Shot",), "one exposure may give several files", needed=True),
+    ),
 )

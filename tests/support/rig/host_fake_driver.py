@@ -13,7 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
-from drivers.errors import DeviceUnavailableError, SafetyStopError
+from drivers.errors import DeviceRefusedError, DeviceUnavailableError, SafetyStopError
+from drivers.host.doing import doing
 from drivers.interfaces import Array, Device, DeviceIdentity, DeviceReport
 from drivers.plugin import DriverConfig, DriverSpec
 
@@ -24,6 +25,7 @@ class FakeConfig(DriverConfig):
     word: str = "hello"
     trace: Path | None = None
     die_on_open: bool = False
+    bad_value: str = ""  # which `open` reads, and which crashes or hangs: `crash` or `hang`
     report_s: float = 0.0  # how long `report` takes
     hangs: Path | None = None  # made when `hang` begins
 
@@ -34,6 +36,7 @@ class Fake(Device, Protocol):
     def double(self, values: Array, *, offset: float = 0.0) -> Array: ...
     def crash(self, signal_number: int) -> None: ...
     def crash_later(self, delay_s: float) -> None: ...
+    def read_value(self, how: str) -> str: ...
     def hang(self, seconds: float) -> None: ...
     def burn(self, processor_s: float) -> None: ...
     def hear(self, count: int) -> None: ...
@@ -65,6 +68,8 @@ class FakeDriver:
     def open(self) -> DeviceIdentity:
         if self._config.die_on_open:
             os._exit(3)
+        if self._config.bad_value:
+            self.read_value(self._config.bad_value)
         self._opened += 1
         return DeviceIdentity("fake", self._config.word, str(os.getpid()), str(self._opened), "fake", "1", "here")
 
@@ -82,6 +87,15 @@ class FakeDriver:
     def crash(self, signal_number: int) -> None:
         os.kill(os.getpid(), signal_number)
         time.sleep(5)
+
+    def read_value(self, how: str) -> str:
+        """Read a value on which a library crashes or hangs; "left out" where the host refuses to."""
+        try:
+            with doing("Reading the setting iso", optional=True):
+                self.hang(600) if how == "hang" else self.crash(signal.SIGSEGV)
+        except DeviceRefusedError as error:
+            return error.what
+        return "read"
 
     def crash_later(self, delay_s: float) -> None:
         subprocess.Popen([sys.executable, "-c", f"import os,time; time.sleep({delay_s}); os.kill({os.getpid()}, 11)"])

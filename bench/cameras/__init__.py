@@ -1,0 +1,1 @@
+"""Cameras as real bodies were recorded, and what the gphoto driver does with their answers."""
