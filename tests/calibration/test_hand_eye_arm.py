@@ -189,7 +189,7 @@ def test_an_arm_of_seven_axes_with_errors_of_another_kind_gains_as_well() -> Non
     record = hand_eye_record(result, [f"{i}.jpg" for i in range(len(shots))]).arm_correction
     assert record is not None
     corrected = corrected_mounting(record)
-    assert corrected.correction.dh_deltas.shape == (7, 4)
+    assert corrected.correction.dh_deltas.shape == (7, 5)
     assert corrected.correction.observed.shape == (7,)
     views = plan(scene, "exvivo_spine", "viewpoint_capture_1", "viewpoint_capture_2")[::2]
     reported = np.array([scene.nominal_flange(shot.q) for shot in views])
@@ -201,7 +201,7 @@ def test_an_arm_of_seven_axes_with_errors_of_another_kind_gains_as_well() -> Non
 
 
 def test_a_correction_of_seven_joints_does_not_fit_an_arm_of_six() -> None:
-    nothing = ArmCorrection("UR10e", np.zeros((7, 4)), np.zeros((7, 10)), np.zeros((7, 10)), np.zeros(7))
+    nothing = ArmCorrection("UR10e", np.zeros((7, 5)), np.zeros((7, 10)), np.zeros((7, 10)), np.zeros(7))
     q = np.array([0.1, -1.5, 1.2, -1.0, -1.5, 0.3])
     with pytest.raises(DataError, match="a correction of 7 joints for a UR10e"):
         corrected_T_base_flange(q, forward(UR10E, q[None])[0], nothing)
@@ -269,7 +269,7 @@ def test_joints_are_found_for_poses_in_reach_and_for_no_others() -> None:
 @settings(max_examples=10, deadline=None)
 def test_an_empty_correction_changes_nothing(q: Array) -> None:
     T = forward(UR10E, q[None])[0]
-    nothing = ArmCorrection("UR10e", np.zeros((6, 4)), np.zeros((6, 10)), np.zeros((6, 10)), np.zeros(6))
+    nothing = ArmCorrection("UR10e", np.zeros((6, 5)), np.zeros((6, 10)), np.zeros((6, 10)), np.zeros(6))
     np.testing.assert_allclose(corrected_T_base_flange(q, T, nothing), T, atol=1e-12)
     record = arm_correction_record(nothing, np.eye(4))
     again = corrected_mounting(records.ArmCorrection.model_validate(json.loads(json.dumps(record.plain()))))
