@@ -48,6 +48,7 @@ _ROBOT_MODES = {
     5: "IDLE",
     6: "BACKDRIVE",
     7: "RUNNING",
+    8: "UPDATING_FIRMWARE",
 }
 T = TypeVar("T")
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from simulators.ur_controller.controller import Controller, Runtime, SafetyMode
+from simulators.ur_controller.controller import Controller
+from simulators.ur_controller.modes import Runtime, SafetyMode
 from simulators.ur_controller.program import Interpreter
 
 WELCOME = "Connected: Universal Robots Dashboard Server"

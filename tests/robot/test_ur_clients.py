@@ -229,9 +229,10 @@ def test_dashboard_lines(controller: tuple[str, str]) -> None:
         assert ask("power off") == "Powering off"
         assert ask("robotmode") == "Robotmode: POWER_OFF"
         assert ask("power on") == "Powering on"
-        assert ask("robotmode") == "Robotmode: IDLE"
+        assert ask("robotmode") == "Robotmode: POWER_ON"
+        until(lambda: ask("robotmode") == "Robotmode: IDLE", "the power does not come")
         assert ask("brake release") == "Brake releasing"
-        assert ask("robotmode") == "Robotmode: RUNNING"
+        until(lambda: ask("robotmode") == "Robotmode: RUNNING", "the brakes stay")
         assert ask("running") == "Program running: false"
         assert ask("stop") == "Stopped"
         assert ask("make coffee").startswith("could not understand")

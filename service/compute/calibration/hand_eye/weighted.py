@@ -8,8 +8,8 @@ the images' errors:
     a_i ~ N(0, diag(σ_t² 1, σ_r² 1)),  c_i ~ N(0, C_i)
 
 C_i is the covariance of the board's pose in the image; G_i φ is the arm's systematic error (arm.correction) with the
-prior φ ~ N(0, s²) in units of usual tolerances. Where φ is large, the reported poses are first corrected by a nearby φ0,
-and e is the increment from there plus G_i φ0. The variances σ_t², σ_r² and s² maximise the restricted likelihood
+prior φ ~ N(0, s²) in units of usual tolerances. Where φ is large, the reported poses are first corrected by a nearby
+φ0, and e is the increment from there plus G_i φ0. The variances σ_t², σ_r² and s² maximise the restricted likelihood
 (REML; Patterson and Thompson 1971, by Henderson's mixed model equations).
 
 κ is the board's true size over the stated one, as the robot's lengths show it, with the prior κ ~ N(1, u²) from the
