@@ -36,7 +36,17 @@ from drivers.ur import UrConfig
 from drivers.ur import vendor as library
 from drivers.ur.dashboard import SWITCH_TO_REMOTE, ControllerFacts, Dashboard
 from drivers.ur.link import VENDOR_ERRORS, probe, vendor
-from drivers.ur.samples import PLAYING, RESTART, VARIABLES, SampleReader, joint_values, joints_for, opened, robot_mode
+from drivers.ur.samples import (
+    PLAYING,
+    RESTART,
+    VARIABLES,
+    SampleReader,
+    joint_values,
+    joints_for,
+    opened,
+    robot_mode,
+    speed_fraction,
+)
 from drivers.ur.script import ControlScript
 from drivers.ur.tool import SET_ELSEWHERE, read_back
 from drivers.ur.watchdog import Watchdog
@@ -230,7 +240,7 @@ class UrRobot:
                 sample=sample,
                 robot_mode=robot_mode(receive),
                 program_running=receive.getRuntimeState() == PLAYING,
-                speed_fraction=receive.getTargetSpeedFraction(),
+                speed_fraction=speed_fraction(receive),
             )
 
     def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:

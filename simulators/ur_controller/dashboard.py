@@ -19,7 +19,7 @@ _FIXED = {
 }
 
 _NOT_ALLOWED = "Command is not allowed due to safety reasons"
-_REFUSED = f"{_NOT_ALLOWED}, please switch robot to Remote Control mode and reconnect to port 29999"
+REFUSED = f"{_NOT_ALLOWED}, please switch robot to Remote Control mode and reconnect to port 29999"
 _LOCAL_TOO = ("addtolog", "popup", "setuserrole")  # beside all queries
 
 
@@ -46,7 +46,7 @@ class Dashboard:
             return queries[word]()
         self._met_local |= self._controller.local
         if self._met_local and word.partition(" ")[0] not in _LOCAL_TOO:
-            return _REFUSED
+            return REFUSED
         return self._act(command, word)
 
     def _queries(self) -> dict[str, Callable[[], str]]:
