@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from simulators.geometry import Array, Ints, from_euler
-from simulators.scene.arm import ARM_MODEL, ArmErrorKind, ArmErrors, SimulatedArm, UniversalRobot
+from simulators.scene.arm import ARM_ERRORS_USUAL, ARM_MODEL, ArmErrorKind, ArmErrors, SimulatedArm, UniversalRobot
 from simulators.scene.intrinsics import FULL_HEIGHT, FULL_WIDTH, Intrinsics
 from simulators.scene.lbr_arm import LBR_MODELS, Lbr, LbrErrors
 from simulators.scene.parts import Part, box, cylinder, joined, sphere_mesh
@@ -90,7 +90,7 @@ class Scene:
         moved: Moved = (),
         arm: str = ARM_MODEL.name,
         arms: int = 1,
-        arm_errors: ArmErrorKind = "gears",
+        arm_errors: ArmErrorKind = ARM_ERRORS_USUAL,
     ) -> Scene:
         """Generate this seed's scene, identical on every machine and in every process, with some spheres moved.
 

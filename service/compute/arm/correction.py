@@ -101,14 +101,14 @@ def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction:
 
 
 def _real(arm: ArmModel, joints_rad: Array, correction: ArmCorrection) -> Array:
-    """(N, J, 5) a, d, α, θ, β of the arm as it is built, at joints (N, J)."""
+    """(N, J, 4 or 5) a, d, α, θ and, where an axis needs it, β of the arm as it is built, at joints (N, J)."""
     phase = joints_rad[:, :, None] * np.arange(1, correction.gear_cos_rad.shape[1] + 1)
     gears = np.sum(correction.gear_cos_rad * np.cos(phase) + correction.gear_sin_rad * np.sin(phase), axis=2)
     real = np.zeros((*joints_rad.shape, 5))
     real[:, :, :4] = arm.joint_values(joints_rad)
     real += correction.dh_deltas
     real[:, :, 3] += gears
-    return real
+    return real if correction.dh_deltas[:, 4].any() else real[:, :, :4]
 
 
 def check_arm(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
