@@ -27,6 +27,11 @@ def metres(length_mm: float | Array) -> float | Array:
     return length_mm / 1000.0
 
 
+def radians_of_mrad(angle_mrad: float) -> float:
+    """Radians of an angle in milliradians."""
+    return angle_mrad / 1000.0
+
+
 def in_unit(lengths_m: Array, unit: str) -> Array:
     """Lengths in metres, in one of UNITS."""
     if unit == "m":

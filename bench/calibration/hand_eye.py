@@ -89,7 +89,7 @@ def systematic_arm(
     rows: list[dict[str, Any]] = []
     for name, protocol, steps in sessions:
         for seed in seeds:
-            scene = kind.generate(seed, arm=arm)
+            scene = kind.generate(seed, arm=arm, arm_errors="gears")
             views = plan(scene, "exvivo_spine", *DATASET)
             session = board_session(scene, plan(scene, protocol, *steps))
             rows.append({"session": name, "seed": seed, **_one(scene, views, session)})

@@ -16,6 +16,7 @@ from typing import Any
 
 from bench.machine import REPOSITORY, RESULTS, commit, machine
 from bench.whole_runs.whole_run import whole_run
+from simulators.scene.arm import ARM_ERRORS, ARM_ERRORS_USUAL
 from tests.support.protocols.shortened import shortened
 
 PROTOCOL = REPOSITORY / "protocols" / "exvivo_spine.yaml"
@@ -35,12 +36,13 @@ def main(words: Sequence[str] | None = None) -> int:
         "ct_voxel_mm": options.ct_voxel_mm,
         "speed_up": options.speed_up,
         "arm": options.arm,
+        "arm_errors": options.arm_errors,
     }
     stem = options.results / f"{options.name}-{options.image_width}-{options.date}"
     options.results.mkdir(parents=True, exist_ok=True)
     rig = ["--image-width", str(options.image_width), "--ct-voxel-mm", str(options.ct_voxel_mm),
            "--speed-up", str(options.speed_up), "--arm", options.arm, "--host", options.host,
-           "--patience", str(options.patience)]  # fmt: skip
+           "--arm-errors", options.arm_errors, "--patience", str(options.patience)]  # fmt: skip
     found: list[dict[str, Any]] = []
     text = ""
     for scene in scenes:
@@ -83,6 +85,7 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
         help="as of `simulate rig`, on a machine that does more (0)",
     )
     parser.add_argument("--arm", default="UR10e", help="model of the simulated arm (UR10e)")
+    parser.add_argument("--arm-errors", choices=ARM_ERRORS, default=ARM_ERRORS_USUAL, help="of an UR10e (both)")
     parser.add_argument("--host", default="127.0.0.1", help="address of its controller (127.0.0.1)")
     parser.add_argument("--protocol", type=Path, default=PROTOCOL, help="a protocol other than the paper's")
     parser.add_argument("--one-of", type=int, default=1, metavar="N", help="take one in N views (1)")
@@ -104,7 +107,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         "",
         f"Commit {record['commit']}; {computer['processor']}, {computer['cores']} cores, {computer['memory_gb']} GB, "
         f"{computer['system']}, Python {computer['python']}; photographs {record['image_width']} px wide, "
-        f"CT voxels of {record['ct_voxel_mm']} mm, {record['arm']} {record['speed_up']:g} times as fast as real.",
+        f"CT voxels of {record['ct_voxel_mm']} mm, {record['arm']} {record['speed_up']:g} times as fast as real, with "
+        f"the errors `{record['arm_errors']}`.",
         "",
         "The true error is the registration's displacement at the scene's centre against the simulator's record. "
         "Nobody was asked anything: the simulated technician did what the screen told him.",

@@ -56,7 +56,7 @@ class UrConfig(DriverConfig):
         return Abandoned(self.watchdog_s, self.rest_within_s)
 
 
-_LIBRARY = ("dashboard_client", "rtde_control", "rtde_receive")
+_LIBRARY = ("rtde_control", "rtde_receive")
 
 
 def _build(config: UrConfig) -> Device:

@@ -1,4 +1,4 @@
-"""The RobotArm driver over ur_rtde (receive, control and dashboard); runs in the child of drivers.host."""
+"""The RobotArm driver over ur_rtde (receive and control) and the dashboard; runs in the child of drivers.host."""
 
 from __future__ import annotations
 
@@ -34,8 +34,19 @@ from drivers.interfaces import (
 )
 from drivers.ur import UrConfig
 from drivers.ur import vendor as library
-from drivers.ur.link import VENDOR_ERRORS, ControllerFacts, connect_dashboard, probe, read_facts, vendor
-from drivers.ur.samples import PLAYING, RESTART, VARIABLES, SampleReader, joint_values, joints_for, opened, robot_mode
+from drivers.ur.dashboard import SWITCH_TO_REMOTE, ControllerFacts, Dashboard
+from drivers.ur.link import VENDOR_ERRORS, probe, vendor
+from drivers.ur.samples import (
+    PLAYING,
+    RESTART,
+    VARIABLES,
+    SampleReader,
+    joint_values,
+    joints_for,
+    opened,
+    robot_mode,
+    speed_fraction,
+)
 from drivers.ur.script import ControlScript
 from drivers.ur.tool import SET_ELSEWHERE, read_back
 from drivers.ur.watchdog import Watchdog
@@ -58,7 +69,8 @@ class UrRobot:
         self._config = config
         self._where = config.host
         self._facts: ControllerFacts | None = None
-        self._dashboard: library.Dashboard | None = None
+        self._dashboard = Dashboard(config.host, config.connect_timeout_s)
+        self._local = False  # the controller was in local control when last asked
         self._stream: PoseStream | None = None
         self._motion_started_s = -np.inf
         self._latch = Latch(config.host)
@@ -69,7 +81,7 @@ class UrRobot:
             unattended_s=config.unattended_s,
             newest=self._newest,
         )
-        self._script = ControlScript(config, self._latch, self._watchdog)
+        self._script = ControlScript(config, self._latch, self._watchdog, end_others=self._end_others)
         self._configured: tuple[Payload, Transform] | None = None  # the tool as this driver set it
         self._tool_read = 0  # value of ControlScript.sent when the tool was last read
 
@@ -83,11 +95,8 @@ class UrRobot:
         """
         self.close()
         probe(self._config.host, self._config.connect_timeout_s)
-        self._dashboard = dashboard = connect_dashboard(self._config.host)
-        self._facts = facts = read_facts(dashboard, self._where, self._config.connect_timeout_s)
-        # An earlier client's script in another register range would block the control constructor for minutes.
-        with vendor(self._where, "stopping the running program"):
-            dashboard.stop()
+        self._facts = facts = self._dashboard.facts()
+        self._local = self._dashboard.local_control(facts.version)
         self._configured = None
         self._samples.tool.start(known_arm(facts.model))
         with vendor(self._where, "connecting the receive interface"):
@@ -124,11 +133,10 @@ class UrRobot:
                 self._script.end()
         else:
             self._script.abandon()
-        for client in (self._samples.receive, self._dashboard):
-            with contextlib.suppress(*VENDOR_ERRORS):
-                if client is not None and client.isConnected():
-                    client.disconnect()
-        self._samples.receive = self._dashboard = None
+        receive, self._samples.receive = self._samples.receive, None
+        with contextlib.suppress(*VENDOR_ERRORS):
+            if receive is not None and receive.isConnected():
+                receive.disconnect()
 
     def report(self) -> DeviceReport:
         """Return versions, clock offset, and what prevents the arm from moving."""
@@ -232,7 +240,7 @@ class UrRobot:
                 sample=sample,
                 robot_mode=robot_mode(receive),
                 program_running=receive.getRuntimeState() == PLAYING,
-                speed_fraction=receive.getTargetSpeedFraction(),
+                speed_fraction=speed_fraction(receive),
             )
 
     def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
@@ -268,12 +276,14 @@ class UrRobot:
     def stop(self) -> None:
         """Decelerate and return when the arm stands still; without a running script, stop the program by dashboard.
 
-        Raises DeviceTimeoutError if the arm does not come to rest.
+        Raises DeviceTimeoutError if the arm does not come to rest, DeviceRefusedError if the controller refuses,
+        because it is in local control.
         """
         with vendor(self._where, "stopping the motion"):
             self._watchdog.look()
-            if not self._script.stop_motion(self._driven_next):
-                opened(self._dashboard, self._where).stop()
+            if self._script.stop_motion(self._driven_next):
+                return
+        self._dashboard.stop()
 
     def is_moving(self) -> bool:
         """Return whether the last motion is still under way.
@@ -337,17 +347,27 @@ class UrRobot:
         if state.robot_mode != "RUNNING":
             remedy = "Power the arm on and release its brakes on the pendant"
             return DeviceRefusedError(f"the arm is in mode {state.robot_mode}", where=self._where, remedy=remedy)
-        if self._facts is not None and not self._facts.remote_control and not self._taken_remote(self._facts):
-            remedy = "Switch the pendant from Local to Remote, then try again"
-            return DeviceRefusedError("the controller is in local control", where=self._where, remedy=remedy)
+        # A controller in local control sends what it measures, and starts no program: one that runs was let start.
+        if self._local or not state.program_running:
+            self._local = self._dashboard.local_control(opened(self._facts, self._where).version)
+        if self._local:
+            return DeviceRefusedError(
+                "the controller is in local control", where=self._where, remedy=SWITCH_TO_REMOTE
+            )
         return None
 
-    def _taken_remote(self, facts: ControllerFacts) -> bool:
-        """Whether somebody has switched the pendant to Remote since the last query."""
-        with vendor(self._where, "asking for remote control"):
-            remote = opened(self._dashboard, self._where).isInRemoteControl()
-        self._facts = dataclasses.replace(facts, remote_control=remote)
-        return remote
+    def _end_others(self) -> None:
+        """End the program that runs at the controller, before the control script is sent for the first time.
+
+        An earlier client's script in another register range would block the vendor's constructor for minutes.
+        Raises DeviceRefusedError if it runs on.
+        """
+        try:
+            self._dashboard.stop()
+        except DeviceRefusedError:
+            if self.state().program_running:
+                raise
+            _LOG.info("%s: no program was running, and none could be ended", self._where)
 
     def _safety_error(self, sample: RobotSample) -> SafetyStopError:
         name = sample.safety.value.replace("_", " ")

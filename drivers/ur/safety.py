@@ -16,6 +16,7 @@ def safety_state(bits: int) -> SafetyState:
         (1 << 4, SafetyState.SAFEGUARD_STOP),
         (1 << 2, SafetyState.PROTECTIVE_STOP),
         (1 << 3, SafetyState.FAULT),  # recovery mode
+        (1 << 10, SafetyState.SAFEGUARD_STOP),  # stopped for safety otherwise: by a three-position switch (bit 11)
         (1 << 1, SafetyState.REDUCED),
         (1 << 0, SafetyState.NORMAL),
     ):

@@ -48,12 +48,20 @@ _ROBOT_MODES = {
     5: "IDLE",
     6: "BACKDRIVE",
     7: "RUNNING",
+    8: "UPDATING_FIRMWARE",
 }
 T = TypeVar("T")
 
 
+class NoNumberError(ValueError):
+    """The controller sent something that is not a number; it ends the stream, as a lost connection does."""
+
+
 class SampleReader:
-    """Reads whole samples from the receive interface, and shows their safety state to the latch."""
+    """Reads whole samples from the receive interface, and shows their safety state to the latch.
+
+    A sample with a value that is not a number raises NoNumberError.
+    """
 
     def __init__(self, latch: Latch) -> None:
         self._latch = latch
@@ -90,19 +98,33 @@ class SampleReader:
 
 
 def _take(receive: library.Receive, controller_time_s: float) -> tuple[RobotSample, Payload]:
-    """A sample with the pose of the tool's centre point, and the payload."""
-    x, y, z = receive.getPayloadCog()
+    """A sample with the pose of the tool's centre point, and the payload. Raises NoNumberError."""
+    _numbers("timestamp", controller_time_s)
+    x, y, z = _numbers("payload_cog", *receive.getPayloadCog())
     sample = RobotSample(
         controller_time_s=controller_time_s,
         monotonic_s=time.monotonic(),
-        joints_rad=np.array(receive.getActualQ()),
-        joint_velocities_rad_s=np.array(receive.getActualQd()),
-        target_velocities_rad_s=np.array(receive.getTargetQd()),
-        T_base_flange=from_rotation_vector(np.array(receive.getActualTCPPose())),
-        tcp_speed_m_s=math.hypot(*receive.getActualTCPSpeed()[:3]),
+        joints_rad=np.array(_numbers("actual_q", *receive.getActualQ())),
+        joint_velocities_rad_s=np.array(_numbers("actual_qd", *receive.getActualQd())),
+        target_velocities_rad_s=np.array(_numbers("target_qd", *receive.getTargetQd())),
+        T_base_flange=from_rotation_vector(np.array(_numbers("actual_TCP_pose", *receive.getActualTCPPose()))),
+        tcp_speed_m_s=math.hypot(*_numbers("actual_TCP_speed", *receive.getActualTCPSpeed())[:3]),
         safety=safety_state(receive.getSafetyStatusBits()),
     )
-    return sample, Payload(receive.getPayload(), (x, y, z))
+    (mass_kg,) = _numbers("payload", receive.getPayload())
+    return sample, Payload(mass_kg, (x, y, z))
+
+
+def _numbers(field: str, *values: float) -> tuple[float, ...]:
+    """The values of a field. Raises NoNumberError if one is not finite."""
+    if all(map(math.isfinite, values)):
+        return values
+    raise NoNumberError(f"the controller sends no number for {field}")
+
+
+def speed_fraction(receive: library.Receive) -> float:
+    """How far the speed slider is up, 0 … 1. Raises NoNumberError."""
+    return _numbers("target_speed_fraction", receive.getTargetSpeedFraction())[0]
 
 
 def robot_mode(receive: library.Receive) -> str:

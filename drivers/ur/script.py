@@ -26,11 +26,17 @@ class ControlScript:
     """The control script on the controller.
 
     The first command connects and sends it. It is sent again after it ended, unless the latch holds the arm.
+
+    Args:
+        config: of the arm.
+        latch: holds the arm after a stop.
+        watchdog: guards the script.
+        end_others: ends another program that runs at the controller. Raises DeviceError.
     """
 
-    def __init__(self, config: UrConfig, latch: Latch, watchdog: Watchdog) -> None:
+    def __init__(self, config: UrConfig, latch: Latch, watchdog: Watchdog, *, end_others: Callable[[], None]) -> None:
         self._config, self._where = config, config.host
-        self._latch, self._watchdog = latch, watchdog
+        self._latch, self._watchdog, self._end_others = latch, watchdog, end_others
         self._control: library.Control | None = None
         self._abandoned: list[library.Control] = []  # kept so that their destructors never run
         self._coming = False  # it was sent again, and was not seen to run yet
@@ -57,6 +63,7 @@ class ControlScript:
         Raises DeviceRefusedError if its registers are used by somebody else.
         """
         upper = self._config.upper_registers
+        self._end_others()
         with self._watchdog.commanding(), vendor(self._where, "starting the control script"):
             try:
                 self._control = control = library.control(self._config.host, STREAM_HZ, upper_registers=upper)

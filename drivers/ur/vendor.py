@@ -8,7 +8,6 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Protocol, cast
 
-import dashboard_client
 import rtde_control
 import rtde_receive
 
@@ -16,19 +15,10 @@ TIMER_SLACK_NS = 2_000_000
 
 
 class Connection(Protocol):
-    """The methods that all three interfaces share."""
+    """The methods that both interfaces share."""
 
     def isConnected(self) -> bool: ...  # noqa: D102 - the vendor's names and meanings
     def disconnect(self) -> None: ...  # noqa: D102
-
-
-class Dashboard(Connection, Protocol):
-    """dashboard_client.DashboardClient."""
-
-    def connect(self, timeout_ms: int) -> None: ...  # noqa: D102
-    def polyscopeVersion(self) -> str: ...  # noqa: D102
-    def isInRemoteControl(self) -> bool: ...  # noqa: D102
-    def stop(self) -> None: ...  # noqa: D102
 
 
 class Receive(Connection, Protocol):
@@ -71,11 +61,6 @@ class Control(Connection, Protocol):
     def getInverseKinematicsHasSolution(self, pose: list[float], near: list[float]) -> bool: ...  # noqa: D102
     def getInverseKinematics(self, pose: list[float], near: list[float]) -> list[float]: ...  # noqa: D102
     def isJointsWithinSafetyLimits(self, q: list[float]) -> bool: ...  # noqa: D102
-
-
-def dashboard(host: str) -> Dashboard:
-    """Create a dashboard client without connecting it."""
-    return cast("Dashboard", dashboard_client.DashboardClient(host))
 
 
 def receive(host: str, frequency_hz: float, variables: list[str]) -> Receive:

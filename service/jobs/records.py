@@ -100,7 +100,8 @@ class ArmCorrection(JobRecord):
         T_flange_camera: of the camera on the flange, for corrected poses.
         arm: name of the arm's model.
         model: which parameters the correction has, in words.
-        dh_deltas: (N, 4) added to a, d (metres), α, θ (radians) of each joint.
+        dh_deltas: (N, 5) added to a, d (metres), α, θ, β (radians) of each joint; (N, 4), without β, in records of
+            the camera calibration before version 4.
         gear_cos_rad, gear_sin_rad: (N, H) amplitudes of the periodic errors of each joint.
         observed: share of each joint's error that the images determine, 0 … 1.
     """

@@ -1,7 +1,8 @@
 """The controller's end of FRI: sends monitor messages over UDP, and judges the session by the replies.
 
-Written from the message definitions of KUKA's client SDKs 1.15, 2.5 and 2.7. An arm that no application commands
-through FRI never leaves the monitoring states.
+Written from the message definitions of KUKA's client SDKs 1.15, 2.5 and 2.7; 3.0 exists, and its messages were not
+at hand. An arm that no application commands through FRI never leaves the monitoring states, but for IDLE: that is the
+last that a client hears of a session whose application ended (lbr_fri_ros2_stack#251).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _LOG = logging.getLogger(__name__)
 
 VERSIONS = ("1", "2.5", "2.7")
 _MONITOR_ID, _COMMAND_ID = 2380098, 212993
-_WAIT, _READY = 1, 2
+_IDLE, _WAIT, _READY = 0, 1, 2
 _JUDGED = 20  # messages by whose replies the quality is judged
 _LATEST = 5  # a reply may come so many messages later
 _MODES = {"T1": 0, "T2": 1, "AUT": 2}
@@ -39,6 +40,7 @@ class Session:
         self._cycle = self._counter = self._reflected = 0
         self._answered: deque[bool] = deque(maxlen=_JUDGED)
         self._replied_to: set[int] = set()
+        self._period_ms = 0
         self.dead = False
 
     def send(self, period_s: float) -> None:
@@ -55,16 +57,31 @@ class Session:
         fault = self._controller.faults.check(self._controller.device, "fri")
         if fault is not None and fault.kind == "drop":
             return
-        message = self._message(round(ms(period_s)) * self._cycles)
+        self._period_ms = round(ms(period_s)) * self._cycles
+        if fault is not None and fault.kind == "end":
+            self._end()
+            return
+        message = self._message(_READY if self.quality >= 2 else _WAIT)
         if fault is not None and fault.kind == "corrupt":
             message = message[:-1] + bytes([message[-1] ^ 0xFF])
+        self._send(message)
+
+    def _send(self, message: bytes) -> None:
         try:
             self._socket.sendto(message, self._client)
         except OSError as error:
             _LOG.debug("FRI: %s", error)
 
+    def _end(self) -> None:
+        """Say that the session has ended."""
+        if not self.dead:
+            self._counter += 1
+            self._send(self._message(_IDLE))
+        self.dead = True
+
     def close(self) -> None:
         """End the session."""
+        self._end()
         self._socket.close()
 
     @property
@@ -102,7 +119,7 @@ class Session:
             self._reflected = numbers[1]
             self._replied_to.add(numbers[2])
 
-    def _message(self, period_ms: int) -> bytes:
+    def _message(self, state: int) -> bytes:
         controller = self._controller
         q = [float(v) for v in controller.q]
         stopped = 0 if controller.safety == "normal" else 2
@@ -114,12 +131,11 @@ class Session:
         if self._version == "1":
             monitor += _part(3, joints)
         monitor += _part(5, torques) + _part(15, _int(1, seconds) + _int(2, nanoseconds))
-        state = _READY if self.quality >= 2 else _WAIT
         message = (
             _part(1, _int(1, _MONITOR_ID) + _int(2, self._counter) + _int(3, self._reflected))
             + _part(2, robot)
             + _part(3, monitor)
-            + _part(4, _int(1, state) + _int(2, self.quality) + _int(3, period_ms) + _int(4, 1))
+            + _part(4, _int(1, state) + _int(2, self.quality) + _int(3, self._period_ms) + _int(4, 1))
         )
         if self._version == "2.7":
             return struct.pack("<I", len(message)) + message + struct.pack("<I", zlib.crc32(message))

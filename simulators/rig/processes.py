@@ -31,6 +31,7 @@ from simulators.rig.export_processes import ExportProcesses
 from simulators.rig.patience import patient
 from simulators.rig.truth import truth_of
 from simulators.rig.world_server import World, WorldServer
+from simulators.scene.arm import ARM_ERRORS, ARM_ERRORS_USUAL
 from simulators.scene.further_cameras import PLACES, FurtherCamera, further_cameras
 from simulators.scene.world import ARMS, SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
 from simulators.serve import SimulatorError, Termination, add_patience, announce
@@ -47,6 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--speed-up", type=float, default=1.0, metavar="N", help="the arm takes 1/N of its time")
     add_delivery_arguments(parser)
     parser.add_argument("--arm", choices=ARMS, default=ARMS[0], help="model of the arm; each has its own stations")
+    parser.add_argument(
+        "--arm-errors",
+        choices=ARM_ERRORS,
+        default=ARM_ERRORS_USUAL,
+        help="what the controller of an UR10e does not know of its arm: how it was built, its gears' errors, or both",
+    )
     parser.add_argument("--camera", choices=tuple(CAMERAS), default="Sony ILCE-7RM5", help="model of the camera")
     parser.add_argument("--version", default="5.12", help="of Polyscope")
     parser.add_argument(
@@ -115,7 +122,7 @@ class _Rig:
         self.termination = termination
         self.folder: Path = args.dir.resolve()
         self.faults: FaultPlan = args.faults
-        scene = Scene.generate(args.scene, arm=args.arm, arms=args.arms)
+        scene = Scene.generate(args.scene, arm=args.arm, arms=args.arms, arm_errors=args.arm_errors)
         self.arms = () if args.hand else ("robot",) if args.arms == 1 else ("robot_1", "robot_2")
         self.children: dict[str, subprocess.Popen[str]] = {}
         self._words: dict[str, tuple[str, ...]] = {}  # command line with which each was started

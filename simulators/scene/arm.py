@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 
 from simulators.geometry import Array, Json
+from simulators.scene.factory_calibrations import draw_departures
 from simulators.ur_controller.kinematics import MODELS, Model, forward
 from simulators.ur_controller.kinematics import inverse as solve_joints
 
@@ -52,11 +53,18 @@ class SimulatedArm(Protocol):
         ...
 
 
+#: What a controller does not know of its arm: how it was built (its factory calibration is lost, and it computes with
+#: the published dimensions), what remains beside a calibration (above all the gears' errors), or both.
+ArmErrorKind = Literal["factory", "gears", "both"]
+ARM_ERRORS: tuple[ArmErrorKind, ...] = get_args(ArmErrorKind)
+ARM_ERRORS_USUAL: ArmErrorKind = "gears"
+
+
 @dataclass(frozen=True, slots=True)
 class ArmErrors:
     """Errors of a real arm of six axes that its controller does not know."""
 
-    dh_deltas: Array  # (6, 4) added to a, d (metres), alpha, theta (radians): as-built minus nominal
+    dh_deltas: Array  # (6, 5) added to a, d (metres), alpha, theta, beta (radians): as-built minus nominal
     wave_rad: Array  # (6,) amplitude of each gear's transmission error, which is periodic in the joint angle
     wave_number: Array  # (6,) periods per revolution
     wave_phase_rad: Array  # (6,)
@@ -73,8 +81,10 @@ class ArmErrors:
         poses of such an arm are good to about half a millimetre after any hand-eye calibration.
         """
         sigma = np.array([0.10e-3, 0.10e-3, np.radians(0.006), np.radians(0.022)])
+        deltas = np.zeros((6, 5))
+        deltas[:, :4] = rng.standard_normal((6, 4)) * sigma
         drawn = cls(
-            dh_deltas=rng.standard_normal((6, 4)) * sigma,
+            dh_deltas=deltas,
             wave_rad=np.radians(0.02) * rng.uniform(0.6, 1.0, 6),
             wave_number=rng.integers(3, 9, 6).astype(np.float64),
             wave_phase_rad=rng.uniform(0.0, 2 * np.pi, 6),
@@ -82,6 +92,15 @@ class ArmErrors:
         # Normalised, because a random draw could be a perfect or a broken arm.
         geometry, gears = drawn.scaled(1.0, 0.0), drawn.scaled(0.0, 1.0)
         return drawn.scaled(0.5e-3 / _rms_error_m(geometry), 0.5e-3 / _rms_error_m(gears))
+
+    def of_kind(self, kind: ArmErrorKind, rng: np.random.Generator) -> ArmErrors:
+        """Return these errors, or those of an arm whose factory calibration its controller lacks, or both."""
+        if kind == "gears":
+            return self
+        departures = draw_departures(rng)
+        if kind == "factory":
+            return dataclasses.replace(self.scaled(0.0, 0.0), dh_deltas=departures)
+        return dataclasses.replace(self, dh_deltas=self.dh_deltas + departures)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,12 +138,14 @@ def perturbed_forward(q: Array, errors: ArmErrors) -> Array:
     """Return the true T_base_flange (4, 4) at joints q (6,) in radians, as the controller reads them."""
     T_base_link = np.eye(4)
     true_q = q + errors.wave_rad * np.sin(errors.wave_number * q + errors.wave_phase_rad)
-    nominal = np.stack([ARM_MODEL.a_m, ARM_MODEL.d_m, _ALPHA_RAD, true_q], axis=1)
-    for a, d, alpha, theta in nominal + errors.dh_deltas:
-        ct, st, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
-        T_base_link = T_base_link @ np.array(
-            [[ct, -st * ca, st * sa, a * ct], [st, ct * ca, -ct * sa, a * st], [0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]]
-        )
+    nominal = np.stack([ARM_MODEL.a_m, ARM_MODEL.d_m, _ALPHA_RAD, true_q, np.zeros(6)], axis=1)
+    for a, d, alpha, theta, beta in nominal + errors.dh_deltas:
+        ct, st, ca, sa, cb, sb = (f(v) for v in (theta, alpha, beta) for f in (np.cos, np.sin))
+        turn = np.array([[cb, sb * sa, sb * ca], [0.0, ca, -sa], [-sb, cb * sa, cb * ca]])
+        link = np.eye(4)
+        link[:3, :3] = np.array([[ct, -st, 0.0], [st, ct, 0.0], [0.0, 0.0, 1.0]]) @ turn
+        link[:3, 3] = a * ct, a * st, d
+        T_base_link = T_base_link @ link
     return T_base_link
 
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from simulators.geometry import Array, Ints, from_euler
-from simulators.scene.arm import ARM_MODEL, ArmErrors, SimulatedArm, UniversalRobot
+from simulators.scene.arm import ARM_ERRORS_USUAL, ARM_MODEL, ArmErrorKind, ArmErrors, SimulatedArm, UniversalRobot
 from simulators.scene.intrinsics import FULL_HEIGHT, FULL_WIDTH, Intrinsics
 from simulators.scene.lbr_arm import LBR_MODELS, Lbr, LbrErrors
 from simulators.scene.parts import Part, box, cylinder, joined, sphere_mesh
@@ -28,6 +28,7 @@ BOARD_BOW_M = (0.9e-4, 0.4e-4)
 SCENE_CENTRE_M = np.array([0.0, 0.0, 0.05])
 STATIONS = ("station_1", "station_2")
 NOMINAL_LUX = 45_000.0
+_AS_BUILT = 0xFAC7  # of the random numbers for how an arm was built, apart from those of the rest of the scene
 ARMS = (ARM_MODEL.name, *sorted(LBR_MODELS))  # that a rig can hold
 
 Moved = tuple[tuple[int, float, float, float], ...]  # moved registration spheres: index and centre (m, world)
@@ -83,19 +84,26 @@ class Scene:
         return RADIUS_M
 
     @classmethod
-    def generate(cls, seed: int, moved: Moved = (), arm: str = ARM_MODEL.name, arms: int = 1) -> Scene:
+    def generate(
+        cls,
+        seed: int,
+        moved: Moved = (),
+        arm: str = ARM_MODEL.name,
+        arms: int = 1,
+        arm_errors: ArmErrorKind = ARM_ERRORS_USUAL,
+    ) -> Scene:
         """Generate this seed's scene, identical on every machine and in every process, with some spheres moved.
 
         Another model of arm stands at other stations; everything else of the scene is the same. Of two arms, the
-        second one stands at station 2.
+        second one stands at station 2. `arm_errors` are those of an UR10e; an LBR has its own.
         """
-        scene = cls._as_set_up(seed)
+        scene = cls._as_set_up(seed, arm_errors)
         if arm != ARM_MODEL.name:
             rng = np.random.default_rng([seed, 0x1B2])
             errors = LbrErrors.draw(rng)
             scene = replace(scene, arm=Lbr(errors, LBR_MODELS[arm]), T_world_base=_lbr_bases(rng))
         if arms == 2:
-            scene = replace(scene, second=_second_arm(seed, arm, scene.T_flange_camera))
+            scene = replace(scene, second=_second_arm(seed, arm, scene.T_flange_camera, arm_errors))
         for index, *centre in moved:
             scene = scene.with_sphere_at(int(index), np.array(centre))
         return scene
@@ -110,7 +118,7 @@ class Scene:
         return replace(self, registration_m=centres, foot_m=feet, moved=(*others, (index, x, y, z)))
 
     @classmethod
-    def _as_set_up(cls, seed: int) -> Scene:
+    def _as_set_up(cls, seed: int, arm_errors: ArmErrorKind) -> Scene:
         rng = np.random.default_rng([seed, 0x5CE11E])
         specimen = Specimen.generate(rng)
         registration, feet = _registration_spheres(rng)
@@ -125,7 +133,7 @@ class Scene:
             control_m=control,
             foot_m=feet,
             T_flange_camera=T_flange_camera,
-            arm=UniversalRobot(ArmErrors.draw(rng)),
+            arm=UniversalRobot(ArmErrors.draw(rng).of_kind(arm_errors, np.random.default_rng([seed, _AS_BUILT]))),
             T_world_base=_bases(rng),
             lens=_lens(rng),
             lamp_m=np.array([0.16, -0.24, 1.05]) + rng.uniform(-0.05, 0.05, 3),
@@ -233,11 +241,15 @@ class Scene:
         return wires
 
 
-def _second_arm(seed: int, model: str, T_flange_camera: Array) -> SecondArm:
+def _second_arm(seed: int, model: str, T_flange_camera: Array, arm_errors: ArmErrorKind) -> SecondArm:
     """Another arm of a model; its mount holds the camera up to 0.3 mm and 0.1° elsewhere."""
     rng = np.random.default_rng([seed, 0x2A12])
     is_lbr = model in LBR_MODELS
-    arm = Lbr(LbrErrors.draw(rng), LBR_MODELS[model]) if is_lbr else UniversalRobot(ArmErrors.draw(rng))
+    if is_lbr:
+        arm: SimulatedArm = Lbr(LbrErrors.draw(rng), LBR_MODELS[model])
+    else:
+        as_built = np.random.default_rng([seed, _AS_BUILT, 2])
+        arm = UniversalRobot(ArmErrors.draw(rng).of_kind(arm_errors, as_built))
     offset = rng.uniform(-1.0, 1.0, 6)
     return SecondArm(arm, T_flange_camera @ from_euler(np.radians(0.1) * offset[:3], 0.3e-3 * offset[3:]))
 

@@ -6,13 +6,22 @@ import logging
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from enum import IntEnum
 
 import numpy as np
 
 from simulators.faults import Fault, FaultPlan
 from simulators.ur_controller import fields, kinematics
 from simulators.ur_controller.kinematics import Array, Model
+from simulators.ur_controller.modes import (
+    FREE,
+    HOLDING,
+    SAFETY_BITS,
+    WITHOUT_POWER,
+    RobotMode,
+    Runtime,
+    SafetyMode,
+    StartUp,
+)
 from simulators.ur_controller.motion import Hand, Motion, MotionError
 
 _LOG = logging.getLogger(__name__)
@@ -21,40 +30,6 @@ PROTECTIVE_UNLOCK_S = 5.0
 LONGEST_CYCLE_S = 0.02
 HISTORY_CYCLES = 4096  # of joint history that programs may query
 RING_FREQUENCY_HZ, RING_DECAY_S, RING_AMPLITUDE_S2 = 12.0, 0.06, 4e-5  # the arm oscillates slightly when it stops
-
-
-class RobotMode(IntEnum):
-    """robot_mode of the RTDE guide."""
-
-    POWER_OFF = 3
-    POWER_ON = 4
-    IDLE = 5
-    RUNNING = 7
-
-
-class SafetyMode(IntEnum):
-    """safety_mode of the RTDE guide."""
-
-    NORMAL = 1
-    REDUCED = 2
-    PROTECTIVE_STOP = 3
-    ROBOT_EMERGENCY_STOP = 7
-
-
-class Runtime(IntEnum):
-    """runtime_state of the RTDE guide."""
-
-    STOPPED = 1
-    PLAYING = 2
-    PAUSED = 4
-
-
-_SAFETY_BITS = {
-    SafetyMode.NORMAL: 1 << 0,
-    SafetyMode.REDUCED: (1 << 1),
-    SafetyMode.PROTECTIVE_STOP: (1 << 2) | (1 << 10),
-    SafetyMode.ROBOT_EMERGENCY_STOP: (1 << 6) | (1 << 7) | (1 << 10),
-}
 
 
 @dataclass
@@ -89,6 +64,7 @@ class Controller:
         self.step_s = 0.002 if version[0] >= 5 else 0.008
         self.time_s = 0.0
         self.robot_mode = RobotMode.RUNNING
+        self._start_up = StartUp(speed_up)
         self.safety = SafetyMode.NORMAL
         self.runtime = Runtime.STOPPED
         self.program_name = ""
@@ -111,7 +87,7 @@ class Controller:
         self.generation = 0  # increases whenever anything but the clock changes
         self.motion: Motion | None = None
         self._stopped_at_s = -math.inf
-        self._button_released_s = -math.inf
+        self._button_released_s = math.inf
         self._pending_fault: tuple[float, Fault] | None = None
         self.stream_fault: Fault | None = None  # for the server: a motion that also breaks the stream
         self._ring: tuple[float, Array] | None = None
@@ -131,6 +107,10 @@ class Controller:
         if self._pending_fault is not None and self.time_s >= self._pending_fault[0]:
             fault, self._pending_fault = self._pending_fault[1], None
             self.emergency_stop(fault) if fault.kind == "emergency_stop" else self.protective_stop(fault.kind)
+        if self._start_up.under_way:
+            self._enter(self._start_up.advance(self.robot_mode, self.time_s))
+        if self.time_s >= self._button_released_s:
+            self._release()
         if self._hand is not None:
             self._give_way(self._hand, dt_s)
         if self.motion is not None:
@@ -143,7 +123,8 @@ class Controller:
     @property
     def busy(self) -> bool:
         """Whether anything but the clock changes from cycle to cycle, or will at a planned time."""
-        return any(v is not None for v in (self.motion, self._ring, self._pending_fault, self._hand))
+        changing = any(v is not None for v in (self.motion, self._ring, self._pending_fault, self._hand))
+        return changing or self._start_up.under_way or self._button_released_s < math.inf
 
     def _move(self, dt_s: float) -> None:
         assert self.motion is not None
@@ -169,6 +150,8 @@ class Controller:
         """Let the hand turn the joints for dt_s."""
         step = hand.advance(dt_s)
         self._hand = None if hand.done else hand
+        if hand.done and self.robot_mode is RobotMode.BACKDRIVE:
+            self._enter(RobotMode.IDLE)
         self._pushed, self.target_q = self._pushed + step, self.target_q + step
         if self.motion is None and self._ring is None:
             self.actual_q, self.actual_qd = self.target_q, np.zeros(6) if hand.done else step / max(dt_s, 1e-6)
@@ -204,7 +187,7 @@ class Controller:
     @property
     def may_move(self) -> bool:
         """Whether the brakes are released and no stop is active."""
-        return self.robot_mode is RobotMode.RUNNING and self.safety in (SafetyMode.NORMAL, SafetyMode.REDUCED)
+        return self.robot_mode is RobotMode.RUNNING and self.safety in FREE
 
     @property
     def planned_qd(self) -> Array:
@@ -238,6 +221,14 @@ class Controller:
     def push(self, by_rad: Array, seconds: float) -> None:
         """Turn the joints (6,) by hand, evenly over some time; the arm gives way."""
         self._hand = Hand(by_rad, seconds)
+
+    def backdrive(self, by_rad: Array, seconds: float) -> bool:
+        """Turn the joints (6,) against the brakes, which is possible before they are released."""
+        if self.robot_mode is not RobotMode.IDLE:
+            return False
+        self._enter(RobotMode.BACKDRIVE)
+        self.push(by_rad, seconds)
+        return True
 
     def set_speed(self, fraction: float) -> None:
         """Move the speed slider."""
@@ -302,14 +293,43 @@ class Controller:
         hold_s = float(fault.value) if fault is not None and isinstance(fault.value, (int, float)) else 2.0
         _LOG.warning("emergency stop")
         self._stop(SafetyMode.ROBOT_EMERGENCY_STOP)
-        self.robot_mode = RobotMode.POWER_OFF
         self._button_released_s = self.time_s + hold_s / self.speed_up
+
+    def _release(self) -> None:
+        """Release the emergency stop: safety is normal again, and the arm stays without power."""
+        self._button_released_s = math.inf
+        self.safety = SafetyMode.NORMAL
+        self.generation += 1
+
+    def turn_safety(self, mode: SafetyMode) -> None:
+        """Enter a safety mode: by a door, a three-position switch, a key, or what the safety system found.
+
+        A door or switch holds the program, which stays paused when it is over. All other stops end it.
+        """
+        self._button_released_s = math.inf
+        if mode in FREE:
+            self.safety = mode
+            self.generation += 1
+        elif mode in HOLDING:
+            held = Runtime.PAUSED if self.runtime is Runtime.PLAYING else self.runtime
+            self._stop(mode)
+            self.runtime = held
+        else:
+            self._stop(mode)
 
     def _stop(self, mode: SafetyMode) -> None:
         self.halt()
         self.safety, self.runtime = mode, Runtime.STOPPED
         self._stopped_at_s = self.time_s
+        if mode in WITHOUT_POWER:
+            self._start_up.cancel()
+            self._enter(RobotMode.POWER_OFF)
         self.generation += 1
+
+    def _enter(self, mode: RobotMode) -> None:
+        if mode is not self.robot_mode:
+            self.robot_mode = mode
+            self.generation += 1
 
     def unlock_protective_stop(self) -> bool:
         """Release a protective stop, possible 5 s after it; returns whether it was released."""
@@ -322,27 +342,22 @@ class Controller:
         return True
 
     def power_on(self) -> None:
-        """Switch the power on without releasing the brakes. Clears an emergency stop whose button was released."""
-        if self.safety is SafetyMode.ROBOT_EMERGENCY_STOP:
-            if self.time_s < self._button_released_s:
-                return
-            self.safety = SafetyMode.NORMAL
-        if self.robot_mode is RobotMode.POWER_OFF:
-            self.robot_mode = RobotMode.IDLE
-        self.generation += 1
+        """Switch the power on without releasing the brakes; in vain while a stop cuts it."""
+        if self.safety not in WITHOUT_POWER:
+            self._enter(self._start_up.begin(self.robot_mode, RobotMode.IDLE, self.time_s))
 
     def power_off(self) -> None:
         """Apply the brakes, switch the power off and end the program."""
         self.halt()
-        self.robot_mode, self.runtime = RobotMode.POWER_OFF, Runtime.STOPPED
+        self._start_up.cancel()
+        self._enter(RobotMode.POWER_OFF)
+        self.runtime = Runtime.STOPPED
         self.generation += 1
 
     def brake_release(self) -> None:
         """Release the brakes, switching the power on if needed; the mode becomes RUNNING."""
-        self.power_on()
-        if self.robot_mode is RobotMode.IDLE:
-            self.robot_mode = RobotMode.RUNNING
-        self.generation += 1
+        if self.safety not in WITHOUT_POWER:
+            self._enter(self._start_up.begin(self.robot_mode, RobotMode.RUNNING, self.time_s))
 
     # --- RTDE fields -----------------------------------------------------------------------------------------
 
@@ -368,7 +383,7 @@ class Controller:
 
     def values(self) -> dict[str, tuple[float, ...]]:
         """The current values of all fields that are not constantly zero, without the registers."""
-        powered = self.robot_mode in (RobotMode.IDLE, RobotMode.RUNNING)
+        powered = self.robot_mode in (RobotMode.IDLE, RobotMode.BACKDRIVE, RobotMode.RUNNING)
         joint_mode = 253 if self.robot_mode is RobotMode.RUNNING else 255 if powered else 239
         return {
             "target_q": tuple(self.target_q),
@@ -396,7 +411,7 @@ class Controller:
             "standard_analog_output1": (self.analog_outputs[1],),
             "runtime_state": (int(self.runtime),),
             "robot_status_bits": (int(powered) | int(self.runtime is Runtime.PLAYING) << 1,),
-            "safety_status_bits": (_SAFETY_BITS[self.safety],),
+            "safety_status_bits": (SAFETY_BITS[self.safety],),
             "payload": (self.payload_kg,),
             "payload_cog": tuple(self.payload_cog_m),
             "payload_inertia": tuple(self.payload_inertia),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from simulators.ur_controller.controller import Controller, Runtime, SafetyMode
+from simulators.ur_controller.controller import Controller
+from simulators.ur_controller.modes import Runtime, SafetyMode
 from simulators.ur_controller.program import Interpreter
 
 WELCOME = "Connected: Universal Robots Dashboard Server"
@@ -12,21 +13,27 @@ _BUILD = {3: "106331 (Jul 07 2021)", 5: "1101319 (Mar 22 2022)"}
 _FIXED = {
     "close popup": "closing popup",
     "close safety popup": "closing safety popup",
-    "restart safety": "Restarting safety",
     "get operational mode": "NONE",
     "quit": "Disconnected",
     "shutdown": "Shutting down",
 }
 
-_REMOTE_ONLY = ("power on", "brake release", "play", "unlock protective stop")
+_NOT_ALLOWED = "Command is not allowed due to safety reasons"
+REFUSED = f"{_NOT_ALLOWED}, please switch robot to Remote Control mode and reconnect to port 29999"
+_LOCAL_TOO = ("addtolog", "popup", "setuserrole")  # beside all queries
 
 
 class Dashboard:
-    """Answers one client's lines. Every requested program file (.urp) exists and runs until it is stopped."""
+    """Answers one client's lines. Every requested program file (.urp) exists and runs until it is stopped.
+
+    In local control whatever commands the arm is refused, and to a client that met local control it stays refused
+    until it connects again (Universal_Robots_ROS_Driver#262).
+    """
 
     def __init__(self, controller: Controller, interpreter: Interpreter) -> None:
         self._controller = controller
         self._interpreter = interpreter
+        self._met_local = controller.local
 
     def answer(self, line: str) -> str:
         """Return the reply to one line, without its line end."""
@@ -37,8 +44,9 @@ class Dashboard:
         queries = self._queries()
         if word in queries:
             return queries[word]()
-        if self._controller.local and word in _REMOTE_ONLY:
-            return f"{command} is not allowed due to safety reasons: the robot is in local control"
+        self._met_local |= self._controller.local
+        if self._met_local and word.partition(" ")[0] not in _LOCAL_TOO:
+            return REFUSED
         return self._act(command, word)
 
     def _queries(self) -> dict[str, Callable[[], str]]:
@@ -66,6 +74,7 @@ class Dashboard:
             "power off": (c.power_off, "Powering off"),
             "brake release": (c.brake_release, "Brake releasing"),
             "stop": (interpreter.stop, "Stopped"),
+            "restart safety": (lambda: None, "Restarting safety"),
         }
         if word in actions:
             actions[word][0]()

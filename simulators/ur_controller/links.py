@@ -14,6 +14,7 @@ from simulators.ur_controller import rtde_codec as codec
 from simulators.ur_controller.dashboard import WELCOME, Dashboard
 from simulators.ur_controller.pendant import Pendant
 from simulators.ur_controller.program import ScriptReader
+from simulators.ur_controller.spoilt import SpoiltFields
 
 if TYPE_CHECKING:
     from simulators.ur_controller.server import Server
@@ -67,6 +68,7 @@ class RtdeLink(Link):
         self._streaming = False
         self._packed: tuple[int, bytes] = (-1, b"")
         self._timestamp_at: int | None = None
+        self._spoilt = SpoiltFields(server.controller.faults, server.controller.device)
 
     def receive(self, data: bytes) -> None:
         """Handle RTDE frames."""
@@ -109,7 +111,8 @@ class RtdeLink(Link):
 
     def _set_up_outputs(self, payload: bytes) -> None:
         frequency_hz, names = codec.parse_setup_outputs(payload)
-        types = [self._server.output_types.get(name, "NOT_FOUND") for name in names]
+        known = self._server.output_types
+        types = ["NOT_FOUND" if self._spoilt.absent(name) else known.get(name, "NOT_FOUND") for name in names]
         found = "NOT_FOUND" not in types and bool(names)
         self._output = codec.Recipe(1, names, types) if found else None
         self._timestamp_at = None
@@ -154,13 +157,12 @@ class RtdeLink(Link):
             return
         self._next_s = max(self._next_s + self._every_s, now_s - self._every_s)
         controller = self._server.controller
+        if self._spoilt:
+            self._send_spoilt(self._output)
+            return
         generation, data = self._packed
         if generation != controller.generation or self._timestamp_at is None:
-            values = self._server.values()
-            flat: list[float] = []
-            for name, kind in zip(self._output.names, self._output.types, strict=True):
-                value = values.get(name) or self._server.register(name) or (0,) * codec.LENGTHS[kind]
-                flat.extend(value)
+            flat = [number for value in self._values(self._output) for number in value]
             if "timestamp" in self._output.names and self._timestamp_at is None:
                 raise SimulatorError("timestamp without a place")
             data = self._output.pack(flat)
@@ -169,6 +171,18 @@ class RtdeLink(Link):
             at = self._timestamp_at
             data = data[:at] + struct.pack(">d", controller.time_s) + data[at + 8 :]
         self.send(data)
+
+    def _values(self, recipe: codec.Recipe) -> list[tuple[float, ...]]:
+        values = self._server.values()
+        return [
+            values.get(name) or self._server.register(name) or (0,) * codec.LENGTHS[kind]
+            for name, kind in zip(recipe.names, recipe.types, strict=True)
+        ]
+
+    def _send_spoilt(self, recipe: codec.Recipe) -> None:
+        self._spoilt.next_package()
+        fields = zip(recipe.names, recipe.types, self._values(recipe), strict=True)
+        self.send(recipe.pack([number for field in fields for number in self._spoilt.value(*field)]))
 
 
 class LineLink(Link):
@@ -189,6 +203,8 @@ class LineLink(Link):
         for raw in lines:
             line = raw.decode("utf-8", "replace").strip()
             if not line or self._server.faulty(self, "dashboard"):
+                continue
+            if self._server.faulty(self, f"dashboard {' '.join(line.lower().split())}"):
                 continue
             self.send(f"{self._dashboard.answer(line)}\n".encode())
             if line.lower() in ("quit", "shutdown"):

@@ -6,7 +6,8 @@ import logging
 import re
 
 from simulators.ur_controller.control_script import ControlProgram, StopProgram
-from simulators.ur_controller.controller import Controller, Runtime
+from simulators.ur_controller.controller import Controller
+from simulators.ur_controller.modes import Runtime
 from simulators.ur_controller.motion import Stop
 
 _LOG = logging.getLogger(__name__)

@@ -98,6 +98,8 @@ class Server:
             link.muted_until_s = time.monotonic() + seconds
         elif fault.kind == "reject" and isinstance(link, LineLink):
             link.send(b"Failed to execute\n")
+        elif fault.kind == "say":
+            link.send(f"{fault.value}\n".encode())
         elif fault.kind == "protective_stop":
             self.controller.protective_stop("fault plan")
             return False

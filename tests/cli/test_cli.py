@@ -306,7 +306,7 @@ def test_doctor_says_what_is_missing(tmp_path: Path) -> None:
 def test_doctor_says_that_the_library_of_an_arm_is_not_installed(tmp_path: Path) -> None:
     absent = tmp_path / "absent"  # hides the installed library, as if there were none
     absent.mkdir()
-    for name in ("dashboard_client", "rtde_control"):
+    for name in ("rtde_receive", "rtde_control"):
         (absent / f"{name}.py").write_text(f"raise ModuleNotFoundError('no {name}', name='{name}')\n")
     rig = tmp_path / "rig.yaml"
     rig.write_text("name: bare\ndevices:\n  robot: {driver: ur, host: 127.0.0.9}\n")

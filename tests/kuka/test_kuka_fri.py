@@ -202,6 +202,16 @@ def test_its_samples_are_the_pose_stream(version: str) -> None:
         assert "MONITORING_READY" in report.details["FRI"], "it has commanded nothing"
 
 
+def test_idle_ends_the_session_and_its_poses() -> None:
+    """As in a log of a real arm: lbr_fri_ros2_stack#251."""
+    faults = [{"device": "robot", "on": "fri", "kind": "end", "nth": 150}]
+    host = address(94)
+    with simulated_kuka(host, "--fri-version", "2.7", "--faults", json.dumps(faults)), opened(host) as arm:
+        until(lambda: any("ended the session of FRI" in p for p in arm.report().problems), "the end is not told")
+        assert arm.report().details["FRI"].startswith("IDLE")
+        until(lambda: bool(last_second(arm)) and not listened(last_second(arm)), "no poses of the application")
+
+
 def test_lost_messages_are_told_and_an_interruption_falls_back_to_the_application() -> None:
     host = address(92)
     faults = [

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import socket
 import struct
 import sys
@@ -16,8 +18,10 @@ import pytest
 from simulators.ur_controller import rtde_codec as codec
 from simulators.ur_controller.kinematics import MODELS, forward, from_pose, inverse, to_pose
 from simulators.ur_controller.motion import MoveJ, MoveL, Stop
+from tests.support.arms.ur_driver import dashboard
 from tests.support.arms.ur_simulator import address, simulated_ur
 from tests.support.processes.forked import run
+from tests.support.processes.waiting import until
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 DATA = Path(__file__).parents[1] / "data"
@@ -225,14 +229,42 @@ def test_dashboard_lines(controller: tuple[str, str]) -> None:
         assert ask("power off") == "Powering off"
         assert ask("robotmode") == "Robotmode: POWER_OFF"
         assert ask("power on") == "Powering on"
-        assert ask("robotmode") == "Robotmode: IDLE"
+        assert ask("robotmode") == "Robotmode: POWER_ON"
+        until(lambda: ask("robotmode") == "Robotmode: IDLE", "the power does not come")
         assert ask("brake release") == "Brake releasing"
-        assert ask("robotmode") == "Robotmode: RUNNING"
+        until(lambda: ask("robotmode") == "Robotmode: RUNNING", "the brakes stay")
         assert ask("running") == "Program running: false"
         assert ask("stop") == "Stopped"
         assert ask("make coffee").startswith("could not understand")
         assert ask("quit") == "Disconnected"
         assert lines.readline() == ""
+
+
+def test_a_client_that_met_local_control_is_refused_until_it_connects_again() -> None:
+    """As Universal_Robots_ROS_Driver#125 and #262 tell it, in the words of PolyScope 5."""
+    host = address(48)
+    with simulated_ur(host, "--local") as ready:
+        with socket.create_connection((host, 29999), timeout=90) as connection, connection.makefile("rw") as lines:
+
+            def ask(line: str) -> str:
+                lines.write(line + "\n")
+                lines.flush()
+                return lines.readline().strip()
+
+            lines.readline()
+            refused = (
+                "Command is not allowed due to safety reasons, please switch robot to Remote Control mode and "
+                "reconnect to port 29999"
+            )
+            commands = ("power on", "brake release", "stop", "play", "unlock protective stop", "load a.urp")
+            assert {ask(command) for command in commands} == {refused}
+            assert ask("robotmode") == "Robotmode: RUNNING"
+            assert ask("is in remote control") == "false"
+            os.kill(int(ready["pid"]), signal.SIGUSR1)
+            until(lambda: dashboard(host, "is in remote control") == ["true"], "the key is not turned")
+            assert ask("is in remote control") == "true"
+            assert ask("stop") == refused
+        assert dashboard(host, "stop") == ["Stopped"]
 
 
 # --- ur_rtde ---------------------------------------------------------------------------------------------------

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
 import time
 
 import pytest
 
 from drivers.errors import (
+    DeviceError,
     DeviceRefusedError,
     DeviceUnavailableError,
     LeaveNeededError,
@@ -28,7 +31,7 @@ from tests.support.arms.ur_driver import (
     turned,
     wait_for,
 )
-from tests.support.arms.ur_simulator import address, simulated_ur
+from tests.support.arms.ur_simulator import address, pendant, simulated_ur
 from tests.support.vendor.ur_rtde_protocol import RtdeClient
 
 STALE_S = 4.0  # of a stream that a test lets end, and far more than a busy machine holds one up
@@ -217,3 +220,34 @@ def test_mute_server_does_not_hang_the_driver(on: str, server: str) -> None:
 def test_nobody_there() -> None:
     with pytest.raises(DeviceUnavailableError, match="RTDE server cannot be reached"), opened(address(57)):
         pass
+
+
+def test_an_arm_in_local_control_is_watched_and_its_program_left_alone() -> None:
+    """Nothing is commanded until the pendant is switched to Remote; then the arm moves without being opened again."""
+    host = address(74)
+    with simulated_ur(host, "--speed-up", SPEED_UP, "--local") as ready:
+        pendant(host, "program technician.urp")
+        wait_for(lambda: dashboard(host, "running") == ["Program running: true"])
+        with opened(host) as arm:
+            assert dashboard(host, "running") == ["Program running: true"]
+            assert arm.state().program_running
+            (problem,) = arm.report().problems
+            assert "the controller is in local control" in problem
+            with pytest.raises(DeviceRefusedError, match="local control") as refused:
+                move(arm, turned(arm, 0.1))
+            assert "from Local to Remote" in refused.value.remedy
+            with pytest.raises(DeviceRefusedError, match="does not end its program: 'Command is not allowed"):
+                arm.stop()
+            assert dashboard(host, "running") == ["Program running: true"]
+            os.kill(int(ready["pid"]), signal.SIGUSR1)
+            wait_for(lambda: dashboard(host, "is in remote control") == ["true"])
+            travel(arm, turned(arm, 0.1))
+            assert arm.report().problems == ()
+            # Back to Local while the script rests: it is not sent again, and the message says why.
+            os.kill(int(ready["pid"]), signal.SIGUSR1)
+            wait_for(lambda: dashboard(host, "is in remote control") == ["false"])
+            pendant(host, "stop")
+            wait_for(lambda: not arm.state().program_running)
+            with pytest.raises(DeviceError, match=r"local control|was ended at the controller"):
+                move(arm, turned(arm, 0.1))
+            assert any("local control" in problem for problem in arm.report().problems)

@@ -116,7 +116,8 @@ STATION = "station_1"
 def erring_arm(made: Scene) -> tuple[Array, list[dict[str, Any]], dict[str, Any]]:
     """T_base_world, the poses reported by an arm with millimetre errors for a scene's cameras, and its correction."""
     arm, T_flange_camera = arm_model("UR10e"), transform(np.eye(3), np.array([0.0, -0.055, 0.095]))
-    deltas = np.random.default_rng(3).normal(0, 5e-4, (6, 4))
+    deltas = np.zeros((6, 5))
+    deltas[:, :4] = np.random.default_rng(3).normal(0, 5e-4, (6, 4))
     correction = ArmCorrection("UR10e", deltas, np.zeros((6, 10)), np.zeros((6, 10)), np.ones(6))
     T_base_world = transform(np.eye(3), np.array([0.0, 0.7, -0.1])) @ inverse(made.T_world_scan)
     reported: list[dict[str, Any]] = []

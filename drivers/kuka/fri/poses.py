@@ -102,6 +102,11 @@ class FriPoses:
     def problems(self) -> list[str]:
         """What is wrong with FRI; each says what to do."""
         last = self._last
+        if last is not None and last.session is Session.IDLE:
+            return [
+                f"The controller ended the session of FRI with {self._where}, and the poses are those of the "
+                "application. If it ended on the smartPAD, start it again; then reconnect"
+            ]
         if last is None or time.monotonic() - last.monotonic_s > STALE_S:
             return [
                 f"FRI brings no messages to {self._where}, and the poses are those of the application. Check the "
@@ -123,7 +128,9 @@ class FriPoses:
         if last is not None and told.monotonic_s - last.monotonic_s > LONGEST_GAP_S:
             silent_s = told.monotonic_s - last.monotonic_s
             _LOG.warning("%s: FRI was silent for %.2f s; those poses are the application's", self._where, silent_s)
-        if told.joints_rad:
+        if told.session is Session.IDLE and (last is None or last.session is not Session.IDLE):
+            _LOG.warning("%s: FRI is IDLE: the controller has ended the session", self._where)
+        if told.joints_rad and told.session is not Session.IDLE:
             sample = self._speeds.sample(self._state(told), told.monotonic_s)
             with self._lock:
                 self._samples.append(sample)

@@ -1,12 +1,13 @@
-"""An arm's systematic error: small DH deltas and periodic gear errors, and the correction of poses by them."""
+"""An arm's systematic error: how it was built and its gears' periodic errors, and the correction of poses by them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from service.compute.arm.kinematics import chain, dh_jacobian, pose_gap
+from service.compute.arm.kinematics import chain, dh_jacobian, parallel_jacobian, pose_gap
 from service.core.arms.known import arm_model
 from service.core.arms.model import ArmModel
 from service.core.errors import DataError
@@ -24,7 +25,7 @@ class ArmCorrection:
 
     Attributes:
         arm: name of the arm model to whose nominal parameters these are added.
-        dh_deltas: (N, 4) added to a, d (metres), α, θ (radians) of each joint.
+        dh_deltas: (N, 5) added to a, d (metres), α, θ, β (radians) of each joint; β is that of `ArmModel.parallel`.
         gear_cos_rad: (N, H) amplitudes of cos(k q), k = 1 … H, added to each joint's angle.
         gear_sin_rad: (N, H) amplitudes of sin(k q).
         observed: (N,) share of each joint's error that the images determine, 0 … 1: 1 - posterior / prior variance,
@@ -44,7 +45,7 @@ class ArmCorrection:
         axes = len(self.observed) if self.observed.ndim == 1 else 0
         if (
             axes == 0
-            or self.dh_deltas.shape != (axes, 4)
+            or self.dh_deltas.shape != (axes, 5)
             or self.gear_cos_rad.ndim != 2
             or len(self.gear_cos_rad) != axes
             or self.gear_cos_rad.shape != self.gear_sin_rad.shape
@@ -91,18 +92,23 @@ def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction:
         raise DataError(
             f"a correction of {len(correction.dh_deltas)} joints for a {arm.name}", where=_PLACE, remedy=_REMEDY
         )
-    nominal = arm.joint_values(joints)
-    k = np.arange(1, correction.gear_cos_rad.shape[1] + 1)
-    phase = joints[:, :, None] * k
-    gears = np.sum(correction.gear_cos_rad * np.cos(phase) + correction.gear_sin_rad * np.sin(phase), axis=2)
-    real = nominal + correction.dh_deltas
-    real[:, :, 3] += gears
-    before, after = chain(nominal)[:, -1], chain(real)[:, -1]
+    before, after = chain(arm.joint_values(joints))[:, -1], chain(_real(arm, joints, correction))[:, -1]
     R_t = np.swapaxes(before[:, :3, :3], 1, 2)
     gap = np.broadcast_to(np.eye(4), before.shape).copy()
     gap[:, :3, :3] = R_t @ after[:, :3, :3]
     gap[:, :3, 3] = np.einsum("nij,nj->ni", R_t, after[:, :3, 3] - before[:, :3, 3])
     return poses @ gap
+
+
+def _real(arm: ArmModel, joints_rad: Array, correction: ArmCorrection) -> Array:
+    """(N, J, 4 or 5) a, d, α, θ and, where an axis needs it, β of the arm as it is built, at joints (N, J)."""
+    phase = joints_rad[:, :, None] * np.arange(1, correction.gear_cos_rad.shape[1] + 1)
+    gears = np.sum(correction.gear_cos_rad * np.cos(phase) + correction.gear_sin_rad * np.sin(phase), axis=2)
+    real = np.zeros((*joints_rad.shape, 5))
+    real[:, :, :4] = arm.joint_values(joints_rad)
+    real += correction.dh_deltas
+    real[:, :, 3] += gears
+    return real if correction.dh_deltas[:, 4].any() else real[:, :, :4]
 
 
 def check_arm(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
@@ -122,7 +128,7 @@ def check_arm(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
 
 def dh_count(arm: ArmModel) -> int:
     """How many parameters the geometry of an arm has in `correction_design`."""
-    return 4 * arm.axes
+    return 4 * arm.axes + len(arm.parallel)
 
 
 def gear_count(arm: ArmModel) -> int:
@@ -130,22 +136,43 @@ def gear_count(arm: ArmModel) -> int:
     return arm.axes * 2 * arm.tolerances.harmonics
 
 
-def correction_design(arm: ArmModel, joints_rad: Array) -> Array:
+def dh_joints(arm: ArmModel) -> NDArray[np.int64]:
+    """(`dh_count`,) joint of each parameter of the geometry, from 0."""
+    return np.concatenate([np.repeat(np.arange(arm.axes), 4), np.array(arm.parallel, dtype=np.int64)])
+
+
+def correction_design(arm: ArmModel, joints_rad: Array, about: ArmCorrection) -> Array:
     """(N, 6, `dh_count` + `gear_count`) derivative of the flange's pose by all parameters, in units of tolerances.
 
-    Columns: DH deltas joint by joint (a, d, α, θ), then for each joint cos(k q), then sin(k q), k = 1 … `harmonics`.
+    Columns: DH deltas joint by joint (a, d, α, θ), β of those that have it, then for each joint cos(k q), then
+    sin(k q), k = 1 … `harmonics`. It is taken for the arm with the errors `about`: twists of half a degree are so
+    large that the derivative at the nominal arm leaves some hundredths of a millimetre.
     """
-    J = dh_jacobian(chain(arm.joint_values(joints_rad)))
+    frames = chain(_real(arm, joints_rad, about))
+    J = dh_jacobian(frames)
     phase = joints_rad[:, :, None] * np.arange(1, arm.tolerances.harmonics + 1)
     waves = np.stack([np.cos(phase), np.sin(phase)], axis=2)  # (N, joints, 2, H)
     gears = J[:, :, 3::4, None, None] * waves[:, None]  # (N, 6 rows, joints, 2, H)
-    dh = J * np.tile(arm.tolerances.dh, arm.axes)
+    dh = np.concatenate([J, parallel_jacobian(frames, arm.parallel)], axis=2) * _dh_tolerances(arm)
     return np.concatenate([dh, gears.reshape(len(J), 6, -1) * arm.tolerances.gear_rad], axis=2)
 
 
+def _dh_tolerances(arm: ArmModel) -> Array:
+    """(`dh_count`,) one standard deviation of each parameter of the geometry."""
+    of = np.tile(arm.tolerances.dh, (arm.axes, 1))
+    if arm.tolerances.twists_rad:
+        of[:, 2] = arm.tolerances.twists_rad
+    return np.concatenate([of.ravel(), np.full(len(arm.parallel), arm.tolerances.parallel_rad)])
+
+
 def correction_of(arm: ArmModel, scaled: Array, observed: Array) -> ArmCorrection:
-    """The correction from scaled parameters (`dh_count` + `gear_count`,) in the order of `correction_design`."""
+    """The correction from scaled parameters in the order of `correction_design`, those of the gears or without."""
     count, of = dh_count(arm), arm.tolerances
-    gears = scaled[count:].reshape(arm.axes, 2, of.harmonics) * of.gear_rad
-    deltas = scaled[:count].reshape(arm.axes, 4) * np.array(of.dh)
+    waves = np.zeros(gear_count(arm))
+    waves[: len(scaled) - count] = scaled[count:]
+    gears = waves.reshape(arm.axes, 2, of.harmonics) * of.gear_rad
+    geometry = scaled[:count] * _dh_tolerances(arm)
+    deltas = np.zeros((arm.axes, 5))
+    deltas[:, :4] = geometry[: 4 * arm.axes].reshape(arm.axes, 4)
+    deltas[list(arm.parallel), 4] = geometry[4 * arm.axes :]
     return ArmCorrection(arm.name, deltas, gears[:, 0].copy(), gears[:, 1].copy(), observed)

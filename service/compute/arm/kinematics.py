@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,12 +56,15 @@ def active_tool(joints_rad: Array, T_base_tool: Array) -> tuple[ArmModel, Transf
 
 
 def chain(values: Array) -> Array:
-    """(N, J + 1, 4, 4) T_base_0 … T_base_J from DH values (N, J, 4) in the order a, d, α, θ."""
+    """(N, J + 1, 4, 4) T_base_0 … T_base_J from values (N, J, 4 or 5) in the order a, d, α, θ and, if given, β.
+
+    T_(i-1)_i = Rz(θ) Tz(d) Tx(a) Ry(β) Rx(α).
+    """
     axes = values.shape[1]
     frames = np.zeros((len(values), axes + 1, 4, 4))
     frames[:, 0] = np.eye(4)
     for i in range(axes):
-        a, d, alpha, theta = values[:, i].T
+        a, d, alpha, theta = values[:, i, :4].T
         ct, st, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
         zero, one = np.zeros_like(a), np.ones_like(a)
         link = np.array(
@@ -71,6 +75,11 @@ def chain(values: Array) -> Array:
                 [zero, zero, zero, one],
             ]
         ).transpose(2, 0, 1)
+        if values.shape[2] == 5:
+            cb, sb = np.cos(values[:, i, 4]), np.sin(values[:, i, 4])
+            turn = np.array([[cb, sb * sa, sb * ca], [zero, ca, -sa], [-sb, cb * sa, cb * ca]])
+            spin = np.array([[ct, -st, zero], [st, ct, zero], [zero, zero, one]])
+            link[:, :3, :3] = spin.transpose(2, 0, 1) @ turn.transpose(2, 0, 1)
         frames[:, i + 1] = frames[:, i] @ link
     return frames
 
@@ -104,6 +113,23 @@ def dh_jacobian(frames: Array) -> Array:
         for k, (shift, turn) in enumerate(columns):
             J[:, :3, 4 * i + k] = np.einsum("nij,nj->ni", to_flange, shift)
             J[:, 3:, 4 * i + k] = np.einsum("nij,nj->ni", to_flange, turn)
+    return J
+
+
+def parallel_jacobian(frames: Array, joints: Sequence[int]) -> Array:
+    """(N, 6, K) derivative of the flange's pose by β of K joints, in the form of `dh_jacobian`.
+
+    Args:
+        frames: (N, J + 1, 4, 4) as from `chain`.
+        joints: of the axes to which the next is parallel, from 0.
+    """
+    flange = frames[:, -1, :3, 3]
+    to_flange = np.swapaxes(frames[:, -1, :3, :3], 1, 2)
+    J = np.zeros((len(frames), 6, len(joints)))
+    for k, i in enumerate(joints):
+        y = np.cross(frames[:, i, :3, 2], frames[:, i + 1, :3, 0])
+        J[:, :3, k] = np.einsum("nij,nj->ni", to_flange, np.cross(y, flange - frames[:, i + 1, :3, 3]))
+        J[:, 3:, k] = np.einsum("nij,nj->ni", to_flange, y)
     return J
 
 

@@ -11,6 +11,7 @@ from service.core.geometry import Array
 
 #: Which closed form gives the joints for a pose: Universal Robots' six axes, or a spherical shoulder and wrist.
 Family = Literal["universal_robot", "seven_axes"]
+_PARALLEL = 1e-9  # sine of the angle between two axes
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +39,15 @@ class ArmTolerances:
 
     Attributes:
         dh: of a, d (metres), α, θ (radians) of each joint.
+        twists_rad: of α, joint by joint; empty: that of `dh` for all.
+        parallel_rad: of β, by which an axis departs from the parallel one before it (`ArmModel.parallel`).
         gear_rad: amplitude of each harmonic of a gear's error.
         harmonics: periods per revolution that are estimated are 1 … this number.
     """
 
     dh: tuple[float, float, float, float] = (0.2e-3, 0.2e-3, float(np.radians(0.015)), float(np.radians(0.04)))
+    twists_rad: tuple[float, ...] = ()
+    parallel_rad: float = float(np.radians(0.015))
     gear_rad: float = float(np.radians(0.01))
     harmonics: int = 10  # tens of poses cannot tell faster ones from noise
 
@@ -90,6 +95,15 @@ class ArmModel:
     def axes(self) -> int:
         """Number of joints."""
         return len(self.d_m)
+
+    @property
+    def parallel(self) -> tuple[int, ...]:
+        """Joints whose next axis is parallel to theirs, from 0.
+
+        Two axes that are nearly parallel need an angle β about y beside α (Hayati and Mirmirani, 1985): without it
+        the smallest departure would take an endless d.
+        """
+        return tuple(int(i) for i in np.flatnonzero((np.abs(np.sin(self.alpha_rad)) < _PARALLEL) & (self.a_m != 0)))
 
     def joint_values(self, joints_rad: Array) -> Array:
         """(K, N, 4) nominal a, d, α, θ for joints (K, N)."""

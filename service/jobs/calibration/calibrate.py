@@ -65,7 +65,7 @@ KIND = JobKind(
     answer=Answer,
     compute="service.worker.calibration.calibrate:calibrate",
     words="camera calibration",
-    version=3,  # weighs the board's stated size against the robot's lengths, and knows boards that are bent
+    version=4,  # knows arms whose axes are twisted as factory calibrations show
     order=12,
     demand=lambda arguments: Demand(
         memory_mb=800 + 5 * len(arguments.images), limit_s=3600 + 60 * len(arguments.images)

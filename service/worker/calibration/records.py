@@ -123,7 +123,7 @@ def corrected_mounting(record: shared.ArmCorrection) -> CorrectedMounting:
         T_flange_camera = np.array(record.T_flange_camera, dtype=np.float64)
         correction = ArmCorrection(
             record.arm,
-            np.array(record.dh_deltas, dtype=np.float64),
+            _five_columns(np.array(record.dh_deltas, dtype=np.float64)),
             np.array(record.gear_cos_rad, dtype=np.float64),
             np.array(record.gear_sin_rad, dtype=np.float64),
             np.array(record.observed, dtype=np.float64),
@@ -133,6 +133,13 @@ def corrected_mounting(record: shared.ArmCorrection) -> CorrectedMounting:
     if T_flange_camera.shape != (4, 4):
         raise DataError("T_flange_camera is not 4 × 4", where=_CORRECTION, remedy=_CALIBRATE_AGAIN)
     return CorrectedMounting(correction, T_flange_camera)
+
+
+def _five_columns(dh_deltas: Array) -> Array:
+    """Deltas with those of β, which calibrations of before version 4 did not have."""
+    if dh_deltas.ndim != 2 or dh_deltas.shape[1] != 4:
+        return dh_deltas
+    return np.concatenate([dh_deltas, np.zeros((len(dh_deltas), 1))], axis=1)
 
 
 def _arm_answer(corrected: CorrectedHandEye, images: Sequence[str]) -> records.ArmAnswer:

@@ -16,7 +16,7 @@ from service.compute.arm.correction import (
     corrected_T_base_flange,
     correction_design,
     correction_of,
-    dh_count,
+    dh_joints,
     gear_count,
 )
 from service.compute.calibration.hand_eye.closed_form import (
@@ -59,6 +59,7 @@ _MAX_EXCLUDED = 1 / 3
 _ARM_FLOOR_M = 3e-6  # no arm is more repeatable
 _MIN_ARM_VIEWS = 9
 _ROUNDS = 6
+_DERIVATIVES = 2  # how often the arm's derivative is taken anew; after two, a micrometre is left
 ANY_SIZE = 1.0  # relative standard deviation of a board's size of which nothing is known
 
 
@@ -121,17 +122,26 @@ class HandEyeMeasurements:
             corners = BoardCorners(scale * corners.points_m, corners.corners_px, corners.camera)
         return dataclasses.replace(self, boards=scaled(self.boards, scale), corners=corners)
 
-    def views(self, terms: ArmTerms) -> BoardViews:
-        """The views for a weighted fit with these parameters of the arm."""
-        if terms == "none":
-            kind, design = np.zeros(0, dtype=np.int64), np.zeros((len(self.hands), 6, 0))
-        else:
-            assert self.arm is not None
-            assert self.joints_rad is not None
-            check_arm(self.arm, self.joints_rad, self.hands)
-            kind = _kinds(self.arm, terms)
-            design = correction_design(self.arm, self.joints_rad)[:, :, : len(kind)]
-        return BoardViews(self.hands, self.boards, self.covariance, design, kind, self.size_sigma)
+    def views(self) -> BoardViews:
+        """The views for a weighted fit without parameters of the arm."""
+        kind, design = np.zeros(0, dtype=np.int64), np.zeros((len(self.hands), 6, 0))
+        return BoardViews(self.hands, self.boards, self.covariance, design, kind, np.zeros(0), self.size_sigma)
+
+    def arm_views(self, terms: ArmTerms, about: Array | None = None) -> BoardViews:
+        """The views for a weighted fit with these parameters (K,) of the arm, near `about`; None: near zero.
+
+        Raises:
+            DataError: the joints are another arm's.
+        """
+        assert self.arm is not None
+        assert self.joints_rad is not None
+        check_arm(self.arm, self.joints_rad, self.hands)
+        kind = _kinds(self.arm, terms)
+        about = np.zeros(len(kind)) if about is None else about
+        near = correction_of(self.arm, about, np.zeros(self.arm.axes))
+        hands = corrected_T_base_flange(self.joints_rad, self.hands, near)
+        design = correction_design(self.arm, self.joints_rad, near)[:, :, : len(kind)]
+        return BoardViews(hands, self.boards, self.covariance, design, kind, about, self.size_sigma)
 
     def placed(self, answer: HandEyeSolution) -> Array:
         """(N, 4, 4) T_base_board from each view alone."""
@@ -149,7 +159,7 @@ def find_outliers(data: HandEyeMeasurements, rng: np.random.Generator) -> dict[i
         ComputeError: more than a third of the views disagree.
     """
     # A board of another size must not make outliers of the views that would show it.
-    views = dataclasses.replace(data, size_sigma=ANY_SIZE).views("none")
+    views = dataclasses.replace(data, size_sigma=ANY_SIZE).views()
     fit = _near(robust_start(data.hands, data.boards, rng))
     noise = _noise_at(data, fit)
     keep = np.zeros(len(data.hands), dtype=bool)
@@ -254,7 +264,7 @@ def without_size(data: HandEyeMeasurements, answer: HandEyeSolution | None = Non
 
 
 def _fit_weighted(data: HandEyeMeasurements, start: HandEyeSolution | None) -> HandEyeSolution:
-    views = data.views("none")
+    views = data.views()
     near = _near(solve_with_scale(data.hands, data.boards) if start is None else start)
     noise = _noise_at(data, near) if start is None or start.noise is None else start.noise
     noise = estimate_noise(views, near, Noise(noise.robot_m, noise.robot_rad))
@@ -269,10 +279,25 @@ def arm_noise(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTerms
         DataError: the joints are another arm's.
     """
     assert plain.noise is not None
-    views = data.views(terms)
+    views, near = data.arm_views(terms), _near(plain)
     scales = (1.0,) * (int(views.kind.max()) + 1)
     first = Noise(plain.noise.robot_m / 5, plain.noise.robot_rad / 5, scales)
-    return estimate_noise(views, _near(plain), first, floor_m=_ARM_FLOOR_M)
+    noise = estimate_noise(views, near, first, floor_m=_ARM_FLOOR_M)
+    # What the derivative at the nominal arm leaves of large twists would count as noise.
+    views, near = _settled(data, terms, views.kind, noise, near)
+    return estimate_noise(views, near, noise, floor_m=_ARM_FLOOR_M)
+
+
+def _settled(
+    data: HandEyeMeasurements, terms: ArmTerms, kind: NDArray[np.int64], noise: Noise, near: Fit
+) -> tuple[BoardViews, Fit]:
+    """The fit with the arm's parameters, and the views with the derivative taken there."""
+    views = dataclasses.replace(data.arm_views(terms), kind=kind)
+    fit = solve(views, noise, near)
+    for _ in range(_DERIVATIVES):
+        views = dataclasses.replace(data.arm_views(terms, fit.arm), kind=kind)
+        fit = solve(views, noise, fit)
+    return views, fit
 
 
 def _near(answer: HandEyeSolution | RobustStart) -> Fit:
@@ -293,29 +318,29 @@ def fit_with_arm(data: HandEyeMeasurements, plain: HandEyeSolution, terms: ArmTe
         DataError: the joints are another arm's.
     """
     assert data.arm is not None
-    views, noise = data.views(terms), start
+    kind, noise = _kinds(data.arm, terms), start
+    views, fit = _settled(data, terms, kind, noise, _near(plain))
     if terms == "geometry+gears":
         groups = _groups(data.arm)
-        noise = select_scales(views, start, _near(plain), groups)
-        views = dataclasses.replace(views, kind=groups)
-    fit = solve(views, noise, _near(plain))
-    scaled = np.zeros(dh_count(data.arm) + gear_count(data.arm))
-    scaled[: len(fit.arm)] = fit.arm
-    correction = correction_of(data.arm, scaled, _observed(data.arm, fit, noise, views.kind))
+        noise = select_scales(views, start, fit, groups)
+        views, fit = _settled(data, terms, groups, noise, fit)
+    correction = correction_of(data.arm, fit.arm, _observed(data.arm, fit, noise, views.kind))
     return dataclasses.replace(_answer_of(fit), views=views, noise=noise, fit=fit, correction=correction)
 
 
 def _kinds(arm: ArmModel, terms: ArmTerms) -> NDArray[np.int64]:
-    """(P,) 0 for a parameter of the geometry, 1 for one of the gears."""
-    kinds = np.repeat(np.array([0, 1], dtype=np.int64), [dh_count(arm), gear_count(arm)])
-    return kinds[: dh_count(arm)] if terms == "geometry" else kinds
+    """(P,) 0 for a length or zero of the geometry, 1 for a twist, 2 for one of the gears."""
+    geometry = np.concatenate([np.tile([0, 0, 1, 0], arm.axes), np.ones(len(arm.parallel))]).astype(np.int64)
+    if terms == "geometry":
+        return geometry
+    return np.concatenate([geometry, np.full(gear_count(arm), 2, dtype=np.int64)])
 
 
 def _groups(arm: ArmModel) -> NDArray[np.int64]:
-    """(P,) group of each parameter: 0 for the geometry, then one for each harmonic of each joint."""
+    """(P,) group of each parameter: 0 and 1 for the geometry, then one for each harmonic of each joint."""
     joints, waves = np.arange(arm.axes)[:, None, None], np.arange(arm.tolerances.harmonics)
-    gears = np.broadcast_to(1 + joints * len(waves) + waves, (arm.axes, 2, len(waves)))
-    return np.concatenate([np.zeros(dh_count(arm), dtype=np.int64), gears.ravel()])
+    gears = np.broadcast_to(2 + joints * len(waves) + waves, (arm.axes, 2, len(waves)))
+    return np.concatenate([_kinds(arm, "geometry"), gears.ravel()])
 
 
 def _observed(arm: ArmModel, fit: Fit, noise: Noise, kind: NDArray[np.int64]) -> Array:
@@ -323,7 +348,7 @@ def _observed(arm: ArmModel, fit: Fit, noise: Noise, kind: NDArray[np.int64]) ->
     prior = np.array(noise.scales)[kind] ** 2
     left = np.diag(fit.covariance)[-len(kind) :]
     joints = np.arange(arm.axes)
-    of = np.concatenate([np.repeat(joints, 4), np.repeat(joints, 2 * arm.tolerances.harmonics)])[: len(kind)]
+    of = np.concatenate([dh_joints(arm), np.repeat(joints, 2 * arm.tolerances.harmonics)])[: len(kind)]
     return np.array([1 - left[of == j].sum() / prior[of == j].sum() for j in joints])
 
 

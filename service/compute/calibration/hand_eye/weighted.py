@@ -8,7 +8,8 @@ the images' errors:
     a_i ~ N(0, diag(σ_t² 1, σ_r² 1)),  c_i ~ N(0, C_i)
 
 C_i is the covariance of the board's pose in the image; G_i φ is the arm's systematic error (arm.correction) with the
-prior φ ~ N(0, s²) in units of usual tolerances. The variances σ_t², σ_r² and s² maximise the restricted likelihood
+prior φ ~ N(0, s²) in units of usual tolerances. Where φ is large, the reported poses are first corrected by a nearby
+φ0, and e is the increment from there plus G_i φ0. The variances σ_t², σ_r² and s² maximise the restricted likelihood
 (REML; Patterson and Thompson 1971, by Henderson's mixed model equations).
 
 κ is the board's true size over the stated one, as the robot's lengths show it, with the prior κ ~ N(1, u²) from the
@@ -48,11 +49,12 @@ class BoardViews:
     """Measurements of N board views.
 
     Attributes:
-        T_base_flange: (N, 4, 4) as reported.
+        T_base_flange: (N, 4, 4) as reported, corrected by the arm's parameters `about`.
         T_camera_board: (N, 4, 4) from the images.
         covariance: (N, 6, 6) of T_camera_board: (d, w) in the camera's axes.
         design: (N, 6, K) derivative of the flange's increment by the arm's parameters; K may be 0.
         kind: (K,) index into `Noise.scales` of each parameter's prior scale.
+        about: (K,) the arm's parameters at which `design` is the derivative.
         size_sigma: relative standard deviation of the board's stated size.
     """
 
@@ -61,6 +63,7 @@ class BoardViews:
     covariance: Array
     design: Array
     kind: NDArray[np.int64]
+    about: Array
     size_sigma: float
 
     @property
@@ -76,6 +79,7 @@ class BoardViews:
             self.covariance[which],
             self.design[which],
             self.kind,
+            self.about,
             self.size_sigma,
         )
 
@@ -142,6 +146,7 @@ def _rows(views: BoardViews, fit: Fit) -> tuple[Array, Array]:
     boards = scaled(views.T_camera_board, fit.scale)
     e, J, JM = linearise(views.T_base_flange, boards, fit.T_flange_camera, fit.T_base_board)
     by_scale = np.einsum("nij,nj->ni", JM[:, :, :3], views.T_camera_board[:, :3, 3])
+    e += views.design @ views.about
     rows = np.concatenate([J, by_scale[:, :, None], -views.design, e[:, :, None]], axis=2)
     return rows, JM @ views.covariance @ np.swapaxes(JM, 1, 2)
 

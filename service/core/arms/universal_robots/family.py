@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.core.arms.model import ArmModel, Link
+from service.core.arms.model import ArmModel, ArmTolerances, Link
 
 _ALLOWED = frozenset(
     {
@@ -21,6 +21,13 @@ _ALLOWED = frozenset(
 # state no acceleration, and for some joints a little more speed: 180°/s, or 360°/s.
 _SPEED_RAD_S, _ACCELERATION_RAD_S2 = 3.14, 40.0
 _BRAKING_RAD_S2 = 4.0  # of a program that was ended; assumed: measure it on the arm (docs/howto/your_hardware.md)
+# Spread of thirteen published factory calibrations, for a controller that lacks its own; the zeros of the joints are
+# right in all of them. Between forearm and wrist 1 the axes are turned by up to 0.76°.
+_TOLERANCES = ArmTolerances(
+    dh=(0.2e-3, 0.3e-3, float(np.radians(0.05)), float(np.radians(0.04))),
+    twists_rad=tuple(float(v) for v in np.radians([0.05, 0.08, 0.34, 0.06, 0.05, 0.05])),
+    parallel_rad=float(np.radians(0.08)),
+)
 _BASE_DEPTH_M = 0.10  # pedestal top below the base frame
 
 
@@ -61,6 +68,7 @@ def universal_robot(
         allowed=_ALLOWED,
         usual_rad=np.array([np.pi, -1.6, 1.9, -1.9, -1.57, 0.0]),  # at 0 the arm lies along -x
         payload_kg=payload_kg,
+        tolerances=_TOLERANCES,
     )
 
 

@@ -21,7 +21,7 @@ from bench.torture.fuzz.mutations import BYTES, JSON, TEXT
 from bench.torture.fuzz.targets.target import MisbehavedError, Target
 from bench.torture.fuzz.targets.wires.peers import Listener, threads_watched
 from drivers.lightbox import LightboxConfig, SerialLightbox
-from drivers.ur.link import read_facts
+from drivers.ur.dashboard import Dashboard
 from service.cli.run.terminal.hands import SimulatedHands
 from service.core.run.noted import HandWork
 from service.store.events import canonical
@@ -260,42 +260,13 @@ class _Answering(Listener):
             link.sendall(next(self._parts) + b"\n")
 
 
-class _Dashboard:
-    """Replaces the vendor's client, which is not under test, and forwards what the controller answers."""
-
-    def __init__(self, said: str) -> None:
-        self._said = said
-
-    def connect(self, timeout_ms: int) -> None:
-        """Do nothing."""
-
-    def polyscopeVersion(self) -> str:
-        """Return the controller's answer."""
-        return self._said
-
-    def isInRemoteControl(self) -> bool:
-        """Always true."""
-        return True
-
-    def stop(self) -> None:
-        """Do nothing."""
-
-    def isConnected(self) -> bool:
-        """Always true."""
-        return True
-
-    def disconnect(self) -> None:
-        """Do nothing."""
-
-
 def _dashboard_answers(_: Path) -> list[bytes]:
-    return [b"URSoftware 5.12.0.1101319 (Mar 22 2022)\nConnected: Universal Robots Dashboard Server\n20235000\nUR10"]
+    return [b"Connected: Universal Robots Dashboard Server\nURSoftware 5.12.0.1101319 (Mar 22 2022)\n20235000\nUR10"]
 
 
 def _facts(data: bytes, _: Path) -> None:
-    said, *answers = data.split(b"\n")
-    with _Answering(_HOST, 29999, answers):
-        facts = read_facts(_Dashboard(said.decode(errors="replace")), _HOST, 0.5)
+    with _Answering(_HOST, 29999, data.split(b"\n")):
+        facts = Dashboard(_HOST, 0.5).facts()
     if not facts.serial.isascii() or len(facts.serial) > 40:
         raise MisbehavedError(f"{facts.serial!r} is accepted as a serial number")
 
@@ -342,7 +313,7 @@ TARGETS: tuple[Target, ...] = (
     Target("lightbox_requests", "simulators.lightbox:Lightbox.serve_once", _box, _box_requests, TEXT, **_SIMULATOR),
     Target("world_requests", "simulators.rig.world_server:WorldServer", _world, _world_requests, JSON, **_SIMULATOR),
     Target("fault_plan", "simulators.faults:FaultPlan.parse", _fault_plan, _fault_plans, JSON, **_SIMULATOR),
-    Target("ur_facts", "drivers.ur.link:read_facts", _facts, _dashboard_answers, TEXT, pace=0.5),
+    Target("ur_facts", "drivers.ur.dashboard:Dashboard", _facts, _dashboard_answers, TEXT, pace=0.5),
     Target("lightbox_answers", "drivers.lightbox:SerialLightbox", _box_driver, _box_answers, _BOTH, pace=0.2),
     Target("hands_answers", "service.cli.run.terminal.hands:SimulatedHands", _hands, _hands_answers, JSON, pace=0.5),
 )
