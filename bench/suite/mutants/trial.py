@@ -171,6 +171,7 @@ def _try(tree: Path, selected: Sequence[Selected], told: Path) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s + 5))
     os.chdir(tree)
     os.environ |= {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"}
+    os.environ.setdefault("ORTHOCAPTURE_RENDER_CACHE", str(REPOSITORY / "build" / "rendered"))  # one for all trees
     for name in ("PYTHONDONTWRITEBYTECODE", "PYTEST_ADDOPTS"):
         os.environ.pop(name, None)
     sys.dont_write_bytecode = False
