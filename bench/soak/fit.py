@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import linregress
-from scipy.stats import t as student
 
 BLOCKS = 12
 
@@ -57,8 +55,10 @@ def growth(x: Sequence[float], y: Sequence[float]) -> Growth | None:
         return None
     if len(set(mean)) == 1:
         return Growth(0.0, 0.0)
+    from scipy.stats import linregress, t  # noqa: PLC0415 - half a second in every worker of the tests
+
     line = linregress(at, mean)
-    return Growth(float(line.slope), float(line.stderr * student.ppf(0.975, len(at) - 2)))
+    return Growth(float(line.slope), float(line.stderr * t.ppf(0.975, len(at) - 2)))
 
 
 def exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float:

@@ -11,15 +11,14 @@ import gdcm
 import numpy as np
 import pydicom
 import pytest
-from highdicom.legacy import LegacyConvertedEnhancedCTImage
 from pydicom.dataset import Dataset
-from pydicom.uid import ExplicitVRLittleEndian, RLELossless, generate_uid
+from pydicom.uid import RLELossless, generate_uid
 
 from drivers.dicom_folder import DicomFolderConfig
 from drivers.dicom_folder.folder import DicomFolder
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import Array, CtSeries
-from tests.support.ct.ct_series import SHAPE, hospital, pixels, write_series
+from tests.support.ct.ct_series import SHAPE, enhanced_of, hospital, pixels, write_series
 from tests.support.rig.rig import REPOSITORY
 
 SYNTAXES = {
@@ -42,16 +41,8 @@ def only(folder: Path) -> CtSeries:
 def enhance(slices: Path, target: Path) -> Array:
     """Write a series of single slices to `slices`, and the same as one enhanced file; returns T_ct_voxel."""
     T = write_series(slices, change=hospital)
-    legacy = [pydicom.dcmread(path) for path in sorted(slices.iterdir())]
     target.mkdir()
-    LegacyConvertedEnhancedCTImage(
-        legacy_datasets=legacy,
-        series_instance_uid=generate_uid(),
-        series_number=2,
-        sop_instance_uid=generate_uid(),
-        instance_number=1,
-        transfer_syntax_uid=ExplicitVRLittleEndian,
-    ).save_as(target / "enhanced.dcm")
+    enhanced_of(slices, generate_uid()).save_as(target / "enhanced.dcm")
     return T
 
 

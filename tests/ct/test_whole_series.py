@@ -9,9 +9,8 @@ import numpy as np
 import pydicom
 import pydicom.data
 import pytest
-from highdicom.legacy import LegacyConvertedEnhancedCTImage
 from pydicom.dataset import Dataset
-from pydicom.uid import ExplicitVRLittleEndian, generate_uid
+from pydicom.uid import generate_uid
 
 from drivers.dicom_folder import DicomFolderConfig
 from drivers.dicom_folder.folder import DicomFolder
@@ -20,7 +19,7 @@ from drivers.interfaces import CtSeries
 from simulators.ct_suite.suite import write_series as simulated_series
 from simulators.ct_suite.volume import Grid
 from simulators.faults import FaultPlan
-from tests.support.ct.ct_series import SHAPE, Change, hospital, write_series
+from tests.support.ct.ct_series import SHAPE, Change, enhanced_of, hospital, write_series
 
 # Five slices of a scanner of GE, numbered 6 to 10.
 SHIPPED = Path(pydicom.data.__file__).parent / "test_files" / "dicomdirtests" / "98892001" / "CT5N"
@@ -45,15 +44,7 @@ def stated(**values: object) -> Change:
 
 def enhanced(slices: Path, target: Path, uid: str, part: tuple[int, int] | None = None) -> None:
     """Let highdicom write single slices as one multi-frame file, which may be a part of several."""
-    legacy = [pydicom.dcmread(path) for path in sorted(slices.iterdir())]
-    file = LegacyConvertedEnhancedCTImage(
-        legacy_datasets=legacy,
-        series_instance_uid=uid,
-        series_number=2,
-        sop_instance_uid=generate_uid(),
-        instance_number=1,
-        transfer_syntax_uid=ExplicitVRLittleEndian,
-    )
+    file = enhanced_of(slices, uid)
     if part is not None:
         file.ConcatenationUID = f"{uid[:60]}.9"
         file.InConcatenationNumber, file.InConcatenationTotalNumber = part

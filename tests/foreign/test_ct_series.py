@@ -10,11 +10,9 @@ from pathlib import Path
 
 import gdcm
 import numpy as np
-import pydicom
 import pytest
-from highdicom.legacy import LegacyConvertedEnhancedCTImage
 from pydicom.dataset import Dataset
-from pydicom.uid import ExplicitVRLittleEndian, generate_uid
+from pydicom.uid import generate_uid
 from typer.testing import CliRunner
 
 from drivers.dicom_folder import DicomFolderConfig
@@ -22,7 +20,7 @@ from drivers.dicom_folder.folder import DicomFolder
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import Array
 from service.cli.main import app
-from tests.support.ct.ct_series import SHAPE, Change, hospital, pixels, write_series
+from tests.support.ct.ct_series import SHAPE, Change, enhanced_of, hospital, pixels, write_series
 
 
 def _source(folder: Path, *, unspecified_is_hounsfield: bool = False) -> DicomFolder:
@@ -138,14 +136,7 @@ def test_frames_of_an_enhanced_file_are_checked_as_slices_are(tmp_path: Path) ->
     """Written by highdicom; one frame's type and unit, and the padding, are changed as programs state them there."""
     write_series(tmp_path / "slices", change=hospital)
     (tmp_path / "enhanced").mkdir()
-    enhanced = LegacyConvertedEnhancedCTImage(
-        legacy_datasets=[pydicom.dcmread(path) for path in sorted((tmp_path / "slices").iterdir())],
-        series_instance_uid=generate_uid(),
-        series_number=2,
-        sop_instance_uid=generate_uid(),
-        instance_number=1,
-        transfer_syntax_uid=ExplicitVRLittleEndian,
-    )
+    enhanced = enhanced_of(tmp_path / "slices", generate_uid())
     enhanced.PixelPaddingValue = 0
     enhanced.save_as(tmp_path / "enhanced" / "a.dcm")
     source = _source(tmp_path / "enhanced")

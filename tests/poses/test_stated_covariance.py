@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.sparse import csr_matrix
-from scipy.stats import chi2
 
 from service.compute.poses.hybrid.bundle import Rows, normal_equations
 from service.compute.poses.hybrid.stated_covariance import (
@@ -29,6 +28,8 @@ ROBUST = {"tracks": (2.4, 2), "spheres": (3.0, 3), "robot_position": (3.0, 3), "
 
 def mean(of: Callable[[float], float], dimensions: int) -> float:
     """Expectation of a function of the squared length of a normal vector."""
+    from scipy.stats import chi2  # noqa: PLC0415 - half a second in every worker, as nothing else needs it
+
     return quad(lambda s: of(s) * chi2.pdf(s, dimensions), 0, np.inf)[0]
 
 

@@ -225,6 +225,35 @@ def test_a_refused_form_does_not_repeat_what_was_typed(site: WebSite, caplog: py
 # --- anything that the interface's own description allows, and what it does not --------------------------------
 
 
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory: pytest.TempPathFactory) -> list[schemathesis.Case[Any]]:
+    """Requests to every operation, the same for each role; to draw them costs as much as to send them."""
+    with web_site(tmp_path_factory.mktemp("described")) as site:
+        schema = schemathesis.openapi.from_dict(site.app.openapi())
+    operations: list[APIOperation[Any, Any, Any, Any]] = [
+        result.ok() for result in schema.get_all_operations() if isinstance(result, Ok)
+    ]
+    assert len(operations) > 40
+    drawn: list[schemathesis.Case[Any]] = []
+    for operation in operations:
+
+        @seed(7)
+        @settings(
+            max_examples=3,
+            deadline=None,
+            database=None,
+            phases=[Phase.generate],
+            suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large],
+        )
+        @given(case=operation.as_strategy())
+        def one(case: schemathesis.Case[Any]) -> None:
+            drawn.append(case)
+
+        one()
+    assert {case.path for case in drawn} == {operation.path for operation in operations}
+    return drawn
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "role",
@@ -235,34 +264,16 @@ def test_a_refused_form_does_not_repeat_what_was_typed(site: WebSite, caplog: py
     ],
 )
 def test_generated_requests_never_break_the_server(
-    tmp_path_factory: pytest.TempPathFactory, role: Role | None
+    cases: list[schemathesis.Case[Any]], tmp_path_factory: pytest.TempPathFactory, role: Role | None
 ) -> None:
     with web_site(tmp_path_factory.mktemp("generated")) as site:
         run_id = site.begin_run().run_id
-        schema = schemathesis.openapi.from_dict(site.app.openapi())
-        operations: list[APIOperation[Any, Any, Any, Any]] = [
-            result.ok() for result in schema.get_all_operations() if isinstance(result, Ok)
-        ]
-        assert len(operations) > 40
-        for operation in operations:
-
-            @seed(7)
-            @settings(
-                max_examples=3,
-                deadline=None,
-                database=None,
-                phases=[Phase.generate],
-                suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large],
-            )
-            @given(case=operation.as_strategy())
-            def one(case: schemathesis.Case[Any]) -> None:
-                if "run_id" in case.path_parameters and case.path not in ("/runs/{run_id}/stream",):
-                    case.path_parameters["run_id"] = run_id
-                answer = _send(site, run_id, role, case)
-                must_be_shielded(answer)
-                case.validate_response(answer, checks=[not_a_server_error])
-
-            one()
+        for case in cases:
+            if "run_id" in case.path_parameters and case.path not in ("/runs/{run_id}/stream",):
+                case.path_parameters["run_id"] = run_id
+            answer = _send(site, run_id, role, case)
+            must_be_shielded(answer)
+            case.validate_response(answer, checks=[not_a_server_error])
 
 
 def _send(site: WebSite, run_id: str, role: Role | None, case: schemathesis.Case[Any]) -> httpx.Response:

@@ -203,11 +203,15 @@ class _Finder(cst.CSTVisitor):
         """Note what a node can be changed to, and go on with its children, unless no result depends on it."""
         if _without_effect(node):
             return False
-        for of, operator in OPERATORS:
-            if isinstance(node, of):
-                kind = operator.__name__.removeprefix("operator_")
-                self.found.extend(_Found(kind, node, change) for change in operator(node))
+        for operator in _operators_of(type(node)):
+            kind = operator.__name__.removeprefix("operator_")
+            self.found.extend(_Found(kind, node, change) for change in operator(node))
         return True
+
+
+@functools.cache
+def _operators_of(kind: type) -> tuple[Callable[..., Iterable[cst.CSTNode]], ...]:
+    return tuple(operator for of, operator in OPERATORS if issubclass(kind, of))
 
 
 @functools.cache

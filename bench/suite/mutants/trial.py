@@ -32,6 +32,7 @@ LIBRARIES = (
     *("numpy", "scipy.optimize", "scipy.spatial.transform", "scipy.sparse.linalg", "scipy.stats", "cv2", "pydantic"),
     *("sqlalchemy", "alembic.command", "hypothesis", "cryptography.x509", "fastapi.testclient", "trimesh", "yaml"),
     *("transitions.extensions", "jinja2", "rfc8785", "typer.testing", "structlog", "argon2", "h5py", "psutil"),
+    *("pydicom", "prometheus_client", "rich.console", "schemathesis.pytest.plugin", "anyio.pytest_plugin"),
 )
 CPU_FACTOR, CPU_LEAST_S = 8.0, 40  # a mutation may need longer than its tests did, and is then taken for a hang
 WALL_S = 900.0
@@ -170,6 +171,7 @@ def _try(tree: Path, selected: Sequence[Selected], told: Path) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s + 5))
     os.chdir(tree)
     os.environ |= {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"}
+    os.environ.setdefault("ORTHOCAPTURE_RENDER_CACHE", str(REPOSITORY / "build" / "rendered"))  # one for all trees
     for name in ("PYTHONDONTWRITEBYTECODE", "PYTEST_ADDOPTS"):
         os.environ.pop(name, None)
     sys.dont_write_bytecode = False

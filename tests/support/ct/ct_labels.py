@@ -8,8 +8,6 @@ from typing import Any
 import nibabel
 import numpy as np
 import pydicom
-from highdicom import AlgorithmIdentificationSequence
-from highdicom.seg import Segmentation, SegmentationTypeValues, SegmentDescription
 from numpy.typing import NDArray
 from pydicom.sr.codedict import codes
 from pydicom.uid import generate_uid
@@ -22,8 +20,11 @@ LABELS: NDArray[np.uint8] = np.random.default_rng(8).integers(0, 3, SHAPE).astyp
 LABELS[2] = 0  # highdicom leaves empty slices out
 
 
-def write_seg(folder: Path, kind: SegmentationTypeValues = SegmentationTypeValues.BINARY, **changed: Any) -> Path:
+def write_seg(folder: Path, kind: str = "BINARY", **changed: Any) -> Path:
     """A segmentation of the series in `folder` with the segments bone (1) and spheres (2)."""
+    from highdicom import AlgorithmIdentificationSequence  # noqa: PLC0415 - every worker collects every file
+    from highdicom.seg import Segmentation, SegmentDescription  # noqa: PLC0415
+
     sources = sorted((pydicom.dcmread(path) for path in folder.iterdir()), key=lambda ds: int(ds.InstanceNumber))
     program = AlgorithmIdentificationSequence("test", codes.DCM.ArtificialIntelligence, "1")
     segments = [

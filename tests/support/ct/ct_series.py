@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pydicom
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.uid import UID, CTImageStorage, ExplicitVRLittleEndian, RLELossless, generate_uid
 
@@ -78,3 +80,17 @@ def hospital(ds: Dataset, k: int) -> None:
     ds.InstitutionName, ds.StationName, ds.OperatorsName = "General Hospital", "CT-3", "SMITH^A"
     ds.Manufacturer, ds.DeviceSerialNumber, ds.SeriesNumber, ds.AcquisitionNumber = "M", "SN-99", 1, 1
     ds.SliceThickness, ds.KVP, ds.PatientPosition = SPACING_MM[2], 120, "HFS"
+
+
+def enhanced_of(slices: Path, series_uid: str) -> Any:
+    """The single slices of a folder as one multi-frame file by highdicom, to be saved with `save_as`."""
+    from highdicom.legacy import LegacyConvertedEnhancedCTImage  # noqa: PLC0415 - every worker collects every file
+
+    return LegacyConvertedEnhancedCTImage(
+        legacy_datasets=[pydicom.dcmread(path) for path in sorted(slices.iterdir())],
+        series_instance_uid=series_uid,
+        series_number=2,
+        sop_instance_uid=generate_uid(),
+        instance_number=1,
+        transfer_syntax_uid=ExplicitVRLittleEndian,
+    )
