@@ -33,6 +33,7 @@ from bench.whole_runs.job_memory import RADIUS_M, SCENE, Folder
 from service.compute.images.develop_parameters import PARAMETERS
 from service.compute.memory import keep_freed_memory
 from service.core.units import megabytes
+from service.jobs.kind import JobKind
 from service.jobs.poses import features, match
 from service.jobs.registration import develop
 from service.jobs.surfaces import merge_scans
@@ -46,7 +47,9 @@ from simulators.still_camera.raw_file import encode_raw
 
 CACHE = REPOSITORY / "build" / "bench" / "image_job_memory"
 WIDTH, HEIGHT = 9504, 6336
-KINDS = {kind.name: kind for kind in (develop.KIND, features.KIND, match.KIND, merge_scans.KIND)}
+KINDS: dict[str, JobKind[Any, Any]] = {
+    kind.name: kind for kind in (develop.KIND, features.KIND, match.KIND, merge_scans.KIND)
+}
 _CAMERA = {"width": WIDTH, "height": HEIGHT, "fx": 11000.0, "fy": 11000.0, "cx": WIDTH / 2, "cy": HEIGHT / 2}
 _SETTINGS = ExposureSettings(22.0, 1 / 15, (1, 15), 100)
 
