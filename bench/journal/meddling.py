@@ -24,21 +24,33 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from argon2 import PasswordHasher
+
 from bench.machine import RESULTS, commit, machine
-from service.core.errors import OrthocaptureError
+from service.audit.verify.verifications import Verifications, keep_verification, verification_of
+from service.core.errors import OrthocaptureError, StoreError
+from service.people.sessions import People
 from service.store.database.engine import DATABASE_NAME
+from service.store.durable_effects import DurableFiles, SystemClock, utc_text
+from service.store.journal.copies import journal_copy
 from service.store.journal.lines import NAME as JOURNAL_NAME
 from service.store.journal.rebuild import rebuild
 from service.store.signatures.log import NAME as LOG_NAME
+from service.store.signatures.second_place import SecondPlace
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
 from tests.support.record.store import capture, start_run
 
-FILES = (DATABASE_NAME, f"{DATABASE_NAME}-wal", f"{DATABASE_NAME}-shm", JOURNAL_NAME, LOG_NAME, "key", "photograph")
+# `verification` is the last result of `audit verify` that the pages show; the copies lie in the second place.
+_OTHERS = ("key", "pepper", "photograph", "verification", "copy of the signatures", "copy of the journal")
+FILES = (DATABASE_NAME, f"{DATABASE_NAME}-wal", f"{DATABASE_NAME}-shm", JOURNAL_NAME, LOG_NAME, *_OTHERS)
 MOMENTS = ("idle", "between two captures", "while the run waits", "before a signature", "in a transaction")
 _BEFORE = 6  # photographs that are recorded before the file is altered
 _LONGEST_S = 120.0
+COPY = Path("place") / "signatures.jsonl"
+_PIN = "2468"
+_QUICK = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
 
 
 def _zeros(path: Path, _old: Path) -> None:
@@ -93,10 +105,11 @@ def main(words: Sequence[str] | None = None) -> int:
     """Try every case, print and write the table. Returns 1 if anything recorded was lost."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--files", nargs="+", choices=FILES, default=list(FILES))
     options = parser.parse_args(words)
     found: list[Result] = []
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as work:
-        for number, (file, way, moment) in enumerate(_cases()):
+        for number, (file, way, moment) in enumerate(_cases(options.files)):
             found.append(_in_a_process(Path(work) / str(number), file, way, moment))
             shutil.rmtree(Path(work) / str(number), ignore_errors=True)
     about = {
@@ -113,8 +126,8 @@ def main(words: Sequence[str] | None = None) -> int:
     return int(any(not result.whole for result in found))
 
 
-def _cases() -> Iterator[tuple[str, str, str]]:
-    for file in FILES:
+def _cases(files: Sequence[str]) -> Iterator[tuple[str, str, str]]:
+    for file in files:
         for way in WAYS:
             for moment in MOMENTS:
                 if moment != "idle" or file not in (f"{DATABASE_NAME}-wal", f"{DATABASE_NAME}-shm"):
@@ -154,17 +167,26 @@ def _noticed_in_use(work: Path, file: str, way: str, moment: str) -> str:
     """What the writing process notices, and where; "-" for nothing."""
     data = work / "data"
     store = Store.open(data)
+    (work / "place").mkdir()
+    place = SecondPlace.of(data, work / COPY, SystemClock(), DurableFiles(), patience_s=_LONGEST_S)
+    people = People(store, _QUICK)
+    people.accounts.set_up(people.first_link() or "", "ada", "Ada Lovelace", "a good password", _PIN)
     run_id = start_run(store)
     capture(store, run_id, "v0")
     checkpoint(store, run_id)
+    place.update()
+    _verified(store, run_id)
     _moved_into_the_database(data)
     capture(store, run_id, "v1")
-    shutil.copytree(data, work / "old")
+    shutil.copytree(data, work / "old" / "data")
+    shutil.copytree(work / "place", work / "old" / "place")
     for number in range(2, _BEFORE):
         capture(store, run_id, f"v{number}")
         if number == _BEFORE - 2:
             _moved_into_the_database(data)
             checkpoint(store, run_id)
+            place.update()
+            _verified(store, run_id)
     if moment == "idle":
         store.close()
     meddle = _meddling(work, file, way)
@@ -174,6 +196,12 @@ def _noticed_in_use(work: Path, file: str, way: str, moment: str) -> str:
         ("the next signature", lambda: checkpoint(store, run_id)),
     ]
     order = {"between two captures": (0, 1, 2), "while the run waits": (1, 0, 2), "before a signature": (2, 1, 0)}
+    # Files that the record does not need are noticed by those who do.
+    needing: list[tuple[str, Callable[[], object]]] = [
+        ("the second place", lambda: _up_to_date(place)),
+        ("the next PIN", lambda: People(store, _QUICK).check_secret("ada", "pin", _PIN)),
+        ("the next page", lambda: _read_verification(data, run_id)),
+    ]
     if moment == "in a transaction":
         try:
             with store.database.writing() as connection:
@@ -185,17 +213,35 @@ def _noticed_in_use(work: Path, file: str, way: str, moment: str) -> str:
         meddle()
     if moment == "idle":
         try:
-            Store.open(data)
+            store = Store.open(data)
         except OrthocaptureError as error:
             return f"opening: {type(error).__name__}"
-        return "-"
-    for index in order.get(moment, (0, 1, 2)):
-        name, act = acts[index]
+        place = SecondPlace.of(data, work / COPY, SystemClock(), DurableFiles(), patience_s=_LONGEST_S)
+        acts = []
+    for name, act in [*(acts[index] for index in order.get(moment, (0, 1, 2)) if acts), *needing]:
         try:
             act()
         except OrthocaptureError as error:
             return f"{name}: {type(error).__name__}"
     return "-"
+
+
+def _verified(store: Store, run_id: str) -> None:
+    """Keep the result of a verification as `audit verify` does."""
+    report = verify(store.database_path.parent, run_id)
+    found = verification_of(report, run_id, by="Ada", at_utc=utc_text(datetime.now(UTC)), duration_s=0.0)
+    keep_verification(store.database_path.parent, run_id, found)
+
+
+def _read_verification(data: Path, run_id: str) -> None:
+    if Verifications(data, SystemClock()).last(run_id) is None:
+        raise StoreError("the run was not verified yet")
+
+
+def _up_to_date(place: SecondPlace) -> None:
+    away = place.update()
+    if away is not None:
+        raise StoreError(away.why)
 
 
 def _moved_into_the_database(data: Path) -> None:
@@ -205,14 +251,20 @@ def _moved_into_the_database(data: Path) -> None:
 
 
 def _meddling(work: Path, file: str, way: str) -> Callable[[], object]:
-    data, old = work / "data", work / "old"
-    found = {
-        "key": lambda folder: next((folder / "keys").glob("*.pem")),
-        "photograph": lambda folder: max((folder / "artefacts").glob("??/*"), key=lambda path: path.stat().st_size),
-    }.get(file, lambda folder: folder / file)
+    def largest(folder: Path) -> Path:
+        return max(folder.glob("??/*"), key=lambda path: path.stat().st_size)
+
+    found: Callable[[Path], Path] = {
+        "key": lambda folder: next((folder / "data" / "keys").glob("*.pem")),
+        "pepper": lambda folder: folder / "data" / "keys" / "pepper",
+        "photograph": lambda folder: largest(folder / "data" / "artefacts"),
+        "verification": lambda folder: next((folder / "data" / "monitor").glob("*.verification.json")),
+        "copy of the signatures": lambda folder: folder / COPY,
+        "copy of the journal": lambda folder: journal_copy(folder / COPY),
+    }.get(file, lambda folder: folder / "data" / file)
 
     def meddle() -> None:
-        path, earlier = found(data), found(old)
+        path, earlier = found(work), found(work / "old")
         path.chmod(0o600)
         WAYS[way](path, earlier)
 
@@ -221,8 +273,8 @@ def _meddling(work: Path, file: str, way: str) -> Callable[[], object]:
 
 def _afterwards(work: Path, file: str, way: str, moment: str, noticed: str) -> Result:
     data = work / "data"
-    faults = _faults(data)
-    noticed = noticed or ("audit verify" if faults else "nobody")
+    noticed = noticed or ("audit verify" if _faults(data, work / COPY) else "nobody")
+    faults = _faults(data, None)
     after = "as it was"
     if faults:
         try:
@@ -230,14 +282,16 @@ def _afterwards(work: Path, file: str, way: str, moment: str, noticed: str) -> R
             after = f"{made.made} rebuilt" if made.made else "not rebuilt"
         except OrthocaptureError as error:
             after = f"not rebuilt: {error.what}"
-        left = _faults(data)
+        left = _faults(data, None)
         after += f"; {left[0].split(':', 1)[-1].strip()[:60]}" if left else ""
     return Result(file, way, moment, noticed, _photographs(data) >= _BEFORE, after)
 
 
-def _faults(data: Path) -> list[str]:
+def _faults(data: Path, copy: Path | None) -> list[str]:
+    """What `audit verify` finds wrong; with the copy in the second place, also what it notes of that."""
     try:
-        return [str(fault) for fault in verify(data).faults]
+        report = verify(data, signatures_copy=copy)
+        return [str(fault) for fault in report.faults] + [note for note in report.notes if copy and str(copy) in note]
     except OrthocaptureError as error:
         return [str(error)]
 
@@ -263,7 +317,8 @@ def report(about: Mapping[str, Any], found: Sequence[Result]) -> str:
         "",
         f"`python -m bench.journal.meddling`; commit {about['commit']}; {cpu['processor']}, Python {cpu['python']}.",
         f"{len(found)} cases; in {lost} of them something recorded was lost. Noticed by nobody, and verified all the",
-        f"same (SQLite or the next signature makes the file again, or it was the same file): {same}.",
+        "same (SQLite or the next signature makes the file again, in the second place as well; or it was the same",
+        f"file, or an older result of a verification, which says when it was made): {same}.",
         "",
         "| file | how it was altered | when | noticed by | all events there | the folder afterwards |",
         "|---|---|---|---|---|---|",

@@ -45,5 +45,5 @@ KIND = JobKind(
     words="features of the images",
     order=40,
     aside=True,
-    demand=lambda arguments: Demand(memory_mb=1500, limit_s=3600 + 300 * len(arguments.images)),
+    demand=lambda arguments: Demand(memory_mb=1100, limit_s=3600 + 300 * len(arguments.images)),
 )

@@ -26,5 +26,5 @@ KIND = JobKind(
     words="matches between images",
     order=41,
     aside=True,
-    demand=lambda _: Demand(memory_mb=800, limit_s=14400),
+    demand=lambda _: Demand(memory_mb=600, limit_s=14400),
 )

@@ -76,5 +76,5 @@ KIND = JobKind(
     compute="service.worker.registration.develop:develop_raw",
     words="developed raw files",
     order=58,
-    demand=lambda _: Demand(memory_mb=2000, limit_s=1800),
+    demand=lambda _: Demand(memory_mb=2700, limit_s=1800),
 )

@@ -29,5 +29,5 @@ KIND = JobKind(
     compute="service.worker.surfaces.merge_scans:merge_scans",
     words="merging of the scan's parts",
     order=23,
-    demand=lambda arguments: Demand(memory_mb=1000 + 200 * len(arguments.meshes), limit_s=7200),
+    demand=lambda arguments: Demand(memory_mb=500 + 200 * len(arguments.meshes), limit_s=7200),
 )
