@@ -170,7 +170,7 @@ def _spheres(
     for mine in rows:
         J, off = np.vstack([j for j, _ in mine]), np.concatenate([o for _, o in mine])
         step, *_ = np.linalg.lstsq(J, off)
-        moved.append(np.asarray(step))
+        moved.append(np.asarray(step, dtype=np.float64))
         noise.append(float(np.trace(np.linalg.inv(J.T @ J)) * np.var(off - J @ step)) / 3)
     unit_m = float(np.mean(depths_m)) / lens.fx
     spread = float(np.mean(np.var(moved, axis=0, ddof=1)))
