@@ -195,8 +195,8 @@ def _in_light(picture: _Picture, change: Callable[[NDArray[np.float32]], Any]) -
     """A picture whose light is changed, not its codes; one colour at a time, which 60 MP have room for."""
     light_of_code = ((np.arange(256) / 255) ** 2.2).astype(np.float32)
     colours: list[_Picture] = []
-    for codes in cv2.split(picture):
-        light = np.clip(np.asarray(change(light_of_code[codes]), dtype=np.float32), 0, 1)
+    for k in range(picture.shape[2]):
+        light = np.clip(np.asarray(change(light_of_code[picture[:, :, k]]), dtype=np.float32), 0, 1)
         colours.append(np.rint(255 * light ** np.float32(1 / 2.2)).astype(np.uint8))
     return np.dstack(colours)
 

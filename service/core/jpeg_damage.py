@@ -61,7 +61,7 @@ def _decoded(files: Sequence[Path]) -> tuple[str, str]:
     allowed_s = _ALLOWED_S + _ALLOWED_S_A_FILE * len(files)
     try:
         done = subprocess.run(
-            [sys.executable, "-m", __name__],
+            [sys.executable, "-P", "-m", __name__],  # no module from where somebody happens to work
             input=names,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

@@ -77,7 +77,7 @@ def test_the_same_again_bit_for_bit_and_nothing_written(folder: Path) -> None:
 def test_a_job_of_an_earlier_version_is_named_with_both_versions(folder: Path) -> None:
     located, _, registered = again(folder).jobs
     assert registered.computed_by == (
-        "computed by version 1 of the registration; this program has version 3, whose numbers differ or are more"
+        "computed by version 1 of the registration; this program has version 4, whose numbers differ or are more"
     )
     assert located.computed_by.startswith("computed by version 1 of the spheres in the mesh")
     assert job_kinds()["live_view"].other_numbers(1) == "", "versions up to 2 differ in their arguments alone"

@@ -25,8 +25,11 @@ IMAGES, SEEDS = 12, 8
 COMMON = CommonErrors(shift_px=1e-5, growth_px=1e-5, light_px=1e-5)
 
 
-def registered(made: Scene, seed: int) -> RegistrationResult:
-    """A registration of an arm's poses at two stations, whose bases are turned by a half."""
+def registered(made: Scene, seed: int, own_light_px: float = 0.0) -> RegistrationResult:
+    """A registration of an arm's poses at two stations, whose bases are turned by a half.
+
+    Light displaces each sphere alike in all images.
+    """
     rng = np.random.default_rng([seed, 14])
     groups = [int(k >= IMAGES // 2) for k in range(IMAGES)]
     T_base_world = [np.eye(4), transform(Rotation.from_rotvec([0.1, 0.0, np.pi]), np.array([1.1, 0.2, -0.1]))]
@@ -35,7 +38,9 @@ def registered(made: Scene, seed: int) -> RegistrationResult:
     for T in poses:
         T[:3, :3] = Rotation.from_rotvec(rng.normal(size=3) * SIGMA_RAD).as_matrix() @ T[:3, :3]
         T[:3, 3] += rng.normal(size=3) * SIGMA_M
-    found = [exact_outlines(made, i, REGISTRATION_M, 0.1, seed) for i in range(IMAGES)]
+    unit_m = float(np.mean([made.centres_camera(i, REGISTRATION_M)[:, 2] for i in range(IMAGES)])) / made.camera.fx
+    seen_m = REGISTRATION_M + np.random.default_rng([seed, 15]).normal(size=(10, 3)) * own_light_px * unit_m
+    found = [exact_outlines(made, i, seen_m, 0.1, seed) for i in range(IMAGES)]
     T_base_scan = [T_base_world[g] @ made.T_world_scan for g in groups]
     assignments = [
         Assignment(dict(enumerate(f[1])), inverse(T) @ T_scan)
@@ -48,7 +53,7 @@ def registered(made: Scene, seed: int) -> RegistrationResult:
         assignments,
         PosedImages(poses, made.camera, groups=groups),
         ScanSpheres(centres, RADIUS_M, covariance_m2=covariance_m2),
-        RegistrationSettings(common_errors=COMMON),
+        RegistrationSettings(common_errors=dataclasses.replace(COMMON, own_light_px=own_light_px)),
     )
 
 
@@ -109,6 +114,25 @@ def test_poses_are_as_wrong_as_stated(known: list[Known], refined: bool) -> None
     assert 0.75 < np.mean(of_all) < 1.3
     assert 0.75 < np.mean(of_single) < 1.3
     assert 0.75 < np.mean(of_pairs) < 1.3
+
+
+def test_light_on_single_spheres_is_in_what_is_stated_of_refined_poses() -> None:
+    """Views from all sides see a sphere where it is not: no residual tells, and the cameras are tilted with it."""
+    aware, unaware = list[float](), list[float]()
+    for seed in range(SEEDS):
+        made = wide(scene(IMAGES, seed=seed))
+        result, true = registered(made, seed, own_light_px=0.3), inverse(made.T_world_scan) @ made.T_world_camera
+        dark = dataclasses.replace(result.solution.problem, own_light_m=0.0)
+        without = dataclasses.replace(result, solution=dataclasses.replace(result.solution, problem=dark))
+        each = [error(T, T_true) for T, T_true in zip(result.T_scan_camera_refined, true, strict=True)]
+        for one, squares in ((result, aware), (without, unaware)):
+            joint = camera_errors(one, refined=True)
+            squares += [squared(e, joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]) for k, e in enumerate(each)]
+        parts = result.refined_components()
+        assert np.trace(parts["spheres"]) > 2 * np.trace(without.refined_components()["spheres"])
+        assert np.sum(list(result.components.values()), axis=0) == pytest.approx(result.covariance, rel=1e-6)
+    assert np.mean(unaware) > 2
+    assert 0.5 < np.mean(aware) < 1.5
 
 
 def test_a_given_pose_errs_about_as_the_arm_and_a_refined_one_less(known: list[Known]) -> None:

@@ -118,7 +118,7 @@ def beyond_model(
     wide = replace(
         settings,
         intrinsics_covariance=lens,
-        common_errors=CommonErrors(_FREE_PX, _FREE_PX, common.light_px),
+        common_errors=CommonErrors(_FREE_PX, _FREE_PX, common.light_px, common.own_light_px),
     )
     free = _fitted(outlines, assignments, images, spheres, wide)
     errors = () if free is None else _errors(free, images, common, lens_covariance)

@@ -23,7 +23,7 @@ def camera_errors(registration: RegistrationResult, *, refined: bool) -> Array:
     covariance of their xi is P, and that of xi with x is K C.
 
     Intrinsics, if uncertain, count with their whole covariance, not with what the outlines leave of it: the poses are
-    those of the calibrated lens.
+    those of the calibrated lens. So does light of their own on single spheres, which is not estimated.
 
     Raises:
         DataError: the scale was estimated, so that the poses are not metric.
@@ -48,12 +48,13 @@ def camera_errors(registration: RegistrationResult, *, refined: bool) -> Array:
     by_pose = (to_scan @ s.pose_gain()).reshape(-1, problem.size)
     through = by_base + by_pose
     known, of_lens = _with_calibrated_lens(s)
+    not_estimated = of_lens + s.by_own_light()
     joint = through @ known @ through.T
     if refined:
-        joint += through @ of_lens @ through.T
+        joint += through @ not_estimated @ through.T
         covariance = s.marginal.Q
     else:
-        joint += by_base @ of_lens @ by_base.T - by_pose @ known @ by_pose.T
+        joint += by_base @ not_estimated @ by_base.T - by_pose @ known @ by_pose.T
         covariance = s.pose_root @ s.pose_root.transpose(0, 2, 1)
     joint += block_diag(*(to_scan @ covariance @ to_scan.transpose(0, 2, 1)))
     return (joint + joint.T) / 2

@@ -33,9 +33,21 @@ class Solution:
     blocks: Blocks
     marginal: Marginal
     linearised: Linearised  # with the cone cost
-    covariance: Array  # (n, n) of all common unknowns
+    covariance: Array  # (n, n) of all common unknowns, as the adjustment has it
     pose_root: Array  # (N, 6, 6)
     outline_factor: float
+
+    def by_own_light(self) -> Array:
+        """(n, n) what light of their own on single spheres adds to the covariance of the common unknowns.
+
+        The adjustment knows nothing of it: with C the covariance and P the information on the spheres' centres, a
+        displacement e of the centres moves the unknowns by C P e.
+        """
+        p = self.problem
+        if p.sphere_prior is None:
+            return np.zeros_like(self.covariance)
+        moved = self.covariance[:, p.sphere_column : p.common_column] @ p.sphere_prior
+        return np.asarray(p.own_light_m**2 * moved @ moved.T, dtype=np.float64)
 
     def pose_gain(self) -> Array:
         """(N, 6, n) K with xi = K dx + own error of covariance Q: how pose errors follow the common unknowns."""
@@ -50,8 +62,9 @@ class RegistrationResult:
     multiplied by `scale`. `T_world_group[g]` maps base frame g to the world. `covariance` is (6, 6), or (7, 7) with
     scale, of (x, y, z in metres, rotation vector in radians[, ln scale]) of a perturbation exp(w) R, t + d in world
     axes. It is the sum of `components`: "outlines" (their own noise), "common" (errors shared by all outlines, and
-    the intrinsics if their covariance was given), "poses", "spheres" (errors of the scan's centres), and those that
-    `register_images` adds. `rms_px` is over the outlines that were not excluded, with the camera poses as given.
+    the intrinsics if their covariance was given), "poses", "spheres" (errors of the scan's centres, and light of
+    their own on single spheres, which displaces each alike in all images), and those that `register_images` adds.
+    `rms_px` is over the outlines that were not excluded, with the camera poses as given.
     """
 
     T_world_scan: Transform
@@ -97,6 +110,7 @@ class RegistrationResult:
         common = through[:, problem.common_column :]
         common = common @ prior[problem.common_column :, problem.common_column :] @ common.T
         noise = through @ by_common.T + own - spheres - common
+        spheres += by_common @ s.by_own_light() @ by_common.T
         return {"outlines and poses": noise, "common": common, "spheres": spheres}
 
     def refined_gain(self) -> tuple[Array, Array]:

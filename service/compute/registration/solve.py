@@ -268,7 +268,7 @@ def _result(s: Solution, stations: NDArray[np.int64], cost: Cost) -> Registratio
         T_world_scan=state.bases[0],
         scale=state.scale,
         T_world_group={g: state.bases[0] @ inverse(state.bases[k]) for k, g in enumerate(problem.groups)},
-        covariance=s.covariance[np.ix_(pick, pick)],
+        covariance=(s.covariance + s.by_own_light())[np.ix_(pick, pick)],
         rms_px=float(np.sqrt(np.mean(given_px[keep] ** 2))),
         residuals=residuals,
         T_scan_camera=_cameras_in_scan(s, stations, refined=False),
@@ -319,4 +319,5 @@ def _components(s: Solution) -> dict[str, Array]:
     spheres[inside, inside] = prior[inside, inside]
     common[p.common_column :, p.common_column :] = prior[p.common_column :, p.common_column :]
     parts = {"outlines": outline, "common": common, "poses": pose, "spheres": spheres}
-    return {name: s.covariance @ part @ s.covariance for name, part in parts.items()}
+    caused = {name: s.covariance @ part @ s.covariance for name, part in parts.items()}
+    return {**caused, "spheres": caused["spheres"] + s.by_own_light()}

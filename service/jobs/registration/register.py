@@ -129,7 +129,7 @@ KIND = JobKind(
     answer=Registration,
     compute="service.worker.registration.register:register",
     words="registration",
-    version=3,
+    version=4,  # states that light displaces single spheres
     order=61,
     demand=lambda arguments: Demand(memory_mb=500 + len(arguments.images), limit_s=3600 + 20 * len(arguments.images)),
 )

@@ -46,6 +46,7 @@ class Problem:
     common_prior: Array = field(repr=False)  # (K, K) information
     sphere_prior: Array | None = field(repr=False)  # (3 M, 3 M) information; None: centres taken as exact
     light_unit_m: float  # displacement of a sphere that appears as one px
+    own_light_m: float  # standard deviation, per coordinate, of a sphere's displacement by light of its own
     with_scale: bool
 
     @property
@@ -162,6 +163,7 @@ def assemble(
     order = sorted(set(used_groups), key=lambda g: (g != first, g))
     f = 0.5 * (camera.fx + camera.fy)
     half = [outlines[i][j].cone.half_angle_rad for i, j, _ in members]
+    light_unit_m = float(np.mean(spheres.radius_m / np.sin(half))) / f
     prior = _common_prior(settings)
     empty = Problem(
         members=[],
@@ -182,7 +184,8 @@ def assemble(
         common=np.zeros((0, 3, len(prior) - 3)),
         common_prior=prior,
         sphere_prior=None if spheres.covariance_m2 is None else _block_inverse(spheres.covariance_m2),
-        light_unit_m=float(np.mean(spheres.radius_m / np.sin(half))) / f,
+        light_unit_m=light_unit_m,
+        own_light_m=light_unit_m * settings.common_errors.own_light_px,
         with_scale=not images.metric,
     )
     return with_outlines(empty, outlines, members)
