@@ -1,4 +1,4 @@
-"""Transcribes listings of real Sony bodies into the tables that the simulated camera serves.
+"""Transcribes listings of real Sony and Nikon bodies into the tables that the simulated cameras serve.
 
     python -m bench.cameras.listings LISTING.txt … --source "REPOSITORY, PATH" --out simulators/sony_camera/recordings
 
@@ -19,19 +19,20 @@ _OLD = re.compile(
 _CONTROL = re.compile(r"\((?:0x)?(?P<code>[0-9a-f]{4})(?: -- ---)?\): (?:PTP error|error) 2002 on query")
 _ENUM = re.compile(r"Enumeration \[(?P<numbers>[-\d,]*)\] value: (?P<value>.*)")
 _RANGE = re.compile(r"Range \[(?P<low>-?\d+) - (?P<high>-?\d+), step (?P<step>-?\d+)\] value: (?P<value>.*)")
-_PLAIN = re.compile(r"value: (?P<value>.*)|(?P<number>-?\d+)$")
+_PLAIN = re.compile(r"(?:value: )?(?P<value>(?:.*\()?-?\d+\)?)$")
 _TYPES = {"1": "i8", "2": "u8", "3": "i16", "4": "u16", "5": "i32", "6": "u32", "7": "i64", "8": "u64", "ffff": "str"}
 _BITS = {"i8": 8, "u8": 8, "i16": 16, "u16": 16, "i32": 32, "u32": 32, "i64": 64, "u64": 64}
-# Texts that say nothing about a person: version, lens, prefix of file names.
+# Texts of a Sony that say nothing about a person: version, lens, prefix of file names. Those of others are left out.
 _TEXTS = {"d040", "d07b", "d1ca"}
 # GetSet and IsEnabled of an entry, where its bytes are public: a piece of the answer to 9209 in gphoto/gphoto2#641.
 _BYTES = {("ILCE-7RM5", "5007"): "0/1"}
-_STEPPED, _DIRECT = 200, 300
+_PLAIN_PTP, _STEPPED, _DIRECT = 100, 200, 300
 _ONLY_3_00 = "d253"
 
 
 def transcribe(listing: str, source: str) -> str:
     """The table of a listing. Raises ValueError if it names no body."""
+    nikon = re.search(r"^Manufacturer: Nikon", listing, re.MULTILINE) is not None
     model = re.search(r"^Model: (.+)$", listing, re.MULTILINE)
     firmware = re.search(r"^ *Version: (.+)$", listing, re.MULTILINE)
     if model is None or firmware is None:
@@ -45,7 +46,7 @@ def transcribe(listing: str, source: str) -> str:
             if found["code"] in lines:
                 controls.append(found["code"])  # some are listed again, among the controls
             lines.setdefault(found["code"], told)
-    protocol = _DIRECT if _ONLY_3_00 in lines else _STEPPED
+    protocol = _PLAIN_PTP if nikon else _DIRECT if _ONLY_3_00 in lines else _STEPPED
     head = (
         f"# Source: {source}",
         f"Model: {model[1].strip()}",
@@ -73,7 +74,7 @@ def _stated(found: re.Match[str], model: str) -> str:
         limits = [_within(told[name], kind) for name in ("low", "high", "step")]
         return f"{head} {' '.join(['range', *map(str, limits)])} = {_number(told['value'], kind)}"
     if told := _PLAIN.match(found["rest"]):
-        return f"{head} none = {_number(told['value'] or told['number'], kind)}"
+        return f"{head} none = {_number(told['value'], kind)}"
     return ""
 
 
@@ -102,7 +103,7 @@ def main() -> None:
     for file in args.listings:
         table = transcribe(file.read_text(encoding="utf-8", errors="replace"), f"{args.source}/{file.name}")
         fields = dict(line.split(": ", 1) for line in table.splitlines() if ": " in line)
-        name = f"{fields['Model'].lower()}-{fields['Firmware']}"
+        name = f"{fields['Model'].lower().replace(' ', '')}-{fields['Firmware'].lower()}"
         (args.out / f"{name}.txt").write_text(table, encoding="utf-8")
 
 

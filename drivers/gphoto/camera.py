@@ -6,6 +6,7 @@ import logging
 import re
 import time
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
@@ -234,7 +235,7 @@ class GphotoCamera:
         )  # without a lens, or with one that states none, no photograph could be used
         room = self._room()
         room.check()
-        trigger_s, *first = release_shutter(self._link, dials, room.check)
+        trigger_s, *first = release_shutter(self._link, dials, partial(room.check, refused=True))
         if self._profile.may_miss_first and not (first or self._has_released):
             trigger_s, *first = release_again(self._link, dials, trigger_s, self._config.capture_timeout_s)
         added = self._collect(2 if quality == "RAW+JPEG" else 1, trigger_s, *first)

@@ -23,25 +23,28 @@ class Room:
         except DeviceRefusedError:
             return None
 
-    def problem(self, free_bytes: int | None) -> str:
-        """What is wrong with the space, as a sentence without a full stop; "" if enough or not known."""
+    def problem(self, free_bytes: int | None, *, refused: bool = False) -> str:
+        """What is wrong with the space, as a sentence without a full stop; "" if enough or not known.
+
+        A full card also counts if the files go to the computer and the camera has `refused` to release.
+        """
         if free_bytes is not None:
             if free_bytes < LEAST_FREE_BYTES:
                 return f"{megabytes(free_bytes):.0f} MB free in the camera"
-        elif self._target != "computer" and (slots := self._slots()):
+        elif (self._target != "computer" or refused) and (slots := self._slots()):
             cards = [shots for state, shots in slots if state != self._profile.no_card]
-            if not cards:
-                return "there is no card in the camera"
-            if not sum(cards):
+            if cards and not sum(cards):
                 return "the camera says that no photograph fits on its card"
+            if not cards and self._target != "computer":
+                return "there is no card in the camera"
         return ""
 
-    def check(self) -> None:
-        """Raise DeviceStorageFullError if the camera says that the next exposure does not fit."""
+    def check(self, *, refused: bool = False) -> None:
+        """Raise DeviceStorageFullError if the camera says that the next exposure does not fit, or did not."""
         free_bytes = self.free_bytes()
         if self._target == "computer" and free_bytes:
             return  # it is fetched and leaves its memory
-        if problem := self.problem(free_bytes):
+        if problem := self.problem(free_bytes, refused=refused):
             raise DeviceStorageFullError(problem, where=self._link.where, remedy="Empty, change or insert the card")
 
     def _slots(self) -> list[tuple[str, int]]:

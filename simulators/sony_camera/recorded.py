@@ -5,6 +5,7 @@ A line is a property: its code, type, access, form and value. bench/cameras/list
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -26,10 +27,20 @@ def names() -> tuple[str, ...]:
 
 def recorded_table(name: str) -> BodyTable:
     """The table of a recorded body. Raises SimulatorError if there is none of this name, or it cannot be read."""
+    table = table_of(_FOLDER / f"{name}.txt")
+    if any(one.code == Code.OBJECTS_IN_MEMORY for one in table.properties):
+        return table
+    # Every body has it, because libgphoto2 cannot wait for a file without: these listings are cut.
+    memory = CameraProperty(Code.OBJECTS_IN_MEMORY, U16, 0, limits=(0, 65535, 1))
+    return replace(table, properties=(*table.properties, memory))
+
+
+def table_of(file: Path) -> BodyTable:
+    """The table in a file. Raises SimulatorError if it is not there."""
     try:
-        lines = (_FOLDER / f"{name}.txt").read_text(encoding="utf-8").splitlines()
+        lines = file.read_text(encoding="utf-8").splitlines()
     except OSError as error:
-        raise SimulatorError(f"no body was recorded as {name}") from error
+        raise SimulatorError(f"no body was recorded as {file.stem}") from error
     head: dict[str, str] = {}
     properties: list[CameraProperty] = []
     for line in (one for one in lines if one and not one.startswith("#")):
@@ -38,9 +49,6 @@ def recorded_table(name: str) -> BodyTable:
             head[key] = value.strip()
         else:
             properties.append(_property(line))
-    if all(one.code != Code.OBJECTS_IN_MEMORY for one in properties):
-        # Every body has it, because libgphoto2 cannot wait for a file without: these listings are cut.
-        properties.append(CameraProperty(Code.OBJECTS_IN_MEMORY, U16, 0, limits=(0, 65535, 1)))
     controls = tuple(int(code, 16) for code in head["Controls"].split()) or CONTROLS
     lens = next((str(one.value) for one in properties if one.code == _LENS_NAME), "")
     return BodyTable(head["Model"], head["Firmware"], int(head["Protocol"]), tuple(properties), controls, lens)

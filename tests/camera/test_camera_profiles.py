@@ -43,7 +43,7 @@ LISTED = (
         {
             "f-number": _STOPS, "iso": ("50", "64", "80", "100", "200", "400"), "imagequality": _NIKON_QUALITY,
             "shutterspeed2": ("1/20", "1/15", "1/13", "1/3", "10/25", "Bulb", "Time"),
-            "whitebalance": _NIKON_WHITE, "focusmode": ("Manual", "AF-S", "AF-C"), "isoauto": ("On", "Off"),
+            "whitebalance": _NIKON_WHITE, "focusmode": ("Manual", "AF-S", "AF-C"), "autoiso": ("On", "Off"),
             "capturetarget": _PLACES, "capturemode": ("Single Shot", "Burst", "Timer"),
         },
         "nikon_z", {"expprogram": "M", "batterylevel": "100%"},
@@ -66,6 +66,37 @@ LISTED = (
             "imageformat": ("Large Fine JPEG", "Large Normal JPEG", "RAW + Large Fine JPEG", "RAW"),
             "whitebalance": ("Auto", "AWB White", "Daylight", "Shadow", "Color Temperature"),
             "capturetarget": _PLACES, "drivemode": ("Single", "Continuous low speed"),
+        },
+        "canon_eos", {"autoexposuremode": "Manual", "batterylevel": "50%"},
+    ),
+    Listed(
+        "Canon.Inc", "Canon EOS R50",
+        {
+            "aperture": ("4.5", "5", "8", "22"), "shutterspeed": ("bulb", "10.3", "1/15", "1/13"),
+            "iso": ("Auto", "100", "125"),
+            "imageformat": ("Large Fine JPEG", "cRAW + Large Fine JPEG", "RAW + Large Fine JPEG", "cRAW", "RAW"),
+            "whitebalance": ("Auto", "Daylight", "AWB White"), "capturetarget": _PLACES,
+            "drivemode": ("Single", "Continuous timer"), "focusmode": ("One Shot", "AI Servo", "AI Focus", "Manual"),
+        },
+        "canon_eos", {"autoexposuremode": "Manual", "batterylevel": "100%"},
+    ),
+    Listed(
+        "Canon.Inc", "Canon EOS R6 Mark III",
+        {
+            "aperture": ("2.8", "8"), "shutterspeed": ("30", "1/15"), "iso": ("Auto", "100", "64000"),
+            "imageformat": ("Large Fine JPEG", "cRAW + Large Fine JPEG", "RAW + Large Fine JPEG", "RAW", "cRAW"),
+            "whitebalance": ("Auto", "AWB White", "Daylight", "Unknown value 0018"), "capturetarget": _PLACES,
+            "drivemode": ("Single", "Super high speed continuous shooting"),
+        },
+        "canon_eos", {"autoexposuremode": "Manual", "batterylevel": "50%"},
+    ),
+    Listed(
+        "Canon.Inc", "Canon EOS 77D",
+        {
+            "aperture": ("1.8", "8"), "shutterspeed": ("bulb", "1/15"), "iso": ("Auto", "100", "Unknown value 0001"),
+            "imageformat": ("Large Fine JPEG", "RAW + Large Fine JPEG", "RAW"),
+            "whitebalance": ("Auto", "Unknown value 0017", "Daylight"), "capturetarget": _PLACES,
+            "drivemode": ("Single", "Unknown value 0007"),
         },
         "canon_eos", {"autoexposuremode": "Manual", "batterylevel": "50%"},
     ),

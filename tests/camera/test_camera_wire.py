@@ -194,6 +194,19 @@ def test_busy_shutter_then_success() -> None:
     assert second["name"] == "capt_DSC00001.JPG"
 
 
+def test_the_lists_are_those_of_recorded_bodies(camera: RunningCamera) -> None:
+    """Before, drives were codes of protocol 2.00, and there was no Bulb, no automatic and no extended ISO."""
+    drives, shutters, isos, balances = vendor_session(
+        camera.gphoto_port, *(["choices", name] for name in ("capturemode", "shutterspeed", "iso", "whitebalance"))
+    )
+    assert drives[0] == "Single Shot"
+    for words in (drives, shutters, balances):
+        assert not [word for word in words if "Unknown" in word]
+    assert shutters[-1] == "Bulb"
+    assert isos[:2] == ["Auto ISO", "50 Multi Frame Noise Reduction"]
+    assert "16000" in isos
+
+
 def test_full_store_shows_in_the_photographs_that_fit() -> None:
     with camera_simulator([{"on": "shutter", "kind": "disk_full"}]) as camera:
         before, capture, _, after = vendor_session(

@@ -16,7 +16,7 @@ from simulators.sony_camera.body import SonyBody
 from simulators.sony_camera.properties import Code, PropertyTable
 from simulators.sony_camera.responder import SonyResponder
 from simulators.still_camera.body import BodyOptions
-from simulators.still_camera.operations import RefusedValueError
+from simulators.still_camera.operations import NotWritableError, RefusedValueError
 from simulators.still_camera.scene import PictureFiles, StillLife, exposure_gain
 from tests.support.processes.waiting import until
 
@@ -110,6 +110,43 @@ def test_extension_info_announces_version_3(body: SonyBody) -> None:
     assert reply.data is not None
     assert struct.unpack_from("<H", reply.data)[0] == 300
     assert reply.data.endswith(bytes.fromhex("04000000" + "c1d2" + "c2d2" + "d1d2" + "d2d2"))
+
+
+def test_in_pc_remote_no_storage_and_no_object_is_listed(body: SonyBody) -> None:
+    """As every listing of a body shows it; newer ones answer StoreNotAvailable."""
+    responder = SonyResponder(body, FaultPlan())
+    assert responder.handle(request(0x1004), b"").data == bytes(4)
+    assert responder.handle(request(0x1007, 0xFFFFFFFF, 0, 0), b"").code == 0x2013
+
+
+def test_while_only_raw_is_set_nothing_of_a_jpeg_can_be() -> None:
+    table = PropertyTable(alpha_7r_v())
+    table.set_from_client(Code.FILE_FORMAT, b"\x01")
+    assert table.value(Code.JPEG_QUALITY) == 0
+    for code in (Code.JPEG_QUALITY, Code.IMAGE_SIZE):
+        with pytest.raises(NotWritableError):
+            table.set_from_client(code, b"\x01")
+    table.set_from_client(Code.FILE_FORMAT, b"\x03")
+    table.set_from_client(Code.JPEG_QUALITY, b"\x01")
+    assert table.exposure_settings().jpeg_level == 1
+
+
+def test_the_memory_says_one_while_the_file_is_written(body: SonyBody, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[int] = []
+    put = body.properties.put
+
+    def listen(code: int, value: int) -> None:
+        said.extend([value] if code == Code.OBJECTS_IN_MEMORY else [])
+        put(code, value)
+
+    monkeypatch.setattr(body.properties, "put", listen)
+    body.shoot()
+    until(lambda: len(said) == 2, "no file in its memory", every_s=0.01)
+    assert said == [1, 0x8001]
+    info = SonyResponder(body, FaultPlan()).handle(request(0x1008, 0xFFFFC001), b"").data
+    assert info is not None
+    assert struct.unpack_from("<I", info)[0] == 0x00010000
+    assert struct.unpack_from("<II", info, 26) == (0, 0), "neither width nor height"
 
 
 def test_exposure_through_the_operations(body: SonyBody) -> None:

@@ -209,6 +209,14 @@ def test_a_value_that_is_stated_late_is_waited_for() -> None:
         assert camera.apply(PAPER) == PAPER
 
 
+def test_a_full_card_is_named_where_the_camera_refuses_to_release_for_it(tmp_path: Path) -> None:
+    with (
+        rig([{"on": "shutter", "kind": "disk_full"}], "--fast") as (camera, _),
+        pytest.raises(DeviceStorageFullError, match="no photograph fits on its card"),
+    ):
+        camera.capture(tmp_path)
+
+
 LISTING = """Camera summary:
 Model: ILCE-1M2
   Version: 3.00

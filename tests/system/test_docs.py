@@ -297,6 +297,9 @@ RUN_ELSEWHERE = {
     "orthocapture simulate camera --recorded ilce-7rm5-2.02": (
         "tests/camera/test_recorded_bodies.py::test_a_recorded_body_is_driven_or_refused_in_words_that_help"
     ),
+    "orthocapture simulate nikon": (
+        "tests/camera/test_recorded_nikons.py::test_a_recorded_body_is_driven_or_refused_in_words_that_help"
+    ),
     "orthocapture simulate kuka": "tests/kuka/test_kuka_driver.py::test_a_day_without_trouble",
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/recovery/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"

@@ -40,6 +40,8 @@ PROFILE = Profile(
     target=Widget("capturetarget"),
     targets=MappingProxyType({"card": "Memory card"}),
     serial="eosserialnumber",
-    fixed=(Fixed("drivemode", ("Single",), "one exposure may give several files", needed=True),),
+    fixed=(
+        Fixed("drivemode", ("Single",), "one exposure may give several files: set the drive to single", needed=True),
+    ),
     echoes=True,
 )

@@ -6,18 +6,22 @@ from types import MappingProxyType
 
 from drivers.gphoto.profile import Fixed, Profile, Widget
 
+_LENS = (
+    "Turn the mode dial to M; without a lens, or with one without electrical contacts, there is no f-number to set"
+)
+
 PROFILE = Profile(
     bodies="Nikon Z",
     manufacturer="Nikon",
     model=r"(NIKON )?Z ?\w+",  # "Z 9", "Z 6_2", "Z f", "Z6_3"
     exif_make="NIKON",
-    f_number=Widget("f-number"),
+    f_number=Widget("f-number", unknown=("f/0",), if_fixed=_LENS),
     # The widget `shutterspeed` of these bodies offers decimals that are cut after four places.
-    shutter=Widget("shutterspeed2"),
-    iso=Widget("iso"),
+    shutter=Widget("shutterspeed2", if_fixed="Turn the mode dial to M"),
+    iso=Widget("iso", if_fixed="Switch ISO sensitivity auto control off in the camera's menu"),
     focus=Widget(
         "focusmode",
-        MappingProxyType({"Manual": ("Manual",), "Automatic": ("AF-S", "AF-C", "AF-F")}),
+        MappingProxyType({"Manual": ("Manual",), "Automatic": ("AF-S", "AF-C", "AF-F", "AF-A")}),
         by_hand="Set the focus mode to MF on the lens or in the camera's menu",
     ),
     quality=Widget(
@@ -39,7 +43,18 @@ PROFILE = Profile(
     target=Widget("capturetarget"),
     targets=MappingProxyType({"card": "Memory card"}),
     fixed=(
-        Fixed("isoauto", ("Off",), "the camera chooses the ISO value of each photograph", needed=True),
-        Fixed("capturemode", ("Single Shot",), "one exposure may give several files", needed=True),
+        # Not `isoauto`: of the Z 5, 6 II and 7 it can only be On, whatever their ISO sensitivity auto control is.
+        Fixed(
+            "autoiso",
+            ("Off",),
+            "the camera chooses the ISO of each photograph: switch ISO sensitivity auto control off in its menu",
+            needed=True,
+        ),
+        Fixed(
+            "capturemode",
+            ("Single Shot",),
+            "one exposure may give several files: set the release mode to single frame",
+            needed=True,
+        ),
     ),
 )
