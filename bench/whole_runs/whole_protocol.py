@@ -107,8 +107,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         "",
         f"Commit {record['commit']}; {computer['processor']}, {computer['cores']} cores, {computer['memory_gb']} GB, "
         f"{computer['system']}, Python {computer['python']}; photographs {record['image_width']} px wide, "
-        f"CT voxels of {record['ct_voxel_mm']} mm, {record['arm']} {record['speed_up']:g} times as fast as real, with "
-        f"the errors `{record['arm_errors']}`.",
+        f"CT voxels of {record['ct_voxel_mm']} mm, {record['arm']} {record['speed_up']:g} times as fast as real, "
+        f"with the errors `{record['arm_errors']}`.",
         "",
         "The true error is the registration's displacement at the scene's centre against the simulator's record. "
         "Nobody was asked anything: the simulated technician did what the screen told him.",

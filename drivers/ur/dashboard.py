@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import re
 import socket
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.errors import DeviceFaultError, DeviceRefusedError, DeviceUnavailableError
 
 PORT = 29999
 MINIMUM_VERSION = {3: (3, 15), 5: (5, 10)}  # the first with get_inverse_kin_has_solution()
-SWITCH_TO_REMOTE = "Switch the pendant from Local to Remote, then try again"
+_SWITCH = "Switch the pendant from Local to Remote, then try again"
 _LONGEST_SERIAL = 20
 _LONGEST_MODEL = 30  # such as UR8 Long
 _LONGEST_LINE = 1000  # limit for answers, which are less than a tenth as long
@@ -39,6 +40,7 @@ class Dashboard:
 
     def __init__(self, host: str, timeout_s: float) -> None:
         self._host, self._timeout_s = host, timeout_s
+        self._local = True
 
     def facts(self) -> ControllerFacts:
         """Read the model, serial number and software version.
@@ -46,6 +48,7 @@ class Dashboard:
         Raises DeviceFaultError if the software is too old or an answer makes no sense, DeviceUnavailableError if the
         dashboard fails.
         """
+        self._local = True  # until it says that it is not
         software, serial, model = self._ask("PolyscopeVersion", "get serial number", "get robot model")
         match = re.search(r"([0-9]{1,3})\.([0-9]{1,3})[0-9.]{0,20}", software)
         if match is None:
@@ -65,12 +68,31 @@ class Dashboard:
         letter = "e" if version[0] >= 5 and model in _E_SERIES else ""
         return ControllerFacts(f"{model}{letter}", serial, match.group(0), version)
 
-    def local_control(self, version: tuple[int, int]) -> bool:
-        """Whether the controller says that it is in local control; CB3 has no such mode.
+    def obstacle(self, version: tuple[int, int], *, running: bool) -> DeviceRefusedError | None:
+        """Why the controller starts no program for a client: it is in local control. None if it is not.
 
-        Raises DeviceUnavailableError if the dashboard fails.
+        It is asked only if no program runs, since one that runs was let start, and as long as it was local. CB3 has
+        no such mode. Raises DeviceUnavailableError if the dashboard fails.
         """
-        return version[0] >= 5 and self._ask("is in remote control")[0].lower() == "false"
+        if version[0] < 5:
+            return None
+        if self._local or not running:
+            self._local = self._ask("is in remote control")[0].lower() == "false"
+        if not self._local:
+            return None
+        return DeviceRefusedError("the controller is in local control", where=self._host, remedy=_SWITCH)
+
+    def end_program(self, running: Callable[[], bool]) -> None:
+        """End the program that runs at the controller; a refusal counts only if one is `running`.
+
+        An earlier client's script in another register range would block the constructor of the vendor's control
+        interface for minutes. Raises DeviceRefusedError, DeviceUnavailableError.
+        """
+        try:
+            self.stop()
+        except DeviceRefusedError:
+            if running():
+                raise
 
     def stop(self) -> None:
         """End the program that runs at the controller.
@@ -82,7 +104,7 @@ class Dashboard:
             return
         remedy = "End the program on the pendant, then try again"
         if "remote control" in answer.lower():
-            remedy = SWITCH_TO_REMOTE
+            remedy = _SWITCH
         raise DeviceRefusedError(
             f"the controller does not end its program: {answer[:_SHOWN]!r}", where=self._host, remedy=remedy
         )

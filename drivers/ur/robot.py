@@ -18,7 +18,6 @@ from drivers.errors import (
     DeviceError,
     DeviceFaultError,
     DeviceRefusedError,
-    SafetyStopError,
     UnreachablePoseError,
 )
 from drivers.interfaces import (
@@ -34,8 +33,10 @@ from drivers.interfaces import (
 )
 from drivers.ur import UrConfig
 from drivers.ur import vendor as library
-from drivers.ur.dashboard import SWITCH_TO_REMOTE, ControllerFacts, Dashboard
+from drivers.ur.dashboard import ControllerFacts, Dashboard
 from drivers.ur.link import VENDOR_ERRORS, probe, vendor
+from drivers.ur.primary import Calibration, calibration_of, not_asked
+from drivers.ur.safety import safety_error
 from drivers.ur.samples import (
     PLAYING,
     RESTART,
@@ -56,6 +57,7 @@ from service.core.geometry import from_rotation_vector, inverse, to_rotation_vec
 DRIVER_VERSION = "1"
 TOOL_CHANGE_S = 0.05  # by the controller's clock, until a new tool shows in the stream
 LONGEST_RINGING_S = 10.0  # how far back the end of the last motion is searched for
+KINEMATICS_S = 2.0  # until the controller has stated with which calibration it computes
 MOTION_START_S = 0.06  # until the target velocity of a new motion shows in the stream
 
 _LOG = logging.getLogger(__name__)
@@ -70,7 +72,6 @@ class UrRobot:
         self._where = config.host
         self._facts: ControllerFacts | None = None
         self._dashboard = Dashboard(config.host, config.connect_timeout_s)
-        self._local = False  # the controller was in local control when last asked
         self._stream: PoseStream | None = None
         self._motion_started_s = -np.inf
         self._latch = Latch(config.host)
@@ -82,6 +83,7 @@ class UrRobot:
             newest=self._newest,
         )
         self._script = ControlScript(config, self._latch, self._watchdog, end_others=self._end_others)
+        self._calibration: Calibration = not_asked
         self._configured: tuple[Payload, Transform] | None = None  # the tool as this driver set it
         self._tool_read = 0  # value of ControlScript.sent when the tool was last read
 
@@ -96,7 +98,7 @@ class UrRobot:
         self.close()
         probe(self._config.host, self._config.connect_timeout_s)
         self._facts = facts = self._dashboard.facts()
-        self._local = self._dashboard.local_control(facts.version)
+        self._calibration = calibration_of(self._config.host, KINEMATICS_S)
         self._configured = None
         self._samples.tool.start(known_arm(facts.model))
         with vendor(self._where, "connecting the receive interface"):
@@ -151,9 +153,9 @@ class UrRobot:
                 f"The speed slider stands at {100 * state.speed_fraction:.0f} %: motions take longer. "
                 "Set it to 100 % on the pendant"
             )
-        tcp = to_rotation_vector(self._samples.tool.T_flange_tcp)
+        tcp, identity = to_rotation_vector(self._samples.tool.T_flange_tcp), self._identity()
         return DeviceReport(
-            identity=self._identity(),
+            identity=identity,
             clock_offset_s=self._streaming().clock_offset_s(),
             clock="uptime",
             details={
@@ -161,6 +163,7 @@ class UrRobot:
                 "safety": state.sample.safety.value,
                 "speed slider": f"{100 * state.speed_fraction:.0f} %",
                 "tool centre point (m, rad)": " ".join(f"{v:.4f}" for v in tcp),
+                "calibration": self._calibration(known_arm(identity.model), state.sample.joints_rad),
                 "joints (rad)": " ".join(f"{v:.4f}" for v in state.sample.joints_rad),
             },
             problems=tuple(problems),
@@ -182,7 +185,7 @@ class UrRobot:
         """
         sample = self._streaming().next()
         if not sample.safety.may_move:
-            raise self._safety_error(sample)
+            raise safety_error(sample.safety, self._where)
         changed = self._latch.changed
         self._latch.let_move(confirmed_by, not_before_monotonic_s)
         self._watchdog.arrive()
@@ -312,7 +315,7 @@ class UrRobot:
     def _driven(self, sample: RobotSample) -> bool:
         """Whether the controller drives the arm in this sample. Raises SafetyStopError if it shows a stop."""
         if not sample.safety.may_move:
-            raise self._safety_error(sample)
+            raise safety_error(sample.safety, self._where)
         return driven(sample)
 
     def _driven_next(self) -> bool:
@@ -343,36 +346,15 @@ class UrRobot:
         """What prevents the arm from moving until a person resolves it; None if nothing does."""
         state = self.state()
         if not state.sample.safety.may_move:
-            return self._safety_error(state.sample)
+            return safety_error(state.sample.safety, self._where)
         if state.robot_mode != "RUNNING":
             remedy = "Power the arm on and release its brakes on the pendant"
             return DeviceRefusedError(f"the arm is in mode {state.robot_mode}", where=self._where, remedy=remedy)
         # A controller in local control sends what it measures, and starts no program: one that runs was let start.
-        if self._local or not state.program_running:
-            self._local = self._dashboard.local_control(opened(self._facts, self._where).version)
-        if self._local:
-            return DeviceRefusedError(
-                "the controller is in local control", where=self._where, remedy=SWITCH_TO_REMOTE
-            )
-        return None
+        return self._dashboard.obstacle(opened(self._facts, self._where).version, running=state.program_running)
 
     def _end_others(self) -> None:
-        """End the program that runs at the controller, before the control script is sent for the first time.
-
-        An earlier client's script in another register range would block the vendor's constructor for minutes.
-        Raises DeviceRefusedError if it runs on.
-        """
-        try:
-            self._dashboard.stop()
-        except DeviceRefusedError:
-            if self.state().program_running:
-                raise
-            _LOG.info("%s: no program was running, and none could be ended", self._where)
-
-    def _safety_error(self, sample: RobotSample) -> SafetyStopError:
-        name = sample.safety.value.replace("_", " ")
-        remedy = "A person must find and clear the cause and release the stop on the pendant; then try again"
-        return SafetyStopError(f"the arm is in {name}", where=self._where, remedy=remedy)
+        self._dashboard.end_program(lambda: self.state().program_running)
 
     @contextlib.contextmanager
     def _commanding(self, doing: str, hold: DeviceError | None) -> Generator[library.Control]:

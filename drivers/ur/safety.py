@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+from drivers.errors import SafetyStopError
 from drivers.interfaces import SafetyState
 
 
@@ -23,3 +24,9 @@ def safety_state(bits: int) -> SafetyState:
         if bits & mask:
             return state
     return SafetyState.UNKNOWN
+
+
+def safety_error(state: SafetyState, where: str) -> SafetyStopError:
+    """The error for an arm that is stopped."""
+    remedy = "A person must find and clear the cause and release the stop on the pendant; then try again"
+    return SafetyStopError(f"the arm is in {state.value.replace('_', ' ')}", where=where, remedy=remedy)

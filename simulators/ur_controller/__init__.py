@@ -1,4 +1,4 @@
-"""A simulated Universal Robots controller on its real ports: RTDE 30004, dashboard 29999, script 30003."""
+"""A simulated Universal Robots controller on its real ports: RTDE 30004, dashboard 29999, script 30003, 30001."""
 
 from __future__ import annotations
 

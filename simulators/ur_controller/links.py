@@ -13,6 +13,7 @@ from simulators.serve import SimulatorError
 from simulators.ur_controller import rtde_codec as codec
 from simulators.ur_controller.dashboard import WELCOME, Dashboard
 from simulators.ur_controller.pendant import Pendant
+from simulators.ur_controller.primary import kinematics_message
 from simulators.ur_controller.program import ScriptReader
 from simulators.ur_controller.spoilt import SpoiltFields
 
@@ -225,6 +226,18 @@ class PendantLink(Link):
         self._rest = rest[-LONGEST_LINE:]
         for raw in lines:
             self.send(f"{self._pendant.carry_out(raw.decode('utf-8', 'replace'))}\n".encode())
+
+
+class PrimaryLink(Link):
+    """One client of the primary interface, which is told the kinematics; the rest of the robot state is not sent."""
+
+    def __init__(self, connection: socket.socket, server: Server) -> None:
+        super().__init__(connection)
+        if not server.faulty(self, "primary"):
+            self.send(kinematics_message(server.controller.model))
+
+    def receive(self, data: bytes) -> None:
+        """Ignore it: programs come by the script port."""
 
 
 class ScriptLink(Link):

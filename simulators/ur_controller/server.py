@@ -13,13 +13,13 @@ from simulators.connection import accept
 from simulators.serve import SimulatorError, Termination, listening
 from simulators.ur_controller import fields
 from simulators.ur_controller.controller import Controller
-from simulators.ur_controller.links import EARLY_S, LineLink, Link, PendantLink, RtdeLink, ScriptLink
+from simulators.ur_controller.links import EARLY_S, LineLink, Link, PendantLink, PrimaryLink, RtdeLink, ScriptLink
 from simulators.ur_controller.program import Interpreter
 from simulators.world_link import WorldLink
 
 _LOG = logging.getLogger(__name__)
 
-RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
+RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORT = 30004, 29999, 30003, 30001
 LONGEST_REST_S = 0.008
 CUT_OFF_S = 10.0  # without a byte read, after which a client is disconnected
 _SEND_BUFFER_BYTES = 1 << 14  # of the system, for a client that does not read
@@ -28,7 +28,7 @@ _FIELDBUS = frozenset(f"input_{kind}_register_{number}" for kind in ("int", "dou
 
 
 class Server:
-    """Listens on the three ports and the pendant's, and advances the controller in real time."""
+    """Listens on the four ports and the pendant's, and advances the controller in real time."""
 
     def __init__(
         self,
@@ -57,6 +57,7 @@ class Server:
         self._listen(host, RTDE_PORT, lambda s: RtdeLink(s, self))
         self._listen(host, DASHBOARD_PORT, lambda s: LineLink(s, self))
         self._listen(host, SCRIPT_PORT, lambda s: ScriptLink(s, self))
+        self._listen(host, PRIMARY_PORT, lambda s: PrimaryLink(s, self))
         self._listen(host, pendant_port, lambda s: PendantLink(s, self))
 
     def _listen(self, host: str, port: int, make: Callable[[socket.socket], Link]) -> None:

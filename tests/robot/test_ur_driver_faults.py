@@ -251,3 +251,17 @@ def test_an_arm_in_local_control_is_watched_and_its_program_left_alone() -> None
             with pytest.raises(DeviceError, match=r"local control|was ended at the controller"):
                 move(arm, turned(arm, 0.1))
             assert any("local control" in problem for problem in arm.report().problems)
+
+
+@pytest.mark.parametrize("field", ["timestamp", "actual_q", "payload"])
+def test_a_field_that_is_no_number_is_named_and_ends_the_stream(field: str) -> None:
+    """bench/motion/arm_answers.py tries every field and every answer of the dashboard in every way."""
+    spoilt, told = {"on": f"field {field}", "kind": "nan"}, f"sends no number for {field}"
+    with faulty(78, spoilt), pytest.raises(DeviceUnavailableError, match=told), opened(address(78)):
+        pass
+
+
+def test_an_idle_controller_that_refuses_to_stop_is_opened() -> None:
+    refusal = {"on": "dashboard stop", "kind": "say", "value": "Failed to execute: stop", "times": 9}
+    with faulty(79, refusal), opened(address(79)) as arm:
+        travel(arm, turned(arm, 0.1))
