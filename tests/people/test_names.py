@@ -140,7 +140,6 @@ def test_every_name_at_every_place_where_there_are_accounts(site: NamedSite, pla
     refused_at(site, place, (*NAMES, *HER_OWN, *PEOPLE))
 
 
-@pytest.mark.slow
 @pytest.mark.sweep
 @pytest.mark.parametrize("place", COMMANDS)
 def test_every_name_at_every_place_where_there_are_none(without: NamedSite, place: str) -> None:

@@ -30,7 +30,7 @@ def run(office: Office, tmp_path: Path) -> str:
 
 
 def _act(store: Store, run: str, reason: str) -> None:
-    words = ["act", "abort", "--reason", reason, "--operator", "grace", "--password-stdin"]
+    words = ["act", "skip", "--reason", reason, "--operator", "grace", "--password-stdin"]
     data = str(store.database_path.parent)
     done = CliRunner().invoke(app, [*words, "--run", run, "--data", data], input="correct horse grace\n")
     if done.exit_code:

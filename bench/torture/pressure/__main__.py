@@ -130,7 +130,7 @@ def run(name: str, pressure: Pressure, folder: Path, host: str, longest_s: float
             words = ["run", str(protocol), "--rig", ready["rig"], "--operator", "Ada", "--auto-confirm"]
             ends_s = began_s + longest_s
             while time.monotonic() < ends_s and (not statuses or statuses[-1] != 0):
-                player = Person(data, killer, ends_s, attends=bool(statuses))
+                player = Person(data, killer, ends_s, program, attends=bool(statuses))
                 statuses.append(_drive([*words, "--data", str(data)], log, groups, player))
                 program.enlarge_memory(1.25)
                 words = ["resume", "latest", "--screens"]
@@ -170,11 +170,15 @@ def _begin_rig(folder: Path, host: str, log: Any, everything: Group) -> subproce
 
 @dataclass
 class Person:
-    """Answers what a run asks at its screens, if somebody attends; meanwhile drivers are killed."""
+    """Answers what a run asks at its screens, if somebody attends; meanwhile drivers are killed.
+
+    Gives the program more memory where it says that a computation needs more than there is.
+    """
 
     data: Path
     killer: Killer
     ends_s: float
+    program: Group
     attends: bool
     asked: int = 0
 
@@ -187,6 +191,8 @@ class Person:
             runner.terminate()
         elif self.attends and (verb := _asked(self.data)):
             self.asked += 1
+            if _memory_short(self.data):
+                self.program.enlarge_memory(1.5)
             words = (
                 "act",
                 verb,
@@ -211,6 +217,14 @@ def _asked(data: Path) -> str:
     if not isinstance(decision, AskOperator):
         return ""
     return "sign" if decision.for_ == "sign" else "confirm"
+
+
+def _memory_short(data: Path) -> bool:
+    """Whether what failed last needs more memory than this machine has."""
+    with Store.open(data, create=False) as store:
+        events = store.events(store.find_run("latest"))
+    failed = [event.payload for event in events if isinstance(event.payload, StepFailed)]
+    return bool(failed) and "MB of memory, and this machine has" in failed[-1].message
 
 
 def _drive(words: Sequence[str], log: Any, groups: Sequence[Group], person: Person) -> int:
