@@ -99,6 +99,7 @@ KIND = JobKind(
     answer=Answer,
     compute="service.worker.registration.further_camera:further_camera",
     words="further camera",
+    version=3,  # states that light displaces single spheres
     order=62,
     demand=lambda arguments: Demand(
         memory_mb=600 + IMAGE_MB * processes_for(len(arguments.images), IMAGE_MB),
