@@ -223,6 +223,7 @@ def test_a_correction_of_seven_joints_does_not_fit_an_arm_of_six() -> None:
         corrected_T_base_flange(q, forward(UR10E, q[None])[0], nothing)
 
 
+@pytest.mark.slow
 def test_no_correction_where_the_arm_has_only_noise() -> None:
     scene = Scene.generate(3)
     shots = plan(scene, "exvivo_spine", "hand_eye")
@@ -410,7 +411,7 @@ def test_suggested_poses_keep_what_they_promise() -> None:
 
 @pytest.mark.slow
 def test_the_command_calibrates_photographs(tmp_path: Path) -> None:
-    scene = Scene.generate(4)
+    scene = Scene.generate(4, arm_errors="gears")  # whose photographs all have the whole board
     session = board_session(scene, plan(scene, "demo", "camera_calibration"), width=900)
     camera, count = session.corners.camera, len(session.T_base_flange)
     names = [f"v{i:02d}.png" for i in range(count)]

@@ -6,7 +6,7 @@ import contextlib
 import json
 import socket
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -41,7 +41,7 @@ def let_move(arm: RobotArm) -> None:
     arm.let_move("Ada", time.monotonic())
 
 
-def faulty(number: int, *faults: dict[str, object]) -> contextlib.AbstractContextManager[dict[str, str]]:
+def faulty(number: int, *faults: Mapping[str, object]) -> contextlib.AbstractContextManager[dict[str, str]]:
     plan = json.dumps([{"device": "robot", **fault} for fault in faults])
     return simulated_ur(address(number), "--speed-up", SPEED_UP, "--faults", plan)
 
