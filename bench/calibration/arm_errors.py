@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from bench.machine import RESULTS, commit, machine
 from service.compute.arm.correction import CorrectedMounting
 from service.compute.calibration.hand_eye.estimate import HandEyeViews, calibrate_hand_eye
 from service.core.arms.known import arm_model
-from service.core.geometry import Array, align_points, apply
+from service.core.geometry import Array, align_points, apply, transform
 from service.core.units import mm
 from simulators.scene.arm import ARM_ERRORS, ArmErrorKind, UniversalRobot
 from simulators.scene.world import Scene
@@ -77,11 +78,11 @@ def one(kind: ArmErrorKind, session: str, seed: int) -> dict[str, Any]:
 
 
 def seen_from_nominal_flange(scene: Scene) -> Array:
-    """T_flange_camera with the flange where its controller has it: a shorter last link looks like another mount."""
+    """T_flange_camera with the flange where its controller has it: errors of the last link look like a mount."""
     assert isinstance(scene.arm, UniversalRobot)
-    T = scene.T_flange_camera.copy()
-    T[2, 3] += scene.arm.errors.dh_deltas[5, 1]
-    return T
+    a, d, alpha, theta, _ = scene.arm.errors.dh_deltas[5]
+    turn, twist = (Rotation.from_euler(axis, angle) for axis, angle in (("z", theta), ("x", alpha)))
+    return transform(turn * twist, turn.apply([a, 0.0, d])) @ scene.T_flange_camera
 
 
 def systematic_mm(scene: Scene, shots: list[Shot], T_base_camera: Array) -> Array:
@@ -110,8 +111,8 @@ def as_markdown(record: dict[str, Any]) -> str:
         "periodic errors of gears; `both`. RMS error (mm) of where the camera puts the scene's centre over the 108 "
         "viewpoints of the data set: as it is, and without the arm's scatter (its worst viewpoint beside it). "
         "Held-out: what the calibration states of itself, rms over boards that it did not use. Mount: the camera's "
-        "place on the flange against its stated sigma, with the flange where the controller has it (d6 cannot be "
-        "told from the mount).",
+        "place on the flange against its stated sigma, with the flange where the controller has it (errors of the "
+        "last link cannot be told from the mount).",
         "",
         "| errors | session | arms | plain: median | corrected: median | worst | without scatter: median | worst | "
         "worst viewpoint | held-out: median | error / held-out: worst | mount: worst sigmas |",

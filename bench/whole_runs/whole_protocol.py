@@ -85,7 +85,9 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
         help="as of `simulate rig`, on a machine that does more (0)",
     )
     parser.add_argument("--arm", default="UR10e", help="model of the simulated arm (UR10e)")
-    parser.add_argument("--arm-errors", choices=ARM_ERRORS, default=ARM_ERRORS_USUAL, help="of an UR10e (both)")
+    parser.add_argument(
+        "--arm-errors", choices=ARM_ERRORS, default=ARM_ERRORS_USUAL, help=f"of an UR10e ({ARM_ERRORS_USUAL})"
+    )
     parser.add_argument("--host", default="127.0.0.1", help="address of its controller (127.0.0.1)")
     parser.add_argument("--protocol", type=Path, default=PROTOCOL, help="a protocol other than the paper's")
     parser.add_argument("--one-of", type=int, default=1, metavar="N", help="take one in N views (1)")

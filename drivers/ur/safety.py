@@ -7,6 +7,8 @@ from functools import lru_cache
 from drivers.errors import SafetyStopError
 from drivers.interfaces import SafetyState
 
+_STOPPED, _THREE_POSITION = 1 << 10, 1 << 11  # the switch may be in use without a stop
+
 
 @lru_cache(maxsize=256)  # a controller sends few of them, another sender any
 def safety_state(bits: int) -> SafetyState:
@@ -17,11 +19,11 @@ def safety_state(bits: int) -> SafetyState:
         (1 << 4, SafetyState.SAFEGUARD_STOP),
         (1 << 2, SafetyState.PROTECTIVE_STOP),
         (1 << 3, SafetyState.FAULT),  # recovery mode
-        (1 << 10, SafetyState.SAFEGUARD_STOP),  # stopped for safety otherwise: by a three-position switch (bit 11)
+        (_THREE_POSITION, SafetyState.SAFEGUARD_STOP),
         (1 << 1, SafetyState.REDUCED),
         (1 << 0, SafetyState.NORMAL),
     ):
-        if bits & mask:
+        if bits & mask and (mask != _THREE_POSITION or bits & _STOPPED):
             return state
     return SafetyState.UNKNOWN
 

@@ -158,10 +158,15 @@ def correction_design(arm: ArmModel, joints_rad: Array, about: ArmCorrection) ->
 
 
 def _dh_tolerances(arm: ArmModel) -> Array:
-    """(`dh_count`,) one standard deviation of each parameter of the geometry."""
+    """(`dh_count`,) one standard deviation of each parameter of the geometry.
+
+    Those of the last joint are zero: its errors move the camera with the flange, and nothing can tell them from
+    another mount of the camera. They stay in T_flange_camera, for whose purpose they are no errors.
+    """
     of = np.tile(arm.tolerances.dh, (arm.axes, 1))
     if arm.tolerances.twists_rad:
         of[:, 2] = arm.tolerances.twists_rad
+    of[-1] = 0.0
     return np.concatenate([of.ravel(), np.full(len(arm.parallel), arm.tolerances.parallel_rad)])
 
 
