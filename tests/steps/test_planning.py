@@ -20,7 +20,7 @@ from service.cli.main import app
 from service.compute.arm.inverse_kinematics import nearest_posture, postures
 from service.compute.arm.kinematics import forward
 from service.compute.planning.capsules import segment_box_distance_m, segment_distance_m
-from service.compute.planning.collision import Capsule, nearest_contacts
+from service.compute.planning.collision import Capsule, nearest_contacts, straight_path
 from service.compute.planning.motion_plan import (
     MotionPlan,
     PlanningScene,
@@ -149,6 +149,30 @@ def test_the_way_between_the_papers_viewpoints_is_free_and_shorter_than_as_liste
     assert plan.total_s < plan.listed_s
     few, again = (plan_motion(views[::6], scene, params.order) for _ in range(2))
     assert [v.name for v in again.views] == [v.name for v in few.views]
+
+
+# Where the arm of scene 11 stood after its last board image, turned far from the postures of the viewpoints.
+FAR_TURNED_RAD = np.array([-5.31, -2.94, 1.24, 2.99, 2.25, -0.82])
+
+
+def test_an_arm_that_stands_far_turned_goes_by_a_detour_and_touches_nothing(scene: PlanningScene) -> None:
+    turned = replace(scene, start_rad=FAR_TURNED_RAD)
+    poses = [camera_at((x, -0.2, 0.6)) for x in (-0.3, -0.1, 0.1, 0.3)]
+    plan = planned(turned, *poses)
+    assert [view.outcome for view in plan.views] == ["feasible"] * 4
+    first, *later = plan.views
+    assert len(first.way_rad) >= 2
+    assert not any(len(view.way_rad) for view in later), "from there the ways are straight"
+    assert np.array_equal(first.way_rad[0], FAR_TURNED_RAD)
+    way = [*first.way_rad, *(view.joints_rad for view in plan.views)]
+    fine = [straight_path(a, b, float(np.radians(0.5)))[1:] for a, b in pairwise(way)]
+    ends = len(fine[0])
+    contacts = nearest_contacts(turned.body, turned.obstacles, np.concatenate(fine))
+    near = [contact.clearance_m for contact in contacts]
+    assert min(near[ends:]) > turned.margin_m - 0.002, "between configurations that were checked it comes no nearer"
+    assert min(near[:ends]) > 0.0, "it stood within the margin"
+    assert first.travel_s > sum(view.travel_s for view in later) / 3
+    assert planned(turned, *poses).views[0].way_rad.tolist() == first.way_rad.tolist(), "the same each time"
 
 
 def test_a_viewpoint_through_the_table_is_refused_and_says_so(scene: PlanningScene) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from service.compute.arm.inverse_kinematics import postures_near
 from service.compute.planning.collision import ArmBody, Obstacles, nearest_contacts, straight_path
+from service.compute.planning.detour import PATH_STEP_RAD, Freedom, detour
 from service.compute.planning.optics import DepthOfField, depths_m
 from service.core.geometry import Array, Transform, inverse, transform
 
@@ -19,11 +20,11 @@ Order = Literal["as_listed", "shortest"]
 Progress = Callable[[str, int, int], None]
 
 _NUDGES_DEG = tuple(sign * step for step in (2.5, 5.0, 7.5, 10.0, 12.5, 15.0) for sign in (1, -1))
-#: Spacing of the configurations that are checked on the way from one viewpoint to the next.
-PATH_STEP_RAD = np.radians(3.0)
 _VIEWS_AT_ONCE = 16  # viewpoints that are checked together: one by one, most of the time goes into calls
 _AT_ONCE = 24  # postures that are checked together: seven axes have hundreds for one pose
 _MOST_WAYS = 36  # postures to which a way is looked for if the straight one to the best posture is blocked
+_ROUND_POSTURES = 3  # postures of a viewpoint to which a detour is looked for
+_VAIN_DETOURS = 12  # looked for in vain, a second each, after which a plan looks for no others
 _ROOM_M = 0.05  # clearance beyond which more is not better
 _ROOM_WEIGHT = 1.0  # rad²: cost of zero clearance, compared with squared joint travel
 
@@ -55,6 +56,9 @@ class PlannedView:
     nudge_deg: float = 0.0  # about the vertical through the scene's centre
     joints_rad: Array = field(default_factory=lambda: np.full(0, np.nan), repr=False)  # (N,); empty if refused
     travel_s: float = 0.0  # from the previous view
+    # (M, N) the joints of a detour, from those of the previous view on, to the last before this view's; straight from
+    # each to the next. Empty if the way is straight.
+    way_rad: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +93,8 @@ def plan_motion(
 
     A pose that is out of reach, in collision or out of focus is turned about the vertical through the scene's centre,
     by up to 15°, until it is feasible; otherwise it is refused with the reason of the original pose. A viewpoint
-    whose straight path in joint space is blocked is refused at its place in the order.
+    whose straight path in joint space is blocked is taken in another posture, or by a detour, or else refused at its
+    place in the order.
     """
     placed: list[PlannedView] = []
     for k in range(0, len(views), _VIEWS_AT_ONCE):
@@ -106,17 +111,22 @@ def plan_motion(
         sequence = shortest_order(travel_times_s(way, scene), lambda: progress("finding a short way", 0, 0))
     kept: list[PlannedView] = []
     here = scene.start_rad
-    total = 0.0
+    total, vain = 0.0, 0
     for number, i in enumerate(sequence):
         progress("checking the way between the viewpoints", number, len(able))
         blocked = _blocked(here, able[i].joints_rad, scene)
         free = _other_way(here, able[i], scene) if blocked else None
         if free is not None:
             able[i], blocked = replace(able[i], joints_rad=free), ""
+        elif blocked and vain < _VAIN_DETOURS:
+            round_about = _round_about(here, able[i], scene)
+            vain += 0 if len(round_about.way_rad) else _ROUND_POSTURES
+            able[i], blocked = round_about, "" if len(round_about.way_rad) else blocked
         if blocked:
             refused.append(replace(able[i], outcome="refused", reason=f"on the way there {blocked}"))
             continue
-        travel_s = float(_legs_s(np.stack([here, able[i].joints_rad]), scene)[0])
+        legs = [*able[i].way_rad, able[i].joints_rad] if len(able[i].way_rad) else [here, able[i].joints_rad]
+        travel_s = float(_legs_s(np.stack(legs), scene).sum())
         kept.append(replace(able[i], travel_s=travel_s))
         total += travel_s + scene.pause_s
         here = able[i].joints_rad
@@ -293,9 +303,19 @@ def _other_way(here: Array, view: PlannedView, scene: PlanningScene) -> Array | 
     return next((q for q in others if not _blocked(here, q, scene)), None)
 
 
+def _round_about(here: Array, view: PlannedView, scene: PlanningScene) -> PlannedView:
+    """The view with a detour from `here`, in the first of its postures to which one is found; else as it is."""
+    freedom = Freedom(scene.body, scene.obstacles, scene.margin_m)
+    for joints_rad in islice(able_postures(view.T_base_camera, scene), _ROUND_POSTURES):
+        between = detour(here, joints_rad, freedom)
+        if between is not None:
+            return replace(view, joints_rad=joints_rad, way_rad=np.concatenate([here[None], between]))
+    return view
+
+
 def _blocked(here: Array, there: Array, scene: PlanningScene) -> str:
     # Both ends are free, or the arm is there already.
-    way = straight_path(here, there, float(PATH_STEP_RAD))[1:-1]
+    way = straight_path(here, there, PATH_STEP_RAD)[1:-1]
     if not len(way):
         return ""
     contacts = nearest_contacts(scene.body, scene.obstacles, way)

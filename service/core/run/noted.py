@@ -51,6 +51,7 @@ class NotedView(_NoteRecord):
         nudge_deg: by how much it was turned along its arc so that the arm can take it.
         joints_rad: of the arm there; None if refused.
         travel_s: from the view before.
+        way_rad: joints of a detour, from those of the view before to the last before this view's; empty if straight.
     """
 
     viewpoint: str
@@ -59,6 +60,7 @@ class NotedView(_NoteRecord):
     nudge_deg: float = 0.0
     joints_rad: tuple[float, ...] | None = None
     travel_s: float = 0.0
+    way_rad: tuple[tuple[float, ...], ...] = ()
 
 
 class NotedStation(_NoteRecord):

@@ -7,6 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from drivers.errors import (
     ArmDepartedError,
     DeviceBusyError,
@@ -45,6 +47,10 @@ WORTH_ANOTHER_TRY = (
     StaleImageError,
     UnreadableFileError,
 )
+
+# How far the arm may stand from where a detour was planned to begin: its controller solves for joints by its own
+# calibration.
+_BEGINS_RAD = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,10 +268,30 @@ class _CaptureLoop:
             target = self._solve(robot, viewpoint)
         motion = context.protocol.motion
         limits = MotionLimits(motion.speed_rad_s, motion.acceleration_rad_s2, context.protocol.settle.timeout_s)
-        settled = move_and_settle(context, robot, target, limits, settle_criteria(context), meanwhile=self.keep)
-        self._require_there(robot, name, settled.joints_rad, target)
+        for joints_rad in (*self._detour(robot, viewpoint), target):
+            settled = move_and_settle(
+                context, robot, joints_rad, limits, settle_criteria(context), meanwhile=self.keep
+            )
+            self._require_there(robot, name, settled.joints_rad, joints_rad)
         self.task.stands_rad[viewpoint.station] = target
         return settled
+
+    def _detour(self, robot: RobotArm, viewpoint: Viewpoint) -> Array:
+        """The joints (M, N) to go through on the way to a viewpoint whose straight way is blocked; none for others.
+
+        Raises UnreachablePoseError if the arm does not stand where the detour begins, as after a viewpoint before it
+        that could not be taken.
+        """
+        if not len(viewpoint.way_rad):
+            return viewpoint.way_rad
+        away_rad = np.abs(robot.state().sample.joints_rad - viewpoint.way_rad[0])
+        if away_rad.max() > _BEGINS_RAD:
+            raise UnreachablePoseError(
+                "its detour was planned from elsewhere, and the straight way is blocked",
+                where=viewpoint.name,
+                remedy="Confirm to capture what is missing: the motions are planned anew from where the arm stands",
+            )
+        return viewpoint.way_rad[1:]
 
     def _require_there(self, robot: RobotArm, name: str, joints_rad: Array, sent_rad: Array) -> None:
         """Hold the arm until a person has confirmed, if it does not stand where it was sent."""

@@ -209,7 +209,9 @@ def plan_station(
     answer = plan_motion([(v.name, v.T_base_camera) for v in viewpoints], scene, order, progress)
     stations = {v.name: v.station for v in viewpoints}
     planned = tuple(
-        Viewpoint(v.name, stations[v.name], v.T_base_camera, None if v.outcome == "refused" else v.joints_rad)
+        Viewpoint(
+            v.name, stations[v.name], v.T_base_camera, None if v.outcome == "refused" else v.joints_rad, v.way_rad
+        )
         for v in answer.views
     )
     refused = {v.name: v.reason for v in answer.refused}
@@ -279,12 +281,15 @@ def usual_posture(model: ArmModel, layout: StationLayout, T_flange_camera: Trans
 
 def _text(plan: MotionPlan) -> str:
     nudged = [f"{v.name} by {v.nudge_deg:+g}°" for v in plan.views if v.outcome == "nudged"]
+    round_about = [v.name for v in plan.feasible if len(v.way_rad)]
     refused = [f"{v.name} ({v.reason})" for v in plan.refused]
     parts = [f"{len(plan.feasible)} of {len(plan.views)} viewpoints, about {max(1, round(plan.total_s / 60))} min"]
     if plan.order == "shortest":
         parts[0] += f" ({plan.listed_s - plan.total_s:.0f} s less than as listed)"
     if nudged:
         parts.append(f"turned along the arc: {', '.join(nudged)}")
+    if round_about:
+        parts.append(f"by a detour, because the straight way is blocked: {', '.join(round_about)}")
     if refused:
         parts.append(f"left out: {', '.join(refused)}")
     return "; ".join(parts)
@@ -308,4 +313,5 @@ def _view(view: PlannedView) -> noted.NotedView:
         nudge_deg=view.nudge_deg,
         joints_rad=None if refused else tuple(round(float(q), 6) for q in view.joints_rad),
         travel_s=round(view.travel_s, 2),
+        way_rad=tuple(tuple(round(float(q), 6) for q in joints) for joints in view.way_rad),
     )

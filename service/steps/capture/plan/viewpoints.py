@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, Self
 
 import numpy as np
@@ -72,6 +72,7 @@ class Viewpoint:
     station: str
     T_base_camera: Transform
     joints_rad: Array | None = None  # (N,) as planned; None: the solution nearest to the present posture
+    way_rad: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (M, N) of a detour, as in PlannedView
 
 
 _UP = np.array([0.0, 0.0, 1.0])
